@@ -127,8 +127,8 @@ def test_messages_stay_short():
         assert len(str(caught.value)) < 3 * MAX_VALUE_CHARACTERS
 
 
-TOML = partial(read_toml, what="a device file", error=DeviceError, kind=dict)
-JSON = partial(read_json, what="a list", error=DeviceError, kind=list)
+TOML = partial(read_toml, description="a device file", error_class=DeviceError, target_type=dict)
+JSON = partial(read_json, description="a list", error_class=DeviceError, target_type=list)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.simulate import Circle, Domain, Sweep, load_sensor, noise_model
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
-from isocharge.train.baselines.learned import SubsetProcess, on_logarithms
+from isocharge.train.baselines.learned import SubsetProcess, log_charge_regressor
 from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
@@ -193,7 +193,7 @@ REGRESSORS = {
 
 def regressor(case: Case, name: str) -> Predict:
     """Fit a regressor of scikit-learn."""
-    model = on_logarithms(case.domain, regressor=REGRESSORS[name])
+    model = log_charge_regressor(case.domain, regressor=REGRESSORS[name])
     with threads_and_seed(1, 0):
         model.fit(case.noisy_train.charge, case.noisy_train.contact)
     return lambda charge: np.asarray(model.predict(charge))

@@ -16,7 +16,7 @@ import numpy as np
 from shared import arguments
 
 from isocharge.serve.recognition.fields import Weights
-from isocharge.serve.recognition.recognise import WEIGHTS, described_frames
+from isocharge.serve.recognition.recognise import WEIGHTS, described_frames_section
 
 BOARDS = runpy.run_path(str(Path(__file__).parents[1] / "serve" / "recognition" / "test_described.py"))
 """Names of the test module that defines random boards."""
@@ -44,7 +44,7 @@ def is_recognised(seed: int, weights: Weights) -> bool:
     wrong_bits = rng.integers(1, 256, len(data), dtype=np.uint8)
     is_damaged = rng.random(len(data)) < DAMAGED_SHARE
     damaged = data ^ (wrong_bits * is_damaged)
-    table = described_frames([damaged.tobytes()], frame_count / BOARDS["RATE_HZ"], weights=weights)
+    table = described_frames_section([damaged.tobytes()], frame_count / BOARDS["RATE_HZ"], weights=weights)
     return table is not None and board.is_read_by(table) and board.has_number_and_clock_of(table)
 
 

@@ -25,7 +25,7 @@ def _rough(monkeypatch):
     monkeypatch.setattr(case_module, "MAX_SEARCH_PRESSES", 50)
     monkeypatch.setattr(search_module, "STARTS", 2)
     monkeypatch.setattr(charge_table, "N_DISTANCES", 2)
-    monkeypatch.setattr(design_module, "ambiguities", lambda *_: design_module.UNAMBIGUOUS)
+    monkeypatch.setattr(design_module, "describe_ambiguities", lambda *_: design_module.UNAMBIGUOUS)
 
 
 @pytest.mark.usefixtures("_rough")

@@ -16,7 +16,7 @@ import pytest
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-from isocharge.serve.export.record_messages import pose_stamped, time_of, wrench_stamped
+from isocharge.serve.export.record_messages import pose_stamped, ros_time_ns, wrench_stamped
 from isocharge.serve.record.record import TrackedContact, Tracking
 
 NODE = Path(__file__).parents[2] / "serve/deploy/ros2/isocharge_ros/isocharge_ros/node.py"
@@ -90,9 +90,9 @@ def test_the_node_publishes_what_an_mcap_file_holds(published, record):
     expected = []
     for one in records[:2]:
         fields = one.json_values
-        expected.append(("/isocharge/wrench", wrench_stamped(fields, time_of(fields))))
+        expected.append(("/isocharge/wrench", wrench_stamped(fields, ros_time_ns(fields))))
         if one.contact:
-            expected.append(("/isocharge/pose", pose_stamped(fields, time_of(fields))))
+            expected.append(("/isocharge/pose", pose_stamped(fields, ros_time_ns(fields))))
     for (topic, message), (expected_topic, line) in zip(published, expected, strict=True):
         values, head = numbers(message)
         expected_values, expected_head = numbers(line)

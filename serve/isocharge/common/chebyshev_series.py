@@ -28,8 +28,8 @@ class Series:
     def values_and_derivatives(self, coordinates: Array) -> Array:
         """Evaluate the series and its derivatives with respect to the three coordinates.
 
-        The points are processed in chunks of at most `CHUNK_SIZE` points. For each chunk, the first sum is over the
-        polynomials in x and y, and the second sum is over the polynomials in the logarithm of the force.
+        The points are processed in chunks of at most `CHUNK_SIZE` points. In each chunk, the method first sums over the
+        polynomials in x and y, and then over the polynomials in the logarithm of the force.
 
         Args:
             coordinates: Scaled coordinates of n points, shape (n, 3). Coordinates outside [-1, 1] are clipped.
@@ -38,11 +38,12 @@ class Series:
             Values and derivatives, shape (n, 4, n_electrode). The second axis contains the value and the derivatives
             with respect to x, y and the logarithm of the force.
         """
-        _, n_y, n_force, n_electrode = self.coefficients.shape
+        n_x, _n_y, n_force, n_electrode = self.coefficients.shape  # numbers of polynomials, and of electrodes
+        degree = n_x - 1  # the same in x and in y
         n_chunk = len(coordinates) // CHUNK_SIZE + 1  # at least one chunk, even for no points
         evaluated_chunks = []
         for chunk in np.array_split(coordinates, n_chunk):
-            position_terms, force_terms = chebyshev_terms(chunk, degree=n_y - 1, force_degree=n_force - 1)
+            position_terms, force_terms = chebyshev_terms(chunk, degree, force_degree=n_force - 1)
 
             # Sum over the products of polynomials in x and y: (points, n_term) @ (n_term, n_force * 4 * n_electrode).
             # The factor 4 stands for the value and its three derivatives. For each point, the sums are the coefficients
@@ -58,10 +59,10 @@ class Series:
 
     @cached_property
     def _term_coefficients(self) -> Array:
-        """Coefficients of the series and of its three derivatives.
+        """Coefficients of the series and of its derivatives with respect to x, y and the logarithm of the force.
 
-        The shape is (n_term, (force_degree + 1) * 4 * n_electrode). Each row belongs to one product of polynomials in x
-        and y.
+        The shape is (n_term, (force_degree + 1) * 4 * n_electrode). Each row belongs to one product of a polynomial in
+        x and a polynomial in y, in the order of `position_degrees`.
         """
         derivatives = [_derivative(self.coefficients, axis) for axis in range(3)]
         series_and_derivatives = np.stack([self.coefficients, *derivatives])
@@ -111,15 +112,15 @@ def chebyshev_terms(coordinates: Array, degree: int, force_degree: int) -> tuple
 
 
 def _derivative(coefficients: Array, axis: int) -> Array:
-    """Return the coefficients of the derivative of a series with respect to one coordinate.
+    """Return the coefficients of the derivative of a Chebyshev series with respect to one coordinate.
 
     Args:
         coefficients: Coefficients of the series; see `Series`.
-        axis: Axis of the coordinate.
+        axis: Axis of `coefficients` that belongs to the coordinate.
 
     Returns:
         Coefficients of the derivative, padded with zeros to the shape of `coefficients`.
     """
     padding = [(0, 0)] * coefficients.ndim
-    padding[axis] = (0, 1)
+    padding[axis] = (0, 1)  # one zero at the end, because the derivative has one coefficient less
     return np.pad(chebyshev.chebder(coefficients, axis=axis), padding)

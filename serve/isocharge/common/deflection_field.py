@@ -108,7 +108,7 @@ def _is_close(given: object, value: float) -> bool:
 def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, rings: Array, angles: int) -> Complexes:
     """For a probe on the x axis, compute the points at which a deflection field contains the deflection.
 
-    Rings around the origin are mapped to rings around the probe by the disk automorphism
+    The points lie on rings. Rings around the origin are mapped to rings around the probe by the disk automorphism
 
         z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
 
@@ -125,9 +125,10 @@ def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, ring
     Returns:
         Points x + i y, shape (rings, angles), mm.
     """
-    probe_far_edge = (distance_mm + probe_radius_mm) / radius_mm
-    probe_near_edge = (distance_mm - probe_radius_mm) / radius_mm
-    shift = math.tanh(0.5 * (math.atanh(probe_far_edge) + math.atanh(probe_near_edge)))
+    # Positions of the two edges of the probe on the x axis, in film radii
+    probe_outer_edge = (distance_mm + probe_radius_mm) / radius_mm
+    probe_inner_edge = (distance_mm - probe_radius_mm) / radius_mm
+    shift = math.tanh(0.5 * (math.atanh(probe_outer_edge) + math.atanh(probe_inner_edge)))
 
     directions = np.exp(1j * np.linspace(0.0, math.pi, angles))
     points_around_origin = rings[:, None] * directions  # shape (rings, angles), in film radii
@@ -186,7 +187,7 @@ class _File(Struct):
         Raises:
             WrongKey: If the value of a key is wrong. The error names the first such key.
         """
-        if set(self.film) != set(FILM_KEYS):
+        if set(self.film) != set(FILM_KEYS):  # sets, because the order of the keys does not matter
             raise WrongKey("film", f"the keys {', '.join(FILM_KEYS)}", list(self.film))
         for key in ("force_N", "distance_mm", "rings"):
             numbers = getattr(self, key)
@@ -202,5 +203,5 @@ class _File(Struct):
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Shape of the table: the numbers of forces, of distances, of rings and of angles."""
+        """Shape of the table: the numbers of forces, distances, rings and angles."""
         return len(self.force_N), len(self.distance_mm), len(self.rings), self.angles

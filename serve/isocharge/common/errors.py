@@ -177,17 +177,17 @@ class MissingExtra(IsochargeError, ImportError):
 
 
 @contextmanager
-def error_prefix(where: str, kind: type[IsochargeError]) -> Iterator[None]:
+def error_prefix(where: str, error_class: type[IsochargeError]) -> Iterator[None]:
     """Add a text in front of the message of each error that the `with` block raises.
 
     Args:
         where: Text that is added, for example the name of a file and a colon.
-        kind: Class of the errors whose messages are changed. All other exceptions are not changed.
+        error_class: Class of the errors whose messages are changed. All other exceptions are not changed.
 
     Raises:
-        kind: If the block raises an error of this class. The new error has the longer message.
+        error_class: If the block raises an error of this class. The new error has the longer message.
     """
     try:
         yield
-    except kind as error:
-        raise kind(f"{where}{error}") from error
+    except error_class as error:
+        raise error_class(f"{where}{error}") from error

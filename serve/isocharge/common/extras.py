@@ -37,7 +37,7 @@ def require(*extras: str) -> Iterator[None]:
     """
     try:
         yield
-    except (ModuleNotFoundError, MissingExtra) as error:  # another `require` inside the block raises MissingExtra
+    except (ModuleNotFoundError, MissingExtra) as error:  # another `require` inside the block may raise MissingExtra
         missing_module = error.name or ""
         package = missing_module.partition(".")[0]  # for example "google" for the module "google.protobuf"
         is_package_of_extras = any(package in PACKAGES[extra] for extra in extras)

@@ -94,22 +94,22 @@ def bounded_lines(file: TextIO, max_characters: int = MAX_LINE_CHARACTERS) -> It
         yield line
 
 
-def read_needed(path: Path, error: type[IsochargeError], advice: str, max_bytes: int = MAX_FILE_BYTES) -> bytes:
+def read_needed(path: Path, error_class: type[IsochargeError], advice: str, max_bytes: int = MAX_FILE_BYTES) -> bytes:
     """Read all bytes of a regular file. If the file cannot be read, raise an error of a given class with advice.
 
     Args:
         path: The file.
-        error: Class of the error.
+        error_class: Class of the error.
         advice: Text for the error message that states what the user can do.
         max_bytes: Largest size of the file, bytes.
 
     Raises:
-        error: If the file cannot be read, is not a regular file, or is larger than `max_bytes`.
+        error_class: If the file cannot be read, is not a regular file, or is larger than `max_bytes`.
     """
     try:
         return read_whole(path, max_bytes)
     except OSError as cause:
-        raise error(f"{path}: cannot be read ({cause.strerror}); {advice}") from cause
+        raise error_class(f"{path}: cannot be read ({cause.strerror}); {advice}") from cause
 
 
 def refuse_existing(path: Path) -> None:
@@ -169,8 +169,8 @@ class AtomicWriter:
     def write(self, data: bytes) -> int:
         """Append data to the file.
 
-        If an earlier call was interrupted, for example by Ctrl-C, the incomplete data of the earlier call are
-        overwritten.
+        If an earlier call was interrupted, for example by Ctrl-C, this call overwrites the incomplete data of the
+        earlier call.
 
         Args:
             data: The data to append.
@@ -233,10 +233,11 @@ def new_file(path: Path) -> Iterator[Path]:
             temporary_path.rename(path)
             flush_to_disk(path.parent)
     finally:
-        # After an error, the temporary path is still a folder or a file, and is removed.
-        shutil.rmtree(temporary_path, ignore_errors=True)  # does nothing for a file
+        # After an error, the temporary path is still a folder or a file, and is removed. Without an error, it does not
+        # exist any more, and the two calls do nothing.
+        shutil.rmtree(temporary_path, ignore_errors=True)  # removes only a folder
         with suppress(OSError):
-            temporary_path.unlink()  # fails if the path does not exist any more
+            temporary_path.unlink()  # removes only a file
 
 
 @contextmanager

@@ -136,7 +136,7 @@ class MeasuredPresses:
         Args:
             rows: Index of one press, indices of several presses, a slice, or a mask of shape (n,).
         """
-        indices = np.atleast_1d(np.arange(len(self))[rows])
+        indices = np.atleast_1d(np.arange(len(self))[rows])  # converts every kind of argument to an array of indices
         return replace(
             self,
             contact=self.contact[indices],
@@ -164,11 +164,13 @@ class MeasuredPresses:
         return self.film_temperature_C is not None and not bool(np.isnan(self.film_temperature_C).all())
 
     def __eq__(self, other: object) -> bool:
+        """Return whether the values and the names of the columns are equal. The numbers of the lines are ignored."""
         if not isinstance(other, MeasuredPresses):
             return NotImplemented
         own_columns = self.columns
         other_columns = other.columns
-        return list(own_columns) == list(other_columns) and all(
+        have_same_names = list(own_columns) == list(other_columns)
+        return have_same_names and all(
             np.array_equal(column, other_columns[name], equal_nan=True) for name, column in own_columns.items()
         )
 
@@ -183,18 +185,18 @@ class MeasuredPresses:
             PressError: If the presses contain no charges of one of the electrodes.
         """
         names = tuple(electrodes)
-        missing = [name for name in names if name not in self.electrodes]
-        if missing:
+        missing_names = [name for name in names if name not in self.electrodes]
+        if missing_names:
             raise PressError(
                 f"expected charges of the electrodes {names} of {owner}, got {self.electrodes}; "
-                f"missing: {', '.join(map(shown, missing))}"
+                f"missing: {', '.join(map(shown, missing_names))}"
             )
-        order = [self.electrodes.index(name) for name in names]
-        return replace(self, charge_pC=self.charge_pC[:, order], electrodes=names)
+        column_indices = [self.electrodes.index(name) for name in names]
+        return replace(self, charge_pC=self.charge_pC[:, column_indices], electrodes=names)
 
     @property
     def columns(self) -> dict[str, Array]:
-        """Columns of a file that contains these presses, as a dictionary from names to arrays of shape (n,).
+        """Columns of numbers that a file of these presses has: a dictionary from names to arrays of shape (n,).
 
         A column of temperatures is omitted if the temperatures of all presses are unknown.
         """
@@ -235,15 +237,15 @@ class MeasuredPresses:
         """Check the values of all presses.
 
         Raises:
-            PressError: If a number is not allowed, if only one of x and y is known, or if no charge of a press is
-                known. Also if the temperature of the film is known, but the temperature of the ring is not.
+            PressError: If a number is not allowed, if only one of x and y is known, if no charge of a press is known,
+                or if the temperature of the film is known, but the temperature of the ring is not.
         """
         # The columns have the same rules as the columns of a file, except that all standard deviations must be known.
         rules = PRESS_RULES | dict.fromkeys(self.electrodes, CHARGE_RULE)
         for name in UNCERTAINTY:
             rules[name] = replace(rules[name], may_be_empty=False)
         columns = NumberColumns(self.columns, np.array(self.lines, dtype=np.intp), self.row_noun)
-        columns.check(rules, where="", error=PressError)  # the caller knows the file, if there is one
+        columns.check(rules, where="", error_class=PressError)  # the caller knows the file, if there is one
 
         if self.knows_film_temperature and not self.knows_temperature:
             raise PressError(
@@ -262,18 +264,18 @@ class MeasuredPresses:
         )
 
     def _refuse_first(self, is_refused: Booleans, reason: str) -> None:
-        """Raise an error if a mask selects at least one press.
+        """Raise an error about the first press that is refused. If no press is refused, do nothing.
 
         Args:
-            is_refused: The mask, shape (n,).
+            is_refused: Whether each press is refused, shape (n,).
             reason: Text after the number of the press in the error message.
 
         Raises:
-            PressError: For the first selected press.
+            PressError: If at least one press is refused.
         """
-        rows = np.flatnonzero(is_refused)
-        if rows.size:
-            raise PressError(f"{self.row_noun} {self.lines[rows[0]]}: {reason}")
+        refused_rows = np.flatnonzero(is_refused)
+        if refused_rows.size:
+            raise PressError(f"{self.row_noun} {self.lines[refused_rows[0]]}: {reason}")
 
 
 def read_presses(
@@ -301,7 +303,8 @@ def read_presses(
     path = Path(path)
     default_stds = {"position_std_mm": position_std_mm, "force_std": force_std}
     for name, std in default_stds.items():
-        if not 0.0 < std <= PRESS_RULES[name].maximum:
+        is_allowed = 0.0 < std <= PRESS_RULES[name].maximum  # false for NaN
+        if not is_allowed:
             raise PressError(f"{name}: expected {PRESS_RULES[name].description}, got {std:g}")
 
     # Read the columns of the file that are electrodes or have another meaning for a press (`PRESS_RULES`).
@@ -320,8 +323,8 @@ def read_presses(
         raise PressError(f"{path}: expected one press or more below the header, got none")
 
     # Columns that the file does not have are filled with NaN. Missing standard deviations get their default values.
-    absent_column = np.full(press_count, np.nan)
-    values = {name: columns.values.get(name, absent_column) for name in (*electrode_names, *PRESS_RULES)}
+    unknown_values = np.full(press_count, np.nan)
+    values = {name: columns.values.get(name, unknown_values) for name in (*electrode_names, *PRESS_RULES)}
     for name, std in default_stds.items():
         values[name] = np.where(np.isnan(values[name]), std, values[name])
     with error_prefix(f"{path}, ", PressError):
@@ -365,7 +368,7 @@ def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
 
 
 def read_press_list(path: Path) -> Array:
-    """Read the positions and forces of the presses that a machine will make, in the order of the rows.
+    """Read the positions and forces of the presses that a machine will make, in the order of the rows of a file.
 
     Args:
         path: CSV or Parquet file with the columns x_mm, y_mm and force_N; see `read_presses`. All other columns are

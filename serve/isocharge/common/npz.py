@@ -97,7 +97,7 @@ def npz_arrays(data: bytes, names: Iterable[str] | None = None) -> dict[str, np.
 
 
 def finite_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None, ...]) -> Array:
-    """Return an array of a file as float64, and check its shape and its values.
+    """Check the shape and the values of an array of a file, and return the array as float64.
 
     Args:
         arrays: Arrays of the file, by name.
@@ -116,8 +116,10 @@ def finite_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int |
         lengths = ", ".join("n" if length is None else str(length) for length in shape)
         raise ValueError(f"{name}: expected an array of shape ({lengths}), got {array.shape}")
     values = array.astype(np.float64)
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name}: expected finite numbers, got {values[~np.isfinite(values)][0]}")
+    is_finite = np.isfinite(values)
+    if not is_finite.all():
+        first_wrong_value = values[~is_finite][0]
+        raise ValueError(f"{name}: expected finite numbers, got {first_wrong_value}")
     return values
 
 
@@ -225,9 +227,9 @@ def _decompress(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytearray:
     """
     content = bytearray()
     with archive.open(entry) as file:
-        while piece := file.read(READ_BYTES):
-            content += piece
-            if len(content) > entry.file_size:
+        while block := file.read(READ_BYTES):
+            content += block
+            if len(content) > entry.file_size:  # the size that the archive declares
                 raise ValueError(f"an entry is longer than the {entry.file_size} bytes that the archive declares")
     return content
 
@@ -255,15 +257,16 @@ def _parse_npy(content: bytearray, name: str) -> np.ndarray:
     if dtype.hasobject:
         raise ValueError(f"{name}: expected numbers or text, got Python objects")
 
-    # Check that the bytes after the header have exactly the size of an array of this shape.
+    # Check that the bytes after the header have exactly the size of an array of this shape. An item of the array is a
+    # number or a text.
     header_bytes = header.tell()
-    number_bytes = len(content) - header_bytes
-    number_count = math.prod(shape)
+    item_bytes = len(content) - header_bytes
+    item_count = math.prod(shape)
     has_negative_length = any(length < 0 for length in shape)  # two negative lengths have a positive product
-    if has_negative_length or number_count * dtype.itemsize != number_bytes:
-        raise ValueError(f"{name}: the shape {shape} of {dtype} does not fit {number_bytes} bytes")
+    if has_negative_length or item_count * dtype.itemsize != item_bytes:
+        raise ValueError(f"{name}: the shape {shape} of {dtype} does not fit {item_bytes} bytes")
 
-    if number_count == 0:  # `frombuffer` refuses an empty buffer
+    if item_count == 0:  # `frombuffer` refuses an empty buffer
         return np.empty(shape, dtype)
-    array = np.frombuffer(content, dtype=dtype, count=number_count, offset=header_bytes)
+    array = np.frombuffer(content, dtype=dtype, count=item_count, offset=header_bytes)
     return array.reshape(shape, order="F" if is_fortran else "C")

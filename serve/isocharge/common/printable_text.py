@@ -63,6 +63,6 @@ def _escape(character: str) -> str:
     """
     if character in SHORT_ESCAPES:
         return SHORT_ESCAPES[character]
-    utf16 = character.encode("utf-16-be", "surrogatepass")  # a single surrogate is accepted, too
-    code_units = (utf16[offset : offset + 2] for offset in range(0, len(utf16), 2))  # two bytes each
+    utf16_bytes = character.encode("utf-16-be", "surrogatepass")  # a single surrogate is accepted, too
+    code_units = (utf16_bytes[offset : offset + 2] for offset in range(0, len(utf16_bytes), 2))  # two bytes each
     return "".join(f"\\u{code_unit.hex()}" for code_unit in code_units)

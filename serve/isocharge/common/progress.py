@@ -55,10 +55,10 @@ def report(title: str, done: int, total: int, note: str = "") -> None:
 
 @contextmanager
 def second_thread() -> Iterator[Executor]:
-    """Provide an executor with one thread. Its calls report their progress to the listener of the present thread.
+    """Provide an executor with one thread. The calls in this thread report to the listener of the present thread.
 
     At the end of the `with` block, the executor waits for all calls. If the block raises an exception, calls that have
-    not started are cancelled, and the running call ends with a `CancelledError` when it next reports its progress.
+    not started are cancelled. The running call ends with a `CancelledError` when it next reports its progress.
 
     Yields:
         The executor.

@@ -135,7 +135,13 @@ class ResumableRun:
         return (self.data if final else self._parts) / name
 
     def prepare(self) -> None:
-        """Create the folders of the draft, and remove incomplete files that a killed process has left."""
+        """Create the folders of the draft, and remove incomplete files that a killed process has left.
+
+        The draft is the folder that stores the finished parts of the run.
+
+        Raises:
+            OutputError: If a folder cannot be created.
+        """
         with output_errors(self.target):
             for folder in (self._parts, self.data):
                 folder.mkdir(exist_ok=True)
@@ -145,6 +151,7 @@ class ResumableRun:
     def publish(self) -> None:
         """Rename the folder `data` of the draft to the target, and remove the rest of the draft.
 
+        The draft is the folder that stores the finished parts of the run. The target is the folder that the run writes.
         The folders are flushed to disk, so that the files and their new names survive a power failure.
 
         Raises:
@@ -206,7 +213,8 @@ class _StoringExecutor(Executor):
             # When the task is done, store its result. The argument of a callback is the finished future, which neither
             # of the two callbacks needs.
             task_future.add_done_callback(lambda _: self._store(part_name, task_future, stored_future))
-            # If the caller cancels the returned future, the task is also cancelled.
+            # If the caller cancels the returned future, also cancel the task. The callback is also called after the
+            # result was stored. It has no effect then, because a finished task cannot be cancelled.
             stored_future.add_done_callback(lambda _: task_future.cancel())
         return stored_future
 
@@ -223,7 +231,8 @@ class _StoringExecutor(Executor):
         if task_future.cancelled():
             stored_future.cancel()
 
-        # The caller may also have cancelled the returned future. After this call, the future cannot be cancelled.
+        # The caller may also have cancelled the returned future. Otherwise, this call marks the future as running, so
+        # that it cannot be cancelled any more while the result is stored.
         is_cancelled = not stored_future.set_running_or_notify_cancel()
         if is_cancelled:
             return
@@ -264,10 +273,10 @@ def draft_of(target: Path) -> Path:
 
 
 def refuse_finished(target: Path) -> None:
-    """Check that the target does not exist.
+    """Check that the target of a run does not exist, and remove the rest of a draft that is not needed any more.
 
-    If a process was killed directly after it had renamed its data to the target, a part of the draft remains. This part
-    is also removed.
+    The draft is a folder that stores the finished parts of the run. At the end of the run, its folder `data` is renamed
+    to the target. If a process was killed directly after this renaming, the rest of the draft remains.
 
     Args:
         target: File or folder that the run writes.
@@ -276,7 +285,9 @@ def refuse_finished(target: Path) -> None:
         OutputExists: If the target exists.
     """
     draft = ResumableRun(target)
-    if target.exists() and (draft.folder / "run.json").is_file() and not draft.data.exists():
+    is_draft = (draft.folder / "run.json").is_file()  # any other folder is never removed
+    is_data_renamed = target.exists() and not draft.data.exists()
+    if is_draft and is_data_renamed:
         draft.remove()
     refuse_existing(target)
 
@@ -285,8 +296,9 @@ def refuse_finished(target: Path) -> None:
 def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
     """Begin or resume a run in the `with` block. At the end of the block, the draft becomes the target folder.
 
-    If the block raises an exception, the draft is kept for the next run. However, it is removed if it contains no
-    finished part, or if the next run would fail with the same error.
+    The draft is a folder next to the target that stores the finished parts of the run. If the block raises an
+    exception, the draft is kept for the next run. However, the draft is removed if it contains no finished part, or if
+    the next run would fail with the same error.
 
     Args:
         target: Folder that the run writes.
@@ -309,9 +321,9 @@ def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fa
 def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
     """Begin or resume a run in the `with` block. The block itself writes the target, for example as a single file.
 
-    The draft is a folder next to the target that stores the finished parts of the run. It is removed at the end of the
-    block. If the block raises an exception, the draft is kept, so that the next run can use the finished parts. In two
-    cases, it is removed nevertheless: it contains no finished part, or the next run would fail with the same error.
+    The draft is a folder next to the target that stores the finished parts of the run. The draft is removed at the end
+    of the block. If the block raises an exception, the draft is kept, so that the next run can use the finished parts.
+    However, the draft is removed if it contains no finished part, or if the next run would fail with the same error.
 
     Args:
         target: File or folder that the run writes.
@@ -336,6 +348,7 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
                 yield draft
                 draft.remove()
             except BaseException as error:
+                # These errors depend only on the settings, which are the same in the next run.
                 would_fail_again = isinstance(error, InputError | SolveError | TrainingError)
                 if draft.is_empty() or would_fail_again:
                     draft.remove()
@@ -368,7 +381,8 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
     is_new = not folder.exists()
     try:
         if is_new:
-            # The folder appears only with both files, even if the process is killed meanwhile.
+            # Create the folder under a temporary name, so that it never exists without both files, even if the process
+            # is killed.
             with new_folder(folder) as temporary_folder:
                 (temporary_folder / "lock").touch()
                 write_whole(temporary_folder / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
@@ -394,7 +408,8 @@ def output_errors(target: Path) -> AbstractContextManager[None]:
 def locked(path: Path) -> Iterator[None]:
     """Lock a folder for the `with` block, so that no other process can lock the folder.
 
-    The operating system unlocks the folder if this process is killed.
+    If the given path does not exist, it is created as a lock file. The operating system unlocks the folder if this
+    process is killed.
 
     Args:
         path: The folder, or a lock file in the folder.
@@ -404,7 +419,7 @@ def locked(path: Path) -> Iterator[None]:
     """
     if path.is_dir():
         folder = path
-        descriptor = os.open(path, os.O_RDONLY)
+        descriptor = os.open(path, os.O_RDONLY)  # a folder cannot be opened for writing
     else:
         folder = path.parent
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT)
@@ -422,6 +437,8 @@ def locked(path: Path) -> Iterator[None]:
 
 def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
     """Check that a draft belongs to a run with the same settings as the present run.
+
+    The draft of a run is a folder that stores the finished parts of the run, and its settings in `run.json`.
 
     Args:
         folder: Folder of the draft.
@@ -445,21 +462,21 @@ def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
         )
 
 
-def _differences(saved_settings: Any, current_settings: Any, name: str = "") -> Iterator[str]:
+def _differences(saved: Any, current: Any, name: str = "") -> Iterator[str]:
     """Yield a description of each setting in which an unfinished run differs from the present run.
 
     If a setting is a table, the settings in the table are compared one by one. If one of the runs does not have a
     setting, the setting counts as None.
 
     Args:
-        saved_settings: All settings of the unfinished run, or one of them.
-        current_settings: All settings of the present run, or the same one of them.
+        saved: All settings of the unfinished run as a dictionary, or the value of one setting.
+        current: All settings of the present run as a dictionary, or the value of the same setting.
         name: Name of the setting that is compared; empty for all settings.
     """
-    if isinstance(saved_settings, dict) and isinstance(current_settings, dict):
-        for key in sorted(saved_settings.keys() | current_settings.keys()):
-            if saved_settings.get(key) != current_settings.get(key):
-                inner_name = f"{name}.{key}" if name else key
-                yield from _differences(saved_settings.get(key), current_settings.get(key), inner_name)
+    if isinstance(saved, dict) and isinstance(current, dict):
+        for key in sorted(saved.keys() | current.keys()):
+            if saved.get(key) != current.get(key):
+                name_with_table = f"{name}.{key}" if name else key
+                yield from _differences(saved.get(key), current.get(key), name_with_table)
     else:
-        yield f"{name or 'run.json'} is {cut(str(saved_settings))} there, {cut(str(current_settings))} here"
+        yield f"{name or 'run.json'} is {cut(str(saved))} there, {cut(str(current))} here"

@@ -119,7 +119,7 @@ class _Table(Struct):
 
     def __post_init__(self) -> None:
         if len(self.shape) != N_AXES or min(self.shape) < 1:
-            raise WrongKey("shape", f"{N_AXES} numbers from 1", list(self.shape))
+            raise WrongKey("shape", f"{N_AXES} numbers from 1", list(self.shape))  # "from 1" means 1 or more
         expected_bytes = 4 * int(np.prod(self.shape))  # four bytes for each float32 number
         if len(self.data) != expected_bytes:
             raise WrongKey("data", f"{expected_bytes} bytes in base64", len(self.data))

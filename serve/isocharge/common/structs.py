@@ -87,118 +87,120 @@ class WrongKey(ValueError):
         self.key = key
 
 
-def read_toml(path: Path, what: str, error: type[InputError], kind: type[T]) -> T:
+def read_toml(path: Path, description: str, error_class: type[InputError], target_type: type[T]) -> T:
     """Read a TOML file, and convert its content to a type.
 
     Args:
         path: The file.
-        what: Description of the expected file for error messages, such as "a device file".
-        error: Class of the error that is raised.
-        kind: Type to which the content is converted; `dict[str, Any]` for any table.
+        description: Description of the expected file for error messages, such as "a device file".
+        error_class: Class of the error that is raised.
+        target_type: Type to which the content is converted; `dict[str, Any]` for any table.
 
     Raises:
-        error: If the file cannot be read or its content is wrong.
+        error_class: If the file cannot be read or its content is wrong.
     """
-    return parse_toml(_text(path, MAX_TOML_BYTES, what, "TOML", error), str(path), error, kind)
+    text = _read_text(path, MAX_TOML_BYTES, description, "TOML", error_class)
+    return parse_toml(text, str(path), error_class, target_type)
 
 
-def read_json(path: Path, what: str, error: type[InputError], kind: type[T]) -> T:
+def read_json(path: Path, description: str, error_class: type[InputError], target_type: type[T]) -> T:
     """Read a JSON file, and convert its content to a type.
 
     Args:
         path: The file.
-        what: Description of the expected file for error messages, such as "a device file".
-        error: Class of the error that is raised.
-        kind: Type to which the content is converted; `dict[str, Any]` for any object.
+        description: Description of the expected file for error messages, such as "a device file".
+        error_class: Class of the error that is raised.
+        target_type: Type to which the content is converted; `dict[str, Any]` for any object.
 
     Raises:
-        error: If the file cannot be read or its content is wrong.
+        error_class: If the file cannot be read or its content is wrong.
     """
-    return parse_json(_text(path, MAX_JSON_BYTES, what, "JSON", error), str(path), error, kind)
+    text = _read_text(path, MAX_JSON_BYTES, description, "JSON", error_class)
+    return parse_json(text, str(path), error_class, target_type)
 
 
-def _text(path: Path, max_bytes: int, what: str, language: str, error: type[InputError]) -> str:
+def _read_text(path: Path, max_bytes: int, description: str, language: str, error_class: type[InputError]) -> str:
     """Read a text file in UTF-8.
 
     Args:
         path: The file.
         max_bytes: Largest size of the file, bytes.
-        what: Description of the expected file for error messages, such as "a device file".
+        description: Description of the expected file for error messages, such as "a device file".
         language: "TOML" or "JSON", for error messages.
-        error: Class of the error that is raised.
+        error_class: Class of the error that is raised.
 
     Raises:
-        error: If the file cannot be read, is too large, or is not text in UTF-8.
+        error_class: If the file cannot be read, is too large, or is not text in UTF-8.
     """
-    data = read_needed(path, error, f"expected {what} in {language}", max_bytes)
+    data = read_needed(path, error_class, f"expected {description} in {language}", max_bytes)
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as cause:
-        raise error(f"{path}: not a {language} file: not text in UTF-8: {cause}") from cause
+        raise error_class(f"{path}: not a {language} file: not text in UTF-8: {cause}") from cause
 
 
-def parse_toml(text: str, where: str, error: type[InputError], kind: type[T]) -> T:
+def parse_toml(text: str, where: str, error_class: type[InputError], target_type: type[T]) -> T:
     """Parse a text in TOML, and convert its content to a type.
 
     Args:
         text: The text.
         where: Name of the file, with which the error message begins.
-        error: Class of the error that is raised.
-        kind: Type to which the content is converted.
+        error_class: Class of the error that is raised.
+        target_type: Type to which the content is converted.
 
     Raises:
-        error: If the text is not TOML, or its content is wrong.
+        error_class: If the text is not TOML, or its content is wrong.
     """
     if _DEEP_KEY.search(text):  # parsing such a key needs much memory
-        raise error(f"{where}: not a TOML file: a key of more than 32 parts")
+        raise error_class(f"{where}: not a TOML file: a key of more than 32 parts")
     try:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as cause:
-        raise error(f"{where}: not a TOML file: {cut(str(cause))}") from cause
-    return convert(content, kind, where, error)
+        raise error_class(f"{where}: not a TOML file: {cut(str(cause))}") from cause
+    return convert(content, target_type, where, error_class)
 
 
-def parse_json(text: str | bytes, where: str, error: type[InputError], kind: type[T]) -> T:
+def parse_json(text: str | bytes, where: str, error_class: type[InputError], target_type: type[T]) -> T:
     """Parse a text in JSON, and convert its content to a type.
 
     Args:
         text: The text.
         where: Name of the file, with which the error message begins; empty if there is no file.
-        error: Class of the error that is raised.
-        kind: Type to which the content is converted.
+        error_class: Class of the error that is raised.
+        target_type: Type to which the content is converted.
 
     Raises:
-        error: If the text is not JSON, or its content is wrong.
+        error_class: If the text is not JSON, or its content is wrong.
     """
     try:
-        return msgspec.json.decode(text, type=kind)
+        return msgspec.json.decode(text, type=target_type)
     except (ValueError, RecursionError) as decoding_error:
-        cause = decoding_error
+        cause = decoding_error  # the name after `as` exists only in this clause
 
     # The text is either not JSON, or JSON with wrong content. Decoding without a type distinguishes the two cases.
     try:
         content = msgspec.json.decode(text)
     except (ValueError, RecursionError):
-        raise error(f"{_prefix(where)}expected JSON, got {shown(text)} ({cut(str(cause))})") from cause
-    raise error(_prefix(where) + _first_mistake(content, kind, cause)) from cause
+        raise error_class(f"{_prefix(where)}expected JSON, got {shown(text)} ({cut(str(cause))})") from cause
+    raise error_class(_prefix(where) + _first_mistake(content, target_type, cause)) from cause
 
 
-def convert(value: object, kind: type[T], where: str, error: type[InputError]) -> T:
+def convert(value: object, target_type: type[T], where: str, error_class: type[InputError]) -> T:
     """Convert a value from TOML or JSON to a type.
 
     Args:
         value: Value that consists of tables, lists, texts, numbers and truth values.
-        kind: Type to which the value is converted: a struct, or another type that msgspec supports.
+        target_type: Type to which the value is converted: a struct, or another type that msgspec supports.
         where: Name of the file, with which the error message begins; empty if there is no file.
-        error: Class of the error that is raised.
+        error_class: Class of the error that is raised.
 
     Raises:
-        error: If the value does not have the type. The message describes the first mistake.
+        error_class: If the value does not have the type. The message describes the first mistake.
     """
     try:
-        return msgspec.convert(value, kind)
+        return msgspec.convert(value, target_type)
     except (msgspec.ValidationError, RecursionError) as cause:
-        raise error(_prefix(where) + _first_mistake(value, kind, cause)) from cause
+        raise error_class(_prefix(where) + _first_mistake(value, target_type, cause)) from cause
 
 
 def _prefix(where: str) -> str:
@@ -206,16 +208,16 @@ def _prefix(where: str) -> str:
     return f"{where}: " if where else ""
 
 
-def _first_mistake(value: object, kind: Any, cause: Exception) -> str:
+def _first_mistake(value: object, target_type: Any, cause: Exception) -> str:
     """Return a description of the first mistake in a value for an error message.
 
     Args:
         value: Value from TOML or JSON.
-        kind: Type to which the value could not be converted.
+        target_type: Type to which the value could not be converted.
         cause: Exception of msgspec. Its message is returned if no mistake is found.
     """
     try:
-        return next(_mistakes(value, kind, ""), cut(str(cause)))
+        return next(_mistakes(value, target_type, ""), cut(str(cause)))
     except RecursionError:
         return "nested too deeply"
 
@@ -235,8 +237,8 @@ def _mistakes(value: object, expected_type: Any, path: str) -> Iterator[str]:
     for member in members:
         yield from _mistakes_in_parts(value, member, path)
 
-    # Check the value as a whole. If `__post_init__` of a struct has raised an exception, it is the cause of the error.
-    # A `WrongKey` without a message means that the key is missing.
+    # Check the value as a whole. If `__post_init__` of a struct has raised an exception, msgspec stores the exception
+    # as the cause of its own error. A `WrongKey` without a message means that the key is missing.
     try:
         msgspec.convert(value, expected_type)
     except msgspec.ValidationError as error:
@@ -281,8 +283,9 @@ def _mistakes_in_tag(value: object, members: list[Any], path: str) -> Iterator[s
         return
     allowed_tags = [config.tag for config in configs_with_tag]
     tag_key = str(configs_with_tag[0].tag_field)  # all structs of a union have the same tag key
+    is_tag_required = len(allowed_tags) > 1
     if tag_key not in value:
-        if len(allowed_tags) > 1:
+        if is_tag_required:
             yield f"key {_join(path, tag_key)!r} is missing"
         return
     tag = value[tag_key]
@@ -332,7 +335,7 @@ def _mistakes_in_keys(table: Mapping[str, Any], struct: type[Struct], path: str)
     config = struct.__struct_config__
     if config.tag is not None:
         selected_tag = table.get(str(config.tag_field))
-        if selected_tag != config.tag:
+        if selected_tag != config.tag:  # the table does not belong to this struct
             return
 
     types_of_fields = get_type_hints(struct, include_extras=True)
@@ -363,7 +366,7 @@ def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
         known: Names of the known keys.
     """
     known_keys = list(known)
-    known_text = cut(", ".join(known_keys))
+    known_text = cut(", ".join(known_keys))  # `cut` limits the length of a text
     similar_keys = difflib.get_close_matches(cut(key), known_keys, n=1)
     if similar_keys:
         return f"unknown key {shown(name)}; did you mean {similar_keys[0]!r}? Known are {known_text}"
@@ -401,8 +404,8 @@ def _join(path: str, key: str) -> str:
 def _describe_type(value_type: inspect.Type) -> str:
     """Describe the values that a type allows for error messages, for example as "a list of 2 numbers".
 
-    If the annotation of the type contains a description, this description is returned. Types without a `case`, such as
-    tables, are described by their noun.
+    If the annotation of the type contains a description, this description is returned. Types for which the function has
+    no `case`, such as tables, are described by their noun.
 
     Args:
         value_type: The type, as `msgspec.inspect.type_info` returns it.

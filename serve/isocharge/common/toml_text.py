@@ -18,7 +18,7 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
     """Return the text of a TOML file.
 
-    The text consists of comments, of the keys that are outside of all tables, and of a section for each table.
+    The text begins with the comment. The keys outside of all tables follow, and then a section for each table.
 
     Args:
         tables: Values by name. A value is a text, a number, a truth value, a list or a table. A table becomes a

@@ -83,7 +83,7 @@ class WriterQueue(Generic[T]):
     def close(self) -> None:
         """Write the waiting items as long as the consumer accepts items, and close the queue.
 
-        Items that the consumer does not accept within the timeout are counted as lost.
+        If the consumer accepts no item within the timeout, the waiting items are dropped and counted as lost.
 
         Raises:
             Exception: The exception that `write` has raised in the thread, unless `put` has raised it already.
@@ -92,8 +92,8 @@ class WriterQueue(Generic[T]):
             # Wait until the queue is empty or the thread has ended, but stop waiting if the thread takes no further
             # item from the queue within the timeout.
             while self._waiting and self._thread.is_alive():
-                has_changed = self._change.wait_for(partial(self._has_changed, self._taken_count), CLOSE_TIMEOUT_s)
-                if not has_changed:
+                has_advanced_or_failed = partial(self._has_advanced_or_failed, self._taken_count)
+                if not self._change.wait_for(has_advanced_or_failed, CLOSE_TIMEOUT_s):  # the timeout has expired
                     break
             self.lost += len(self._waiting)
             self._waiting.clear()
@@ -104,7 +104,7 @@ class WriterQueue(Generic[T]):
             self.lost += 1
         self._raise_error()
 
-    def _has_changed(self, earlier_count: int) -> bool:
+    def _has_advanced_or_failed(self, earlier_count: int) -> bool:
         """Return whether the thread has taken an item since an earlier time, or has ended with an error.
 
         Args:
@@ -115,7 +115,7 @@ class WriterQueue(Generic[T]):
     def _raise_error(self) -> None:
         """If the thread has ended with an exception, raise this exception, but only once."""
         error = self._error
-        self._error = None  # so that the exception is raised only once
+        self._error = None  # the next call raises nothing
         if error is not None:
             raise error
 

@@ -71,7 +71,7 @@ class Timing(NamedTuple):
     presses_per_s: float
 
     @classmethod
-    def of(cls, name: str, presses: int, durations_ns: Array) -> "Timing":
+    def from_durations(cls, name: str, presses: int, durations_ns: Array) -> "Timing":
         """Compute the statistics of the durations of the calls of one contender.
 
         Args:
@@ -79,13 +79,14 @@ class Timing(NamedTuple):
             presses: Number of presses that one call predicts.
             durations_ns: Duration of each call, shape (calls,), ns.
         """
-        p50, p99 = np.percentile(durations_ns, (50, 99)) / 1e3
-        rate = presses * len(durations_ns) / (float(durations_ns.sum()) / 1e9)
-        return cls(name, presses, len(durations_ns), float(p50), float(p99), rate)
+        p50_us, p99_us = np.percentile(durations_ns, (50, 99)) / 1e3
+        total_s = float(durations_ns.sum()) / 1e9
+        presses_per_s = presses * len(durations_ns) / total_s
+        return cls(name, presses, len(durations_ns), float(p50_us), float(p99_us), presses_per_s)
 
 
 def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = time.perf_counter_ns) -> list[Timing]:
-    """Measure how long the calls of each contender take.
+    """Measure how long the calls of each contender take. A contender is one way to compute predictions.
 
     In each round, every contender has one turn, in which it is called repeatedly. The first round only warms up the
     processor and the caches. The durations of its calls are not used.
@@ -98,7 +99,7 @@ def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = t
     Returns:
         The timing of each contender, in the order of `contenders`.
     """
-    turn_count = ROUNDS * max(len(contenders), 1)  # at least 1, so that no division by zero occurs
+    turn_count = ROUNDS * max(len(contenders), 1)  # not 0, so that no division by zero occurs
     turn_ns = round(seconds * 1e9 / turn_count)
     durations: list[list[int]] = [[] for _ in contenders]
     for round_number in track(range(ROUNDS), "measuring", ROUNDS):
@@ -108,7 +109,7 @@ def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = t
             if not is_warm_up:
                 contender_durations.extend(turn_durations)
     return [
-        Timing.of(contender.name, contender.presses, np.array(contender_durations, float))
+        Timing.from_durations(contender.name, contender.presses, np.array(contender_durations, float))
         for contender, contender_durations in zip(contenders, durations, strict=True)
     ]
 
@@ -133,7 +134,7 @@ def _measure_turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> lis
 def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Singles:
     """Draw charges at random from the golden vectors, which are charges that are stored with a model.
 
-    Golden vectors for which the model returns a contact with flags are excluded.
+    Golden vectors for which the model returns a contact with flags are excluded. A press may be drawn several times.
 
     Args:
         predictor: Predictor with the model.
@@ -185,7 +186,7 @@ def machine(packages: Sequence[str] = ("numpy", "onnxruntime")) -> dict[str, str
     lines = cpu_file.read_text("utf-8").splitlines() if cpu_file.exists() else []
     cpu_names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return {
-        "cpu": next(cpu_names, platform.processor()),
+        "cpu": next(cpu_names, platform.processor()),  # the name of the first processor
         "cores": str(os.cpu_count()),
         "system": platform.platform(),
         "python": platform.python_version(),

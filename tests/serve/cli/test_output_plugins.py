@@ -11,7 +11,7 @@ import zipfile
 import pytest
 
 from isocharge.common.errors import InputError
-from isocharge.serve.outputs.targets import kind_of
+from isocharge.serve.outputs.targets import output_kind
 
 PLUGIN = '''
 """An output that counts the records of each touch."""
@@ -96,4 +96,4 @@ def test_installed_package_adds_an_output(installed, recorded, models, tmp_path,
 def test_broken_package_is_named(installed, monkeypatch, entry_point, reason):
     monkeypatch.syspath_prepend(installed(entry_point))
     with pytest.raises(InputError, match=rf"output count \({entry_point}\): {reason}"):
-        kind_of("touch.count")
+        output_kind("touch.count")

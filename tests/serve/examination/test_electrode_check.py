@@ -97,7 +97,7 @@ def test_channels_are_assigned_for_any_order_and_gain(order):
 
 
 def test_presses_that_do_not_distinguish_the_channels_raise_an_error():
-    with pytest.raises(PressCheckError, match="moves two channels alike; press closer"):
+    with pytest.raises(PressCheckError, match="changes two channels by almost the same amount; press closer"):
         assign_channels(np.ones((3, 3)), "ABC")
 
 

@@ -59,9 +59,9 @@ def constant(t):
             constant,
             -8.0,
             {"leak": {"tau_s": LEARNING_TAU_s}},
-            r"the rest drifts, by -1.6 % .*keeps its charge .*\[leak\] tau_s = 100000",
+            r"the rest level drifts by -1.6 % .*keeps its charge .*\[leak\] tau_s = 100000",
         ),
-        (lambda t: 1.0 + 0.1 * np.sin(t), 0.0, {}, "by no law that is clear"),
+        (lambda t: 1.0 + 0.1 * np.sin(t), 0.0, {}, "follows no clear law"),
     ],
 )
 def test_held_press_finds_leak_creep_or_drift(law, drift, sections, message, scale):

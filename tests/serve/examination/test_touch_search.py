@@ -61,8 +61,8 @@ def test_press_of_0_05_N_is_found(level, press):
         touch = find_touch(charges, times_s, unit_is_pC=True)
         assert touch is not None
         if level == "reference":  # the amplifier `bench` leaks
-            assert touch.position == 0
-            assert touch.change == pytest.approx(150.0 * np.ptp(PRESSES[press](times_s)), abs=20.0)
+            assert touch.column == 0
+            assert touch.total_change == pytest.approx(150.0 * np.ptp(PRESSES[press](times_s)), abs=20.0)
         if press != "slow":
             assert find_touch(np.round(20.0 * charges), times_s, unit_is_pC=False) is not None
         if press in ("begins", "ends"):

@@ -6,7 +6,7 @@ import pytest
 
 from isocharge.common.errors import InputError, OutputError, OutputExists
 from isocharge.serve.outputs.output import OutputContext, OutputKind
-from isocharge.serve.outputs.targets import OUTPUT_KINDS, Outputs, kind_of, target_forms
+from isocharge.serve.outputs.targets import OUTPUT_KINDS, Outputs, output_kind, target_forms
 
 ELECTRODES = ("A", "B")
 
@@ -29,7 +29,7 @@ def context(**changes):
     ],
 )
 def test_form_of_a_target_chooses_the_output(target, form):
-    assert kind_of(target).form == form
+    assert output_kind(target).form == form
 
 
 @pytest.mark.parametrize("target", ["touch.txt", "", "tcp://127.0.0.1:9", "JSON", "touch"])

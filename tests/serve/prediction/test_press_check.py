@@ -207,7 +207,7 @@ def test_common_error_is_the_weighted_mean():
     std = rng.uniform(0.5, 2.0, 500)
     for scatter in (1.0, 3.0):
         error = 0.3 + scatter * std * rng.normal(size=500)
-        common = CommonError.of(np.append(error, np.nan), np.append(std, 1.0) ** 2)
+        common = CommonError.from_errors(np.append(error, np.nan), np.append(std, 1.0) ** 2)
         mean, weight = np.average(error, weights=std**-2, returned=True)
         widening = max(1.0, np.sum(((error - mean) / std) ** 2) / 499) ** 0.5  # as the Particle Data Group averages
         assert (common.mean, common.std) == pytest.approx((mean, widening * weight**-0.5))
@@ -215,11 +215,11 @@ def test_common_error_is_the_weighted_mean():
 
 
 def test_error_summary_of_known_numbers():
-    summary = ErrorSummary.of(np.array([3.0, 4.0]), np.array([2.0, 4.0]), np.array([1.0, 0.0]))
+    summary = ErrorSummary.from_errors(np.array([3.0, 4.0]), np.array([2.0, 4.0]), np.array([1.0, 0.0]))
     assert (summary.rms, summary.median, summary.max) == (12.5**0.5, 3.5, 4.0)
     assert (summary.noise, summary.rig, summary.explained, summary.beyond) == (3**0.5, 0.5**0.5, 3.5**0.5, 3.0)
-    assert ErrorSummary.of(np.array([1.0]), np.array([4.0]), np.array([0.0])).beyond == 0.0
-    assert ErrorSummary.of(np.array([]), np.array([]), np.array([])) is None
+    assert ErrorSummary.from_errors(np.array([1.0]), np.array([4.0]), np.array([0.0])).beyond == 0.0
+    assert ErrorSummary.from_errors(np.array([]), np.array([]), np.array([])) is None
 
 
 @given(degrees=st.integers(1, 2000), sigmas=st.floats(-4.0, 20.0))

@@ -12,7 +12,7 @@ import pytest
 from cobs import cobs
 
 from isocharge.serve import device_from_table
-from isocharge.serve.recognition.recognise import described_frames, recognise
+from isocharge.serve.recognition.recognise import described_frames_section, recognise
 
 FRAMES = 300
 RATE_HZ = 200.0
@@ -156,7 +156,7 @@ def test_noise_is_not_recognised(seed):
 
 def test_constant_bytes_and_nothing_are_not_recognised():
     for data in (b"", b"\xaa" * 1000, b"\xaa\x55\x01\x02\x03\x04" * 100):
-        assert described_frames([data], 1.0) is None
+        assert described_frames_section([data], 1.0) is None
 
 
 @pytest.mark.parametrize("per_datagram", [1, 3])

@@ -66,7 +66,7 @@ def test_triangulation_of_circular_contours_finds_the_position(layout):
 def test_seed_grid_estimates_the_distance_from_contours():
     """The charges are (10 + x) F and (10 + y) F, so their contours are parallel to the axes."""
     plane = FunctionMap(lambda c: (10.0 + c[:, :2]) * c[:, 2:], ("A", "B"), Domain(5.0, (0.5, 2.0)))
-    grid = SeedGrid.of(plane)
+    grid = SeedGrid.from_charge_map(plane)
     at = draw(200, seed=2, radius=5.0, forces=(0.5, 2.0))
     charge = plane.charges(at)
     distance = np.linalg.norm(at[:, None, :2] - grid.position, axis=2)

@@ -20,7 +20,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.forward.family import Family, check_presses
+from isocharge.simulate.forward.family import Family, spread_check_presses
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR, NODE_COUNTS
 from kept import kept
 
@@ -238,7 +238,7 @@ def test_family_interpolates_fields_that_change_over_the_distance_to_the_clamp()
 
 
 def test_check_presses_cover_the_distances_and_forces():
-    presses = check_presses(DOMAIN, 7)
+    presses = spread_check_presses(DOMAIN, 7)
     force = np.array([press.force for press in presses])
     assert len(set(force)) == 7
     assert (0.05 <= force.min() < 0.1, 1.0 < force.max() <= 2.0) == (True, True)

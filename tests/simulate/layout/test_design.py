@@ -13,7 +13,7 @@ from isocharge.simulate.layout import design as design_module
 from isocharge.simulate.layout import search as search_module
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, WeightMap
 from isocharge.simulate.layout.charge_table import ChargeTable
-from isocharge.simulate.layout.design import NOT_SEARCHED, UNAMBIGUOUS, ambiguities, design
+from isocharge.simulate.layout.design import NOT_SEARCHED, UNAMBIGUOUS, describe_ambiguities, design
 from isocharge.simulate.layout.search import Search, random_layouts
 from kept import kept
 
@@ -98,9 +98,9 @@ def test_ambiguous_layout_is_rejected_for_the_next_one(sensor, monkeypatch):
     """If all layouts are ambiguous, the one with the smallest error is returned."""
     answers = iter(["it folds", UNAMBIGUOUS])
     monkeypatch.setattr(Search, "refine", lambda _, places: np.append(places[0, 0], places))
-    monkeypatch.setattr(design_module, "ambiguities", lambda *_: next(answers))
+    monkeypatch.setattr(design_module, "describe_ambiguities", lambda *_: next(answers))
     second = design(case_of(sensor))
-    monkeypatch.setattr(design_module, "ambiguities", lambda *_: "it folds")
+    monkeypatch.setattr(design_module, "describe_ambiguities", lambda *_: "it folds")
     best = design(case_of(sensor))
     assert (second.unambiguous, second.n_rejected, best.unambiguous, best.n_rejected) == (True, 1, False, 0)
     assert best.minimised_error < second.minimised_error
@@ -117,7 +117,7 @@ def test_ambiguities_reports_folds_and_pairs(sensor, monkeypatch):
     monkeypatch.setattr(design_module, "find_ambiguous_pairs", lambda *_: [1, 2])
     text = "the map folds 3.0 mm from the centre; 6 pairs of contacts have the same charges"
     charge_map = FunctionMap(charges, ("A", "B", "C"), Domain(4.0, (0.05, 2.0)))
-    assert ambiguities(case_of(sensor), charge_map) == text
+    assert describe_ambiguities(case_of(sensor), charge_map) == text
 
 
 def test_design_reports_that_charges_cannot_be_interpolated(sensor, monkeypatch):

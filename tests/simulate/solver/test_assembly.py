@@ -58,6 +58,6 @@ def test_sparse_solution_with_the_tangent_of_a_film_equals_dense_solution(mesh, 
     field = 0.01 * mesh.random_field(1)
     matrix = elastic.tangent(field, 0.0 if bending == 0.0 else 1.0)
     right = -elastic.residual(field)
-    solution = Assembly(mesh.template, elastic.components).factor(matrix).solve(right)
+    solution = Assembly(mesh.template, elastic.unknowns_per_node).factor(matrix).solve(right)
     expected = dense_solution(mesh.template, matrix, right)
     np.testing.assert_allclose(solution, expected, atol=1e-8 * np.abs(expected).max())

@@ -170,7 +170,7 @@ def check_contact(contact_only, expected):
     """Check the contacts of a batch and of single presses."""
     np.testing.assert_allclose(contact_only.predict(CHARGE), expected, rtol=1e-4, atol=1e-4)
     for charge, contact in zip(CHARGE[:9], expected, strict=False):
-        compute = contact_only.single(charge)
+        compute = contact_only.single_press_function(charge)
         np.testing.assert_allclose(np.ravel(compute())[:3], contact, rtol=1e-4, atol=1e-4)
 
 

@@ -200,7 +200,7 @@ def test_cells_cover_the_disk_once(radius):
         total_area = 0.0
         first_moment = np.zeros(2)
         for cells in levels:
-            fraction, centroid = cells.inside(radius)
+            fraction, centroid = cells.fraction_and_centroid_inside(radius)
             area = cells.side**2 * fraction
             total_area += area.sum()
             first_moment += area @ centroid

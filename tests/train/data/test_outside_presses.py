@@ -24,7 +24,7 @@ def test_unnoticed_shares_are_those_of_the_places():
     """Presses with y > 0 beyond 25 mm are unnoticed; these are half of the outer rings and none of the inner rings."""
     contact = OUTSIDE.grid().contact
     distance = np.hypot(contact[:, 0], contact[:, 1])
-    unnoticed = OUTSIDE.unnoticed((contact[:, 1] > 0.0) & (distance > 25.0))
+    unnoticed = OUTSIDE.unnoticed_shares((contact[:, 1] > 0.0) & (distance > 25.0))
     assert (unnoticed.from_mm, unnoticed.to_mm, unnoticed.force_N) == (10.0, 40.0, (0.2, 2.0))
     outer_ring = unnoticed.share[-1]
     assert outer_ring == (1.0,) * (N_SECTORS // 2) + (0.0,) * (N_SECTORS // 2)
@@ -42,4 +42,4 @@ def test_presses_beyond_a_working_area():
 
 
 def test_a_probe_as_wide_as_the_film_leaves_no_presses_outside():
-    assert OutsidePresses.of(load_sensor("four-25um-biaxial"), ("circle:22",), (0.05, 2.0)) is None
+    assert OutsidePresses.simulate(load_sensor("four-25um-biaxial"), ("circle:22",), (0.05, 2.0)) is None

@@ -133,7 +133,8 @@ def test_the_followed_film_has_the_misfit_of_the_network(name):
 
 @pytest.mark.parametrize("name", ACTIVATIONS)
 def test_a_student_with_8_bits_is_trained_and_served(name, dataset, fitted, trained, monkeypatch, tmp_path):
-    monkeypatch.setattr(Split, "of", lambda *_: trained.split)  # the search for folds would take most of the time
+    # The search for folds would take most of the time.
+    monkeypatch.setattr(Split, "by_position", lambda *_: trained.split)
     teacher = Teacher("teacher/1", "", lambda charge: fitted.predict(charge)[:2])
     config = FitConfig(
         network=NetworkConfig(hidden=(24, 24), misfit_hidden=(16, 16), activation=name, weights="int8"),

@@ -41,7 +41,7 @@ def test_markdown_table_aligns_text_and_number_columns():
 def test_contact_errors_equal_those_of_scikit_learn():
     truth = random_contacts(500, 0)
     estimate = truth + np.random.default_rng(1).normal(0.0, 0.1, truth.shape)
-    errors = ContactErrors.of(estimate, truth)
+    errors = ContactErrors.compute(estimate, truth)
     coordinate_rms = root_mean_squared_error(truth[:, :2].ravel(), estimate[:, :2].ravel())
     relative_force_rms = root_mean_squared_error(np.ones(500), estimate[:, 2] / truth[:, 2])
     np.testing.assert_allclose(errors.position_rms_mm, np.sqrt(2.0) * coordinate_rms, rtol=1e-3)
@@ -55,11 +55,11 @@ def test_presses_without_an_estimate_are_left_out_of_the_errors():
     truth = random_contacts(10, 2)
     estimate = truth + 0.1
     estimate[3] = np.nan
-    errors = ContactErrors.of(estimate, truth)
+    errors = ContactErrors.compute(estimate, truth)
     assert errors.answered == 0.9
     np.testing.assert_allclose(errors.position_rms_mm, 0.1 * np.sqrt(2.0), rtol=1e-3)
     no_estimate = np.full((10, 3), np.nan)
-    assert ContactErrors.of(no_estimate, truth).position_rms_mm is None
+    assert ContactErrors.compute(no_estimate, truth).position_rms_mm is None
 
 
 def test_pareto_front_equals_the_front_by_brute_force():
@@ -158,18 +158,18 @@ def test_case_has_the_same_number_of_presses_for_each_probe(dataset):
     angles_deg = [0.0, 30.0, np.linspace(0.0, 90.0, len(dataset.samples))]
     rotated_rectangle = parse_probe("rectangle:4x2").rotated(np.deg2rad(30.0))
 
-    all_probes = EvaluationCase.of(dataset_with_probes(dataset, names, angles_deg), 101, 0)
+    all_probes = EvaluationCase.for_dataset(dataset_with_probes(dataset, names, angles_deg), 101, 0)
     assert all_probes.probes == (parse_probe("circle:1.0"), rotated_rectangle, parse_probe("triangle:4.0"))
     assert all_probes.press_count == 99
     assert all_probes.is_rotated
 
-    fixed_probes = EvaluationCase.of(dataset_with_probes(dataset, names[:2], angles_deg[:2]), 101, 0)
+    fixed_probes = EvaluationCase.for_dataset(dataset_with_probes(dataset, names[:2], angles_deg[:2]), 101, 0)
     assert fixed_probes.probes == (parse_probe("circle:1.0"), rotated_rectangle)
     assert fixed_probes.press_count == 100
     assert not fixed_probes.is_rotated
 
 
 def test_test_sweep_multiplies_the_ranges_of_the_dataset(dataset):
-    sweep = EvaluationCase.of(dataset, 101, 0).test_sweep(2.0)
+    sweep = EvaluationCase.for_dataset(dataset, 101, 0).test_sweep(2.0)
     assert sweep.radius == pytest.approx(16.0)
     assert sweep.force_range == pytest.approx((0.025, 4.0))

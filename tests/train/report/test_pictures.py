@@ -16,7 +16,7 @@ from isocharge.train.report.studies import Mismatch, NoiseDraws, measure_mismatc
 @pytest.fixture(scope="module")
 def case(dataset):
     """The case of a dataset with 1,500 test presses."""
-    return EvaluationCase.of(dataset, 1500, 0)
+    return EvaluationCase.for_dataset(dataset, 1500, 0)
 
 
 @pytest.fixture(scope="module")

@@ -45,7 +45,7 @@ def test_systematic_error_is_corrected(seed):
     fresh = draw(np.random.default_rng(100 + seed), 1000, 7.5)
     remaining_error = correction.log_factor(fresh) - systematic_error(fresh)
     assert rms(remaining_error) < 0.25 * rms(systematic_error(fresh))
-    assert 4.0 < correction.freedom < 200.0
+    assert 4.0 < correction.effective_count < 200.0
 
 
 def test_noise_alone_is_not_corrected():
@@ -67,7 +67,7 @@ def test_correction_does_not_depend_on_the_size_of_the_chunks(monkeypatch):
     monkeypatch.setattr(correction_module, "CHUNK_SIZE", 64)
     correction = fit_correction(residuals)
     np.testing.assert_allclose(correction.coefficients, expected.coefficients, rtol=1e-6, atol=1e-9)
-    assert correction.freedom == pytest.approx(expected.freedom)
+    assert correction.effective_count == pytest.approx(expected.effective_count)
 
 
 def test_correction_outside_the_domain_is_that_of_the_nearest_contact():

@@ -201,7 +201,7 @@ def long_pad(tmp_path_factory):
 
 def test_pressed_area_contains_its_own_presses_and_no_others():
     contact = presses_on_long_pad(900, 7).contact
-    area = PressedArea.of(contact)
+    area = PressedArea.of_contacts(contact)
     assert area.contains(contact).all()
     area.check(np.array([[50.0, 0.0, 1.0]]), "pad")
     outside = np.array([[-20.0, 0.0, 1.0], [50.0, 20.0, 1.0], [50.0, 0.0, 9.0], [np.nan, 0.0, 1.0]])
@@ -251,7 +251,7 @@ def test_outline_of_a_square_grid_is_larger_by_half_the_grid_step():
     places = np.stack(np.meshgrid(np.arange(11.0), np.arange(11.0)), axis=-1).reshape(-1, 2)
     assert sorted(map(tuple, outline(places))) == [(-0.5, -0.5), (-0.5, 10.5), (10.5, -0.5), (10.5, 10.5)]
     contact = np.column_stack([places, np.ones(len(places))])
-    assert PressedArea.of(contact).radius == pytest.approx(5.5 * np.sqrt(2.0))
+    assert PressedArea.of_contacts(contact).radius == pytest.approx(5.5 * np.sqrt(2.0))
 
 
 def test_outline_of_the_l_has_its_area():
@@ -267,7 +267,7 @@ def test_places_on_a_line_have_no_outline():
 def test_pressed_area_of_presses_with_one_force_has_a_range_of_forces():
     contact = contacts_on_l(600, 6)
     contact[:, 2] = 2.0
-    low, high = PressedArea.of(contact).force_range
+    low, high = PressedArea.of_contacts(contact).force_range
     assert low < 2.0 < high
 
 
@@ -276,7 +276,7 @@ def test_noise_of_channels_that_are_mostly_zero_is_finite():
     contact[:, 2] = 2.0
     is_zero = np.random.default_rng(7).random((600, 4)) < 0.6
     charge = np.where(is_zero, 0.0, charges_on_l(contact, 8))
-    noise = ChannelNoise.of(charge, PressedArea.of(contact).to_unit(contact))
+    noise = ChannelNoise.estimate(charge, PressedArea.of_contacts(contact).to_unit(contact))
     np.testing.assert_allclose(noise.charge(noise.level(charge)), charge, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(noise.transition_charge(np.abs(charge)), noise.transition_charge(-np.abs(charge)))
     assert np.isfinite(WhitenedFeatures.fit_signed(charge, noise.transition_charge(charge)).matrix).all()

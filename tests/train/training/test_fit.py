@@ -110,7 +110,7 @@ def settings(hidden=(16, 16), misfit_hidden=(8, 8), weights="float32", electrode
 @pytest.fixture
 def split_once(trained, monkeypatch):
     """Use the split of the session's training and few outside presses, which take longer than these trainings."""
-    monkeypatch.setattr(Split, "of", lambda *_: trained.split)
+    monkeypatch.setattr(Split, "by_position", lambda *_: trained.split)
     monkeypatch.setattr(misfit_training, "N_OUTSIDE_PRESSES", 200)
 
 

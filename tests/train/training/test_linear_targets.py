@@ -30,7 +30,7 @@ CHARGE_MAP = FunctionMap(bell_charges, tuple("ABCDEF"), DOMAIN)
 
 def targets_of(noise, contact=CONTACT):
     """Return the targets of presses on the bell-shaped map."""
-    return LinearTargets.of(LabelledPresses(contact, bell_charges(contact)), CHARGE_MAP, noise)
+    return LinearTargets.compute(LabelledPresses(contact, bell_charges(contact)), CHARGE_MAP, noise)
 
 
 def nonlinear_estimate(charge, noise_std):

@@ -61,16 +61,16 @@ LATENCY_S = 0.5
 """Time for which the latency of a prediction is measured, s."""
 
 
-class FollowedPress(NamedTuple):
+class FollowedFrame(NamedTuple):
     """Frame of the live part in which both the virtual sensor and the model report a contact.
 
     Attributes:
-        number: Number of the press, counted from 1.
+        press_number: Number of the press to which the frame belongs, counted from 1.
         true_x_mm, true_y_mm, true_force_N: True contact, which the virtual sensor plays.
         x_mm, y_mm, force_N: Contact that the model estimates.
     """
 
-    number: int
+    press_number: int
     true_x_mm: float
     true_y_mm: float
     true_force_N: float
@@ -157,13 +157,13 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
 
     Returns:
         Two values. The first is an array of the frames in which both the virtual sensor and the model have a contact,
-        shape (n, 7), mm and N: number of the press, true (x, y, F) and estimated (x, y, F), as in `FollowedPress`. The
+        shape (n, 7), mm and N: number of the press, true (x, y, F) and estimated (x, y, F), as in `FollowedFrame`. The
         second contains the counts of all frames of the stream.
     """
     touch = TouchStream(predictor)
     frame_count = round(seconds * RATE_HZ)
     print_interval = round(PRINT_INTERVAL_S * RATE_HZ)
-    followed: list[FollowedPress] = []
+    followed: list[FollowedFrame] = []
     press_number = 0
     is_pressed = False
     say("   estimated: x mm, y mm, N   true: x mm, y mm, N")
@@ -175,13 +175,14 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
             true_contact = (truth.x_mm, truth.y_mm, truth.force_N)
             contact = _contact_of(record)
 
-            # A press lasts as long as both the virtual sensor and the model have a contact.
+            # A press lasts as long as both the virtual sensor and the model have a contact. A new press has a new
+            # number.
             was_pressed = is_pressed
             is_pressed = record.contact and truth.force_N > 0.0
             if is_pressed and not was_pressed:
                 press_number += 1
             if is_pressed:
-                followed.append(FollowedPress(press_number, *true_contact, *contact))
+                followed.append(FollowedFrame(press_number, *true_contact, *contact))
             if frame_number % print_interval == 0:
                 estimated_columns = _contact_columns(record.contact, contact)
                 true_columns = _contact_columns(truth.force_N > 0.0, true_contact)
@@ -222,8 +223,8 @@ def _test_presses(forward_map: ForwardMap, predictor: Predictor, sweep: Sweep) -
     true_contact = test_sweep.over((forward_map.probe,)).contact
     clean_charge_pC = forward_map.charges(true_contact)
     noisy_charge_pC = noise_model("reference").add(clean_charge_pC, np.random.default_rng(test_sweep.seed))
-    x_mm, y_mm, force_N = predictor.predict_batch(noisy_charge_pC)[:3]
-    return np.column_stack([true_contact, x_mm, y_mm, force_N])
+    estimates = predictor.predict_batch(noisy_charge_pC)
+    return np.column_stack([true_contact, estimates.x_mm, estimates.y_mm, estimates.force_N])
 
 
 def _position_error(presses: Array) -> Array:
@@ -262,7 +263,7 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], mode
     true_contact, estimated_contact = np.split(tested, 2, axis=1)  # each of shape (m, 3)
     errors = ContactErrorStatistics.of(estimated_contact, true_contact)
 
-    # Measure the latency of one kind of call, the prediction of a single press from a list of charges.
+    # Measure the latency of one kind of call only: the prediction of a single press from a list of charges.
     model = load_model(find_model(str(model_folder)))
     predictor = Predictor(model.folder)
     charges = press_charges(predictor, model.golden.charge_pC)
@@ -324,11 +325,11 @@ def _draw_live_paths(axes: Any, forward_map: ForwardMap, followed: Array) -> Non
         axes: Axes of matplotlib.
         forward_map: Forward map of the film, whose layout is drawn.
         followed: Frames of the live part, shape (n, 7), mm and N: number of the press, true and estimated (x, y, F),
-            with the names of `FollowedPress`.
+            with the names of `FollowedFrame`. There must be at least one press.
     """
-    columns = dict(zip(FollowedPress._fields, followed.T, strict=True))
-    for press_number in np.unique(columns["number"]):
-        is_in_press = columns["number"] == press_number  # mask of the frames of this press
+    columns = dict(zip(FollowedFrame._fields, followed.T, strict=True))
+    for press_number in np.unique(columns["press_number"]):
+        is_in_press = columns["press_number"] == press_number  # mask of the frames of this press
         true_path = (columns["true_x_mm"][is_in_press], columns["true_y_mm"][is_in_press])
         estimated_path = (columns["x_mm"][is_in_press], columns["y_mm"][is_in_press])
         axes.plot(*true_path, color=PRESSED, lw=3.0, solid_capstyle="round")

@@ -40,7 +40,7 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
         # The page starts before the film is solved, so that the user can open it meanwhile.
         metadata = predictor.metadata
         link = stack.enter_context(
-            live_page(address, token=None, name=sensor, metadata=metadata, model=find_model(sensor))
+            live_page(address, token=None, name=sensor, metadata=metadata, model_folder=find_model(sensor))
         )
         with shown_progress():
             radius_mm = played_radius_mm(sensor)

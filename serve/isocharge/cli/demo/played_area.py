@@ -24,8 +24,9 @@ def played_radius_mm(sensor: str) -> float:
     except ModelError:
         return DEFAULT_RADIUS
 
-    # The radius is the smallest distance of an edge of the working area from the centre, which is the origin. The
-    # distance of the origin from the line through an edge is |corner x edge| / |edge|, with the cross product.
+    # The working area is a polygon around the centre of the film, which is the origin. The radius is the smallest
+    # distance of an edge from the origin. The distance of the origin from the line through an edge is
+    # |corner x edge| / |edge|, with the cross product.
     corners = np.array(model.metadata.working_area_mm)  # shape (n, 2)
     edges = np.roll(corners, -1, axis=0) - corners  # vector from each corner to the next
     corner_x, corner_y = corners.T

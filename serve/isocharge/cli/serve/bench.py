@@ -49,10 +49,10 @@ def bench_command(
         report |= {"timings": [timing._asdict() for timing in timings], "errors": errors}
         show_json(report)
     else:
-        show("\n".join(_lines(loaded, timings, errors)))
+        show("\n".join(_report_lines(loaded, timings, errors)))
 
 
-def _lines(model: Model, timings: list[Timing], errors: dict[str, float]) -> Iterator[str]:
+def _report_lines(model: Model, timings: list[Timing], errors: dict[str, float]) -> Iterator[str]:
     """Yield the lines of the report on the machine, the timings and the errors of the model.
 
     Args:

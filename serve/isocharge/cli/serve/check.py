@@ -46,11 +46,11 @@ def check_command(
     if json:
         show_json(check.to_dict())
     else:
-        show("\n".join(_text(check)))
+        show("\n".join(_report_lines(check)))
     raise typer.Exit(0 if check.fits else 1)
 
 
-def _text(check: PressCheck) -> Iterator[str]:
+def _report_lines(check: PressCheck) -> Iterator[str]:
     """Yield the lines of the report: presses, summary of the errors, statistical tests, verdict and notes.
 
     The summary contains the errors, and the parts of the errors that are explained by the noise of the charges and by
@@ -90,19 +90,23 @@ def _text(check: PressCheck) -> Iterator[str]:
 
 
 def _press_lines(check: PressCheck) -> Iterator[str]:
-    """Yield the lines of a table of the presses with the largest errors, in the order of the file."""
+    """Yield the lines of a table of the `MAX_ROWS` presses with the largest errors, in the order of the file."""
     squared_ratio = check.errors.squared_ratio  # squared errors of x, y and F over their variances, shape (n, 3)
-    chi_squared = np.nansum(squared_ratio, axis=1)  # shape (n,)
-    worst_presses = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
+    chi_squared = np.nansum(squared_ratio, axis=1)  # shape (n,); an unknown error is NaN and does not count
+    worst_indices = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
     if check.presses > MAX_ROWS:
         yield f"the {MAX_ROWS} worst of {check.presses} presses; --json has all"
     yield f"{check.errors.row_noun:>6}{'x, mm':>9}{'y, mm':>9}{'force, N':>10}{'off, mm':>9}{'off, %':>9}  flags"
-    for press in sorted(worst_presses.tolist()):
-        yield _press_line(check.errors.row(press))
+    for press_index in sorted(worst_indices.tolist()):  # in the order of the file
+        yield _press_line(check.errors.row(press_index))
 
 
 def _press_line(row: dict[str, Any]) -> str:
-    """Format the values of `PressErrors.row` as the line of one press."""
+    """Format the values of `PressErrors.row` as the line of one press.
+
+    The line contains the place of the press in the file, the estimated x, y and force, their errors, the flags and, if
+    the press is left out of the comparison, the reason.
+    """
     numbers = [
         _number_cell(row["x_mm"], width=9, decimals=2),
         _number_cell(row["y_mm"], width=9, decimals=2),
@@ -110,10 +114,10 @@ def _press_line(row: dict[str, Any]) -> str:
         _number_cell(row["position_error_mm"], width=9, decimals=3),
         _number_cell(row["force_error_percent"], width=9, decimals=2),
     ]
-    words = list(row["flags"])
+    notes = list(row["flags"])
     if row["left_out"]:  # the reason why the press is left out
-        words.append(row["left_out"])
-    return f"{row['line']:>6}{''.join(numbers)}  {', '.join(words)}".rstrip()
+        notes.append(row["left_out"])
+    return f"{row['line']:>6}{''.join(numbers)}  {', '.join(notes)}".rstrip()
 
 
 def _number_cell(value: float, width: int, decimals: int) -> str:

@@ -144,7 +144,7 @@ def doctor_command(
         show_json(asdict(examination) | {"found_channels": found_channels, "unnoticed_share": unnoticed_share})
     channel_count = len(examination.channels)
     if examination.good and len(electrodes) > channel_count:
-        suitable_models = ", ".join(_models_with(channel_count, models)) or "none"
+        suitable_models = ", ".join(_models_with_electrode_count(channel_count, models)) or "none"
         say(f"models of {channel_count} electrodes: {suitable_models}; choose one with --model")
     if not examination.good:
         raise typer.Exit(1)
@@ -157,26 +157,26 @@ def doctor_command(
 
 
 def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> ElectrodeCheck:
-    """Ask the user for a press near each electrode, and return the channel that changes most under each press.
+    """Ask the user for a press near each electrode, and return which channel changes most under each press.
 
     Args:
-        examination: Result of the port check.
-        electrodes: Electrodes of the model; empty for any model.
+        examination: Result of the port check, with the device file and the channels of the board.
+        electrodes: Electrodes of the model; empty if no model is chosen.
 
     Raises:
         PressCheckError: If a press does not come, or the presses do not distinguish the channels.
     """
     device = device_from_table(examination.device, "board")
     channel_names = [channel.name for channel in examination.channels]
-    are_electrodes_named = set(electrodes) <= set(channel_names)  # whether each electrode has a channel of its name
+    # Whether each electrode has a channel with its own name
+    are_names_equal = all(electrode in channel_names for electrode in electrodes)
 
-    # The channel that each electrode is assumed to have before the check: the one in the device file, the one at the
-    # same place in the order of the channels, or the one of the same name.
-    if device.channels:
+    # Determine the channel that each electrode is assumed to have before the check.
+    if device.channels:  # the device file assigns the channels
         channel_of_electrode = dict(device.channels)
-    elif len(electrodes) == len(channel_names) and not are_electrodes_named:
+    elif len(electrodes) == len(channel_names) and not are_names_equal:  # assigned by their order
         channel_of_electrode = dict(zip(electrodes, channel_names, strict=True))
-    else:
+    else:  # each channel is assumed to be an electrode with the name of the channel
         channel_of_electrode = {name: name for name in channel_names}
 
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
@@ -184,10 +184,10 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
 
 
 def port_lines() -> Iterator[str]:
-    """Yield a line for each serial port of this machine.
+    """Listen on each serial port of this machine for one second, and yield a line for each port.
 
-    The line contains the name of the port, and describes the frames that arrived within one second. If no intact frames
-    arrived, the line names the first missing setting. If the port cannot be read, the line contains the error message.
+    The line contains the name of the port and describes the frames that arrived. If no intact frames arrived, the line
+    names the first missing setting. If the port cannot be read, the line contains the error message.
     """
     for port in sorted(list_ports.comports()):
         try:
@@ -204,7 +204,7 @@ def port_lines() -> Iterator[str]:
         yield f"{port.device} ({port.description}): {received}"
 
 
-def _models_with(electrode_count: int, models: Path | None) -> Iterator[str]:
+def _models_with_electrode_count(electrode_count: int, models: Path | None) -> Iterator[str]:
     """Yield the names of the models with a given number of electrodes. Models that cannot be read are omitted.
 
     Args:
@@ -357,7 +357,8 @@ def _channel_line(channel: ChannelHealth, unit: str) -> str:
         channel: Health of the channel.
         unit: Unit of the channel: "pC", "counts" or "V".
     """
-    # The attributes are named after pC, but their values have the unit of the channel. The hum has two amplitudes.
+    # The attributes are named after pC, but their values have the unit of the channel. The hum has two amplitudes, at
+    # 50 Hz and at 60 Hz. A value that was not measured is None.
     results = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
     decimals_of_columns = VOLT_DECIMALS if unit == "V" else DECIMALS
     cells = [f"{printable(channel.name):8.8s}"]

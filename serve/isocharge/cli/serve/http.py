@@ -104,8 +104,8 @@ def http_command(
 def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
     """Context manager that yields the traffic counters of the servers, and writes a log of requests for `--log json`.
 
-    A separate thread writes the log to stderr, so a slow reader of stderr does not delay the answers. The warnings of
-    all packages are written to the same log.
+    A separate thread writes the log to stderr, so that a slow reader of stderr does not delay the answers. The warnings
+    of all packages are written to the same log. For `--log text`, there is no log.
 
     Args:
         log: Value of `--log`.
@@ -128,8 +128,8 @@ def _report(traffic: Traffic, level: str, event: str, message: str) -> None:
 
     Args:
         traffic: Counters of the server, which contain the log; `traffic.log` is None without a log.
-        level: Level of the event in the log.
-        event: Name of the event: "refused" for models that are not served, or "serving".
+        level: Level of the event in the log, "warning" or "info".
+        event: Name of the event: "refused" for a model that is not served, or "serving".
         message: The reason for the refusal, or the names of the served models.
     """
     if traffic.log is not None:
@@ -151,7 +151,8 @@ def _grpc(handler: Handler, host: str, port: int | None, tls: Tls | None) -> Abs
     """
     if port is None:
         return nullcontext("")
-    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # the core of gRPC would print errors that are reported anyway
+    # The core of gRPC reads this variable when it is imported. It would print errors that are reported anyway.
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")
     with require("grpc"):
         from isocharge.serve.network.grpc import grpc_server
     return grpc_server(handler, host, port, tls)

@@ -127,18 +127,19 @@ def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
     if first is None:
         raise RecordingError(f"{where}: expected at least one record, got none; replay or record it again")
     electrodes = tuple(first.charge_raw_pC or ())
-    names = [*NUMBERS, *(f"charge_pC.{name}" for name in electrodes), *MEANINGS]  # MEANINGS contains all flags
+    charge_names = [f"charge_pC.{electrode}" for electrode in electrodes]
+    names = [*NUMBERS, *charge_names, *MEANINGS]  # MEANINGS contains all flags
 
     all_records = chain([first], records)
     row_type = np.dtype((float, len(names)))  # None in a row becomes NaN
     rows = np.fromiter((_record_values(record, electrodes) for record in all_records), row_type)  # shape (n, n_column)
     columns = dict(zip(names, rows.T, strict=True))
-    # Leave out the flags that no record has.
-    return {name: column for name, column in columns.items() if name not in MEANINGS or column.any()}
+    unused_flags = [flag for flag in MEANINGS if not columns[flag].any()]
+    return {name: column for name, column in columns.items() if name not in unused_flags}
 
 
 def _record_values(record: Any, electrodes: tuple[str, ...]) -> tuple[Any, ...]:
-    """Return the numbers of a record, the charge of each electrode, and a truth value for each flag.
+    """Return the numbers of a record, the charge of each electrode, and whether each flag of `MEANINGS` is set.
 
     Missing values are None.
 
@@ -149,31 +150,31 @@ def _record_values(record: Any, electrodes: tuple[str, ...]) -> tuple[Any, ...]:
     numbers = [getattr(record, name) for name in NUMBERS]
     charge_of_electrode = record.charge_pC or {}
     charge_pC = [charge_of_electrode.get(name) for name in electrodes]
-    flags = [word in record.flags for word in MEANINGS]
-    return (*numbers, *charge_pC, *flags)
+    is_flag_set = [flag in record.flags for flag in MEANINGS]
+    return (*numbers, *charge_pC, *is_flag_set)
 
 
 class _Groups(NamedTuple):
     """Groups of neighbouring records. Each group is drawn as a single point.
 
     Attributes:
-        start: Position of the first record of each group, shape (n_group,).
+        first_rows: Index of the first record of each group, shape (n_group,).
         start_time: Time of the first record of each group, in the unit of the time axis.
         end_time: Time of the last record of each group, in the unit of the time axis.
-        after_gap: Numbers of the groups that follow a gap. No line is drawn across a gap.
+        after_gap: Indices of the groups that follow a gap. No line is drawn across a gap.
     """
 
-    start: Integers
+    first_rows: Integers
     start_time: Array
     end_time: Array
     after_gap: Integers
 
     @classmethod
-    def of(cls, time_s: Array, unit_s: float) -> "_Groups":
+    def divide(cls, time_s: Array, unit_s: float) -> "_Groups":
         """Divide consecutive records into at most `MAX_GROUPS` groups of equal size, and find the gaps between them.
 
-        A gap is a pause before a group that is much longer than the usual time between the starts of two groups. A gap
-        is at least as long as `MIN_GAP_S`, and at least `MIN_GAP_GROUPS` times as long as this usual time.
+        The last group may be smaller. A gap is a pause between two groups that is longer than `MIN_GAP_S`, and longer
+        than `MIN_GAP_GROUPS` times the median time between the starts of consecutive groups.
 
         Args:
             time_s: Times since the first record, shape (n,), s.
@@ -183,16 +184,16 @@ class _Groups(NamedTuple):
             The groups, with times in the unit of the time axis.
         """
         group_size = math.ceil(len(time_s) / MAX_GROUPS)
-        start = np.arange(0, len(time_s), group_size)  # position of the first record of each group
-        last = np.append(start[1:], len(time_s)) - 1  # position of the last record of each group
-        start_s = time_s[start]
-        end_s = time_s[last]
+        first_rows = np.arange(0, len(time_s), group_size)  # index of the first record of each group
+        last_rows = np.append(first_rows[1:], len(time_s)) - 1  # index of the last record of each group
+        start_s = time_s[first_rows]
+        end_s = time_s[last_rows]
 
-        usual_length_s = float(np.median(np.diff(start_s))) if len(start) > 1 else 0.0
+        usual_length_s = float(np.median(np.diff(start_s))) if len(first_rows) > 1 else 0.0
         min_gap_s = max(MIN_GAP_S, MIN_GAP_GROUPS * usual_length_s)
-        pause_s = start_s[1:] - end_s[:-1]  # pauses before the second group, before the third group, and so on
-        after_gap = np.flatnonzero(pause_s > min_gap_s) + 1  # numbers of the groups after a gap
-        return cls(start, start_s / unit_s, end_s / unit_s, after_gap)
+        pause_s = start_s[1:] - end_s[:-1]  # element 0 is the pause before group 1
+        after_gap = np.flatnonzero(pause_s > min_gap_s) + 1
+        return cls(first_rows, start_s / unit_s, end_s / unit_s, after_gap)
 
     def draw_band(self, axes: Any, lower: Array, upper: Array, **style: Any) -> None:
         """Draw the band between two columns, with one point for each group.
@@ -204,10 +205,10 @@ class _Groups(NamedTuple):
             style: Further arguments of `fill_between`.
         """
         # Smallest lower edge and largest upper edge of the records of each group; `fmin` and `fmax` ignore NaN.
-        group_lower = np.fmin.reduceat(lower, self.start)
-        group_upper = np.fmax.reduceat(upper, self.start)
+        group_lower = np.fmin.reduceat(lower, self.first_rows)
+        group_upper = np.fmax.reduceat(upper, self.first_rows)
 
-        # A point of NaN interrupts the band at each gap.
+        # A point of NaN before the first group after each gap interrupts the band.
         curves = (self.start_time, group_lower, group_upper)
         interrupted_curves = [np.insert(curve, self.after_gap, np.nan) for curve in curves]
         axes.fill_between(*interrupted_curves, **style)
@@ -239,7 +240,7 @@ def recording_picture(
 
     # Right half: position, force, charges and flags over time
     time_label = f"time since {datetime.fromtimestamp(start_s, UTC):%Y-%m-%d %H:%M:%S} UTC, {unit}"
-    _draw_over_time(time_figure, _Groups.of(time_s, unit_s), traces, time_label)
+    _draw_over_time(time_figure, _Groups.divide(time_s, unit_s), traces, time_label)
 
     # Left half: the path of the contacts on the film
     film_axes = film_figure.subplots()
@@ -252,7 +253,7 @@ def recording_picture(
 
 
 def _time_unit(duration_s: float) -> tuple[float, str]:
-    """Return the length (s) and the symbol of the longest unit of time that suits the duration of a recording."""
+    """Return the length (s) and the symbol of the unit of time in which the duration of a recording is shown."""
     for min_duration_s, unit_s, unit in TIME_UNITS:  # from the longest unit to the shortest
         if duration_s >= min_duration_s:
             return unit_s, unit
@@ -268,8 +269,8 @@ def _draw_over_time(figure: Any, groups: _Groups, traces: dict[str, Array], time
         traces: Columns of the records.
         time_label: Label of the common time axis.
     """
-    flag_words = [word for word in MEANINGS if word in traces]
-    flag_height = 0.09 * max(1, len(flag_words)) + 0.05  # grows with the number of rows of flags
+    flags = [flag for flag in MEANINGS if flag in traces]
+    flag_height = 0.09 * max(1, len(flags)) + 0.05  # grows with the number of rows of flags
     heights = (1.0, 0.8, 1.0, flag_height)
     position_axes, force_axes, charge_axes, flag_axes = figure.subplots(4, 1, sharex=True, height_ratios=heights)
 
@@ -277,7 +278,7 @@ def _draw_over_time(figure: Any, groups: _Groups, traces: dict[str, Array], time
     _draw_with_std(position_axes, groups, traces, "y_mm", COLOURS[1])
     _draw_with_std(force_axes, groups, traces, "force_N", INK)
     _draw_charges(charge_axes, groups, traces)
-    _draw_flags(flag_axes, groups, traces, flag_words)
+    _draw_flags(flag_axes, groups, traces, flags)
 
     _label_axes(position_axes, "position, mm; bands: 2 standard deviations")
     _label_axes(force_axes, "force, N")
@@ -310,27 +311,27 @@ def _draw_charges(axes: Any, groups: _Groups, traces: dict[str, Array]) -> None:
         groups.draw_line(axes, traces[name], color=colour, label=name.removeprefix("charge_pC."))
 
 
-def _draw_flags(axes: Any, groups: _Groups, traces: dict[str, Array], words: list[str]) -> None:
+def _draw_flags(axes: Any, groups: _Groups, traces: dict[str, Array], flags: list[str]) -> None:
     """Draw bars for the times at which flags are set, in one row for each flag.
 
-    A single record is also drawn as a short bar, because a bar without length would be invisible.
+    All bars have a minimum length, because the bar of a single record would be invisible.
 
     Args:
         axes: Axes of matplotlib.
         groups: Groups of records, each of which is drawn as one bar.
         traces: Columns of the records.
-        words: The flags, from the lowest row to the highest.
+        flags: The flags, from the lowest row to the highest.
     """
     total_time = max(float(groups.end_time[-1]), 1e-9)  # above zero, even if there is only one record
     min_length = 2e-3 * total_time
     lengths = np.maximum(groups.end_time - groups.start_time, min_length)
-    for row_height, word in enumerate(words):
+    for row_index, flag in enumerate(flags):
         # The flag of a group is set if the flag is set in one of its records.
-        is_set = np.maximum.reduceat(traces[word], groups.start) > 0.0
+        is_set = np.maximum.reduceat(traces[flag], groups.first_rows) > 0.0
         starts_and_lengths = np.column_stack([groups.start_time[is_set], lengths[is_set]])
-        bottom_and_height = (row_height - 0.35, 0.7)  # the bar is centred on the tick of the row
+        bottom_and_height = (row_index - 0.35, 0.7)  # the bar is centred on the tick of the row
         axes.broken_barh(starts_and_lengths, bottom_and_height, color=INK)
-    axes.set(yticks=range(len(words)), yticklabels=words)
+    axes.set(yticks=range(len(flags)), yticklabels=flags)
 
 
 def _label_axes(axes: Any, label: str) -> None:
@@ -351,7 +352,7 @@ def _draw_path(axes: Any, traces: dict[str, Array], time: Array, time_label: str
     """Draw the path of the contacts on the film, true to scale.
 
     Each press is a line, with dots at the positions of its records. The colour of the dots shows the time, and their
-    size shows the force. If there are too many records, only every n-th record is drawn.
+    area shows the force. If there are too many records, only every n-th record is drawn.
 
     Args:
         axes: Axes of matplotlib.
@@ -359,10 +360,10 @@ def _draw_path(axes: Any, traces: dict[str, Array], time: Array, time_label: str
         time: Time of each record, shape (n,), in the unit of the label.
         time_label: Label of the scale of colours.
     """
-    position_mm = np.column_stack([traces["x_mm"], traces["y_mm"]])
+    position_mm = np.column_stack([traces["x_mm"], traces["y_mm"]])  # NaN for records without contact
     has_position = ~np.isnan(position_mm[:, 0])
     dot_rows = _every_nth(np.flatnonzero(has_position), MAX_POINTS)  # rows of the records that are drawn as dots
-    if len(dot_rows):
+    if len(dot_rows) > 0:
         line_x, line_y = _every_nth(position_mm, MAX_POINTS).T
         axes.plot(line_x, line_y, color=INK, lw=0.5, alpha=0.5)  # NaN separates the presses
         _draw_contacts(axes, traces, position_mm, dot_rows, time, time_label)
@@ -388,9 +389,9 @@ def _draw_contacts(
         time: Time of each record, shape (n,), in the unit of the label.
         time_label: Label of the scale of colours.
     """
-    # The area of a dot increases with the force. The lower limit of the largest force only avoids a division by zero.
+    # The area of a dot increases with the force. A negative force counts as 0.
     force_N = np.clip(traces["force_N"][rows], 0.0, None)
-    largest_force_N = max(float(force_N.max()), 1e-9)
+    largest_force_N = max(float(force_N.max()), 1e-9)  # avoids a division by 0
     dot_area = 3.0 + 30.0 * (force_N / largest_force_N)
     dots = axes.scatter(*position_mm[rows].T, c=time[rows], s=dot_area, lw=0.0, alpha=0.8, zorder=4)
     axes.figure.colorbar(dots, ax=axes, shrink=0.6, label=time_label, location="bottom", pad=0.02)
@@ -417,13 +418,13 @@ def _draw_contacts(
 
     # Crosses mark the contacts with at least one of the flags. A flag that no record has is not in `traces`.
     is_doubtful = np.zeros(len(rows), dtype=bool)
-    for word in DOUBTFUL_FLAGS:
-        if word in traces:
-            is_doubtful |= traces[word][rows] > 0.0
+    for flag in DOUBTFUL_FLAGS:
+        if flag in traces:
+            is_doubtful |= traces[flag][rows] > 0.0
     axes.scatter(*position_mm[rows[is_doubtful]].T, c=FELT, marker="x", s=24, lw=0.9, zorder=5)
 
 
 def _every_nth(values: Any, max_count: int) -> Any:
-    """Return every n-th row of an array, with the smallest n for which at most `max_count` rows remain."""
+    """Return every n-th row of an array, where n is the smallest number for which at most `max_count` rows remain."""
     n = max(1, math.ceil(len(values) / max_count))
     return values[::n]

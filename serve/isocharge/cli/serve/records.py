@@ -62,13 +62,14 @@ def write_records(
         if record.tare_pC != last_tare_pC:
             last_tare_pC = record.tare_pC
             if last_tare_pC is not None:  # None until a tare is measured
-                say("tared: " + ", ".join(f"{name} {charge:.2f} pC" for name, charge in last_tare_pC.items()))
+                tare_text = ", ".join(f"{electrode} {charge:.2f} pC" for electrode, charge in last_tare_pC.items())
+                say(f"tared: {tare_text}")
         if record.latency_us is not None:
             latencies.append(record.latency_us)
 
 
-def outputs_of(targets: Sequence[str] | None, touch: TouchStream, *, is_live: bool) -> Outputs:
-    """Return the outputs for the targets of `--output`.
+def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_live: bool) -> Outputs:
+    """Return the outputs for the targets of `--output`. They are opened when their context is entered.
 
     Args:
         targets: Values of the option; None or empty for `DEFAULT_TARGETS`.
@@ -76,7 +77,7 @@ def outputs_of(targets: Sequence[str] | None, touch: TouchStream, *, is_live: bo
         is_live: Whether the records come from a sensor.
 
     Raises:
-        InputError: If a target has none of the forms.
+        InputError: If a target has none of the forms, two targets are equal, or two targets write to standard output.
     """
     context = OutputContext(
         electrodes=touch.predictor.metadata.electrodes,

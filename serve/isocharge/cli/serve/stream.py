@@ -16,7 +16,7 @@ from isocharge.cli.serve.records import (
     OutputOption,
     RecordWriter,
     WaitOption,
-    outputs_of,
+    command_outputs,
     say_missing_records,
     summary,
     write_records,
@@ -187,11 +187,11 @@ def stream_command(
         # The handlers of the signals only request changes, which the stream carries out later.
         stack.enter_context(on_signal(signal.SIGUSR1, stream.request_tare))
         stack.enter_context(on_signal(signal.SIGUSR2, stream.request_film_reset))
-        request_latest_model = partial(stream.request_model, partial(_load, model, models))
+        request_latest_model = partial(stream.request_model, partial(_load_latest, model, models))
         stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(request_latest_model)))
         timer = stack.enter_context(stop_after(seconds))
 
-        outputs = stack.enter_context(outputs_of(output, touch, is_live=source.is_live))
+        outputs = stack.enter_context(command_outputs(output, touch, is_live=source.is_live))
         writers: list[RecordWriter] = [outputs.write]
         if page is not None:
             # The page must not begin a recording if the command itself records the stream.
@@ -220,7 +220,7 @@ def stream_command(
         raise typer.Exit(1)
 
 
-def _load(model: str, models: Path | None) -> Predictor:
+def _load_latest(model: str, models: Path | None) -> Predictor:
     """Load the latest version of a model, and check that this machine computes the outputs in its golden vectors.
 
     Args:
@@ -270,8 +270,8 @@ def replay_command(
     predictor = Predictor(folder)
     board = load_device(device) if device else device_from_table(recording.device, str(file))
 
-    # The function `play` yields the records. If the recording loads other models, `play` loads them, too, but not if
-    # the user has chosen one model for the whole recording.
+    # The function `play` yields the records. If the model was changed during the recording, `play` changes the model,
+    # too, unless the user has chosen one model for the whole recording.
     clock = RecordedClock()
     touch = TouchStream(
         predictor, board, policy=Policy(recording.policy), now_ns=clock, frame_id=recording.name or None
@@ -280,7 +280,7 @@ def replay_command(
     play = partial(replay, recording, touch, clock, real_time=real_time, load=load)
 
     latencies: deque[float] = deque(maxlen=LATENCIES)
-    with until_stopped(), outputs_of(output, touch, is_live=False) as outputs:
+    with until_stopped(), command_outputs(output, touch, is_live=False) as outputs:
         if address is None:
             write_records(play(), [outputs.write], latencies)
         else:
@@ -301,7 +301,7 @@ def _play_on_page(
     outputs: Outputs,
     latencies: deque[float],
 ) -> None:
-    """Write the records of a recording to the outputs and to its page, and keep the page open until Ctrl-C.
+    """Write the records of a recording to the outputs and to the replay page, and keep the page open until Ctrl-C.
 
     Args:
         play: Function that yields the records. Its argument `on_marker` is called with each marker of the recording.
@@ -314,5 +314,5 @@ def _play_on_page(
     write_records(records, [outputs.write, feed.write], latencies)
     outputs.close()  # now, because the page stays open until Ctrl-C, which would discard files that are not closed
     link.send_message(is_complete=True)
-    while link.wait_for_request() is not None:  # until the process of the page ends, or Ctrl-C
+    while link.wait_for_request() is not None:  # keeps the page open until its process ends, or until Ctrl-C
         pass

@@ -132,7 +132,8 @@ def virtual_command(
     board = None
     if device is not None:
         board = BoardEncoder(load_device(device), played_sensor.electrode_names, frames)
-    # Until the film is solved, the player sends frames without a touch, for which no charges need to be computed.
+    # Until the film is solved, the player sends frames without a touch. It then only computes the charges of an empty
+    # list of contacts, for which the first function returns an empty array.
     player = VirtualSensor(
         lambda _: np.zeros((0, electrode_count)),
         _untouched_frame(rate),
@@ -174,7 +175,7 @@ def virtual_command(
 
 
 def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) -> tuple[Sensor, Probe]:
-    """Return the described sensor and probe. If there is a seed, vary the sensor and the probe at random.
+    """Return the given sensor and probe or, if there is a seed, a random variation of both.
 
     Args:
         sensor_name: Name or file of the sensor.
@@ -194,25 +195,26 @@ def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) 
 
 
 def _amplifier(noise: str, settings: VirtualScript) -> Amplifier:
-    """Return the amplifier that `--noise` names, with the changes that the settings of the script request.
+    """Return the amplifier that `--noise` describes, with the changes in the script.
 
     Args:
-        noise: Value of `--noise`.
+        noise: Value of `--noise`: name of an amplifier or path of its file.
         settings: Settings of the script. Each setting that is None leaves the amplifier unchanged.
     """
-    settings_of_amplifier: dict[str, Any] = {
+    scripted_values: dict[str, Any] = {
         "step": settings.temperature_step_K,
         "bias": settings.drift_pC_per_s,
         "limit": settings.limit_pC,
     }
-    changes = {key: value for key, value in settings_of_amplifier.items() if value is not None}
+    changes = {attribute: value for attribute, value in scripted_values.items() if value is not None}
     return replace(load_amplifier(noise), **changes)
 
 
 def _untouched_frame(rate_Hz: float) -> Script:
     """Return a script of one frame without a press."""
     no_position = np.full(1, np.nan)
-    return Script(no_position, no_position, np.zeros(1), rate_Hz)
+    no_force = np.zeros(1)
+    return Script(no_position, no_position, no_force, rate_Hz)
 
 
 def _frame_settings(frames: FrameFormat | None, board: BoardEncoder | None) -> dict[str, Any]:
@@ -239,8 +241,11 @@ def _frame_settings(frames: FrameFormat | None, board: BoardEncoder | None) -> d
 def _largest_distance_mm(radius_mm: float, scripted_presses: Script | None) -> float:
     """Return the largest distance from the centre of the film at which charges are needed, mm.
 
+    For scripted presses, the result is at least `DEFAULT_RADIUS`, and slightly larger than the largest distance in the
+    script, because rounding may move the outermost presses outwards.
+
     Args:
-        radius_mm: Largest distance of a random press, mm.
+        radius_mm: Largest distance of a random press, mm. It is also used if the script contains no press.
         scripted_presses: Presses of the script; None if the presses are random.
     """
     if scripted_presses is None or not scripted_presses.touching.any():
@@ -251,6 +256,8 @@ def _largest_distance_mm(radius_mm: float, scripted_presses: Script | None) -> f
 
 def _largest_force_N(force_max_N: float, scripted_presses: Script | None) -> float:
     """Return the largest force for which charges are needed, N.
+
+    For scripted presses, the result is slightly larger than the largest force in the script, because of rounding.
 
     Args:
         force_max_N: Largest force of a random press, N.

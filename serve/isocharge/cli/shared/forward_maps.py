@@ -32,7 +32,11 @@ outermost presses beyond them."""
 
 
 def executor_for(workers: int | None, cluster: str | None) -> AbstractContextManager[Executor | None]:
-    """Return the executor that the values of `--workers` and `--cluster` select.
+    """Return a context manager that yields the executor which the values of `--workers` and `--cluster` select.
+
+    Args:
+        workers: Number of processes on this computer; None for one process for each core.
+        cluster: Address of a Dask scheduler; None to compute on this computer.
 
     Raises:
         InputError: If both options are given.
@@ -44,7 +48,7 @@ def executor_for(workers: int | None, cluster: str | None) -> AbstractContextMan
 
 @contextmanager
 def shown_run(target: Path) -> Iterator[None]:
-    """Context manager that shows the progress of a resumable run.
+    """Context manager that shows the progress of a run, which is a long computation that can be stopped and resumed.
 
     If the user stops the run, a message states that the same command resumes the run.
 
@@ -65,7 +69,7 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
     """Return the radius of a sweep, mm.
 
     Args:
-        text: Value of `--radius`: a number, or `auto` for the radius of the working area that all probes share.
+        text: Value of `--radius`: a number, or `auto` for the radius of the smallest working area of the probes.
         sensor: The sensor.
         probes: The probes.
         force: Smallest and largest force, N.
@@ -81,13 +85,13 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
         area = working_area(forward_map, noise_model("reference"))
         say(f"{probe.notation}: {area.summary}")
         radii.append(area.radius)
-    shared_radius = min(radii)
-    if shared_radius == 0.0:
+    smallest_radius = min(radii)
+    if smallest_radius == 0.0:
         raise InputError(
             "--radius auto: the charges determine the contact nowhere well enough; see 'isocharge simulate identify', "
             "or give a radius in mm"
         )
-    return shared_radius
+    return smallest_radius
 
 
 def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit: float = DEFAULT_STRESS_LIMIT) -> None:
@@ -100,7 +104,7 @@ def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit:
         limit: Limit of the stress, MPa.
     """
     for probe in probes:
-        with suppress(IsochargeError):  # the computation of the press raises the same error later
+        with suppress(IsochargeError):  # the caller computes the same press later, and then reports the error
             caution = stress_caution(film, probe, max_force, limit)
             if caution:
                 say(f"caution: {caution}")

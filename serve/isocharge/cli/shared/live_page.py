@@ -32,7 +32,7 @@ from isocharge.serve.viewer.messages import (
     SampleFormat,
     Tare,
     describe_film,
-    find_field,
+    find_deflection_field,
 )
 
 RATE_RECORDS = 400
@@ -95,7 +95,7 @@ TlsKeyOption = Annotated[
 
 
 def given_tls(certificate: Path | None, key: Path | None) -> Tls | None:
-    """Return the TLS files that the options name, or None if they name no certificate.
+    """Return the TLS files in the options, or None if no certificate is given.
 
     Args:
         certificate: Value of `--tls-cert`; None if the option is not given.
@@ -148,7 +148,8 @@ def page_address(live: str, token: str | None) -> Address:
     # The length is checked before the conversion, because `int` refuses very long texts.
     is_short_number = port.isascii() and port.isdecimal() and len(port) <= len(str(MAX_PORT))
     is_port = is_short_number and int(port) <= MAX_PORT
-    if not (host and is_port):
+    is_valid_address = host != "" and is_port
+    if not is_valid_address:
         raise InputError(f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}")
     bare_host = host.removeprefix("[").removesuffix("]")  # IPv6 addresses are written in brackets
     address = Address(bare_host, int(port))
@@ -162,7 +163,7 @@ def live_page(
     token: str | None,
     name: str,
     metadata: ModelMetadata,
-    model: Path,
+    model_folder: Path,
     *,
     is_recording: bool = False,
     tls: Tls | None = None,
@@ -174,7 +175,7 @@ def live_page(
         token: Value of `--token`.
         name: Name of the stream, which the page shows.
         metadata: Metadata of the model that estimates the contacts.
-        model: Folder of the version of the model.
+        model_folder: Folder of the version of the model, which may contain a deflection field.
         is_recording: Whether the stream is a recording. Its replay waits for the page instead of losing records.
         tls: Certificate and key; None for no TLS.
 
@@ -188,12 +189,12 @@ def live_page(
     with require("http"):
         from isocharge.serve.viewer.process import Page, page_process
 
-    description = describe_film(name, metadata, find_field(model, metadata))
+    description = describe_film(name, metadata, find_deflection_field(model_folder, metadata))
     reader, page_end = make_link()
     page = Page(page_end, description, address, given_token(token), is_recording, tls)
     # The process of the page ends when the reader's end of the link is closed. At the end of the block, the contexts
-    # are closed in reverse order. The second `closing` therefore ends the process before `page_process` waits for its
-    # end. The first `closing` is needed if the process cannot be started. Closing twice is harmless.
+    # are left in reverse order: the second `closing` closes the reader's end before `page_process` waits for the end of
+    # the process. The first `closing` is needed if the process cannot be started. Closing twice is harmless.
     with closing(reader), page_process(page) as url, closing(reader):
         if is_recording:
             reader.enable_waiting()  # a slow page then delays the replay, instead of losing records
@@ -265,18 +266,22 @@ class PageFeed:
 def answering(link: ReaderEnd, stream: RecordedStream, header: RecordingHeader | None) -> Iterator[None]:
     """Context manager that carries out the requests of the page, and shows warnings of `isocharge.serve` on the page.
 
-    A separate thread waits for the requests and carries out each request. The thread ends when the link is closed.
+    A separate thread waits for requests and carries them out. The thread ends when the link is closed.
 
     Args:
         link: The reader's end of the link to the page.
         stream: The stream, which carries out the requests.
-        header: Header of the recordings that the page begins. If it is None, requests for recordings are refused.
+        header: Header of the recordings that the page begins. If it is None, because the command itself records the
+            stream, requests for recordings are refused.
     """
     handler = logging.Handler()
     handler.emit = lambda record: _show_note(link, record.getMessage())  # type: ignore[method-assign]
     logger = logging.getLogger("isocharge.serve")
     logger.addHandler(handler)
-    threading.Thread(target=_answer_requests, args=(link, stream, header), name="page requests", daemon=True).start()
+    request_thread = threading.Thread(
+        target=_answer_requests, args=(link, stream, header), name="page requests", daemon=True
+    )
+    request_thread.start()
     try:
         yield
     finally:
@@ -293,7 +298,10 @@ def _answer_requests(link: ReaderEnd, stream: RecordedStream, header: RecordingH
 
 
 def _carry_out(request: LiveRequest, link: ReaderEnd, stream: RecordedStream, header: RecordingHeader | None) -> None:
-    """Carry out one request of the page: write a marker, begin or end a recording, tare, or reset the film.
+    """Carry out one request of the page.
+
+    The page can request to write a marker, to begin or end a recording, to measure the tare again, or to reset the
+    estimated pretension of the film to the value of its calibration. The page is informed of markers and recordings.
 
     Args:
         request: The request.
@@ -309,10 +317,10 @@ def _carry_out(request: LiveRequest, link: ReaderEnd, stream: RecordedStream, he
             marker = recording.Marker(time.time(), text)
             stream.request_marker(marker)
             link.send_message(marker=[*marker])
-        case Record(on=begins):
+        case Record(on=must_record):
             if header is None:
                 raise InputError("the command that runs the stream records it already (--record)")
-            if begins:  # otherwise the request ends a recording
+            if must_record:
                 model_label = stream.predictor.metadata.label
                 path = Path(f"{model_label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
                 recorder = Recorder(path, model_label, header.policy, header.device, header.name)
@@ -323,7 +331,7 @@ def _carry_out(request: LiveRequest, link: ReaderEnd, stream: RecordedStream, he
                 link.send_message(recording=None)
         case Tare():
             stream.request_tare()
-        case Back():  # back to the film as it was calibrated
+        case Back():
             stream.request_film_reset()
 
 

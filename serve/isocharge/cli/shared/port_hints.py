@@ -33,7 +33,7 @@ def no_frames_hint(port: str, device: Path | None) -> str:
         port: Value of `--port`.
         device: Value of `--device`; None if the option is not given.
     """
-    if port == STDIN or Path(port).is_file():  # `isocharge serve doctor` can only listen on a port
+    if port == STDIN or Path(port).is_file():  # the command `isocharge serve doctor` below can only listen on a port
         return "describe the board in a device file (--device)"
     wrong_device = f"{device} may describe another board; " if device is not None else ""
     command = f"isocharge serve doctor --port {shlex.quote(port)} --write board.toml"

@@ -111,9 +111,10 @@ def announce(line: str) -> None:
 
 
 def stdout_writer() -> Callable[[str], None]:
-    """Return the function that writes lines of records to stdout at once.
+    """Return a function that writes a text to stdout at once.
 
-    The function does not use Python's buffer, in which a thread may hang at exit.
+    The function does not use Python's buffer, in which a thread may hang at exit. If stdout has no file descriptor, the
+    function uses the buffer and flushes it.
     """
     try:
         descriptor = sys.stdout.fileno()
@@ -131,7 +132,7 @@ def write_stderr(line: str) -> None:
 
 
 def stdout_is_ready() -> bool:
-    """Return whether stdout is ready for a line within a tenth of a second.
+    """Wait at most a tenth of a second until stdout is ready for a line, and return whether it is ready.
 
     A pipe that is ready has room for `PIPE_BUF` bytes, which is more than the length of a record.
     """
@@ -358,11 +359,10 @@ def _progress_bars() -> Iterator[Listener]:
         bar_of_title: dict[str, TaskID] = {}
 
         def update_bar(title: str, done: int, total: int, note: str) -> None:
-            """In the bar with the given title, show that `done` of `total` steps are complete.
+            """Show in the bar with the given title that `done` of `total` steps are complete.
 
-            If there is no bar with this title, create it.
-
-            If fewer steps are complete than before, the work has started again. The bar then also starts again.
+            If there is no bar with this title, create it. If fewer steps are complete than before, the work has started
+            again. The bar then also starts again.
 
             Args:
                 title: Title of the work, which identifies its bar.

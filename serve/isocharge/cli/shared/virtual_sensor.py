@@ -62,8 +62,8 @@ def film_charges(forward_map: ForwardMap) -> Charges:
 def film_charges_per_K(forward_map: ForwardMap) -> Charges | None:
     """Return the function that computes the change of the touch charges per kelvin of warming, pC/K.
 
-    The result is None if the temperature of the film does not change the pretension of the film. If the temperature
-    changes the pretension, further presses are simulated in order to determine the effect.
+    The result is None if the temperature of the film does not change its pretension. If the temperature changes the
+    pretension, further presses are simulated in order to determine the effect.
 
     Args:
         forward_map: Charges of the presses.
@@ -80,7 +80,7 @@ def film_charges_per_K(forward_map: ForwardMap) -> Charges | None:
 def _charges(map_charges: Callable[[Array], Array], min_force_N: float, contact: Array) -> Array:
     """Compute the charges of contacts, including contacts below the smallest force of the forward map.
 
-    Below the smallest force, the charges at the smallest force are scaled with F^(2/3), as on a membrane.
+    Below this smallest force F_min, the charges at F_min are multiplied by (F / F_min)^(2/3), as on a membrane.
 
     Args:
         map_charges: Function from contacts in the domain of the forward map to charges.

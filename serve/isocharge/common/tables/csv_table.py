@@ -48,7 +48,7 @@ class CsvTable(NumberTable):
     row_noun = "line"
 
     def __init__(
-        self, lines: Iterable[str], names: Collection[str], where: str, error: type[InputError], expected: str
+        self, lines: Iterable[str], names: Collection[str], where: str, error_class: type[InputError], expected: str
     ) -> None:
         """Read the header, which is the first line that is neither blank nor a comment.
 
@@ -57,25 +57,25 @@ class CsvTable(NumberTable):
             names: Names of columns that have a meaning. A header whose first name is one of these names is not a
                 comment, even if the name begins with #.
             where: Name of the file, for error messages.
-            error: Class of the error that is raised for every mistake in the file.
+            error_class: Class of the error that is raised for every mistake in the file.
             expected: Description of the expected header, for error messages.
 
         Raises:
-            error: If the file is empty, is not CSV text in UTF-8, or has too many columns.
+            error_class: If the file is empty, is not CSV text in UTF-8, or has too many columns.
         """
-        self._rows = _numbered_rows(lines, names, where, error)
+        self._rows = _numbered_rows(lines, names, where, error_class)
         first_row = next(self._rows, None)
         if first_row is None:
-            raise error(f"{where}: empty; expected {expected}")
+            raise error_class(f"{where}: empty; expected {expected}")
         _, header = first_row
         if any("\0" in name for name in header):
             # In UTF-16, one of the two bytes of an ASCII letter is zero: the first in UTF-16BE, the second in UTF-16LE.
             encoding = "UTF-16BE" if header[0].startswith("\0") else "UTF-16LE"
-            raise error(
+            raise error_class(
                 f"{where}: the header has null characters: the file seems to be UTF-16 without a byte order mark; save "
                 f"it as UTF-8, as with: iconv -f {encoding} -t UTF-8 FILE > NEW.csv"
             )
-        super().__init__(header, names, where, error, expected)
+        super().__init__(header, names, where, error_class, expected)
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Convert the cells of the requested columns to numbers, row by row.
@@ -86,14 +86,15 @@ class CsvTable(NumberTable):
             max_rows: Largest number of rows that is accepted.
 
         Raises:
-            error: If there are too many rows, a row has the wrong number of cells, or a cell is not a finite number.
+            error_class: If there are too many rows, a row has the wrong number of cells, or a cell is not a finite
+                number.
         """
         column_indices = {name: self.header.index(name) for name in rules}
         # The arrays of the module `array` need less memory than lists. "q" are 64-bit integers, "d" are 64-bit floats.
         line_numbers = array("q")
         numbers = array("d")  # the numbers of the first row, then the numbers of the second row, and so on
         for line_number, cells in self._rows:
-            if len(line_numbers) == max_rows:
+            if len(line_numbers) == max_rows:  # this row is one row too many
                 self._refuse_row_count(max_rows)
             self._check_cell_count(line_number, cells)
             line_numbers.append(line_number)
@@ -114,11 +115,11 @@ class CsvTable(NumberTable):
             cells: Cells of the row.
 
         Raises:
-            error: If the row has too few cells, or additional cells that are not blank.
+            error_class: If the row has too few cells, or additional cells that are not blank.
         """
         additional_cells = cells[len(self.header) :]
         if len(cells) < len(self.header) or any(cell.strip() for cell in additional_cells):
-            raise self.error(
+            raise self.error_class(
                 f"{self.where}, line {line_number}: expected {len(self.header)} cells as in the header, got "
                 f"{len(cells)}: {shown(cells)}"
             )
@@ -133,11 +134,12 @@ class CsvTable(NumberTable):
             cell: Content of the cell.
 
         Raises:
-            error: Always.
+            error_class: Always.
         """
+        # The cell may contain a comma, because it may be quoted.
         has_decimal_comma = "," in cell and _number(cell.replace(",", ".", 1)) is not None
         advice = "; write a decimal point" if has_decimal_comma else ""
-        raise self.error(
+        raise self.error_class(
             f"{self.where}, line {line_number}, column {shown(name)}: expected {rule.description}, got "
             f"{shown(cell)}{advice}"
         )
@@ -149,15 +151,17 @@ class CsvTable(NumberTable):
             reason: What is wrong with the header, for the error message.
 
         Raises:
-            error: Always.
+            error_class: Always.
         """
-        for separator, command in _SEPARATORS.items():
-            if len(self.header) == 1 and separator in self.header[0]:
-                reason += (
-                    f"; the columns are separated by {separator!r}: save the file with commas between columns and "
-                    f"points in numbers, as with: {command} < FILE > NEW.csv"
-                )
-        super()._refuse_header(reason)
+        advice = ""
+        if len(self.header) == 1:  # the only cell may consist of names with another separator
+            for separator, command in _SEPARATORS.items():
+                if separator in self.header[0]:
+                    advice += (
+                        f"; the columns are separated by {separator!r}: save the file with commas between columns and "
+                        f"points in numbers, as with: {command} < FILE > NEW.csv"
+                    )
+        super()._refuse_header(reason + advice)
 
 
 def csv_text(columns: Mapping[str, Array]) -> str:
@@ -217,7 +221,7 @@ class _LinesWithoutComments:
 
 
 def _numbered_rows(
-    lines: Iterable[str], names: Collection[str], where: str, error: type[InputError]
+    lines: Iterable[str], names: Collection[str], where: str, error_class: type[InputError]
 ) -> Iterator[tuple[int, list[str]]]:
     """Yield the line number and the cells of each row that is neither blank nor a comment.
 
@@ -229,10 +233,10 @@ def _numbered_rows(
         names: Names of columns that have a meaning. A line whose first cell is one of these names is not a comment,
             even if the name begins with #.
         where: Name of the file, for error messages.
-        error: Class of the error that is raised.
+        error_class: Class of the error that is raised.
 
     Raises:
-        error: If the lines are not CSV text in UTF-8.
+        error_class: If the lines are not CSV text in UTF-8.
     """
     lines_without_comments = _LinesWithoutComments(lines, names)
     reader = csv.reader(lines_without_comments, strict=True)
@@ -241,15 +245,16 @@ def _numbered_rows(
             lines_without_comments.is_at_row_start = True  # the next line begins a row and may be a comment
             if any(cell.strip() for cell in cells):
                 yield reader.line_num, cells
-    # The order of the next clauses matters, because InputError and UnicodeDecodeError are subclasses of ValueError.
+    # InputError and UnicodeDecodeError are subclasses of ValueError, so their clauses must precede the clause of
+    # ValueError.
     except InputError:  # the iterator `lines` has raised an error with its own message
         raise
     except csv.Error as cause:
-        raise error(f"{where}, line {reader.line_num}: not CSV text ({cause})") from cause
+        raise error_class(f"{where}, line {reader.line_num}: not CSV text ({cause})") from cause
     except UnicodeDecodeError as cause:
-        raise error(where + _decoding_advice(cause, reader.line_num)) from cause
+        raise error_class(where + _decoding_advice(cause, reader.line_num)) from cause
     except ValueError as cause:  # a line is too long; the reader has not counted this line yet
-        raise error(f"{where}, line {reader.line_num + 1}: not CSV text ({cause})") from cause
+        raise error_class(f"{where}, line {reader.line_num + 1}: not CSV text ({cause})") from cause
 
 
 def _decoding_advice(cause: UnicodeDecodeError, lines_before: int) -> str:
@@ -262,13 +267,14 @@ def _decoding_advice(cause: UnicodeDecodeError, lines_before: int) -> str:
             in this part.
         lines_before: Number of lines before this part.
     """
-    decoded_part = cause.object
-    is_first_part = lines_before == 0
-    format_advice = _other_format_advice(decoded_part) if is_first_part else None
+    part = cause.object
+    is_first_part = lines_before == 0  # only the first bytes of the file reveal its format
+    format_advice = _other_format_advice(part) if is_first_part else None
     if format_advice:
         return f": {format_advice}"
-    line_number = lines_before + decoded_part[: cause.start].count(b"\n") + 1
-    wrong_byte = decoded_part[cause.start]
+    complete_lines_in_part = part[: cause.start].count(b"\n")  # before the wrong byte
+    line_number = lines_before + complete_lines_in_part + 1
+    wrong_byte = part[cause.start]
     return (
         f", line {line_number}: the byte 0x{wrong_byte:02x} is not text in UTF-8: "
         "save the file as UTF-8; if it is Windows or Latin-1 text, as with: iconv -f WINDOWS-1252 -t UTF-8 FILE > "

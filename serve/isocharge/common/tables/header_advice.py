@@ -63,7 +63,7 @@ def header_advice(columns: Iterable[str], absent_columns: Mapping[str, ColumnMea
             advice = _advice(column, name, meaning)
             if advice:
                 yield advice
-                del remaining_columns[name]  # the `break` ends the loop, so the change of the dictionary does no harm
+                del remaining_columns[name]  # allowed, because the `break` ends the loop over the dictionary
                 break
 
 
@@ -73,7 +73,7 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
     Three kinds of names are recognised in the file. A name of the first kind differs from the missing name only by
     capital letters. A name of the second kind consists of words that mean the missing column. A name of the third kind
     consists of such words and a unit. The unit is either the unit of the missing column, or a unit that can be
-    converted to it.
+    converted to it. Some columns, such as a force in N, are recognised by a unit in brackets after any words.
 
     Args:
         column: Name of the column in the file.
@@ -91,8 +91,8 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
     # Check whether the name consists only of words that mean the missing column, such as "force", and of general words,
     # such as "position", which do not change the meaning.
     words = _words(column)
-    other_words = words - meaning.words - GENERAL_WORDS
-    if _is_named(words, meaning) and not other_words:
+    unknown_words = words - meaning.words - GENERAL_WORDS
+    if _is_named(words, meaning) and not unknown_words:
         return advice_to_rename
 
     # Check whether the name consists of a label and a unit, such as "force (N)" or "force_N".
@@ -101,12 +101,12 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
         return ""
     label, bracketed_unit, last_word = match.groups()
     unit = bracketed_unit or last_word  # only one of them is not None
-    is_named = _is_named(_words(label), meaning)
+    is_label_known = _is_named(_words(label), meaning)
     is_recognised_by_unit = meaning.is_known_by_unit and bracketed_unit is not None
-    if unit == meaning.unit and (is_named or is_recognised_by_unit):
+    if unit == meaning.unit and (is_label_known or is_recognised_by_unit):
         return advice_to_rename
     convertible_units = OTHER_UNITS.get(meaning.unit, ())
-    if unit in convertible_units and is_named:
+    if unit in convertible_units and is_label_known:
         return f"column {shown(column)} is in {unit}: convert it to {meaning.unit} and rename it to {shown(name)}"
     return ""
 

@@ -86,27 +86,27 @@ class NumberColumns:
     row_numbers: Integers
     row_noun: str
 
-    def check(self, rules: Mapping[str, ColumnRule], where: str, error: type[InputError]) -> None:
+    def check(self, rules: Mapping[str, ColumnRule], where: str, error_class: type[InputError]) -> None:
         """Check that all values comply with the rules of their columns.
 
         Args:
             rules: Rules by the names of the columns.
             where: Beginning of the error message, such as "presses.csv, "; may be empty.
-            error: Class of the error that is raised.
+            error_class: Class of the error that is raised.
 
         Raises:
-            error: If a value violates its rule. The message names the first wrong row, the column, the rule and the
-                value.
+            error_class: If a value violates its rule. The message names the first wrong row, the column, the rule and
+                the value.
         """
-        masks = [rules[name].violations(column) for name, column in self.values.items()]
-        is_violation = np.column_stack(masks)  # shape (n, n_column)
-        violations = np.argwhere(is_violation)  # row and column of each violation, ordered by rows
-        if not violations.size:
+        violations_of_columns = [rules[name].violations(column) for name, column in self.values.items()]
+        is_violation = np.column_stack(violations_of_columns)  # shape (n, n_column)
+        positions = np.argwhere(is_violation)  # row and column of each violation, ordered by rows
+        if not positions.size:
             return
-        row, column_index = violations[0]  # the first violation
+        row, column_index = positions[0]  # the first violation
         name = list(self.values)[column_index]
         value = _value_text(float(self.values[name][row]))
-        raise error(
+        raise error_class(
             f"{where}{self.row_noun} {self.row_numbers[row]}, column {shown(name)}: expected "
             f"{rules[name].description}, got {value}"
         )
@@ -130,7 +130,7 @@ class NumberTable(ABC):
     Attributes:
         header: Names of the columns in the file.
         where: Name of the file, for error messages.
-        error: Class of the error that is raised for every mistake in the file.
+        error_class: Class of the error that is raised for every mistake in the file.
         expected: Description of the expected header, for error messages.
         row_noun: What the row numbers of the format count, for error messages: "line" or "row".
     """
@@ -138,25 +138,26 @@ class NumberTable(ABC):
     row_noun: ClassVar[str]
 
     def __init__(
-        self, header: Sequence[str], names: Collection[str], where: str, error: type[InputError], expected: str
+        self, header: Sequence[str], names: Collection[str], where: str, error_class: type[InputError], expected: str
     ) -> None:
         """Check the number of columns, and store the names of the columns.
 
         Args:
             header: Names of the columns in the file.
-            names: Names of columns that have a meaning. Blanks at the ends of all other names are removed.
+            names: Names of columns that have a meaning. These names are kept unchanged. Blanks at the ends of all other
+                names are removed.
             where: Name of the file, for error messages.
-            error: Class of the error that is raised for every mistake in the file.
+            error_class: Class of the error that is raised for every mistake in the file.
             expected: Description of the expected header, for error messages.
 
         Raises:
-            error: If the file has too many columns.
+            error_class: If the file has too many columns.
         """
         if len(header) > MAX_COLUMNS:
-            raise error(f"{where}: expected at most {MAX_COLUMNS:,} columns, got {len(header):,}")
+            raise error_class(f"{where}: expected at most {MAX_COLUMNS:,} columns, got {len(header):,}")
         self.header = tuple(name if name in names else name.strip() for name in header)
         self.where = where
-        self.error = error
+        self.error_class = error_class
         self.expected = expected
 
     def choose_columns(
@@ -172,8 +173,8 @@ class NumberTable(ABC):
             The rules of the chosen columns, by the names of the columns.
 
         Raises:
-            error: If a required column is missing, if the file contains a chosen column twice, or if a column has a
-                similar name as an optional column that the file does not contain. The message states which column to
+            error_class: If a required column is missing, if the file contains a chosen column twice, or if a column has
+                a similar name as an optional column that the file does not contain. The message states which column to
                 rename.
         """
         known_rules = {**required, **(optional or {})}
@@ -182,7 +183,8 @@ class NumberTable(ABC):
 
         missing_names = [name for name in required if name not in self.header]
         if missing_names:
-            # The file may contain a missing column under another name. The message then contains advice.
+            # The file may contain a missing column under another name. The message then contains advice. The length of
+            # the message is limited.
             absent_columns = {name: rule.meaning for name, rule in known_rules.items() if name not in self.header}
             advice = islice(header_advice(other_columns, absent_columns), MAX_LISTED_NAMES)
             self._refuse_header("; ".join([f"missing: {_listed(missing_names)}", *advice]))
@@ -201,7 +203,7 @@ class NumberTable(ABC):
             optional: Rules of the optional columns, by the names of the columns.
 
         Raises:
-            error: If a column has such a name. The column is probably an optional column whose name is misspelt.
+            error_class: If a column has such a name. The column is probably an optional column whose name is misspelt.
         """
         absent_columns = {name: rule.meaning for name, rule in optional.items() if name not in self.header}
         advice = list(islice(header_advice(columns, absent_columns), MAX_LISTED_NAMES))
@@ -217,11 +219,11 @@ class NumberTable(ABC):
             max_rows: Largest number of rows that is accepted.
 
         Raises:
-            error: If the file is damaged or has more than `max_rows` rows, or if a cell violates the rule of its
+            error_class: If the file is damaged or has more than `max_rows` rows, or if a cell violates the rule of its
                 column.
         """
         columns = self._read_columns(rules, max_rows)
-        columns.check(rules, f"{self.where}, ", self.error)
+        columns.check(rules, f"{self.where}, ", self.error_class)
         return columns
 
     @abstractmethod
@@ -235,17 +237,19 @@ class NumberTable(ABC):
             reason: What is wrong with the header, for the error message.
 
         Raises:
-            error: Always.
+            error_class: Always.
         """
-        raise self.error(f"{self.where}: expected {self.expected}, got the header {shown(list(self.header))}; {reason}")
+        raise self.error_class(
+            f"{self.where}: expected {self.expected}, got the header {shown(list(self.header))}; {reason}"
+        )
 
     def _refuse_row_count(self, max_rows: int) -> NoReturn:
         """Raise the error for a file that has more than `max_rows` rows.
 
         Raises:
-            error: Always.
+            error_class: Always.
         """
-        raise self.error(f"{self.where}: expected at most {max_rows:,} presses, got more; split the file")
+        raise self.error_class(f"{self.where}: expected at most {max_rows:,} presses, got more; split the file")
 
 
 def _listed(names: Sequence[str]) -> str:

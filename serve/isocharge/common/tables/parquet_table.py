@@ -46,7 +46,7 @@ class ParquetTable(NumberTable):
     row_noun = "row"
 
     def __init__(
-        self, file: BinaryIO, names: Collection[str], where: str, error: type[InputError], expected: str
+        self, file: BinaryIO, names: Collection[str], where: str, error_class: type[InputError], expected: str
     ) -> None:
         """Read the metadata of the file.
 
@@ -54,23 +54,23 @@ class ParquetTable(NumberTable):
             file: The file, which is open for reading. It must remain open until the columns have been read.
             names: Names of columns that have a meaning.
             where: Name of the file, for error messages.
-            error: Class of the error that is raised for every mistake in the file.
+            error_class: Class of the error that is raised for every mistake in the file.
             expected: Description of the expected header, for error messages.
 
         Raises:
-            error: If the file is not Parquet, is damaged, or has too many columns.
+            error_class: If the file is not Parquet, is damaged, or has too many columns.
             MissingExtra: If pyarrow is not installed.
         """
         require_pyarrow()
         from pyarrow.parquet import ParquetFile
 
-        _check_ends(file, where, error)
-        with _pyarrow_errors_converted(where, error):
+        _check_ends(file, where, error_class)
+        with _pyarrow_errors_converted(where, error_class):
             self._parquet = ParquetFile(file)
             self._metadata = self._parquet.metadata
             self._schema = self._parquet.schema_arrow
             header = self._schema.names
-        super().__init__(header, names, where, error, expected)
+        super().__init__(header, names, where, error_class, expected)
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Decode the requested columns.
@@ -81,7 +81,8 @@ class ParquetTable(NumberTable):
             max_rows: Largest number of rows that is accepted.
 
         Raises:
-            error: If there are too many rows, if the type of a column is not a number type, or if the file is damaged.
+            error_class: If there are too many rows, if the type of a column is not a number type, or if the file is
+                damaged.
         """
         row_count = self._metadata.num_rows
         if row_count > max_rows:
@@ -101,50 +102,50 @@ class ParquetTable(NumberTable):
             The numbers of the column as float64, shape (n,); NaN for null.
 
         Raises:
-            error: If the type of the column is not a number type, if the conversion may have rounded an integer, or if
-                the file is damaged.
+            error_class: If the type of the column is not a number type, if the conversion may have rounded an integer,
+                or if the file is damaged.
         """
         from pyarrow.types import is_integer
 
         field = self._schema.field(self.header.index(name))
         if not _is_number_type(field.type):
-            raise self.error(
+            raise self.error_class(
                 f"{self.where}, column {shown(name)}: expected numbers ({rule.description}), got a column of type "
                 f"{cut(str(field.type))}; convert it to float64"
             )
-        with _pyarrow_errors_converted(self.where, self.error):
+        with _pyarrow_errors_converted(self.where, self.error_class):
             numbers = self._decode(self._leaf_index(field.name), name)
         if is_integer(field.type):
             self._refuse_rounded_integers(numbers, name)
         return numbers
 
-    def _decode(self, index: int, name: str) -> Array:
+    def _decode(self, leaf_index: int, name: str) -> Array:
         """Decode one column in batches of rows, in order to limit the memory.
 
         Args:
-            index: Index under which Parquet stores the column.
+            leaf_index: Index under which Parquet stores the numbers of the column; see `_leaf_index`.
             name: Name of the column, for error messages.
 
         Returns:
             The numbers of the column as float64, shape (n,); NaN for null.
 
         Raises:
-            error: If the column has another number of rows than the metadata declare.
+            error_class: If the column has another number of rows than the metadata declare.
         """
-        row_count = self._metadata.num_rows  # the number of rows that the metadata declare
-        numbers = np.empty(row_count)
-        decoded_row_count = 0  # number of rows that are decoded
+        declared_row_count = self._metadata.num_rows
+        numbers = np.empty(declared_row_count)
+        row_count = 0  # number of rows that are decoded so far
         all_groups = list(range(self._metadata.num_row_groups))
-        for batch in self._parquet.reader.iter_batches(ROWS_PER_BATCH, all_groups, [index], use_threads=False):
-            batch_end = decoded_row_count + batch.num_rows
-            if batch_end > row_count:  # the column has more rows than the metadata declare
+        for batch in self._parquet.reader.iter_batches(ROWS_PER_BATCH, all_groups, [leaf_index], use_threads=False):
+            batch_end = row_count + batch.num_rows
+            if batch_end > declared_row_count:  # the column has more rows than the metadata declare
                 break
-            numbers[decoded_row_count:batch_end] = _as_float64(batch.column(0))  # the only column of the batch
-            decoded_row_count = batch_end
-        if decoded_row_count != row_count:
-            raise self.error(
-                f"{self.where}, column {shown(name)}: expected {row_count:,} rows as in the metadata of the file, got "
-                "another number; the file is damaged, write it again"
+            numbers[row_count:batch_end] = _as_float64(batch.column(0))  # the only column of the batch
+            row_count = batch_end
+        if row_count != declared_row_count:
+            raise self.error_class(
+                f"{self.where}, column {shown(name)}: expected {declared_row_count:,} rows as in the metadata of the "
+                "file, got another number; the file is damaged, write it again"
             )
         return numbers
 
@@ -158,12 +159,12 @@ class ParquetTable(NumberTable):
             field_name: Name of the column in the file.
 
         Raises:
-            error: If no column, or more than one column, is stored under this name.
+            error_class: If no column, or more than one column, is stored under this name.
         """
         schema = self._parquet.schema
         indices = [index for index in range(len(schema)) if schema.column(index).path == field_name]
         if len(indices) != 1:
-            raise self.error(
+            raise self.error_class(
                 f"{self.where}: expected one column {shown(field_name)}, got {len(indices)} that are stored under "
                 "this name; rename the others"
             )
@@ -177,12 +178,12 @@ class ParquetTable(NumberTable):
             name: Name of the column, for the error message.
 
         Raises:
-            error: If the magnitude of a number is at least `FIRST_INEXACT_INTEGER`.
+            error_class: If the magnitude of a number is at least `FIRST_INEXACT_INTEGER`.
         """
         inexact_rows = np.flatnonzero(np.abs(numbers) >= FIRST_INEXACT_INTEGER)
         if inexact_rows.size:
             row = inexact_rows[0]
-            raise self.error(
+            raise self.error_class(
                 f"{self.where}, row {row + 1}, column {shown(name)}: expected an integer of a magnitude below 2^53, "
                 f"which float64 holds exactly, got {numbers[row]:.0f}; convert the column to float64"
             )
@@ -218,7 +219,7 @@ def require_pyarrow() -> None:
         import pyarrow.parquet  # noqa: F401
 
 
-def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
+def _check_ends(file: BinaryIO, where: str, error_class: type[InputError]) -> None:
     """Check the marks at both ends of a Parquet file, and the size of the metadata.
 
     The size is checked before pyarrow reads the metadata, because large metadata need much memory.
@@ -226,10 +227,10 @@ def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
     Args:
         file: The file, which is open for reading. Its position is 0 before and after the call.
         where: Name of the file, for error messages.
-        error: Class of the error that is raised.
+        error_class: Class of the error that is raised.
 
     Raises:
-        error: If the file is not Parquet, is incomplete, or has very large metadata.
+        error_class: If the file is not Parquet, is incomplete, or has very large metadata.
     """
     first_mark = file.read(len(MARK))
 
@@ -241,34 +242,36 @@ def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
     file.seek(0)  # pyarrow reads the file from its beginning
 
     if first_mark != MARK or last_mark != MARK:
-        raise error(f"{where}: not a Parquet file, or one that was cut off; write it again, or as CSV")
+        raise error_class(f"{where}: not a Parquet file, or one that was cut off; write it again, or as CSV")
     if metadata_bytes > MAX_FOOTER_BYTES:
-        raise error(
+        raise error_class(
             f"{where}: expected metadata of at most {MAX_FOOTER_BYTES:,} bytes, got {metadata_bytes:,}; write the file "
             "with fewer columns or row groups"
         )
 
 
 @contextmanager
-def _pyarrow_errors_converted(where: str, error: type[InputError]) -> Iterator[None]:
+def _pyarrow_errors_converted(where: str, error_class: type[InputError]) -> Iterator[None]:
     """If pyarrow raises an exception for a damaged file in the `with` block, raise a given error instead.
 
     Args:
         where: Name of the file, for the error message.
-        error: Class of the error that is raised.
+        error_class: Class of the error that is raised.
 
     Raises:
-        error: If the block raises one of the exceptions of pyarrow.
+        error_class: If the block raises one of the exceptions of pyarrow.
     """
     from pyarrow import ArrowException
 
     try:
         yield
-    except error:  # the block has raised an error with its own message; it may also be a ValueError
+    except error_class:  # the block has raised an error with its own message; it may also be a ValueError
         raise
     except (ArrowException, OSError, ValueError, MemoryError, OverflowError) as cause:
         reason = cut(" ".join(str(cause).split()))
-        raise error(f"{where}: not a Parquet file, or a damaged one ({reason}); write it again, or as CSV") from cause
+        raise error_class(
+            f"{where}: not a Parquet file, or a damaged one ({reason}); write it again, or as CSV"
+        ) from cause
 
 
 def _is_number_type(given_type: "DataType") -> bool:

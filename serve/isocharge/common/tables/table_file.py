@@ -21,33 +21,35 @@ def is_parquet(path: Path) -> bool:
 
 
 @contextmanager
-def open_table(path: Path, names: Collection[str], error: type[InputError], expected: str) -> Iterator[NumberTable]:
+def open_table(
+    path: Path, names: Collection[str], error_class: type[InputError], expected: str
+) -> Iterator[NumberTable]:
     """Open a file for the `with` block, and read its header.
 
     Args:
         path: The file. A Parquet file must be a regular file. A CSV file must be text in UTF-8, with or without a byte
             order mark.
         names: Names of columns that have a meaning.
-        error: Class of the error that is raised for every mistake in the file.
+        error_class: Class of the error that is raised for every mistake in the file.
         expected: Description of the expected header, for error messages.
 
     Yields:
         The table, whose columns have not been read yet.
 
     Raises:
-        error: If the file cannot be read, either when it is opened or when the block reads the columns.
+        error_class: If the file cannot be read, either when it is opened or when the block reads the columns.
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     if is_parquet(path):
         require_pyarrow()
-        with _os_errors_converted(path, error, "a Parquet file of presses"), open_regular(path) as file:
-            yield ParquetTable(file, names, str(path), error, expected)
+        with _os_errors_converted(path, error_class, "a Parquet file of presses"), open_regular(path) as file:
+            yield ParquetTable(file, names, str(path), error_class, expected)
     else:
         with (
-            _os_errors_converted(path, error, "a CSV file of presses"),
+            _os_errors_converted(path, error_class, "a CSV file of presses"),
             path.open(encoding="utf-8-sig", newline="") as text,  # `newline=""`: the CSV reader handles the line ends
         ):
-            yield CsvTable(bounded_lines(text), names, str(path), error, expected)
+            yield CsvTable(bounded_lines(text), names, str(path), error_class, expected)
 
 
 def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
@@ -67,20 +69,20 @@ def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
 
 
 @contextmanager
-def _os_errors_converted(path: Path, error: type[InputError], expected: str) -> Iterator[None]:
+def _os_errors_converted(path: Path, error_class: type[InputError], expected: str) -> Iterator[None]:
     """If the `with` block raises an OSError, raise an error of a given class instead.
 
     Args:
         path: The file, for the error message.
-        error: Class of the error that is raised.
+        error_class: Class of the error that is raised.
         expected: Description of the expected file, for the error message.
 
     Raises:
-        error: If the block raises an OSError that is not an error of isocharge.
+        error_class: If the block raises an OSError that is not an error of isocharge.
     """
     try:
         yield
     except OSError as cause:
         if isinstance(cause, IsochargeError):  # some errors of isocharge, such as OutputError, inherit from OSError
             raise
-        raise error(f"{path}: cannot be read ({cause.strerror or cause}); expected {expected}") from cause
+        raise error_class(f"{path}: cannot be read ({cause.strerror or cause}); expected {expected}") from cause

@@ -13,10 +13,10 @@ from isocharge.serve.signal_chain.chain import LARGEST_PC
 MAINS_HZ = (50.0, 60.0)
 """Frequencies at which hum is searched for, Hz."""
 
-SAMPLES_PER_PERIOD = 2.2
+MIN_SAMPLES_PER_PERIOD = 2.2
 """Smallest frame rate at which a hum is estimated, in samples per period: 10 % above the Nyquist rate."""
 
-SHORTEST_S = 0.5
+MIN_HUM_TIME_S = 0.5
 """Shortest time from which hum is estimated, s. Its resolution of 2 Hz separates 50 from 60 Hz."""
 
 
@@ -24,8 +24,8 @@ SHORTEST_S = 0.5
 class ChannelHealth:
     """Health of one channel.
 
-    The results are in pC if the gain of the channel is known, and otherwise in the unit of the board. All results are
-    None if no value of the channel can be a charge.
+    The results are in pC if the gain of the channel is known, and otherwise in the unit of the board. Offset, noise,
+    drift, hum and span are None if no value of the channel is usable.
 
     Attributes:
         name: Name that the device uses, or the number of the channel, counted from 1.
@@ -35,7 +35,7 @@ class ChannelHealth:
         hum_pC: Amplitudes of the hum at 50 and at 60 Hz. An amplitude is None if the frame rate is too low or the time
             is too short to estimate it.
         span_pC: Difference between the largest and the smallest value.
-        unusable: Number of values that are not finite, or whose magnitude is larger than the charge of any film.
+        unusable: Number of values that are not finite, or whose magnitude is larger than any charge of a film.
     """
 
     name: str
@@ -51,17 +51,17 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
     """Measure the offset, the noise, the drift and the hum of a channel while the film is at rest.
 
     A constant, a slope (the drift) and the hum at each mains frequency are fitted to the values by least squares. The
-    noise is the standard deviation of the residuals. The function ignores NaN and values whose magnitude is larger than
-    `LARGEST_PC`.
+    hum is left out if the time is too short or the frame rate too low. The noise is the standard deviation of the
+    residuals. The function ignores NaN and values whose magnitude is larger than `LARGEST_PC`.
 
     Args:
         name: Name of the channel.
-        charge_pC: Values, shape (n,), pC.
+        charge_pC: Values, shape (n,), pC, or in the unit of the board if the gain is not known.
         times_s: Times since the first frame, shape (n,), s.
         rate_Hz: Frames per second, Hz.
 
     Returns:
-        The results. They are None if the channel has no usable value.
+        The number of unusable values, and the other results, which are None if the channel has no usable value.
     """
     is_usable = np.abs(charge_pC) <= LARGEST_PC  # false for NaN
     unusable_count = int(np.count_nonzero(~is_usable))
@@ -72,8 +72,8 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
 
     # In a short time, a hum cannot be distinguished from a drift. At a low frame rate, it cannot be sampled.
     hum_frequencies_Hz: list[float] = []
-    if usable_times_s[-1] > SHORTEST_S:
-        hum_frequencies_Hz = [hum_Hz for hum_Hz in MAINS_HZ if rate_Hz > SAMPLES_PER_PERIOD * hum_Hz]
+    if usable_times_s[-1] > MIN_HUM_TIME_S:
+        hum_frequencies_Hz = [hum_Hz for hum_Hz in MAINS_HZ if rate_Hz > MIN_SAMPLES_PER_PERIOD * hum_Hz]
     fit = _fit_drift_and_hum(usable_pC, usable_times_s, hum_frequencies_Hz)
     hum_50_Hz_pC = fit.hum_amplitudes_pC.get(50.0)  # None if the hum of this frequency was not fitted
     hum_60_Hz_pC = fit.hum_amplitudes_pC.get(60.0)
@@ -119,7 +119,7 @@ def _fit_drift_and_hum(charge_pC: Array, times_s: Array, hum_frequencies_Hz: Seq
     Returns:
         Slope of the line, amplitude of the hum at each frequency, and residuals.
     """
-    # Each column is the function that one coefficient multiplies, at the times of the values.
+    # Each column contains the values of one function of time, which is multiplied by its coefficient.
     columns = [np.ones_like(times_s), times_s]
     for hum_Hz in hum_frequencies_Hz:
         phase = 2.0 * np.pi * hum_Hz * times_s

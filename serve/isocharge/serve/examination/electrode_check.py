@@ -16,10 +16,10 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressCheckError
 from isocharge.common.printable_text import printable
-from isocharge.serve.examination.proposal import noise_of
-from isocharge.serve.examination.touch_search import BLOCK_S, CHANGE_SIGMAS, resolution_of
+from isocharge.serve.examination.proposal import estimate_noise
+from isocharge.serve.examination.touch_search import BLOCK_S, CHANGE_SIGMAS, rounding_error_std
 from isocharge.serve.live.device import Device
-from isocharge.serve.live.reading_stream import position_of
+from isocharge.serve.live.reading_stream import channel_index
 from isocharge.serve.port.source import Port
 
 REST_BLOCKS = 5
@@ -49,8 +49,8 @@ class ElectrodeCheck:
     """Result of the electrode check: the channel that changed most under the press near each electrode.
 
     Attributes:
-        expected: Channel of each electrode as it was assumed, by the names of the electrodes.
-        found: Channel of each electrode as the presses show it, by the names of the electrodes.
+        expected: Assumed channel of each electrode, by the name of the electrode.
+        found: Channel of each electrode that the presses show, by the name of the electrode.
         changes: Change of each channel under each press, shape (electrodes, channels), in the unit of the board.
         inverted: Channels whose charge falls under a press.
     """
@@ -82,8 +82,8 @@ def _order_sentence(expected_channels: Mapping[str, str], found_channels: Mappin
     """Return a sentence about the order of the channels, which may be swapped, turned or otherwise different.
 
     Args:
-        expected_channels: Channel of each electrode as it was assumed, by the names of the electrodes.
-        found_channels: Channel of each electrode as the presses show it, by the names of the electrodes.
+        expected_channels: Assumed channel of each electrode, by the name of the electrode.
+        found_channels: Channel of each electrode that the presses show, by the name of the electrode.
     """
     electrodes = list(expected_channels)
     wrong_electrodes = [name for name in electrodes if found_channels[name] != expected_channels[name]]
@@ -97,7 +97,7 @@ def _order_sentence(expected_channels: Mapping[str, str], found_channels: Mappin
         found_channel = found_channels[electrode]
         assumed_electrodes.append(expected_electrode[found_channel])
 
-    # With two electrodes, turned channels are also swapped. "Swapped" is the simpler description.
+    # With two electrodes, turned channels are also swapped. "Swapped" is then the simpler description.
     turned_places = _turned_places(electrodes, assumed_electrodes)
     if turned_places is not None and len(electrodes) > 2:
         return f"the channels are turned by {turned_places} of {len(electrodes)} places"
@@ -138,7 +138,7 @@ def check_electrodes(
     Args:
         port: The open port.
         device: Format of the frames.
-        channels: Name of the channel of each electrode, as it is assumed.
+        channels: Assumed channel of each electrode, by the name of the electrode.
         ask: Function that is called with a sentence that asks the user for a press.
         timeout_s: Time to wait for each press, s.
 
@@ -151,7 +151,7 @@ def check_electrodes(
     """
     electrodes = list(channels)
     channel_names = list(channels.values())
-    blocks = _Blocks(port, device, channel_names)  # reads the port, and computes medians over short blocks of time
+    blocks = _BlockReader(port, device, channel_names)  # reads the port, and computes medians over short blocks of time
     measured_changes = []
     for electrode in electrodes:
         ask(f"press near electrode {electrode}, as close to it as you can, and let go")
@@ -162,10 +162,10 @@ def check_electrodes(
     found_channels = {}
     inverted_channels = []
     columns = assign_channels(changes, electrodes)  # column of the channel that belongs to each electrode
-    for row, column in enumerate(columns):
+    for press, column in enumerate(columns):
         channel = channel_names[column]
-        found_channels[electrodes[row]] = channel
-        if changes[row, column] < 0.0:
+        found_channels[electrodes[press]] = channel
+        if changes[press, column] < 0.0:
             inverted_channels.append(channel)
     return ElectrodeCheck(
         expected=dict(channels), found=found_channels, changes=changes, inverted=tuple(inverted_channels)
@@ -199,13 +199,13 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
         other_changes = np.delete(normalised[row], column)  # empty if there is only one channel
         if other_changes.size and normalised[row, column] < MIN_ADVANTAGE * other_changes.max():
             raise PressCheckError(
-                f"the press near electrode {electrodes[row]} moves two channels alike; press closer to the electrode, "
-                "with a thinner probe, and try again"
+                f"the press near electrode {electrodes[row]} changes two channels by almost the same amount; press "
+                "closer to the electrode, with a thinner probe, and try again"
             )
         if column in columns[:row]:
             earlier_electrode = electrodes[columns.index(column)]
             raise PressCheckError(
-                f"the presses near electrodes {earlier_electrode} and {electrodes[row]} move the same channel most; "
+                f"the presses near electrodes {earlier_electrode} and {electrodes[row]} change the same channel most; "
                 "press closer to each electrode, and try again"
             )
     return columns
@@ -251,8 +251,8 @@ def _reassigned_settings(section: Any, source_electrode: Mapping[str, str]) -> A
     return reassigned_section
 
 
-class _Blocks:
-    """Reads a port, and computes the medians of the given channels over blocks of time of the length `BLOCK_S`."""
+class _BlockReader:
+    """Reader of a port that computes the medians of the given channels over blocks of time of the length `BLOCK_S`."""
 
     def __init__(self, port: Port, device: Device, channels: list[str]) -> None:
         """Store the port and the channels. The first data are read by `next_block`.
@@ -289,7 +289,7 @@ class _Blocks:
                 rows += self._rows(chunk.data)
         values = np.array(rows)  # shape (frames, channels)
         # Consecutive values of a coarse converter may be equal. The noise is then the rounding error of whole numbers.
-        noise = np.array([max(noise_of(column), resolution_of(column)) for column in values.T])
+        noise = np.array([max(estimate_noise(column), rounding_error_std(column)) for column in values.T])
         return np.median(values, axis=0), noise
 
     def _rows(self, data: bytes) -> Iterator[list[float]]:
@@ -299,14 +299,14 @@ class _Blocks:
             data: Bytes from the port. They may end within a frame, which the next bytes complete.
         """
         for frame in self._parser.feed(data):
-            positions = [position_of(channel, frame) for channel in self._channels]  # None for a missing channel
+            positions = [channel_index(channel, frame) for channel in self._channels]  # None for a missing channel
             values = [frame.values[position] for position in positions if position is not None]
             has_all_channels = len(values) == len(positions)
             if has_all_channels and all(map(math.isfinite, values)):
                 yield values
 
 
-def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
+def _wait_for_press(blocks: _BlockReader, electrode: str, timeout_s: float) -> Array:
     """Wait for a press that begins and ends, and return the change of the channels at its peak.
 
     Each block contains the median of each channel over a short time. The change of a channel is the difference between
@@ -351,7 +351,7 @@ def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
     raise _missing_press_error(electrode, timeout_s)
 
 
-def _wait_for_rest(blocks: _Blocks, electrode: str, deadline_s: float, timeout_s: float) -> tuple[Array, Array]:
+def _wait_for_rest(blocks: _BlockReader, electrode: str, deadline_s: float, timeout_s: float) -> tuple[Array, Array]:
     """Wait until the channels are quiet in `REST_BLOCKS` consecutive blocks.
 
     A block contains the level (median) and the noise of each channel over a short time. The channels are quiet if the

@@ -3,8 +3,8 @@
 The description states whether the charge of the press is constant, leaks, creeps or drifts.
 
 The gain of the board may be unknown. A press is therefore not recognised by a charge in pC, but by the first large
-change of the channels within 0.2 s. The size of the press is the projection of the channel values onto the direction of
-this change, minus the rest level before the press. If the rest level drifts, it is extrapolated along a straight line.
+change of the channels within 0.2 s. The charge of the press is the projection of the channel values onto the direction
+of this change, minus the rest level before the press. A rest level that drifts is extrapolated along a straight line.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ STEADY_SHARE = 0.02
 """Largest relative change of the charge of a steady press, dimensionless."""
 
 DRIFT_SIGMAS = 4.0
-"""Slope of the rest above which it drifts, in standard errors of the slope."""
+"""Slope above which the rest level is assumed to drift, in standard errors of the slope."""
 
 LEARNING_TAU_s = 1e5
 """Time constant for `[leak]` that corrects no leak, s. The stage still estimates the drift at rest and removes it."""
@@ -57,7 +57,7 @@ class HeldPress:
     Attributes:
         begin_s: Time at which the press began, s since the first frame.
         sections: Sections for a device file, as tables by name.
-        description: Sentence that describes how the charge of the press changes.
+        description: Sentence that describes whether and how the charge of the press changes.
     """
 
     begin_s: float
@@ -69,42 +69,42 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     """Find a press that is held for at least `MIN_HELD_S`, and describe how its charge changes.
 
     The values are averaged over blocks of time. The press begins with the first large step between the blocks. The film
-    must be at rest before the press, and the step must be much larger than the usual change between blocks. The step is
-    a vector with one change for each channel. The values of all channels are combined into one component, which is
-    their projection onto the direction of the step.
+    must be at rest before the press, and the step must be much larger than the usual change between blocks.
+
+    The step is a vector with one change for each channel. The values of all channels are combined into one component,
+    which is their projection onto the direction of the step.
 
     Args:
         values: Values of the channels, shape (n, channels), in any unit.
         times_s: Times since the first frame, shape (n,), s.
 
     Returns:
-        The press; None if there is none.
+        The press; None if no such press is found.
     """
     min_duration_s = MIN_REST_S + SETTLE_S + MIN_HELD_S
     levels = _block_means(values, times_s)
     if levels is None or len(levels) * BLOCK_S < min_duration_s:
         return None
 
-    # Find the numbers of the blocks in which the force rises (begin), becomes constant (settled), and falls (end). The
-    # step is the change between two blocks, and the force rises in the block between them.
+    # Find the indices of the blocks in which the force rises (begin), becomes constant (settled), and falls (end). The
+    # force rises in the block between the two blocks of the step.
     step = _find_step(levels)
-    begin_block = step.rest_blocks + 1
-    settled_block = begin_block + round(SETTLE_S / BLOCK_S)
+    settled_block = step.begin_block + round(SETTLE_S / BLOCK_S)
     end_block = _end_of_press(step.component, settled_block, step.size)
     has_rest = step.rest_blocks * BLOCK_S >= MIN_REST_S
     is_long = (end_block - settled_block) * BLOCK_S >= MIN_HELD_S
     if not (step.is_large and has_rest and is_long):
         return None
 
-    # Subtract the rest level from the component. The difference is the size of the press in each block.
+    # Subtract the rest level from the component. The difference is the charge of the press in each block.
     block_times_s = BLOCK_S * (np.arange(len(step.component)) + 0.5)  # middle of each block
-    rest, drift_per_s = _extrapolate_rest(step.component, block_times_s, step.rest_blocks, step.size)
-    press_size = step.component - rest
+    rest_level, drift_per_s = _extrapolate_rest(step.component, block_times_s, step.rest_blocks, step.size)
+    press_charge = step.component - rest_level
 
-    # Describe how the size changes while the force is constant. A drift of the rest level is described separately.
-    begin_s = BLOCK_S * begin_block
+    # Describe how this charge changes while the force is constant. A drift of the rest level is described separately.
+    begin_s = BLOCK_S * step.begin_block
     held_times_s = block_times_s[settled_block:end_block] - begin_s
-    description, sections = _describe(held_times_s, press_size[settled_block:end_block])
+    description, sections = _describe(held_times_s, press_charge[settled_block:end_block])
     if drift_per_s != 0.0:
         description, sections = _with_drift(description, sections, percent_per_s=100.0 * drift_per_s / step.size)
     return HeldPress(begin_s, sections, description)
@@ -114,13 +114,15 @@ class _Step(NamedTuple):
     """Step of the channels at the beginning of a press.
 
     Attributes:
-        rest_blocks: Number of blocks before the press.
+        rest_blocks: Number of blocks at rest before the press.
+        begin_block: Index of the block in which the force rises.
         size: Euclidean norm of the change of the channels, in the unit of the channels.
         is_large: Whether the step is much larger than the usual change of the channels.
         component: Mean of each block along the direction of the change, shape (blocks,), in the unit of the channels.
     """
 
     rest_blocks: int
+    begin_block: int
     size: float
     is_large: bool
     component: Array
@@ -136,18 +138,24 @@ def _find_step(levels: Array) -> _Step:
         levels: Mean of each channel in each block of time, shape (blocks, channels), any unit.
 
     Returns:
-        The step, with the number of blocks before it, and the values of all blocks along its direction.
+        The step, its position among the blocks, and the projection of all blocks onto its direction.
     """
     changes = levels[2:] - levels[:-2]  # change i is from block i to block i + 2; shape (blocks - 2, channels)
     change_sizes = np.linalg.norm(changes, axis=1)
     is_step = change_sizes > 0.5 * change_sizes.max()
-    first_block = int(np.argmax(is_step))  # position of the first True: the block before the step
-    size = float(change_sizes[first_block])
+    block_before = int(np.argmax(is_step))  # index of the first True: the last block before the force rises
+    size = float(change_sizes[block_before])
     is_large = bool(size >= STEP_RATIO * np.median(change_sizes))
 
     # Project the levels onto the direction of the step, a unit vector of shape (channels,).
-    direction = changes[first_block] / max(size, SMALLEST_SIZE)  # no division by zero if the channels never change
-    return _Step(rest_blocks=first_block, size=size, is_large=is_large, component=levels @ direction)
+    direction = changes[block_before] / max(size, SMALLEST_SIZE)  # no division by zero if the channels never change
+    return _Step(
+        rest_blocks=block_before,  # does not include block_before itself, at whose end the force may begin to rise
+        begin_block=block_before + 1,
+        size=size,
+        is_large=is_large,
+        component=levels @ direction,
+    )
 
 
 def _extrapolate_rest(
@@ -167,8 +175,8 @@ def _extrapolate_rest(
         step_size: Change of the component when the press begins, in the unit of the component.
 
     Returns:
-        The rest level in each block, shape (blocks,), and its slope per second, which is 0 if the rest level is
-        constant.
+        The rest level in each block, shape (blocks,), and the slope of the rest level per second, which is 0 if the
+        mean is used.
     """
     rest_component = component[:rest_blocks]
     rest_times_s = block_times_s[:rest_blocks]
@@ -207,24 +215,23 @@ def _block_means(values: Array, times_s: Array) -> Array | None:
 
 
 def _end_of_press(component: Array, settled_block: int, step_size: float) -> int:
-    """Return the index of the block at which the press ends.
+    """Return the index of the block before which the held part of a press ends.
 
     The press ends when the component first falls by a large part of the step within two blocks. If the component never
     falls by so much, the press is held to the end, and the result is the total number of blocks.
 
     Args:
         component: Mean of each block, projected onto the change of the channels by the press, shape (blocks,).
-        settled_block: Number of the first block in which the force is constant.
+        settled_block: Index of the first block in which the force is constant.
         step_size: Change of the component when the press begins.
     """
     held_component = component[settled_block:]
     changes = held_component[2:] - held_component[:-2]  # from each block to the second block after it
     is_release = changes < -RELEASE_SHARE * step_size
-    release_positions = np.flatnonzero(is_release)
-    if release_positions.size == 0:
+    releases = np.flatnonzero(is_release)  # indices within `held_component`
+    if releases.size == 0:
         return len(component)
-    first_release = int(release_positions[0])
-    return settled_block + first_release  # the positions count from the block in which the force is constant
+    return settled_block + int(releases[0])
 
 
 def _with_drift(
@@ -235,10 +242,10 @@ def _with_drift(
     The section `[leak]` of a device file has two effects. It corrects an exponential loss of charge with the time
     constant `tau_s`, and it removes a drift at rest.
 
-    - If the press has no section `[leak]`, the section is added in order to remove the drift. Its `tau_s` is so large
-      that no loss of charge is corrected.
-    - If the press has a section `[leak]`, the press loses charge exponentially, and the section is kept. The user is
-      asked to measure again without a drift.
+    - Without a section `[leak]`, the press does not lose charge exponentially. The section is then added in order to
+      remove the drift. Its `tau_s` is so large that no loss of charge is corrected.
+    - A given section `[leak]` is kept. Because the drift may have falsified its `tau_s`, the user is asked to measure
+      again without a drift.
 
     Args:
         description: Description of the press, a sentence.
@@ -249,16 +256,16 @@ def _with_drift(
         The completed description, and the completed sections.
     """
     if "leak" in sections:
-        remedy = "leave the board alone until the rest stands still, and measure again"
+        remedy = "do not touch the film until the drift has ended, and measure again"
         completed_sections = sections
     else:
-        remedy = f"[leak] tau_s = {LEARNING_TAU_s:g} in a device file lets the drift be learned at rest and taken off"
+        remedy = f"[leak] tau_s = {LEARNING_TAU_s:g} in a device file measures the drift at rest and subtracts it"
         completed_sections = {"leak": {"tau_s": LEARNING_TAU_s}, **sections}
-    sentence = f"the rest drifts, by {percent_per_s:.2g} % of the press in a second; {description}; {remedy}"
+    sentence = f"the rest level drifts by {percent_per_s:.2g} % of the press per second; {description}; {remedy}"
     return sentence, completed_sections
 
 
-def _describe(held_times_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, float]]]:
+def _describe(held_times_s: Reals, press_charge: Reals) -> tuple[str, dict[str, dict[str, float]]]:
     """Describe how the charge of a press changes: whether it is constant, leaks, creeps, or follows no clear law.
 
     A leak is an exponential loss of charge in the amplifier. Creep is a decrease of the charge of the film in
@@ -266,31 +273,31 @@ def _describe(held_times_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str
 
     Args:
         held_times_s: Times since the beginning of the press, shape (n,), s.
-        size: Charge of the press at these times, shape (n,), any unit.
+        press_charge: Charge of the press at these times, shape (n,), any unit.
 
     Returns:
         A sentence, and sections for a device file, as tables by name; empty if no setting is needed or known.
     """
     # Means over some blocks at the beginning and at the end have less noise than single blocks.
-    first_size = size[:END_BLOCKS].mean()
-    last_size = size[-END_BLOCKS:].mean()
-    lost_share = 1.0 - float(last_size / first_size)
+    first_charge = press_charge[:END_BLOCKS].mean()
+    last_charge = press_charge[-END_BLOCKS:].mean()
+    lost_share = 1.0 - float(last_charge / first_charge)
     if abs(lost_share) < STEADY_SHARE:
         return f"a held press keeps its charge for {held_times_s[-1]:.0f} s", {}
 
-    positive_size = np.maximum(size, 1e-9)  # the law is fitted to the logarithm of the size
-    times_and_sizes = list(zip(held_times_s.tolist(), positive_size.tolist(), strict=True))
-    law = law_of_fading(times_and_sizes)
+    positive_charge = np.maximum(press_charge, 1e-9)  # the law is fitted to the logarithm of the charge
+    times_and_charges = list(zip(held_times_s.tolist(), positive_charge.tolist(), strict=True))
+    law = law_of_fading(times_and_charges)
     if law.tau_s is not None:
-        return f"a held press leaks: {law.settings} in a device file undoes it", law.sections
+        return f"a held press leaks: {law.settings} in a device file corrects the leak", law.sections
     if law.creep is not None:
         sentence = (
-            f"a held press creeps by {100.0 * law.creep:.2g} % in each decade of time: the film does, so set no [leak] "
-            f"for it, and {law.creep_remedy}"
+            f"a held press creeps by {100.0 * law.creep:.2g} % in each decade of time: this is a property of the film, "
+            f"so set no [leak] for it, and {law.creep_remedy}"
         )
         return sentence, law.sections
     sentence = (
-        f"a held press changes by {-100.0 * lost_share:.2g} % in {held_times_s[-1]:.0f} s, by no law that is clear: "
-        "hold one longer, with a weight"
+        f"a held press changes by {-100.0 * lost_share:.2g} % in {held_times_s[-1]:.0f} s and follows no clear law: "
+        "hold a press longer, with a weight"
     )
     return sentence, {}

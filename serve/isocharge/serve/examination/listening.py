@@ -41,7 +41,7 @@ class ReceivedData:
         request: Request that was sent to the board; None if the board sends frames by itself.
         chunks: The bytes with the times of their arrival.
         seconds: Time of listening, s.
-        echo_share: Share of the requests that the line returned, dimensionless.
+        echo_share: Share of the requests that the line returned as an echo, dimensionless.
     """
 
     url: str
@@ -91,19 +91,20 @@ def listen(
 ) -> ReceivedData:
     """Find the baud rate of a port, and listen to the port at this baud rate.
 
-    The chosen baud rate is the first one at which most of the bytes belong to frames. The search also ends at a baud
-    rate at which no bytes arrive.
+    The function chooses the first baud rate at which most of the bytes belong to frames, or at which no bytes arrive.
+    A port that is silent at one baud rate is silent at every baud rate, so further attempts would be useless.
 
     Args:
         url: The port.
         bauds: Baud rates to try, bit/s, each for `TRY_S`.
         seconds: Time of listening at the right baud rate, s.
-        request: Request that the board needs. The function measures whether the line returns it as an echo.
+        request: Request that the board needs; None if the board sends frames by itself. The function measures whether
+            the line returns the request as an echo.
         has_frames: Function that returns whether most of the bytes are frames.
         wait: Time to wait until the port can be opened, s.
 
     Returns:
-        The bytes at the chosen baud rate. If no baud rate of `bauds` is suitable, the first one is chosen.
+        The bytes at the chosen baud rate, which is the first of `bauds` if no baud rate is suitable.
 
     Raises:
         PortError: If the port cannot be opened.
@@ -113,7 +114,7 @@ def listen(
         received = _listen_at_baud(url, bauds[0], ECHO_S, request, wait)
         request = replace(request, echo=received.echo_share >= ECHO_SHARE)
 
-    # Try the baud rates. A port without a baud rate, such as a network port, is not tried.
+    # Try the baud rates, unless the port has none, as a network port.
     chosen_baud = bauds[0]
     if has_speed(url) and len(bauds) > 1:
         for baud in bauds:
@@ -131,7 +132,7 @@ def _listen_at_baud(url: str, baud: int, seconds: float, request: Request | None
     Args:
         url: The port.
         baud: Baud rate, bit/s.
-        seconds: Time of listening, s. It is shorter if the port is lost.
+        seconds: Time of listening, s. Listening ends earlier if the port is lost.
         request: Request that the board needs; None if the board sends frames by itself.
         wait: Time to wait until the port can be opened, s.
     """

@@ -36,28 +36,29 @@ class BoardFindings:
     Attributes:
         capture: The frames.
         channels: Health of the channels that electrodes use.
-        unused: Names of the other channels.
+        unused_channels: Names of the other channels.
         device: Settings of the board.
         electrodes: Electrodes of the model; empty for any model.
         unit: Unit of the channels: "pC", "counts" or "V".
-        held: Press that was held during the check; None if there was none.
-        touch: Sentence about a touch of the film, which should be at rest; empty if there was none.
+        held_press: Press that was held during the check; None if no press was held.
+        touch_sentence: Sentence about a touch of the film, which should be at rest; empty if there was no touch.
     """
 
     capture: Capture
     channels: tuple[ChannelHealth, ...]
-    unused: tuple[str, ...]
+    unused_channels: tuple[str, ...]
     device: Device
     electrodes: tuple[str, ...]
     unit: str
-    held: HeldPress | None
-    touch: str
+    held_press: HeldPress | None
+    touch_sentence: str
 
 
 def missing_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield one sentence for each setting or property that the board needs before contacts can be computed.
+    """Yield one sentence for each missing setting and for each problem that prevents the computation of contacts.
 
-    Without bytes or without frames, there is only one sentence, because nothing else is known.
+    Without bytes or without frames, there is only one sentence, because nothing else is known. Problems of charges,
+    such as a large noise, are reported only if the unit of the channels is pC.
 
     Args:
         findings: Results of the port check.
@@ -76,8 +77,8 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
             "touched"
         )
         return
-    if findings.touch:
-        yield findings.touch
+    if findings.touch_sentence:
+        yield findings.touch_sentence
     yield from _transmission_sentences(capture)
     yield from _channel_count_sentences(findings)
     if findings.unit != "pC":
@@ -86,7 +87,7 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
     for channel in findings.channels:
         if channel.span_pC == 0.0:
             yield f"channel {printable(channel.name)} is dead: every value is {channel.offset_pC:g}"
-        if findings.unit == "pC":  # the limits of the charges are in pC
+        if findings.unit == "pC":  # the limits of noise, offset, drift and hum are in pC
             yield from _charge_sentences(channel, tare_rule)
 
 
@@ -115,12 +116,14 @@ def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
         findings: Results of the port check.
     """
     electrodes = findings.electrodes  # empty without a model
+    if not electrodes:
+        return
     channel_count = len(findings.channels)
-    are_channels_assigned = set(findings.device.channels) >= set(electrodes)
-    if not electrodes or channel_count == len(electrodes) or are_channels_assigned:
+    has_every_electrode_a_channel = set(electrodes) <= set(findings.device.channels)
+    if channel_count == len(electrodes) or has_every_electrode_a_channel:
         return
     used_channels = f"{channel_count} channels"
-    if findings.unused:
+    if findings.unused_channels:
         used_channels = f"{channel_count} of {len(findings.capture.names)} channels"
     yield (
         f"the board uses {used_channels}, but the model has the electrodes {electrodes}: choose another model with "
@@ -131,14 +134,14 @@ def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
 def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
     """Yield a sentence for each problem of a channel that prevents a tare or makes contacts inaccurate.
 
-    The tare is the measurement of the charge at rest. A tare requires a small noise and a small offset of each channel.
+    A tare is the measurement of the charges at rest. It requires a small noise and a small offset of each channel.
 
     Args:
         channel: Offset, noise, drift and hum of the channel, pC.
         rule: Conditions of the tare.
     """
     name = printable(channel.name)
-    # The results are None if the channel has no usable value. The first sentence reports these values.
+    # A channel without a usable value has no noise, offset or drift. Only its unusable values are then reported.
     noise_pC = channel.noise_pC or 0.0
     offset_pC = channel.offset_pC or 0.0
     drift_pC_per_s = channel.drift_pC_per_s or 0.0
@@ -166,21 +169,22 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
 
 
 def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield sentences about missing settings and properties that make the force of a held press constant.
+    """Yield one sentence for each missing setting or property without which the force of a held press seems to change.
 
-    Without them, touches are computed, but the force of a held press seems to change, because the amplifiers leak.
+    The force seems to change because the amplifiers leak. Touches are computed in any case.
 
-    - If the device file contains time constants of a leak, a clock of the device is needed in each frame.
-    - If the user has held a press during the check, the charge of the press has determined the settings.
-    - If no press was held, the time constants of the amplifiers are needed, unless the device file contains them.
+    - If the device file contains time constants of a leak, each frame must contain the time of a clock of the device.
+    - If the user has held a press during the check, the settings that correct the press are requested, unless the
+      device file contains them.
+    - If no press was held, the time constants of the amplifiers are requested, unless the device file contains them.
 
     Args:
-        findings: Results of the port check. `held.sections` are the sections of a device file that correct the press.
+        findings: Results of the port check.
     """
     if not findings.capture.frames:
         return
     device = findings.device
-    held_press = findings.held
+    held_press = findings.held_press
     has_device_clock = findings.capture.frames[0].t_us is not None
     if device.leak is not None and not has_device_clock:
         yield (
@@ -188,9 +192,10 @@ def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
             "the arrival times, which jitter"
         )
     if held_press is not None:
-        for name, section in held_press.sections.items():
-            if name not in device.table:  # the device file has no such section yet
-                yield f"put {section_text(name, section)} into a device file"
+        # The sections are parts of a device file that make the charge of this press constant.
+        for section_name, settings in held_press.sections.items():
+            if section_name not in device.table:  # the device file has no such section yet
+                yield f"put {section_text(section_name, settings)} into a device file"
     elif device.leak is None:
         yield (
             "state the time constants of the amplifiers in a device file ([leak] tau_s): without them the force of a "

@@ -22,7 +22,7 @@ from isocharge.serve.examination.proposal import Proposal, propose, unit_of
 from isocharge.serve.examination.touch_search import find_touch
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
-from isocharge.serve.live.reading_stream import ReadingStream, position_of
+from isocharge.serve.live.reading_stream import ReadingStream, channel_index
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.recognition.recognise import recognise
 
@@ -55,9 +55,9 @@ class Examination:
         held: Sentence about a press that was held during the check; empty if there was none.
         touch: Sentence about a touch while the film should be at rest; empty if there was none.
         missing: One sentence for each setting or property that is missing before contacts can be computed.
-        missing_for_held_presses: One sentence for each setting or property that is missing before held presses keep
-            their force. Touches are computed without them.
-        works: Whether a film at rest is tared with this device file. False after a touch.
+        missing_for_held_presses: One sentence for each setting or property without which the force of a held press
+            seems to change. Touches are computed without them.
+        works: Whether a film at rest can be tared with this device file. It is false after a touch.
         device: Content of the given device file, or of a proposed device file. It is empty without frames, and has no
             offsets after a touch.
     """
@@ -109,16 +109,23 @@ def examine(
         request: Request that the board needs for each frame; by default the request in the device file.
         wait: Time to wait until the port can be opened, s.
 
+    Returns:
+        The result of the check: the frames, the channels, the missing settings, and the content of a device file.
+
     Raises:
         PortError: If the port cannot be opened.
         InputError: If the port is a file.
-        DeviceError: If the gain is wrong, or for other electrodes.
+        DeviceError: If the gain is not valid, or is stated for other electrodes.
     """
-    received = listen(url, bauds, seconds, request or device.request, lambda part: _is_clear(part, device), wait)
+
+    def has_frames(received_at_baud: ReceivedData) -> bool:
+        return _are_most_bytes_frames(received_at_baud, device)
+
+    received = listen(url, bauds, seconds, request or device.request, has_frames, wait)
     return examine_received(received, device=device, electrodes=electrodes, gain=gain)
 
 
-def _is_clear(received: ReceivedData, device: Device) -> bool:
+def _are_most_bytes_frames(received: ReceivedData, device: Device) -> bool:
     """Return whether most of the bytes belong to frames, which shows that the baud rate is right.
 
     Args:
@@ -135,11 +142,12 @@ def _proposed_device(proposal: Proposal, *, is_gain_stated: bool) -> Device:
     """Return the settings of a proposed device file.
 
     Args:
-        proposal: The proposal.
-        is_gain_stated: Whether the user has stated the gain. Otherwise the proposed section `[gain]` is not applied.
+        proposal: The content of the file, and the names of the electrodes.
+        is_gain_stated: Whether the user has stated the gain. Otherwise the settings leave out the proposed section
+            `[gain]`, so that the values remain as the board sends them.
 
     Raises:
-        DeviceError: If the gain is wrong, or for other electrodes.
+        DeviceError: If the gain is not valid, or is stated for other electrodes.
     """
     table = {key: value for key, value in proposal.table.items() if is_gain_stated or key != "gain"}
     device = device_from_table(table, "board")
@@ -168,20 +176,21 @@ def examine_received(
         The result of the check: the frames, the channels, the missing settings, and the content of a device file.
 
     Raises:
-        DeviceError: If the gain is wrong, or for other electrodes.
+        DeviceError: If the gain is not valid, or is stated for other electrodes.
     """
     # Without a device file (`ANY_BOARD`), the format of the frames and the settings are proposed from the bytes.
-    proposal = Proposal(dict(device.table), electrodes)
     is_proposed = device is ANY_BOARD
     if is_proposed:
         proposal = propose(received, electrodes, gain or {})
         device = _proposed_device(proposal, is_gain_stated=bool(gain))
+    else:
+        proposal = Proposal(dict(device.table), electrodes)
 
     # Read the frames, and examine the channels in the time before a held press. With a gain, all values are converted
     # to pC.
     capture = read_frames(received, device)
     unit = "pC" if device.gain is not None else unit_of(capture)
-    electrode_at_position = electrode_positions(capture, device)
+    electrode_at_position = electrodes_by_position(capture, device)
     unused_channels = tuple(
         name for position, name in enumerate(capture.names) if position not in electrode_at_position
     )
@@ -279,11 +288,11 @@ def _touch_sentence(
 
     # The charges have one column for each electrode. Find the channel of the column that was touched.
     positions_in_frame = list(electrode_at_position)
-    position_in_frame = positions_in_frame[touch.position]
+    position_in_frame = positions_in_frame[touch.column]
     name = printable(capture.names[position_in_frame])
     return (
-        f"an untouched film: channel {name} changes by {touch.change:.4g} {unit} about {touch.time_s:.1f} s after the "
-        "first frame, as under a touch; take the finger away, and try again"
+        f"an untouched film: channel {name} changes by {touch.total_change:.4g} {unit} about {touch.time_s:.1f} s "
+        "after the first frame, as under a touch; take the finger away, and try again"
     )
 
 
@@ -295,7 +304,8 @@ def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: 
     - If there are no frames, the result is false.
     - If reading the frames raises an error, the result is false.
     - If the device file switches the tare off, the result is true.
-    - If there are too few frames to judge, the result is true. Twice as many frames as a tare needs are enough.
+    - If there are fewer than twice as many frames as a tare needs, the result is true. The frames then do not show
+      that a tare would fail.
 
     Args:
         received: Bytes that the board sent while the film was at rest.
@@ -308,10 +318,11 @@ def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: 
         device = device_from_table(table, "board")
         stream = ReadingStream(electrodes, device)
         for chunk in received.chunks:
-            for timed in stream.feed(chunk):
+            for timed_reading in stream.feed(chunk):
                 frame_count += 1
                 is_tare_needed = device.tare is not None
-                if timed.reading.tare is not None or not is_tare_needed:
+                has_tare = timed_reading.reading.tare is not None
+                if has_tare or not is_tare_needed:
                     return True
     except IsochargeError:
         return False
@@ -322,15 +333,24 @@ def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: 
     return frame_count < 2 * device.tare.frames
 
 
-def electrode_positions(capture: Capture, device: Device) -> dict[int, str]:
-    """Return a dictionary from the position of each channel in the frame to the name of its electrode.
+def electrodes_by_position(capture: Capture, device: Device) -> dict[int, str]:
+    """Return the name of each electrode, by the position of its channel in the frame.
 
     If the device file has no section `[channels]`, every channel is an electrode with the name of the channel.
+    Electrodes whose channel is missing in the frames are left out.
+
+    Args:
+        capture: The frames. Without frames, the result is empty.
+        device: Settings of the board. `channels` contains the name of the channel of each electrode.
     """
     if not device.channels or not capture.frames:
         return dict(enumerate(capture.names))
-    positions = {position_of(name, capture.frames[-1]): electrode for electrode, name in device.channels.items()}
-    return {position: electrode for position, electrode in positions.items() if position is not None}
+    electrode_at_position = {}
+    for electrode, channel in device.channels.items():
+        position = channel_index(channel, capture.frames[-1])
+        if position is not None:
+            electrode_at_position[position] = electrode
+    return electrode_at_position
 
 
 def _measure_channels(

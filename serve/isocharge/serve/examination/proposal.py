@@ -52,13 +52,13 @@ ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Names of the electrodes if there is no model."""
 
 
-def rest_of(values: Array) -> float:
+def measure_rest_level(values: Array) -> float:
     """Compute the rest level of a channel, which is the median of its finite values. It is 0 without finite values."""
     finite_values = values[np.isfinite(values)]
     return float(np.median(finite_values)) if len(finite_values) else 0.0
 
 
-def noise_of(values: Array) -> float:
+def estimate_noise(values: Array) -> float:
     """Estimate the noise of a channel from the differences between consecutive values.
 
     Presses have little effect on these differences. If the noise is normally distributed, the median magnitude of a
@@ -125,8 +125,9 @@ def propose(received: ReceivedData, electrodes: tuple[str, ...], gain: Mapping[s
     held_press = find_held_press(values, times_s)
     rest_values = values if held_press is None else values[times_s < held_press.begin_s]
     rest_columns = {electrode: rest_values[:, position] for electrode, position in positions.items()}
+    rest_levels = [measure_rest_level(column) for column in rest_columns.values()]
     largest_tared_offset_pC = TareRule().offset_limit_pC  # a tare fails if a channel rests at a larger value
-    has_large_offset = any(abs(rest_of(column)) > largest_tared_offset_pC for column in rest_columns.values())
+    has_large_offset = any(abs(rest_level) > largest_tared_offset_pC for rest_level in rest_levels)
     is_in_pC = unit_of(capture) == "pC"
     if gain or has_large_offset or not is_in_pC:
         known_gain = dict(gain)
@@ -163,10 +164,11 @@ def unit_of(capture: Capture) -> str:
 
     The unit is guessed from the names and the values of the channels. The first rule that applies determines the unit.
 
-    - Binary frames of isocharge, channels whose names end in `_pC`, and small values that never change are in pC.
-    - Whole numbers are counts.
-    - Channels whose names end in `V`, and small numbers with little noise, are in volts.
-    - All other numbers are assumed to be in pC.
+    - The unit is pC for binary frames of isocharge, if all names end in `_pC`, or if all values are small and never
+      change.
+    - The unit is counts if all values are whole numbers.
+    - The unit is volts if all names end in `V`, or if all values are small and have little noise.
+    - The unit of all other values is assumed to be pC.
 
     Args:
         capture: The frames that were received. Without frames, the result is "pC".
@@ -184,7 +186,7 @@ def unit_of(capture: Capture) -> str:
     if has_whole_numbers:
         return "counts"
 
-    largest_noise = max(noise_of(column) for column in finite_rows.T)
+    largest_noise = max(estimate_noise(column) for column in finite_rows.T)
     names_state_volts = all(name.endswith("V") for name in capture.names)
     has_values_of_volts = largest_magnitude <= LARGEST_V and 0.0 < largest_noise <= LARGEST_NOISE_V
     if names_state_volts or has_values_of_volts:
@@ -221,7 +223,7 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
         electrodes = channel_electrodes if are_usual_names else tuple(ELECTRODES[: len(candidates)])
     has_channel_for_each = len(names) == len(electrodes)
     if len(candidates) < len(electrodes) and has_channel_for_each:
-        candidates = list(range(len(names)))  # a channel that never changes keeps its place and is reported
+        candidates = list(range(len(names)))  # keeps a channel that never changes, which is reported later
     if len(candidates) < len(electrodes):
         return {}
     positions = _channels_of_similar_noise(values, candidates, len(electrodes))
@@ -229,9 +231,9 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
 
 
 def _varying_channels(values: Array) -> list[int]:
-    """Return the positions of the channels that vary. Channels with much less noise than the others are left out.
+    """Return the positions of the channels whose values vary, except channels with much less noise than the others.
 
-    All positions are returned if no channel varies. A channel with a value that is not finite does not vary.
+    A channel with a value that is not finite is left out, too. If no channel remains, all positions are returned.
 
     Args:
         values: Values of all channels, shape (n, channels).
@@ -239,7 +241,7 @@ def _varying_channels(values: Array) -> list[int]:
     noise_at_position = {}  # noise of each channel that varies
     for position, column in enumerate(values.T):
         if np.isfinite(column).all() and np.ptp(column) > 0.0:
-            noise_at_position[position] = noise_of(column)
+            noise_at_position[position] = estimate_noise(column)
     if not noise_at_position:
         channel_count = values.shape[1]
         return list(range(channel_count))
@@ -250,19 +252,20 @@ def _varying_channels(values: Array) -> list[int]:
 def _channels_of_similar_noise(values: Array, candidates: list[int], count: int) -> list[int]:
     """Choose the group of adjacent candidates whose noise is most similar, and return their positions.
 
-    For each group of `count` candidates that follow each other, the ratio of the largest to the smallest noise is
-    rounded to a power of ten, so that small differences do not matter. The first group with the smallest rounded ratio
-    is chosen.
+    A group consists of `count` candidates that follow each other. For each group, the ratio of the largest to the
+    smallest noise is rounded to a power of ten, so that small differences do not matter. The first group with the
+    smallest rounded ratio is chosen.
 
     Args:
         values: Values of all channels, shape (n, channels).
         candidates: Positions of the channels to choose from.
         count: Number of channels to choose, at most the number of candidates.
     """
-    noise = [noise_of(values[:, position]) for position in candidates]
+    noise = [estimate_noise(values[:, position]) for position in candidates]
     log_noise = np.log10(np.maximum(noise, SMALLEST_NOISE))  # the lower limit avoids the logarithm of 0
     rounded_log_ratios = []  # logarithm of the rounded ratio of each group
-    for first in range(len(candidates) - count + 1):
+    group_count = len(candidates) - count + 1
+    for first in range(group_count):
         log_noise_of_group = log_noise[first : first + count]
         log_ratio = float(np.ptp(log_noise_of_group))  # largest minus smallest logarithm
         rounded_log_ratios.append(round(log_ratio))
@@ -274,9 +277,10 @@ def _offset_setting(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> di
     """Return the setting `offset` of the section `[gain]`, which contains the values of the channels without charge.
 
     The rest level of a channel is its measured value at rest. If a channel rests near half of the range of a converter,
-    half of the range is its offset. For any other channel, the offset is the rest level. The rest levels are used for
-    all electrodes if, at any electrode, the rest level differs so much from the offset that a tare would fail. A tare
-    is the measurement of the charges at rest.
+    half of the range is its offset. For any other channel, the offset is the rest level.
+
+    A tare is the measurement of the charges at rest. It fails if a rest level differs too much from the offset. If the
+    gain is known and the tare of any electrode would fail, the rest levels are the offsets of all electrodes.
 
     Args:
         columns: Values of the channel of each electrode at rest, each of shape (n,), in the unit of the board.
@@ -286,7 +290,7 @@ def _offset_setting(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> di
         The key with its value, which is one number if all electrodes have the same offset, and otherwise a table of
         numbers by electrode; empty if all electrodes rest at 0.
     """
-    rest_levels = {electrode: rest_of(column) for electrode, column in columns.items()}
+    rest_levels = {electrode: measure_rest_level(column) for electrode, column in columns.items()}
 
     # A rest level whose magnitude is at most the limit of the electrode counts as 0.
     limits = _zero_limits(columns, gain)
@@ -294,8 +298,8 @@ def _offset_setting(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> di
     if all_rest_at_zero:
         return {}
 
-    # After the offset is subtracted, the remaining rest level must be small enough for a tare. Without the gain, it is
-    # not known how large it may be, because the limit of a tare is in pC.
+    # After the offset is subtracted, the remaining rest level must be small enough for a tare. Without the gain, the
+    # largest allowed rest level is not known, because the limit of a tare is in pC.
     offsets = {electrode: _proposed_offset(column) for electrode, column in columns.items()}
     prevents_tare = any(abs(rest - offsets[electrode]) > limits[electrode] for electrode, rest in rest_levels.items())
     if gain and prevents_tare:
@@ -319,7 +323,10 @@ def _zero_limits(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[
     if gain:
         limit = 0.5 * TareRule().offset_limit_pC / _largest_charge_of_unit(gain)
         return dict.fromkeys(columns, limit)
-    return {electrode: max(REST_SIGMAS * noise_of(column), SMALLEST_LIMIT) for electrode, column in columns.items()}
+    limits = {}
+    for electrode, column in columns.items():
+        limits[electrode] = max(REST_SIGMAS * estimate_noise(column), SMALLEST_LIMIT)
+    return limits
 
 
 def _largest_charge_of_unit(gain: Mapping[str, Any]) -> float:
@@ -349,7 +356,7 @@ def _proposed_offset(column: Array) -> float | int:
     Args:
         column: Values of the channel at rest, shape (n,).
     """
-    rest_level = rest_of(column)
+    rest_level = measure_rest_level(column)
     has_whole_numbers = bool((column == np.round(column)).all())
     if has_whole_numbers:
         for bits in CONVERTER_BITS:
@@ -360,8 +367,8 @@ def _proposed_offset(column: Array) -> float | int:
 
 
 def _round_rest_level(rest: float) -> float | int:
-    """Round a rest level to six digits, or to a whole number if it is 1000 or more."""
-    value = float(f"{rest:.6g}")
-    if abs(rest) >= 1000.0 or value.is_integer():
+    """Round a rest level to six digits, or to a whole number if its magnitude is 1000 or more."""
+    rounded_rest = float(f"{rest:.6g}")
+    if abs(rest) >= 1000.0 or rounded_rest.is_integer():
         return round(rest)
-    return value
+    return rounded_rest

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from isocharge.common.arrays import Array
-from isocharge.serve.examination.proposal import noise_of
+from isocharge.serve.examination.proposal import estimate_noise
 
 BLOCK_S = 0.1
 """Time over which values are averaged, s. It contains whole periods of 50 and of 60 Hz."""
@@ -38,16 +38,16 @@ MAX_SLOW_CHANGE_PC = 100.0
 
 
 class TouchFound(NamedTuple):
-    """A touched channel, and the largest change of its charge during the time when the film should be at rest.
+    """A channel that was touched while the film should be at rest.
 
     Attributes:
-        position: Position of the channel in the frame.
-        change: Size of the change, in the unit of the values.
+        column: Column of the channel in the array of values.
+        total_change: Largest minus smallest value of the channel, in the unit of the values.
         time_s: Time of the steepest change, s from the first frame.
     """
 
-    position: int
-    change: float
+    column: int
+    total_change: float
     time_s: float
 
 
@@ -65,7 +65,7 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
             noise only.
 
     Returns:
-        The touched channel with the largest change; None if no channel is touched.
+        The touched channel with the largest total change. None if no channel is touched, or if the time is too short.
     """
     blocks = block_medians(values, times_s)  # shape (blocks, channels)
     if len(blocks) < MIN_BLOCKS:
@@ -73,22 +73,35 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
     # Smooth the blocks with the median of three consecutive blocks. The result has the shape (blocks - 2, channels).
     smoothed = np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0)
     touches: list[TouchFound] = []
-    for channel_index, channel_levels in enumerate(smoothed.T):
+    for column, channel_levels in enumerate(smoothed.T):
         if not np.isfinite(channel_levels).all():
             continue
-        min_change = _smallest_touch(values[:, channel_index], unit_is_pC)
-
-        # Compute the change of the channel within each window of half a second, and during the whole time.
-        windows = sliding_window_view(channel_levels, min(STEEP_BLOCKS, len(channel_levels)))
-        window_changes = np.ptp(windows, axis=1)  # shape (windows,)
-        total_change = float(np.ptp(channel_levels))
-        is_fast_touch = window_changes.max() > min_change  # faster than warming or the drift of an amplifier
+        min_change = _smallest_touch(values[:, column], unit_is_pC)
+        total_change, steepest_change, steepest_time_s = _changes_of_channel(channel_levels)
+        is_fast_touch = steepest_change > min_change  # faster than warming or the drift of an amplifier
         is_slow_touch = unit_is_pC and total_change > max(min_change, MAX_SLOW_CHANGE_PC)
         if is_fast_touch or is_slow_touch:
-            # A window begins one block later than its index, because smoothing has removed the first block.
-            middle_block = int(np.argmax(window_changes)) + STEEP_BLOCKS // 2 + 1
-            touches.append(TouchFound(channel_index, total_change, BLOCK_S * middle_block))
-    return max(touches, key=lambda touch: touch.change, default=None)
+            touches.append(TouchFound(column, total_change, steepest_time_s))
+    return max(touches, key=lambda touch: touch.total_change, default=None)
+
+
+def _changes_of_channel(smoothed_levels: Array) -> tuple[float, float, float]:
+    """Compute the total change of a channel, its largest change within half a second, and the time of this change.
+
+    Args:
+        smoothed_levels: Level of the channel in each block of time, shape (blocks - 2,). Smoothing over three blocks
+            has removed the first and the last block.
+
+    Returns:
+        The two changes in the unit of the levels, and the time of the middle of the half second, s from the first
+        frame.
+    """
+    windows = sliding_window_view(smoothed_levels, min(STEEP_BLOCKS, len(smoothed_levels)))
+    window_changes = np.ptp(windows, axis=1)  # largest minus smallest level of each window, shape (windows,)
+    steepest_window = int(np.argmax(window_changes))
+    first_block = steepest_window + 1  # the first smoothed level belongs to the second block
+    middle_block = first_block + STEEP_BLOCKS // 2
+    return float(np.ptp(smoothed_levels)), float(window_changes.max()), BLOCK_S * middle_block
 
 
 def _smallest_touch(channel_values: Array, unit_is_pC: bool) -> float:
@@ -98,10 +111,11 @@ def _smallest_touch(channel_values: Array, unit_is_pC: bool) -> float:
         channel_values: Values of the channel, shape (n,).
         unit_is_pC: Whether the values are charges in pC.
     """
-    noise_limit = CHANGE_SIGMAS * noise_of(channel_values)
+    noise_limit = CHANGE_SIGMAS * estimate_noise(channel_values)
     if unit_is_pC:
         return max(noise_limit, MIN_CHANGE_PC)
-    return max(noise_limit, CHANGE_SIGMAS * resolution_of(channel_values))
+    # The values of a coarse converter may all be equal at rest. They then have no noise, but errors of rounding.
+    return max(noise_limit, CHANGE_SIGMAS * rounding_error_std(channel_values))
 
 
 def block_medians(values: Array, times_s: Array) -> Array:
@@ -136,15 +150,22 @@ def _finite_medians(block: Array) -> Array:
         Medians, shape (channels,); NaN for a column without a finite value.
     """
     medians = np.full(block.shape[1], np.nan)
-    for position, column in enumerate(block.T):
-        finite = column[np.isfinite(column)]
-        if finite.size:
-            medians[position] = np.median(finite)
+    for channel_index, column in enumerate(block.T):
+        finite_values = column[np.isfinite(column)]
+        if finite_values.size:
+            medians[channel_index] = np.median(finite_values)
     return medians
 
 
-def resolution_of(column: Array) -> float:
-    """Return the standard deviation of the rounding errors of a channel: 12**-0.5 for whole numbers, otherwise 0."""
-    finite = column[np.isfinite(column)]
-    is_whole = bool((finite == np.round(finite)).all())
-    return 12.0**-0.5 if is_whole else 0.0
+def rounding_error_std(column: Array) -> float:
+    """Return the standard deviation of the rounding errors of a channel.
+
+    It is 12**-0.5 if all finite values are whole numbers, because rounding errors are distributed uniformly between
+    -0.5 and 0.5. It is 0 for other values, whose rounding is not known.
+
+    Args:
+        column: Values of the channel, shape (n,).
+    """
+    finite_values = column[np.isfinite(column)]
+    are_whole_numbers = bool((finite_values == np.round(finite_values)).all())
+    return 12.0**-0.5 if are_whole_numbers else 0.0

@@ -30,8 +30,8 @@ from isocharge.serve.export.record_messages import (
     WRENCH_DEFINITION,
     RecordEncoding,
     pose_stamped,
+    ros_time_ns,
     string_message,
-    time_of,
     wrench_stamped,
 )
 from isocharge.serve.record.record import PredictionRecord
@@ -122,7 +122,7 @@ class McapFile:
             OSError: If the disk is full or was removed.
         """
         values = record.json_values
-        time_ns = time_of(values)
+        time_ns = ros_time_ns(values)
         json_text = record.to_json()
         is_json = self._encoding is RecordEncoding.json
         record_message = json_text.encode() if is_json else string_message(json_text)
@@ -135,7 +135,7 @@ class McapFile:
             self._add_messages(messages, time_ns)
 
     def _add_messages(self, messages: dict[str, bytes | None], time_ns: int) -> None:
-        """Add the messages of one record, and flush the writer if the last flush was `FLUSH_INTERVAL_S` ago or earlier.
+        """Add the messages of one record. Flush the writer if `FLUSH_INTERVAL_S` have passed since the last flush.
 
         The caller must hold the lock of the file.
 

@@ -82,8 +82,11 @@ STRING = "std_msgs/msg/String"
 STRING_DEFINITION = "string data\n"
 
 
-def time_of(record: Mapping[str, Any]) -> int:
-    """Return the `timestamp` of a record in nanoseconds, rounded to a whole microsecond.
+def ros_time_ns(record: Mapping[str, Any]) -> int:
+    """Return the `timestamp` of a record as unix time in nanoseconds, rounded to a whole microsecond.
+
+    Args:
+        record: Values of the prediction record by name.
 
     Raises:
         InputError: If a time stamp of ROS 2 cannot represent this time.
@@ -97,10 +100,10 @@ def time_of(record: Mapping[str, Any]) -> int:
     return round(seconds * 1e6) * 1000
 
 
-def contact_of(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the values of a record, in which a tracked contact replaces the contact of the single frame.
+def with_tracked_contact(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the values of a record, in which the tracked contact replaces the contact of the single frame.
 
-    The values are unchanged if the record has no tracked contact, or if its force is unknown.
+    The values are unchanged if the record has no tracked contact, or if the force in the single frame is unknown.
 
     Args:
         record: Values of the prediction record by name.
@@ -124,7 +127,7 @@ def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
     Returns:
         The message, whose numbers are zero if nothing touches the film; None if the force is unknown.
     """
-    values = contact_of(record)  # a tracked contact replaces the contact of the frame
+    values = with_tracked_contact(record)  # a tracked contact replaces the contact of the frame
     force_N = values["force_N"]
     if force_N is None:
         return None
@@ -147,7 +150,7 @@ def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
     Returns:
         The message; None if nothing touches the film.
     """
-    values = contact_of(record)  # a tracked contact replaces the contact of the frame
+    values = with_tracked_contact(record)  # a tracked contact replaces the contact of the frame
     x_mm = values["x_mm"]
     y_mm = values["y_mm"]
     x_std_mm = values["x_std_mm"]
@@ -164,7 +167,8 @@ def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
 def _pose_covariance(x_std_m: float, y_std_m: float, xy_correlation: float) -> list[float]:
     """Return the 36 elements of the covariance matrix of a pose, row by row, in m^2 and rad^2.
 
-    The matrix has 6 rows and 6 columns: x, y, z and the rotations about these axes. Only x and y are correlated.
+    The matrix has 6 rows and 6 columns: x, y, z and the rotations about the axes x, y and z. Only x and y are
+    correlated.
 
     Args:
         x_std_m: Standard deviation of x, m.

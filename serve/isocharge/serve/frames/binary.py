@@ -39,7 +39,7 @@ MAX_STUFFED_LENGTH = MAX_FRAME_LENGTH + 1 + MAX_FRAME_LENGTH // MAX_BLOCK
 
 
 def encode_frame(frame: Frame) -> bytes:
-    """Encode a frame as bytes, and append the delimiter. A missing counter or clock is encoded as zero.
+    """Encode a frame with COBS, and append the delimiter. A missing counter or clock is encoded as zero.
 
     Raises:
         struct.error: If a number does not fit its field.
@@ -52,17 +52,17 @@ def encode_frame(frame: Frame) -> bytes:
     return cobs_encode(body + crc) + DELIMITER
 
 
-def decode_frame(piece: bytes) -> Frame:
+def decode_frame(stuffed_frame: bytes) -> Frame:
     """Decode a frame and check its CRC.
 
     Args:
-        piece: Bytes of the frame as they are sent, encoded by COBS, without the delimiter.
+        stuffed_frame: Bytes of the frame as they are sent, encoded by COBS, without the delimiter.
 
     Raises:
         ChecksumError: If the CRC is wrong.
         ValueError: If the bytes are not a frame of this version.
     """
-    data = cobs_decode(piece)
+    data = cobs_decode(stuffed_frame)
     if len(data) < HEADER.size + CRC.size:
         raise ValueError("the frame is shorter than a frame without charges")
     body = data[: -CRC.size]  # header and charges

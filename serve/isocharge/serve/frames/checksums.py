@@ -40,11 +40,14 @@ class Crc:
 
     @cached_property
     def initial_register(self) -> int:
-        """Initial value of the register, with the bits of `start` in the order of the register."""
+        """Initial value of the register, which is `start`, with its bits reversed if the check is reflected."""
         return self._in_register_order(self.start)
 
     def _in_register_order(self, number: int) -> int:
-        """Reverse the bits of a number if the check is reflected. Otherwise, return the number unchanged."""
+        """Reverse the bits of a number if the check is reflected. Otherwise, return the number unchanged.
+
+        A reflected check processes the lowest bit of each byte first, and its register has the reverse bit order.
+        """
         if not self.reflected:
             return number
         bits = f"{number:0{self.width}b}"
@@ -106,8 +109,8 @@ class Crc:
 def _fletcher_16(data: bytes) -> int:
     """Compute Fletcher's checksum (1982), which has two bytes.
 
-    The low byte of the checksum is the sum of all data bytes, modulo 255. The high byte is the sum of the successive
-    values of the low byte after each data byte, modulo 255.
+    The low byte of the checksum is the sum of all data bytes, modulo 255. Each time a data byte was added to the low
+    byte, the new low byte is added to the high byte, modulo 255.
     """
     byte_sum = 0
     sum_of_sums = 0

@@ -34,16 +34,15 @@ class AutoParser(Parser):
         """Return the frames that end within `data`.
 
         Until the format is recognised, the data are split into pieces. A piece ends with a zero byte or a line feed,
-        because every frame ends with one of these two bytes. Each piece is passed to the parsers of all formats. As
-        soon as one of the parsers finds a frame, all further data are passed only to the parser that has found the
-        frame.
+        because every frame ends with one of these two bytes. Each piece is passed to the parsers of all formats. The
+        first parser that finds a frame receives all further data, and the other parsers are dropped.
         """
         is_recognised = len(self._candidates) == 1
         if is_recognised:
             return self._feed_recognised(self._candidates[0], data)
         for match in _PIECE.finditer(data):
             piece = match.group()
-            self.counts.count_dropped(len(piece))  # until the counters of the recognised parser replace these counters
+            self.counts.count_dropped(len(piece))  # has no effect after recognition, which replaces these counters
             for candidate in self._candidates:
                 frames = candidate.feed(piece)
                 if frames:  # the format is recognised, and the rest of the data is passed to this parser alone
@@ -54,7 +53,10 @@ class AutoParser(Parser):
         return []
 
     def reset(self) -> None:
-        """Drop the bytes of an unfinished frame, because the next bytes come from another connection."""
+        """Drop the bytes of an unfinished frame, because the next bytes come from another connection.
+
+        A format that was recognised stays recognised.
+        """
         for candidate in self._candidates:
             candidate.reset()
 

@@ -1,7 +1,7 @@
 """Classes that all frame formats share, such as the frame and the base classes of the parsers.
 
 A parser converts bytes to frames, and is independent of the source of the bytes. Except for datagrams, the frames and
-counters do not depend on how the bytes are divided into chunks. A parser stores only a limited number of bytes, even if
+counters do not depend on the division of the bytes into chunks. A parser stores only a limited number of bytes, even if
 it never finds a frame.
 """
 
@@ -74,16 +74,16 @@ class SequenceGaps:
         self._last_seq = seq
         if last_seq is None:  # this is the first frame of a connection
             return ()
-        step = (seq - last_seq) % modulus  # from 0 to modulus - 1, also if the counter has wrapped
-        if step == 1:
+        increase = (seq - last_seq) % modulus  # from 0 to modulus - 1, also if the counter has wrapped
+        if increase == 1:
             return ()
-        if step == 0:
+        if increase == 0:
             self.repeated += 1
             return (REPEAT,)
-        if step >= modulus // 2:  # modulo `modulus`, a step back is the same as a large step forward
+        if increase >= modulus // 2:  # modulo `modulus`, a decrease is the same as a large increase
             self.restarts += 1
             return (RESTART,)
-        self.lost += step - 1
+        self.lost += increase - 1
         return (GAP,)
 
 
@@ -107,11 +107,13 @@ class CounterWrap:
         self._modulus = initial_modulus
         self._max_step_ratio = max_step_ratio
         self._last_value: int | None = None
-        self._last_increase = 1  # difference of the last two values of which the second was larger
+        self._last_increase = 1  # latest increase from one value to the next
         self._largest_value = 0
 
     def update(self, value: int | None) -> int:
         """Process the next value of the counter, and return the present estimate of the modulus.
+
+        The modulus is the value at which the counter wraps to 0.
 
         Args:
             value: Next value of the counter; None if a connection has ended. The value after None is not compared with
@@ -134,8 +136,9 @@ class CounterWrap:
     def _modulus_after_decrease(self, step: int) -> int:
         """Return the estimate of the modulus after the counter has decreased.
 
-        The result is the smallest usual modulus that is consistent with a wrap. If no usual modulus is consistent with
-        a wrap, a restart is assumed, and the present estimate of the modulus is returned.
+        The modulus is the value at which the counter wraps to 0. The result is the smallest usual modulus that is
+        consistent with a wrap. If no usual modulus is consistent with a wrap, a restart is assumed, and the present
+        estimate of the modulus is returned.
 
         A modulus is consistent with a wrap if the modulus is larger than all values so far, and if the step across the
         wrap is plausible. The step across the wrap is the difference of the last two values modulo the tested modulus.
@@ -196,18 +199,18 @@ class FrameCounts:
     is_out_of_sync: bool = False
 
     def count_frame(self) -> None:
-        """Count an intact frame."""
+        """Count an intact frame, and a resynchronisation if bytes were dropped before the frame."""
         self.frames += 1
         if self.is_out_of_sync:
             self.resyncs += 1
         self.is_out_of_sync = False
 
     def count_rejected(self, size: int, *, wrong_checksum: bool = False) -> None:
-        """Count a rejected piece.
+        """Count bytes that the parser expected to be one frame, but has rejected.
 
         Args:
-            size: Length of the piece with its delimiter, bytes.
-            wrong_checksum: Whether the piece was rejected because of its checksum.
+            size: Number of rejected bytes, including the delimiter.
+            wrong_checksum: Whether the bytes were rejected because of their checksum.
         """
         if wrong_checksum:
             self.crc_errors += 1
@@ -216,7 +219,11 @@ class FrameCounts:
         self.count_dropped(size)
 
     def count_dropped(self, size: int) -> None:
-        """Count dropped bytes."""
+        """Count dropped bytes. If there are any, the next intact frame counts as a resynchronisation.
+
+        Args:
+            size: Number of dropped bytes, which may be 0.
+        """
         self.bytes_dropped += size
         if size > 0:
             self.is_out_of_sync = True
@@ -230,15 +237,15 @@ class Columns:
     """Meanings of the numbers in a row. Each number is the frame counter, a clock, the flags or a channel.
 
     Args:
-        names: Names of all numbers; an empty text for a number without a name.
-        scales: Factor by which each number is multiplied, in the unit of the channel or of the clock per count.
-        flags_column: Position of the number that contains the flags; None if there is no such number.
+        names: Names of all columns; an empty text for a column without a name.
+        scales: Factor by which the numbers of each column are multiplied.
+        flags_column: Index of the column with the flags; None if there is no such column.
 
     Attributes:
-        seq_column: Position of the frame counter; None if there is none.
-        clock_column: Position of the clock; None if there is none.
+        seq_column: Index of the column with the frame counter; None if there is no such column.
+        clock_column: Index of the column with the clock; None if there is no such column.
         clock_unit_us: Duration of one count of the clock, us.
-        channels: Position of each channel, and factor by which its number is multiplied.
+        channels: For each channel, the index of its column and the factor by which its numbers are multiplied.
         names: Names of the channels; empty if they have no names.
     """
 
@@ -251,7 +258,7 @@ class Columns:
         Args:
             names: Names of all columns; an empty text for a column without a name.
             scales: Factor by which the numbers of each column are multiplied.
-            flags_column: Position of the column with the flags; None if there is no such column.
+            flags_column: Index of the column with the flags; None if there is no such column.
         """
         self.seq_column = names.index(SEQ) if SEQ in names else None
         self.flags_column = flags_column
@@ -281,12 +288,12 @@ class Columns:
             numbers: One number for each column.
 
         Raises:
-            ValueError, OverflowError: If the frame counter or the clock is not finite.
+            ValueError, OverflowError: If the frame counter, the clock or the flags are not a finite number.
         """
         return Frame(
             seq=None if self.seq_column is None else round(numbers[self.seq_column]),
             t_us=None if self.clock_column is None else round(numbers[self.clock_column] * self.clock_unit_us),
-            values=tuple([numbers[column] * scale for column, scale in self.channels]),
+            values=tuple([numbers[column] * scale for column, scale in self.channels]),  # faster than a generator
             flags=0 if self.flags_column is None else int(numbers[self.flags_column]),
             names=self.names,
         )
@@ -318,15 +325,15 @@ class Parser(ABC):
         """Return the frames that end within `data`. Bytes of an unfinished frame are stored for the next call."""
 
     def reset(self) -> None:
-        """Drop the bytes of an unfinished frame, because the next bytes come from another connection."""
+        """Drop the stored bytes of an unfinished frame, because the next bytes come from another connection."""
         self.counts.count_dropped(len(self._tail))
         self._tail = b""
 
     def _try_decode(self, decode: Callable[[Raw], Frame], raw: Raw, dropped_size: int) -> list[Frame]:
-        """Try to decode one frame, and count either an intact frame or a rejected piece.
+        """Try to decode one frame, and count either an intact frame or rejected bytes.
 
         Args:
-            decode: Function that decodes a frame, and raises ValueError or OverflowError if `raw` is not a frame.
+            decode: Function that decodes a frame. It raises ValueError or OverflowError if `raw` is not a frame.
             raw: Bytes or numbers that are passed to `decode`.
             dropped_size: Number of bytes that are counted as dropped if `raw` is not a frame.
 
@@ -363,14 +370,15 @@ class DelimitedParser(Parser):
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
-        The bytes are divided into pieces at the delimiters. The bytes after the last delimiter are an unfinished piece,
-        the tail. The tail is stored for the next call. If the tail is longer than `max_length`, it is dropped instead.
-        The rest of the same piece is dropped when it arrives.
+        The bytes are divided into pieces at the delimiters. Pieces that are longer than `max_length` are dropped.
+
+        The bytes after the last delimiter are an unfinished piece, the tail, which is stored for the next call. If the
+        tail is longer than `max_length`, it is dropped instead, and so is the rest of the same piece when it arrives.
         """
         *pieces, tail = (self._tail + data).split(self._delimiter)
         frames = []
         for piece in pieces:
-            # If the beginning of a long piece was dropped by an earlier call, the first piece is its rest.
+            # If an earlier call has dropped the beginning of a long piece, the first piece is the rest of it.
             if self._beginning_was_dropped or len(piece) > self._max_length:
                 self._beginning_was_dropped = False  # the following pieces are complete
                 self.counts.count_rejected(len(piece) + 1)  # with the delimiter
@@ -391,19 +399,19 @@ class DelimitedParser(Parser):
 
     @abstractmethod
     def _parse_piece(self, piece: bytes) -> list[Frame]:
-        """Return the frames that a piece completes.
+        """Return the frames that the next piece completes. A piece consists of the bytes between two delimiters.
 
         Implementations of this method must count every piece that they reject.
         """
 
 
 class StuffedParser(DelimitedParser):
-    """Parser of frames with byte stuffing. Every piece is expected to be empty or to be a frame.
+    """Parser of frames with byte stuffing. The bytes between two delimiters are expected to be one frame, or empty.
 
     Args:
         delimiter: The byte after each frame.
         max_length: Length of the longest stuffed frame, bytes.
-        decode: Function that decodes the frame in a piece. It raises ValueError if the piece is not a frame.
+        decode: Function that decodes the bytes between two delimiters. It raises ValueError if they are not a frame.
         parser_arguments: Arguments of `Parser`.
     """
 
@@ -415,9 +423,9 @@ class StuffedParser(DelimitedParser):
         self._decode = decode
 
     def _parse_piece(self, piece: bytes) -> list[Frame]:
-        """Decode a piece, and return a list that contains the frame.
+        """Decode the bytes between two delimiters, and return a list that contains the frame.
 
-        The list is empty if the piece is empty or is not a frame.
+        The list is empty if there are no bytes, or if the bytes are not a frame.
         """
         if not piece:
             return []

@@ -1,4 +1,4 @@
-"""Definition of a single field of a frame whose layout is described in a device file."""
+"""Definition of one field of a frame. A device file describes the layout of such frames field by field."""
 
 import struct
 import sys
@@ -33,7 +33,7 @@ PADDING = "pad"
 """Type of a field whose bytes are not read."""
 
 MAX_PADDING = 4096
-"""Largest number of bytes of padding. Because of this limit, a typing error cannot request a gigabyte."""
+"""Largest number of bytes of padding. The limit prevents that a typing error requests a gigabyte."""
 
 ByteOrder = Literal["little", "big"]
 Hexadecimal = Annotated[
@@ -45,14 +45,14 @@ class Field(Settings, frozen=True):
     """A field of a frame.
 
     Attributes:
-        kind: Type of the field.
+        type_name: Type of the field.
         name: Name of the channel, or a name with a meaning, such as `seq`; empty for padding.
-        scale: Value of one count, in the unit of the channel or of the clock.
+        scale: Factor that converts the number in the field to the unit of the channel or of the clock.
         count: Number of bytes of padding.
         value: Bytes that the padding must have in every frame, in hexadecimal; None if any bytes are allowed.
     """
 
-    kind: Literal["pad", "u8", "u16", "u24", "u32", "i8", "i16", "i24", "i32", "f32", "f64"] = field(name="type")
+    type_name: Literal["pad", "u8", "u16", "u24", "u32", "i8", "i16", "i24", "i32", "f32", "f64"] = field(name="type")
     name: Annotated[str, Meta(max_length=1000)] = ""
     scale: Finite = 1.0
     count: Annotated[int, Meta(ge=1, le=MAX_PADDING)] = 1
@@ -69,7 +69,7 @@ class Field(Settings, frozen=True):
         """
         if self.scale == 0.0:
             raise WrongKey("scale", "a finite number that is not 0", self.scale)
-        if self.kind == PADDING:
+        if self.type_name == PADDING:
             return
         if not self.name:
             raise WrongKey("name")
@@ -85,8 +85,8 @@ class Field(Settings, frozen=True):
 
         For example, four bytes of padding have the format `4x`.
         """
-        if self.kind != PADDING:
-            return STRUCT_FORMATS[self.kind]
+        if self.type_name != PADDING:
+            return STRUCT_FORMATS[self.type_name]
         padding_size = self.count
         if self.value:  # the bytes that the padding must have, in hexadecimal
             padding_size = len(bytes.fromhex(self.value))
@@ -99,51 +99,51 @@ class Field(Settings, frozen=True):
 
     @property
     def modulus(self) -> int:
-        """Value at which an unsigned counter of this size wraps to 0."""
+        """Number of different values of an integer of this size, at which an unsigned counter wraps to 0."""
         return 1 << 8 * self.size
 
     @property
-    def largest_count(self) -> float:
+    def largest_number(self) -> float:
         """Largest number that the field can contain."""
-        if self.kind in LARGEST_FLOATS:
-            return LARGEST_FLOATS[self.kind]
+        if self.type_name in LARGEST_FLOATS:
+            return LARGEST_FLOATS[self.type_name]
         if self.is_signed:
             return self.modulus // 2 - 1
         return self.modulus - 1
 
     @property
-    def smallest_count(self) -> float:
+    def smallest_number(self) -> float:
         """Smallest number that the field can contain."""
-        if self.kind in LARGEST_FLOATS:
-            return -LARGEST_FLOATS[self.kind]
+        if self.type_name in LARGEST_FLOATS:
+            return -LARGEST_FLOATS[self.type_name]
         return -self.modulus // 2 if self.is_signed else 0
 
     @property
     def is_signed(self) -> bool:
         """Whether the field contains signed integers."""
-        return self.kind.startswith("i")
+        return self.type_name.startswith("i")
 
     def holds(self, value: float) -> bool:
         """Return whether the field can contain a given value in the unit of the channel."""
-        return self.smallest_count <= value / self.scale <= self.largest_count
+        return self.smallest_number <= value / self.scale <= self.largest_number
 
     def nearest_value(self, value: float) -> float:
         """Return the value in the range of the field that is nearest to a given value.
 
         Both values are in the unit of the channel.
         """
-        return self._nearest_count(value / self.scale) * self.scale
+        return self._nearest_number(value / self.scale) * self.scale
 
-    def _nearest_count(self, count: float) -> float:
+    def _nearest_number(self, number: float) -> float:
         """Return the number in the range of the field that is nearest to a given number."""
-        return min(max(count, self.smallest_count), self.largest_count)
+        return min(max(number, self.smallest_number), self.largest_number)
 
     def pack(self, value: float, byte_order: ByteOrder) -> float | bytes:
         """Convert a value to a form that the module `struct` can pack.
 
-        The field contains the count, which is the value divided by the scale of the field. A counter or clock in an
-        integer field wraps around if its count exceeds the range of the field. Every other count is limited to the
-        range of the field. The result is the count as a number, or as bytes for a field of three bytes.
+        The field contains a number, which is the value divided by the scale of the field. A counter or clock in an
+        integer field wraps around if its number exceeds the range of the field. Every other number is limited to the
+        range of the field. The result is the number, which is converted to bytes for a field of three bytes.
 
         Args:
             value: Value in the unit of the channel or of the clock.
@@ -152,17 +152,17 @@ class Field(Settings, frozen=True):
         Raises:
             ValueError: If the value of an integer field is not a number.
         """
-        count = value
+        number = value
         if self.name not in (SEQ, FLAGS):  # a parser reads the frame counter and the flags without a scale
-            count = value / self.scale
-        is_float = self.kind in LARGEST_FLOATS
-        wraps = self.name in (SEQ, *TIMES_US) and not is_float
-        if wraps:  # the result is between the smallest and the largest count of the field
-            count = (round(count) - self.smallest_count) % self.modulus + self.smallest_count
-        limited_count = self._nearest_count(count)
+            number = value / self.scale
+        is_float = self.type_name in LARGEST_FLOATS
+        is_counter_or_clock = self.name in (SEQ, *TIMES_US)
+        if is_counter_or_clock and not is_float:  # the number wraps around within the range of the field
+            number = (round(number) - self.smallest_number) % self.modulus + self.smallest_number
+        limited_number = self._nearest_number(number)
         if is_float:
-            return limited_count
-        whole_count = round(limited_count)
+            return limited_number
+        whole_number = round(limited_number)
         if self.size == 3:  # struct has no format for three bytes
-            return whole_count.to_bytes(3, byte_order, signed=self.is_signed)
-        return whole_count
+            return whole_number.to_bytes(3, byte_order, signed=self.is_signed)
+        return whole_number

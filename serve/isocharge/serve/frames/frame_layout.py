@@ -24,7 +24,7 @@ every frame must contain, for example the length of the frame. The field `seq` i
 name `t_us`, `t_ms` or `t_s` is the clock. The field `flags` contains bits such as `SATURATED_BIT`
 (`isocharge.serve.frames.frame`). All other fields are channels.
 
-If a frame with a sync pattern is damaged, the parser searches for the next sync pattern from the following byte. The
+If a frame with a sync pattern is damaged, the parser searches for the next sync pattern, beginning one byte later. The
 parser does not skip the length of a frame, because an intact frame may begin only a few bytes later. This happens if
 the pattern has occurred by chance inside another frame. In a stream with byte stuffing, all bytes between two
 delimiters are dropped if they are not an intact frame. In a datagram, only the damaged frames are dropped, unless the
@@ -82,10 +82,14 @@ class CrcParameters(Settings, frozen=True):
     final: HexadecimalNumber = "0"
 
     def __post_init__(self) -> None:
-        """Check that no number has more bits than the checksum, and raise WrongKey for the first number that does."""
+        """Check that no number has more bits than the checksum.
+
+        Raises:
+            WrongKey: For the first number that has more bits.
+        """
         for key in ("polynomial", "start", "final"):
             text = getattr(self, key)
-            has_too_many_bits = int(text, 16) >= 1 << self.width
+            has_too_many_bits = int(text, 16).bit_length() > self.width
             if has_too_many_bits:
                 raise WrongKey(key, f"a number of {self.width} bits in hexadecimal, as in '1021'", text)
 
@@ -140,7 +144,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     checksum_order: ByteOrder | None = None
 
     def __post_init__(self) -> None:
-        """Check that all keys of the layout are present, valid and consistent with each other.
+        """Check that the keys of the layout are valid and consistent with each other.
 
         Raises:
             WrongKey: For the first key that is missing or not valid.
@@ -159,7 +163,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             raise WrongKey("fields", "one or more that are channels", names)
 
         checksum_start = len(self.sync) + self.body.size  # position of the checksum, which is at the end of the frame
-        expected_length = checksum_start + self.check.size
+        expected_length = checksum_start + self.selected_checksum.size
         if self.length != expected_length:
             raise WrongKey("length", f"{expected_length} for these fields", self.length)
         if self.checksum_from >= checksum_start:
@@ -180,7 +184,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     @cached_property
     def fields(self) -> tuple[Field, ...]:
         """Fields of the frame without padding, in their order."""
-        return tuple(field for field in self.fields_and_padding if field.kind != PADDING)
+        return tuple(field for field in self.fields_and_padding if field.type_name != PADDING)
 
     @cached_property
     def channels(self) -> tuple[Field, ...]:
@@ -188,7 +192,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         return tuple(self.fields[position] for position, _ in self.columns.channels)
 
     @cached_property
-    def check(self) -> Checksum:
+    def selected_checksum(self) -> Checksum:
         """The checksum that the key `checksum` selects by name or describes by the parameters of a CRC."""
         if isinstance(self.checksum, str):
             return CHECKSUMS[self.checksum]
@@ -222,9 +226,10 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     def three_byte_fields(self) -> tuple[tuple[int, bool], ...]:
         """Fields of three bytes. Each element contains the position of a field and whether the field is signed.
 
-        Fields of three bytes are converted separately, because the module `struct` cannot read them as numbers.
+        Fields of three bytes are converted separately, because the module `struct` cannot read them as numbers. The
+        position of a field is its index in `fields`, which do not include padding.
         """
-        return tuple((position, field.kind == "i24") for position, field in enumerate(self.fields) if field.size == 3)
+        return tuple((position, field.is_signed) for position, field in enumerate(self.fields) if field.size == 3)
 
     @cached_property
     def constants(self) -> tuple[tuple[int, bytes], ...]:
@@ -240,12 +245,17 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             position += part.size
         return tuple(constants)
 
-    def checksum_of(self, data: bytes) -> bytes:
-        """Compute the checksum of a frame from the bytes of the frame before the checksum."""
-        covered_bytes = data[self.checksum_from :]
-        value = self.check.compute(covered_bytes)
+    def compute_checksum(self, frame_without_checksum: bytes) -> bytes:
+        """Return the checksum of a frame as bytes in the order in which they are sent.
+
+        Args:
+            frame_without_checksum: All bytes of the frame before the checksum. The first `checksum_from` bytes are not
+                covered by the checksum.
+        """
+        covered_bytes = frame_without_checksum[self.checksum_from :]
+        value = self.selected_checksum.compute(covered_bytes)
         byte_order = self.checksum_order or self.byte_order
-        return value.to_bytes(self.check.size, byte_order)
+        return value.to_bytes(self.selected_checksum.size, byte_order)
 
     def decode(self, data: bytes) -> Frame:
         """Decode one frame.
@@ -261,9 +271,9 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         """
         if len(data) != self.length or not data.startswith(self.sync):
             raise ValueError("the length or the sync pattern is wrong")
-        has_checksum = self.check.size > 0
-        checksum_start = self.length - self.check.size
-        if has_checksum and self.checksum_of(data[:checksum_start]) != data[checksum_start:]:
+        has_checksum = self.selected_checksum.size > 0
+        checksum_start = self.length - self.selected_checksum.size
+        if has_checksum and self.compute_checksum(data[:checksum_start]) != data[checksum_start:]:
             raise ChecksumError("the checksum is wrong")
         for position, constant in self.constants:
             if not data.startswith(constant, position):
@@ -324,22 +334,23 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         data = bytearray(self.sync + self.body.pack(*packed_values))
         for position, constant in self.constants:  # `struct` has packed all padding as zeros
             data[position : position + len(constant)] = constant
-        return bytes(data) + self.checksum_of(bytes(data))
+        return bytes(data) + self.compute_checksum(bytes(data))
 
     def parser(self) -> Parser:
-        """Create a parser for frames with this layout."""
+        """Create a parser for frames with this layout and this framing."""
         if self.framing == SYNC:
             return SyncParser(self)
         if self.framing == DATAGRAM:
             return DatagramParser(self)
 
-        # SLIP and HDLC at most double the length. COBS adds 1 byte, and 1 more for every 254 bytes.
+        # SLIP and HDLC at most double the length. COBS adds 1 byte, and 1 more for every 254 bytes. The limit is not
+        # exact, because it only prevents that an endless piece without a delimiter is stored.
         stuffing = STUFFINGS[self.framing]
         max_length = 2 * self.length + 2
 
-        def decode_stuffed(piece: bytes) -> Frame:
-            """Remove the byte stuffing from a piece, and decode the frame in the piece."""
-            return self.decode(stuffing.decode(piece))
+        def decode_stuffed(stuffed_frame: bytes) -> Frame:
+            """Remove the byte stuffing from a frame, and decode the frame."""
+            return self.decode(stuffing.decode(stuffed_frame))
 
         return StuffedParser(stuffing.delimiter, max_length, decode_stuffed, *_parser_arguments(self))
 
@@ -377,7 +388,8 @@ class SyncParser(Parser):
             # If the bytes are not a frame, one byte is dropped, because a frame may begin at the next byte.
             decoded = self._try_decode(self.layout.decode, unparsed[start : start + length], dropped_size=1)
             frames += decoded
-            parsed_end = start + length if decoded else start + 1
+            parsed_size = length if decoded else 1
+            parsed_end = start + parsed_size
             start = unparsed.find(sync, parsed_end)
 
         tail_start = start  # the beginning of an unfinished frame

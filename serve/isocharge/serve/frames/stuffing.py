@@ -1,4 +1,4 @@
-"""Byte stuffing, which ensures that the byte that separates frames never occurs inside a frame.
+"""Byte stuffing, which ensures that the delimiter between frames never occurs inside a frame.
 
 - COBS (Consistent Overhead Byte Stuffing, Cheshire and Baker 1999) ends each frame with a zero byte. Each zero byte in
   the data is replaced by the distance to the next zero byte. An additional byte at the beginning contains the distance
@@ -41,7 +41,7 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
-    """Encode a block of bytes without zeros. If a zero follows the block, encode the zero as well.
+    """Encode a block of bytes without zeros, and the zero that may follow the block, with COBS.
 
     The block is cut into pieces of at most `MAX_BLOCK` bytes. Before each piece, a distance byte contains the length of
     the piece plus 1. The zero itself is not sent. A decoder adds a zero after each piece that has fewer than
@@ -91,28 +91,31 @@ def cobs_decode(data: bytes) -> bytes:
 
 def _slip_encode(data: bytes) -> bytes:
     """Apply the byte stuffing of SLIP, so that the result does not contain the byte C0."""
+    # The byte DB is replaced first, because the second replacement inserts further bytes DB.
     return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc")
 
 
-def _slip_decode(piece: bytes) -> bytes:
-    """Remove the byte stuffing of SLIP.
+def _slip_decode(stuffed: bytes) -> bytes:
+    """Remove the byte stuffing of SLIP, which sends the byte C0 as DB DC and the byte DB as DB DD.
 
     Raises:
-        ValueError: If no encoder produces these bytes.
+        ValueError: If the byte DB is not followed by DC or DD.
     """
-    decoded = piece.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
-    # Every byte DB must be the beginning of one of the two sequences.
-    if piece.count(b"\xdb") != piece.count(b"\xdb\xdc") + piece.count(b"\xdb\xdd"):
+    escape_count = stuffed.count(b"\xdb")
+    valid_count = stuffed.count(b"\xdb\xdc") + stuffed.count(b"\xdb\xdd")
+    if escape_count != valid_count:
         raise ValueError("expected DC or DD after the byte DB")
-    return decoded
+    # The sequence DB DD is replaced last, because a DB that results from it may stand before a byte DC of the data.
+    return stuffed.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
 
 
 def _hdlc_encode(data: bytes) -> bytes:
     """Apply the byte stuffing of HDLC, so that the result does not contain the byte 7E."""
+    # The byte 7D is replaced first, because the second replacement inserts further bytes 7D.
     return data.replace(b"\x7d", b"\x7d\x5d").replace(b"\x7e", b"\x7d\x5e")
 
 
-def _hdlc_decode(piece: bytes) -> bytes:
+def _hdlc_decode(stuffed: bytes) -> bytes:
     """Remove the byte stuffing of HDLC.
 
     After the byte 7D, the encoder has inverted the bit 0x20 of the next byte. The decoder therefore drops the byte 7D,
@@ -121,7 +124,7 @@ def _hdlc_decode(piece: bytes) -> bytes:
     Raises:
         ValueError: If the byte 7D is not followed by another byte.
     """
-    first_part, *parts_after_7d = piece.split(b"\x7d")
+    first_part, *parts_after_7d = stuffed.split(b"\x7d")
     decoded = bytearray(first_part)
     for part in parts_after_7d:
         if not part:

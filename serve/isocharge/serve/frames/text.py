@@ -16,7 +16,7 @@ of a request, the line is dropped. Such a line does not prevent the recognition 
 
 A column with the name `seq` is the frame counter. A column with the name `t_us`, `t_ms` or `t_s` is the clock of the
 device. All other columns are channels. At first, the values at which the counter and the clock wrap to 0 are unknown.
-The parser estimates the value for the counter or the clock when it observes the first wrap.
+The parser estimates each value when the counter or the clock wraps for the first time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -101,19 +101,22 @@ class TextParser(DelimitedParser):
         self._columns = columns
         self._meanings = dict(meanings or {})
         self._seq_wrap = CounterWrap(SEQ_MODULI, SEQ_MODULUS, MAX_SEQ_STEP_RATIO)
-        self._clock_wrap = clock_wrap(1.0)  # until the layout states the unit of the clock
+        self._clock_wrap = create_clock_wrap(1.0)  # until the layout states the unit of the clock
         self._last_unreadable_line = b""
         self._is_first_line = True  # whether the next line is the first line of a connection
 
-        # Lines from which the layout is recognised, with their sizes in bytes
-        self._unrecognised: list[tuple[Line, int]] = []
+        # Lines from which the layout will be recognised, with their sizes in bytes
+        self._collected_lines: list[tuple[Line, int]] = []
 
-        # Values by name, and number of bytes, of the present cycle of lines
+        # Values (by name) and number of bytes of the present cycle of lines, which together contain one frame
         self._cycle_values: dict[str, float] = {}
-        self._cycle_bytes = 0
+        self._cycle_byte_count = 0
 
     def reset(self) -> None:
-        """Drop an unfinished frame, because the next bytes come from another connection."""
+        """Drop an unfinished frame, and treat the next line as the first line of another connection.
+
+        A layout that was recognised stays recognised.
+        """
         super().reset()
         self._drop_cycle()
         self._is_first_line = True
@@ -124,7 +127,7 @@ class TextParser(DelimitedParser):
         """Parse a line, and return the frames that the line completes.
 
         Lines are collected until their layout can be recognised. When the layout is recognised, the frames of the
-        collected lines are returned.
+        collected lines are returned. Comments and headers complete no frame.
 
         Args:
             piece: Bytes of the line, without the line feed.
@@ -141,9 +144,9 @@ class TextParser(DelimitedParser):
             names = tuple(self._meanings.get(name, name) for name in line.names)
             line = line._replace(names=names)
 
-        # A first line may have lost its beginning: "801.2" cut to "1.2" is still a number.
+        # The beginning of the first line may be missing. For example, "801.2" may have become "1.2", a valid number.
         if is_first_line and line.notation is Notation.csv:
-            self._reject_unrecognised()
+            self._reject_collected()
             return self._reject(size)
         if line.notation is Notation.nothing:  # such as a comment
             return []
@@ -151,39 +154,39 @@ class TextParser(DelimitedParser):
             self._name_columns(line, size)
             return []
         if self.layout is None:
-            return self._recognise(line, size)
-        return self._read(self.layout, line, size)
+            return self._recognise_layout(line, size)
+        return self._read_line(self.layout, line, size)
 
     def _reject(self, size: int) -> list[Frame]:
         """Count a rejected line, and return an empty list, because a rejected line completes no frame."""
         self.counts.count_rejected(size)
         return []
 
-    def _reject_unreadable(self, piece: bytes, size: int) -> list[Frame]:
-        """Count a line that cannot be parsed.
+    def _reject_unreadable(self, line_bytes: bytes, size: int) -> list[Frame]:
+        """Count a line as rejected, because it cannot be parsed.
 
         If the line is equal to the previous line that could not be parsed, it is probably the echo of a request. After
         an echo, the lines that were collected to recognise a layout are kept. After any other line, the collected lines
         are dropped.
 
         Args:
-            piece: Bytes of the line.
-            size: Number of bytes of the line.
+            line_bytes: Bytes of the line, without the line feed.
+            size: Number of bytes of the line, with the line feed.
 
         Returns:
             An empty list.
         """
-        is_echo = piece == self._last_unreadable_line
+        is_echo = line_bytes == self._last_unreadable_line
         if not is_echo:
-            self._reject_unrecognised()
-        self._last_unreadable_line = piece
+            self._reject_collected()
+        self._last_unreadable_line = line_bytes
         return self._reject(size)
 
-    def _reject_unrecognised(self) -> None:
+    def _reject_collected(self) -> None:
         """Drop all lines that were collected to recognise a layout, and count them as rejected."""
-        for _, size in self._unrecognised:
+        for _, size in self._collected_lines:
             self.counts.count_rejected(size)
-        self._unrecognised = []
+        self._collected_lines = []
 
     def _name_columns(self, header: Line, size: int) -> None:
         """Use the names in a header of a CSV as the names of the columns, unless names are already known.
@@ -197,30 +200,31 @@ class TextParser(DelimitedParser):
             header: Parsed line with the names of the columns.
             size: Number of bytes of the line.
         """
-        has_column_names = bool(self._columns)
-        if self.layout is None:
-            if not has_column_names:
+        are_names_known = bool(self._columns)
+        layout = self.layout
+        if layout is None:
+            if not are_names_known:
                 self._columns = header.names
             return
-        can_be_named = self.layout.notation is Notation.csv and not has_column_names
-        if can_be_named and self.layout.value_count == len(header.names):
-            self._set_layout(Layout(Notation.csv, header.names, self.layout.value_count))
+        fits_layout = layout.notation is Notation.csv and layout.value_count == len(header.names)
+        if fits_layout and not are_names_known:
+            self._set_layout(Layout(Notation.csv, header.names, layout.value_count))
         else:
             self._reject(size)
 
     def _set_layout(self, layout: Layout) -> None:
         """Use a layout for all further lines, and describe the layout in the attribute `format`."""
         self.layout = layout
-        self._clock_wrap = clock_wrap(layout.columns.clock_unit_us)
+        self._clock_wrap = create_clock_wrap(layout.columns.clock_unit_us)
         names = ", ".join(layout.names) or f"{layout.value_count} columns without names"
         self.format = f"text, {layout.notation}: {printable(names)}"
 
-    def _recognise(self, line: Line, size: int) -> list[Frame]:
+    def _recognise_layout(self, line: Line, size: int) -> list[Frame]:
         """Add a line to the collected lines. If their layout can now be recognised, return their frames.
 
         A layout is recognised if the latest lines consist of `RECOGNITION_REPEATS` equal cycles. A cycle consists of
         one or several lines that together contain one frame. Collected lines before the equal cycles are counted as
-        rejected.
+        rejected. Lines with more than `MAX_VALUES` values are never recognised.
 
         Args:
             line: The next line.
@@ -229,20 +233,20 @@ class TextParser(DelimitedParser):
         Returns:
             The frames of all equal cycles; an empty list if no layout is recognised yet.
         """
-        self._unrecognised.append((line, size))
-        cycle_length = _repeated_cycle_length([collected_line for collected_line, _ in self._unrecognised])
+        self._collected_lines.append((line, size))
+        cycle_length = _repeated_cycle_length([collected_line for collected_line, _ in self._collected_lines])
         is_recognised = cycle_length > 0 and len(line.values) <= MAX_VALUES
         if not is_recognised:
             # Keep as many lines as the longest cycles need, and reject the older lines.
-            while len(self._unrecognised) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
-                _, oldest_size = self._unrecognised.pop(0)
+            while len(self._collected_lines) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
+                _, oldest_size = self._collected_lines.pop(0)
                 self._reject(oldest_size)
             return []
 
-        first_repeated = len(self._unrecognised) - RECOGNITION_REPEATS * cycle_length
-        repeated_lines = self._unrecognised[first_repeated:]
-        self._unrecognised = self._unrecognised[:first_repeated]
-        self._reject_unrecognised()
+        first_repeated = len(self._collected_lines) - RECOGNITION_REPEATS * cycle_length
+        repeated_lines = self._collected_lines[first_repeated:]
+        self._collected_lines = self._collected_lines[:first_repeated]
+        self._reject_collected()
 
         # One cycle determines the layout, with which all repeated lines are read.
         first_cycle = [cycle_line for cycle_line, _ in repeated_lines[:cycle_length]]
@@ -250,7 +254,7 @@ class TextParser(DelimitedParser):
         self._set_layout(layout)
         frames = []
         for repeated_line, repeated_size in repeated_lines:
-            frames += self._read(layout, repeated_line, repeated_size)
+            frames += self._read_line(layout, repeated_line, repeated_size)
         return frames
 
     def _layout_of(self, lines: list[Line]) -> Layout:
@@ -273,7 +277,7 @@ class TextParser(DelimitedParser):
             names = self._columns
         return Layout(notation, names, value_count)
 
-    def _read(self, layout: Layout, line: Line, size: int) -> list[Frame]:
+    def _read_line(self, layout: Layout, line: Line, size: int) -> list[Frame]:
         """Return a list with the frame that a line completes.
 
         The list is empty if the line completes no frame, or if the line is rejected because it has another layout.
@@ -291,7 +295,7 @@ class TextParser(DelimitedParser):
         has_other_names = bool(line.names) and line.names != layout.names
         if len(line.values) != layout.value_count or has_other_names:
             return self._reject(size)
-        return self._frame(layout, line.values, size)
+        return self._frame_of_values(layout, line.values, size)
 
     def _read_cycle_line(self, layout: Layout, line: Line, size: int) -> list[Frame]:
         """Store the values of one line of a cycle. A cycle is a sequence of lines that together contain one frame.
@@ -320,29 +324,29 @@ class TextParser(DelimitedParser):
             self._drop_cycle()  # an earlier cycle, if it is unfinished
         line_values = dict(zip(line.names, line.values, strict=True))
         self._cycle_values.update(line_values)
-        self._cycle_bytes += size
+        self._cycle_byte_count += size
         is_complete = len(self._cycle_values) == layout.value_count
         if not is_complete:
             return []
 
         # The cycle is complete. Convert its values to a frame, in the order of the layout.
         values = [self._cycle_values[name] for name in layout.names]
-        cycle_bytes = self._cycle_bytes
+        cycle_byte_count = self._cycle_byte_count
         self._clear_cycle()
-        return self._frame(layout, values, cycle_bytes)
+        return self._frame_of_values(layout, values, cycle_byte_count)
 
     def _drop_cycle(self) -> None:
         """Drop the lines of an unfinished cycle, and count them as rejected."""
         if self._cycle_values:
-            self.counts.count_rejected(self._cycle_bytes)
+            self.counts.count_rejected(self._cycle_byte_count)
         self._clear_cycle()
 
     def _clear_cycle(self) -> None:
         """Delete the stored values of the present cycle, so that a new cycle can begin."""
         self._cycle_values = {}
-        self._cycle_bytes = 0
+        self._cycle_byte_count = 0
 
-    def _frame(self, layout: Layout, values: Sequence[float], size: int) -> list[Frame]:
+    def _frame_of_values(self, layout: Layout, values: Sequence[float], size: int) -> list[Frame]:
         """Convert values to a frame, and update the moduli of the counter and the clock.
 
         Args:
@@ -361,7 +365,7 @@ class TextParser(DelimitedParser):
         return frames
 
 
-def clock_wrap(unit_us: float) -> CounterWrap:
+def create_clock_wrap(unit_us: float) -> CounterWrap:
     """Create the estimator of the time at which a clock wraps to 0.
 
     The estimator assumes that the clock has 16, 24 or 32 bits, or that the board computes the time from a 32-bit clock
@@ -379,7 +383,7 @@ def clock_wrap(unit_us: float) -> CounterWrap:
 
 
 def _counter_and_clock_first(name: str) -> tuple[bool, str]:
-    """Return a sorting key for names that places the frame counter and the clock before the channels."""
+    """Return the sorting key of a name, which sorts the frame counter and the clock before the channels."""
     is_channel = name != SEQ and name not in TIMES_US
     return is_channel, name
 

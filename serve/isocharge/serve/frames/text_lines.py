@@ -63,7 +63,7 @@ class Line(NamedTuple):
     values: tuple[float, ...] = ()
 
 
-NO_READING = Line(Notation.nothing)
+LINE_WITHOUT_VALUES = Line(Notation.nothing)
 """Content of a line without values, such as a comment."""
 
 
@@ -78,21 +78,21 @@ def parse_line(data: bytes) -> Line:
     """
     text = data.decode("utf-8").strip()
     if not text or text[0] == "#":  # a blank line or a comment
-        return NO_READING
+        return LINE_WITHOUT_VALUES
     # The first character is tested before the separators, because JSON and Teleplot lines also contain colons.
     if text[0] in "{[":
-        return _json(text)
+        return _parse_json(text)
     if text[0] == ">":
-        return _teleplot(text)
+        return _parse_teleplot(text)
     if text[0] == "$":
-        return _sentence(text)
+        return _parse_sentence(text)
     if ":" in text or "=" in text:
-        return _pairs(text)
-    return _csv(text)
+        return _parse_pairs(text)
+    return _parse_csv(text)
 
 
-def _csv(text: str) -> Line:
-    """Parse a line of CSV, which contains either numbers or the names of the columns.
+def _parse_csv(text: str) -> Line:
+    """Parse a line of CSV, which contains either numbers or, in a header, the names of the columns.
 
     The cells of the line may be separated by commas, semicolons, tabs or blanks. Separators at the end of the line are
     ignored.
@@ -103,7 +103,7 @@ def _csv(text: str) -> Line:
     cells = _SEPARATOR.split(text.rstrip(",; \t"))
     try:
         return Line(Notation.csv, values=tuple(map(parse_number, cells)))
-    except ValueError:  # a cell is not a number, so that the line may be a header
+    except ValueError:  # a cell is not a number, but the line may be a header
         are_names = all(_NAME.fullmatch(cell) for cell in cells)
         are_different = len(set(cells)) == len(cells)
         if are_names and are_different:
@@ -111,7 +111,7 @@ def _csv(text: str) -> Line:
         raise
 
 
-def _sentence(text: str) -> Line:
+def _parse_sentence(text: str) -> Line:
     """Parse a sentence such as `$FILM,1.5,2.5*3A`, which consists of a name and numbers.
 
     The sentence may end with `*` and a checksum. The checksum is the exclusive or of all bytes between `$` and `*`,
@@ -133,7 +133,7 @@ def _sentence(text: str) -> Line:
     return Line(Notation.sentence, values=tuple(map(parse_number, cells)))
 
 
-def _pairs(text: str) -> Line:
+def _parse_pairs(text: str) -> Line:
     """Parse a line of one or several pairs `name:value` or `name=value`.
 
     Raises:
@@ -150,7 +150,7 @@ def _pairs(text: str) -> Line:
     return Line(Notation.pairs, names=tuple(pairs), values=tuple(pairs.values()))
 
 
-def _teleplot(text: str) -> Line:
+def _parse_teleplot(text: str) -> Line:
     """Parse a Teleplot line of the form `>name:time:value;time:value§unit|flags`, and return its latest value.
 
     The time, the unit and the flags may be missing. If the line is a text (flag `t`) or contains points of an x-y plot
@@ -164,11 +164,11 @@ def _teleplot(text: str) -> Line:
     if not name.strip() or not values:
         raise ValueError(f"expected >name:value, got {text!r}")
     if "t" in flags or "xy" in flags:
-        return NO_READING
+        return LINE_WITHOUT_VALUES
 
-    _, _, latest_value = values.rstrip("; ").rpartition(";")
-    reading, _, _unit = latest_value.partition("§")
-    *times, value = reading.split(":")  # one time, or none
+    _earlier_values, _, latest_value = values.rstrip("; ").rpartition(";")
+    time_and_value, _, _unit = latest_value.partition("§")
+    *times, value = time_and_value.split(":")  # one time, or none
     if len(times) > 1:
         raise ValueError(f"expected >name:time:value, got {text!r}")
     pairs = {}
@@ -178,10 +178,10 @@ def _teleplot(text: str) -> Line:
     return Line(Notation.teleplot, names=tuple(pairs), values=tuple(pairs.values()))
 
 
-def _json(text: str) -> Line:
-    """Parse a JSON object that contains numbers, or a JSON list of numbers.
+def _parse_json(text: str) -> Line:
+    """Parse a JSON text, and return all numbers in it, each with its path in the text as its name.
 
-    For a list of numbers, the result has the notation CSV, because the numbers have no names.
+    A list that contains only numbers has the notation CSV in the result, because its numbers have no names.
 
     Raises:
         ValueError: If the text is not valid JSON, or contains no numbers.
@@ -246,7 +246,7 @@ def _named_values(frame: Frame) -> list[tuple[str, str]]:
 
 
 def _write_csv(frame: Frame) -> str:
-    """Return the values of the channels as a text with commas between the values."""
+    """Return the values of the channels with commas between them. The counter and the clock are left out."""
     return ",".join(f"{value:.7g}" for value in frame.values)
 
 

@@ -52,7 +52,7 @@ class BoardFrames(NamedTuple):
 
 
 class BoardEncoder:
-    """Encoder that converts charges to frames of the board that a device file describes.
+    """Encoder that converts charges to the frames of a board, which a device file describes.
 
     The value of a channel is the charge of its electrode divided by the gain, plus the offset of the board. The device
     file assigns the channels to the electrodes. Channels without an electrode have the value 0. If a value is outside
@@ -76,20 +76,21 @@ class BoardEncoder:
                 `encode_text`. By default, a notation is chosen that fits the device file.
 
         Raises:
-            DeviceError: If the device file describes datagrams, contains settings for other electrodes, states an
-                offset that its field cannot contain, or does not fit the notation.
+            DeviceError: If the device file describes datagrams, contains settings for other electrodes, contains a
+                channel number that is too large, states an offset that its field cannot contain, or does not fit the
+                notation; or if the parser of the device file cannot read the frames.
             ChargeError: If an electrode has no channel.
         """
-        self._frames = _frames_of(device, electrodes, notation)
+        self._frames = _board_frames(device, electrodes, notation)
         chain = device.chain(electrodes)
         self._gain = Gain(chain.gain_pC, chain.zero)
 
-        # Find the position of each electrode's channel in a frame. All frames have the same channels, so that any frame
+        # Find the index of each electrode's channel in a frame. All frames have the same channels, so that any frame
         # can be used.
         picker = ChannelPicker(electrodes, device.channels, "the sensor", device.where)
         zeros = (0.0,) * len(self._frames.channels)
         frame_of_zeros = Frame(0, 0, zeros, names=self._frames.names)
-        self._positions = picker.positions(frame_of_zeros)
+        self._channel_indices = picker.channel_indices(frame_of_zeros)
 
         self.seq_modulus = self._frames.seq_modulus
         self.t_us_modulus = self._frames.t_us_modulus
@@ -101,7 +102,7 @@ class BoardEncoder:
         self._check_reading(device, electrodes)
 
     def _check_offsets(self, where: str, electrodes: tuple[str, ...]) -> None:
-        """Check that each channel can contain the value that the board sends if the charge is zero.
+        """Check that the channel of each electrode can contain the value that the board sends without charge.
 
         Args:
             where: Name of the device file, for messages.
@@ -112,19 +113,19 @@ class BoardEncoder:
         """
         no_charge_pC = np.zeros(len(electrodes))
         offsets = self._gain.revert(no_charge_pC).tolist()
-        for electrode, position, offset in zip(electrodes, self._positions, offsets, strict=True):
-            channel = self._frames.channels[position]
+        for electrode, channel_index, offset in zip(electrodes, self._channel_indices, offsets, strict=True):
+            channel = self._frames.channels[channel_index]
             if not channel.holds(offset):
                 raise DeviceError(
                     f"{where}: gain: without charge, electrode {electrode} has the value {offset:g}, which does not "
-                    f"fit its channel {channel.name} of the type {channel.kind}; correct gain.offset or the type"
+                    f"fit its channel {channel.name} of the type {channel.type_name}; correct gain.offset or the type"
                 )
 
     def _check_reading(self, device: Device, electrodes: tuple[str, ...]) -> None:
         """Check that the parser of the device file can read frames in which all charges are zero.
 
         Args:
-            device: Settings of the board, which contain the parser.
+            device: Settings of the board, from which the parser is created.
             electrodes: Names of the electrodes, in the order of the charges.
 
         Raises:
@@ -134,7 +135,7 @@ class BoardEncoder:
         no_charge = (0.0,) * len(electrodes)
         # A parser may need several frames to recognise their layout.
         for seq in range(FRAMES_TO_RECOGNISE):
-            t_us = 1000 * seq
+            t_us = 1000 * seq  # as from a board that sends one frame per millisecond
             encoded_frame = self.encode(Frame(seq, t_us, no_charge))
             parser.feed(encoded_frame)
         if parser.counts.frames == 0:
@@ -155,28 +156,29 @@ class BoardEncoder:
         """
         board_values = self._gain.revert(np.array(frame.values)).tolist()
         channels = self._frames.channels
-        values = [0.0] * len(channels)
+        channel_values = [0.0] * len(channels)
         is_clipped = False
-        for position, value in zip(self._positions, board_values, strict=True):
-            channel = channels[position]
-            values[position] = channel.nearest_value(value)
+        for channel_index, value in zip(self._channel_indices, board_values, strict=True):
+            channel = channels[channel_index]
+            channel_values[channel_index] = channel.nearest_value(value)
             if not channel.holds(value):
                 is_clipped = True
         flags = frame.flags
         if is_clipped:
             self.clipped += 1
             flags |= SATURATED_BIT
-        return self._frames.encode(Frame(frame.seq, frame.t_us, tuple(values), flags, self._frames.names))
+        board_frame = Frame(frame.seq, frame.t_us, tuple(channel_values), flags, self._frames.names)
+        return self._frames.encode(board_frame)
 
 
-def _frames_of(device: Device, electrodes: tuple[str, ...], notation: str | None) -> BoardFrames:
-    """Return the description of the frames that the board of a device file sends.
+def _board_frames(device: Device, electrodes: tuple[str, ...], notation: str | None) -> BoardFrames:
+    """Return the description of the frames that a board sends.
 
     Args:
-        device: Settings of the board.
+        device: Settings of the board. They may describe the channels as binary fields or as columns of text.
         electrodes: Names of the electrodes.
-        notation: Notation of frames whose channels the device file does not describe: "binary", or a notation of
-            `encode_text`. If None, a notation is chosen that fits the device file.
+        notation: Notation of the frames: "binary", or a notation of `encode_text`. It must fit the device file. If
+            None, a notation is chosen that fits the device file.
 
     Raises:
         DeviceError: If the device file describes datagrams, contains a channel number that is too large, or does not
@@ -184,7 +186,7 @@ def _frames_of(device: Device, electrodes: tuple[str, ...], notation: str | None
     """
     frames = device.frames
     if isinstance(frames, FrameLayout):  # the device file describes the channels as binary fields
-        _check_notation(device.where, notation, fitting_notations=())  # no notation may be given
+        _check_notation(device.where, notation, fitting_notations=())  # raises an error if a notation is given
         return _layout_frames(frames, device.where)
     if isinstance(frames, TextFrames) and frames.columns:  # the device file describes the channels as columns of a CSV
         _check_notation(device.where, notation, fitting_notations=(CSV,))
@@ -196,7 +198,8 @@ def _frames_of(device: Device, electrodes: tuple[str, ...], notation: str | None
 def _undescribed_frames(device: Device, electrodes: tuple[str, ...], notation: str | None) -> BoardFrames:
     """Return the description of frames whose channels the device file does not describe.
 
-    The channels follow from the electrodes and from the notation.
+    The names and the number of the channels are derived from the electrodes. The notation determines the type of the
+    channels, and whether the frames contain the names.
 
     Args:
         device: Settings of the board.
@@ -211,20 +214,21 @@ def _undescribed_frames(device: Device, electrodes: tuple[str, ...], notation: s
     default_notation, fitting_notations = _fitting_notations(device, has_channel_names=bool(channel_names))
     _check_notation(device.where, notation, fitting_notations)
     chosen_notation = notation or default_notation
+    # The second argument of `Field` is its name, which is only used in messages here. It states the notation.
     if chosen_notation == BINARY:
-        binary_channels = (Field("f32", BINARY),) * n_channel  # the name of a field is only used in messages
+        binary_channels = (Field("f32", BINARY),) * n_channel
         return BoardFrames(names=(), channels=binary_channels, encode=encode_frame)
-    frame_names = () if chosen_notation == CSV else channel_names
+    frame_names = () if chosen_notation == CSV else channel_names  # lines of CSV contain no names
     text_channels = (Field("f64", chosen_notation),) * n_channel
     encode = partial(encode_text, notation=chosen_notation)
     return BoardFrames(names=frame_names, channels=text_channels, encode=encode)
 
 
 def _layout_frames(layout: FrameLayout, where: str) -> BoardFrames:
-    """Return the description of frames whose binary fields are laid out as a device file describes.
+    """Return the description of binary frames whose fields a device file describes.
 
     Args:
-        layout: Layout of the binary fields, as the device file describes it.
+        layout: Layout of the fields in the device file.
         where: Name of the device file, for messages.
 
     Raises:
@@ -243,15 +247,15 @@ def _column_frames(columns: tuple[str, ...]) -> BoardFrames:
     """Return the description of frames that are sent as lines of CSV.
 
     Args:
-        columns: Names of the columns. A column contains the frame number, a clock, or the values of a channel.
+        columns: Names of the columns. A column contains the frame number, the time, or the values of a channel.
     """
-    names = tuple(name for name in columns if name not in (SEQ, *TIMES_US))
-    channels = tuple(Field("f64", name) for name in names)
-    return BoardFrames(names, channels, partial(_encode_row, columns))
+    channel_names = tuple(name for name in columns if name not in (SEQ, *TIMES_US))
+    channels = tuple(Field("f64", name) for name in channel_names)
+    return BoardFrames(channel_names, channels, encode=partial(_encode_row, columns))
 
 
 def _fitting_notations(device: Device, *, has_channel_names: bool) -> tuple[str, tuple[str, ...]]:
-    """Return the notations that fit a device file without a description of the channels.
+    """Return the notations that fit a device file if the file does not describe the channels.
 
     Args:
         device: Settings of the board.
@@ -263,7 +267,7 @@ def _fitting_notations(device: Device, *, has_channel_names: bool) -> tuple[str,
     if isinstance(device.frames, BinaryFrames):
         return BINARY, (BINARY,)
     if isinstance(device.frames, AutoFrames):
-        # Binary frames contain no names. They therefore do not fit a section [channels] that contains names.
+        # The default is not binary if a section [channels] contains names, because binary frames contain no names.
         default = PAIRS if device.channels and has_channel_names else BINARY
         return default, (BINARY, *TEXT_FORMATS)
     default = PAIRS if has_channel_names else CSV
@@ -296,7 +300,7 @@ def _used_channels(device: Device, electrodes: tuple[str, ...]) -> tuple[tuple[s
     """Return the names of the channels that the electrodes use, and the number of channels in a frame.
 
     By default, an electrode uses the channel with its own name. The section `[channels]` of the device file may state
-    another name, or a number. If it states numbers for all electrodes, the tuple of names is empty.
+    another name, or a number. If the section states numbers for all electrodes, the tuple of names is empty.
 
     Args:
         device: Settings of the board.
@@ -324,8 +328,8 @@ def _encode_row(columns: tuple[str, ...], frame: Frame) -> bytes:
     """Encode a frame as a line of CSV.
 
     Args:
-        columns: Names of the columns in their order. A column contains the frame number (`seq`), a clock (`t_us`,
-            `t_ms` or `t_s`), or the values of a channel.
+        columns: Names of the columns in their order. A column contains the frame number (`seq`), the time (`t_us`,
+            `t_ms` or `t_s`), or the value of a channel.
         frame: Frame with one value for each channel. If the frame has no time, the line contains the time 0.
     """
     value_of_channel = dict(zip(frame.names, frame.values, strict=True))

@@ -46,8 +46,8 @@ class CurrentModel:
     """Holder of the current model, which all stages share.
 
     Attributes:
-        predictor: The loaded model. If the film is followed, this is the model of the film at its estimated pretension
-            instead.
+        predictor: The loaded model. If a `FilmStage` estimates the pretension of the film, this is instead the model of
+            the film at its estimated pretension.
     """
 
     predictor: Predictor
@@ -62,11 +62,11 @@ class ContactFrame:
         clock_s: Time of the frame on a monotonic clock, s.
         flags: Flags of the frame, as in `isocharge.serve.flags`.
         contact: The estimated contact. None if nothing touches the film, or if the frame is invalid.
-        film: State of the followed film; None if the film is not followed.
+        film: Estimated pretension of the film; None if the pretension is not estimated.
         tracking: The tracked contact; None if contacts are not tracked.
         is_mixture_contact: Whether the contact comes from a `ContactMixture` and not from the model.
         model_charge_pC: Charges from which the current model predicts the contact, shape (n_electrode,), pC. None if
-            there is no contact. If the film is followed, these charges differ from the charges of the reading.
+            there is no contact. If the pretension is estimated, these charges differ from the charges of the reading.
     """
 
     reading: Reading
@@ -97,8 +97,8 @@ class PredictionStage(ContactStage):
         """Store the model, and the limits within which contacts of the model are valid.
 
         Args:
-            model: The current model. Its predictor may be replaced later. The limits of valid contacts then stay the
-                same.
+            model: The current model. Its predictor may be replaced later by the model of the same film at another
+                pretension. The limits of valid contacts then stay the same.
         """
         self._model = model
         self._validity = model.predictor.validity
@@ -106,7 +106,8 @@ class PredictionStage(ContactStage):
     def step(self, frame: ContactFrame) -> None:
         """Predict the contact of a frame, and add the flags of the contact to the frame.
 
-        If nothing touches the film, or if the frame has the flag `invalid`, no contact is predicted.
+        If nothing touches the film, if there is no tare yet, or if the frame has the flag `invalid`, no contact is
+        predicted.
         """
         reading = frame.reading
         if INVALID in reading.flags or not reading.contact or reading.charge_pC is None:
@@ -128,7 +129,7 @@ class FilmStage(ContactStage):
 
         Args:
             model: The current model, whose predictor this stage replaces.
-            rule: Settings of the estimation, which are the section `[follow]` of the device file.
+            rule: Settings of the estimation, from the section `[follow]` of the device file.
             warming_ratio: Charge that warming adds to each electrode, relative to the mean magnitude over all
                 electrodes, shape (n_electrode,), or one number for all electrodes.
 
@@ -144,7 +145,7 @@ class FilmStage(ContactStage):
         The model for the new estimate is used from the next frame on. If the pretension can no longer be estimated,
         every frame with a contact gets the flag `film`.
         """
-        # Correct the contact with the estimate from the earlier frames, and store this estimate in the frame.
+        # Correct the contact with the estimate from the earlier frames. The frame reports this estimate.
         charge_pC = frame.reading.charge_pC
         if frame.contact is not None and charge_pC is not None:
             frame.contact, frame.model_charge_pC = self.follower.follow_contact(frame.contact, charge_pC)
@@ -169,25 +170,24 @@ class FilmStage(ContactStage):
 class TrackingStage(ContactStage):
     """Stage that tracks the contact from frame to frame."""
 
-    def __init__(self, tracker: Tracker, predictor: Predictor, *, is_film_followed: bool) -> None:
-        """Store the tracker, and give it a mixture of several possible contacts if the film needs one.
+    def __init__(self, tracker: Tracker, predictor: Predictor, *, is_pretension_estimated: bool) -> None:
+        """Store the tracker, and replace its mixture of several possible contacts.
 
-        On some films, several different contacts cause the same charges. For such a film, the tracker uses a mixture of
-        Gaussian components that represents all possible contacts. The mixture needs the file `charges.npz` in the
-        folder of the model. The file describes the charges of every contact. The tracker keeps the contact that it
-        tracks at present.
+        On some films, several different contacts cause the same charges. The folder of the model of such a film
+        contains the file `charges.npz`, which describes the charges of all contacts. The tracker then uses a mixture
+        of Gaussian components that represents all possible contacts. Without the file, the tracker uses no mixture.
 
         Args:
-            tracker: The tracker. Its mixture is replaced, and its state is kept.
+            tracker: The tracker. Its mixture is replaced. It keeps the contact that it tracks at present.
             predictor: The loaded model.
-            is_film_followed: Whether the pretension of the film is estimated. If it is, no mixture is used, because the
-                file of charges describes the calibrated film instead of the current film.
+            is_pretension_estimated: Whether a `FilmStage` estimates the present pretension of the film. The tracker
+                then uses no mixture, because the file describes the charges at the calibrated pretension.
 
         Raises:
-            ModelError: If the file of charges of the model is damaged.
+            ModelError: If the file `charges.npz` is damaged.
         """
         mixture = None
-        if not is_film_followed:
+        if not is_pretension_estimated:
             mixture = contact_mixture(predictor)  # None if the model has no file `charges.npz`
         self._mixture_validity = predictor.validity
         if mixture is not None:
@@ -199,8 +199,9 @@ class TrackingStage(ContactStage):
     def step(self, frame: ContactFrame) -> None:
         """Update the tracker with the contact of the frame, and add the tracked contact and its event to the frame.
 
-        If the tracker uses a mixture of several possible contacts, the most probable contact replaces the contact of
-        the model, and determines the flags of the frame.
+        An event is, for example, the beginning of a press or its release. If the tracker uses a mixture of several
+        possible contacts, the most probable contact replaces the contact of the model, and determines the flags of the
+        frame.
         """
         tracker = self._tracker
         reading = frame.reading
@@ -210,6 +211,8 @@ class TrackingStage(ContactStage):
             frame.tracking = NO_TRACKING
         else:
             frame.tracking = Tracking(tracked, event, other)
+
+        # `mixture_contact` is None without a mixture, and for a frame from which the mixture estimates no contact.
         if tracker.mixture_contact is not None:
             frame.contact = tracker.mixture_contact
             frame.flags = reading.flags + self._mixture_validity.flags(frame.contact)
@@ -220,11 +223,11 @@ class TrackingStage(ContactStage):
         self._tracker.reset()
 
 
-def _add_error(frame: ContactFrame, contact: Contact, shift: tuple[float, float, float]) -> None:
-    """Increase the standard deviations of the contact of a frame and of the tracked contact by an error.
+def _widen_contacts(frame: ContactFrame, contact: Contact, shift: tuple[float, float, float]) -> None:
+    """Add an independent error to the standard deviations of the contact of a frame and of its tracked contact.
 
     Args:
-        frame: The frame, which is changed.
+        frame: The frame, whose contact and tracked contact are replaced.
         contact: The contact of the frame.
         shift: Changes of x, mm, of y, mm, and of the force, N, that an error of one standard deviation causes.
     """
@@ -234,9 +237,10 @@ def _add_error(frame: ContactFrame, contact: Contact, shift: tuple[float, float,
 
 
 class ChargeScaleStage(ContactStage):
-    """Stage that adds the uncertainty of the common scale of all charges to the standard deviations of a contact.
+    """Stage that adds the uncertainty of the charge scale to the standard deviations of a contact.
 
-    The common scale is uncertain if the parameters of the film's memory are not known exactly.
+    The charge scale is the common factor of all charges. It is uncertain if the parameters of the film's memory, which
+    changes the charges of a held press, are not known exactly.
     """
 
     def __init__(self, model: CurrentModel) -> None:
@@ -249,33 +253,33 @@ class ChargeScaleStage(ContactStage):
         self.reset()
 
     def step(self, frame: ContactFrame) -> None:
-        """Add the error of the common scale to the standard deviations of the contact and the tracked contact."""
+        """Add the error of the charge scale to the standard deviations of the contact and the tracked contact."""
         if frame.contact is None:
             return
-        shift = self._shift(frame, frame.contact)
-        if shift is None:
-            return
-        _add_error(frame, frame.contact, shift)
+        shift = self._contact_shift(frame, frame.contact)
+        if shift is not None:
+            _widen_contacts(frame, frame.contact, shift)
 
     def reset(self) -> None:
         """Discard the sensitivity of the previous contact."""
         self._sensitivity = Sensitivity(CHARGE_SCALE_STEP)
         self._sensitivity_predictor = self._model.predictor
 
-    def _shift(self, frame: ContactFrame, contact: Contact) -> tuple[float, float, float] | None:
-        """Return the change of the contact that an error of the charge scale by one standard deviation causes.
+    def _contact_shift(self, frame: ContactFrame, contact: Contact) -> tuple[float, float, float] | None:
+        """Return how much the contact changes if the charge scale is wrong by one standard deviation.
 
         If the model has predicted the contact, the change is computed from a second prediction with slightly larger
         charges. If the contact comes from the mixture of the tracker, only its force F is assumed to depend on the
-        scale. The assumption is that F is proportional to scale^p, with the exponent p = `LARGEST_FORCE_EXPONENT`. It
-        gives the change dF = p F d(scale).
+        scale: F is proportional to scale^p, with the exponent p = `LARGEST_FORCE_EXPONENT`. A small relative change of
+        the scale then changes F by p F times this relative change.
 
         Args:
             frame: The frame.
             contact: The contact of the frame.
 
         Returns:
-            Changes of x, mm, of y, mm, and of the force, N. None if the scale is known exactly.
+            Changes of x, mm, of y, mm, and of the force, N. None if the model has predicted the contact and the scale
+            is known exactly.
         """
         charge_scale_std = frame.reading.charge_scale_std  # relative standard deviation of the scale
         if frame.is_mixture_contact:
@@ -284,15 +288,18 @@ class ChargeScaleStage(ContactStage):
         if charge_scale_std <= 0.0 or charge_pC is None:
             return None
 
-        # `_sensitivity` stores the result of the latest second prediction. The result is discarded if the model has
-        # changed since then.
+        # `_sensitivity` stores the result of the latest second prediction. If another model is used since then, the
+        # stored result is discarded.
         predictor = self._model.predictor
         if predictor is not self._sensitivity_predictor:
             self.reset()
         scaled_pC = charge_pC * (1.0 + CHARGE_SCALE_STEP)
-        # The last argument makes a new second prediction. It is only called if the contact has moved since the latest
-        # one.
-        return self._sensitivity.shift(contact, charge_scale_std, lambda: predictor.predict(scaled_pC))
+
+        # `shift` calls this function only if the contact has moved since the latest second prediction.
+        def predict_scaled() -> Contact:
+            return predictor.predict(scaled_pC)
+
+        return self._sensitivity.shift(contact, charge_scale_std, predict_scaled)
 
 
 class TouchOffsetRule(Rule, frozen=True, kw_only=True):
@@ -311,46 +318,49 @@ class TouchOffsetRule(Rule, frozen=True, kw_only=True):
 class TouchOffsetStage(ContactStage):
     """Stage that adds the uncertainty of a common offset of all charges to the standard deviations of a contact.
 
-    A common offset changes the contact of a light press more than the contact of a strong press. The standard
-    deviations of a contact of the tracker's mixture are not changed. The model does not predict such a contact, so that
-    the effect of an offset on the contact is not known.
+    A common offset changes the contact of a light press more than the contact of a strong press. If a contact comes
+    from the mixture of the tracker, its standard deviations are not changed. The model does not predict such a contact,
+    so that the effect of an offset on the contact is not known.
     """
 
-    def __init__(self, model: CurrentModel, rule: TouchOffsetRule, warming_ratio: Array | float) -> None:
+    def __init__(self, model: CurrentModel, rule: TouchOffsetRule, offset_ratio: Array | float) -> None:
         """Create the stage. The stage computes the sensitivity of a contact when the first contact is processed.
 
         Args:
             model: The current model, with which the sensitivity of the contact is computed.
             rule: Settings that describe the offset.
-            warming_ratio: Charge that the offset adds to each electrode, relative to the common offset, shape
+            offset_ratio: Charge that the offset adds to each electrode, relative to the common offset, shape
                 (n_electrode,), or one number for all electrodes.
         """
         self._model = model
         self._rule = rule
-        self._warming_ratio = warming_ratio
+        self._offset_ratio = offset_ratio
         self.reset()
 
     def step(self, frame: ContactFrame) -> None:
         """Add the error of a common offset to the standard deviations of the contact and the tracked contact.
 
-        The error is computed from a second prediction, in which an offset is added to the charges. A contact from the
-        mixture of the tracker is not changed, because the model does not predict such a contact.
+        The error is computed from a second prediction, in which an offset is added to the charges. If the contact comes
+        from the mixture of the tracker, it is not changed, because the model does not predict such a contact.
         """
         charge_pC = frame.model_charge_pC
         contact = frame.contact
         if contact is None or charge_pC is None or frame.is_mixture_contact:
             return
 
-        # `_sensitivity` stores the result of the latest second prediction. The result is discarded if the model has
-        # changed since then.
+        # `_sensitivity` stores the result of the latest second prediction. If another model is used since then, the
+        # stored result is discarded.
         predictor = self._model.predictor
         if predictor is not self._sensitivity_predictor:
             self.reset()
-        shifted_pC = charge_pC + TOUCH_OFFSET_STEP_pC * self._warming_ratio
-        # The last argument makes a new second prediction. It is only called if the contact has moved since the latest
-        # one.
-        shift = self._sensitivity.shift(contact, self._rule.std_pC, lambda: predictor.predict(shifted_pC))
-        _add_error(frame, contact, shift)
+        offset_charge_pC = charge_pC + TOUCH_OFFSET_STEP_pC * self._offset_ratio
+
+        # `shift` calls this function only if the contact has moved since the latest second prediction.
+        def predict_with_offset() -> Contact:
+            return predictor.predict(offset_charge_pC)
+
+        shift = self._sensitivity.shift(contact, self._rule.std_pC, predict_with_offset)
+        _widen_contacts(frame, contact, shift)
 
     def reset(self) -> None:
         """Discard the sensitivity of the previous contact."""

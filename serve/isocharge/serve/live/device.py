@@ -100,8 +100,8 @@ class Gain(Rule, frozen=True, kw_only=True):
 
         if self.per_unit is None:
             raise WrongKey("pC_per_unit")  # the section contains neither form
-        numbers = self.per_unit.values() if isinstance(self.per_unit, dict) else [self.per_unit]
-        if 0.0 in numbers:
+        gains = self.per_unit.values() if isinstance(self.per_unit, dict) else [self.per_unit]
+        if 0.0 in gains:
             key = "V_per_unit" if has_voltage else "pC_per_unit"
             raise WrongKey(key, "a finite number that is not 0, or one for each electrode", self.per_unit)
 
@@ -113,7 +113,9 @@ class Gain(Rule, frozen=True, kw_only=True):
     def charge_pC(self, electrode: str, values: Array) -> Array:
         """Convert values of one electrode to charges.
 
-        If the offset is missing, the value 0 is used. If a factor is missing, the value 1 is used.
+        The charge is the difference between the value and the offset, times the charge of one unit. The charge of one
+        unit is `pC_per_unit`, or the product of `V_per_unit` and `feedback_pF`. A missing offset counts as 0, and a
+        missing factor counts as 1.
 
         Args:
             electrode: Name of the electrode.
@@ -197,7 +199,8 @@ class DeviceSections(Settings, frozen=True):
 class Device(DeviceSections, frozen=True):
     """Settings of a board, as its device file states them.
 
-    The inherited attributes are the sections of the device file. A section is None if its stage is switched off.
+    The inherited attributes are the name of the board and the sections of the device file. The section of a stage is
+    None if the stage is switched off.
 
     Attributes:
         table: Content of the device file without any conversion, which is stored in recordings.
@@ -221,15 +224,15 @@ class Device(DeviceSections, frozen=True):
     def chain(self, electrodes: tuple[str, ...]) -> Chain:
         """Return the settings of the signal chain for a sensor with the given electrodes.
 
-        If the device file has no section for a stage, the settings of the stage are None. The attribute `leak` is an
-        exception: if the file has no section `[leak]`, the attribute contains the default settings.
+        If the section of a stage is None, the settings of the stage are None. The attribute `leak` of the result is an
+        exception: without a section `[leak]`, it contains the default settings.
 
         Args:
             electrodes: Names of the electrodes of the model, in the order of the charges.
 
         Raises:
-            DeviceError: If a setting contains other electrodes, or if warming must be estimated with too few
-                electrodes.
+            DeviceError: If a setting states numbers for other electrodes than the given ones, if the numbers of
+                `pC_per_K` are all 0, or if warming must be estimated with too few electrodes.
         """
         if self.common_mode is not None and len(electrodes) < MIN_ELECTRODES_FOR_WARMING:
             raise DeviceError(
@@ -258,31 +261,31 @@ class Device(DeviceSections, frozen=True):
             memory=self.memory,
             touch=self.touch,
             thermal=self.common_mode,
-            warming_ratios=self._warming_ratio(electrodes),
+            warming_ratios=self._warming_ratios(electrodes),
         )
 
-    def _warming_ratio(self, electrodes: tuple[str, ...]) -> Array | float:
+    def _warming_ratios(self, electrodes: tuple[str, ...]) -> Array | float:
         """Return the charge that warming adds to each electrode, relative to the mean magnitude over all electrodes.
 
         Args:
             electrodes: Names of the electrodes, in the order of the charges.
 
         Returns:
-            Ratio of the charge of each electrode to the mean magnitude, shape (n_electrode,), dimensionless. The number
-            1.0 if the device file does not contain the key `pC_per_K`.
+            Ratio of the charge of each electrode to the mean magnitude, shape (n_electrode,), dimensionless. The single
+            number 1.0, for equal charges on all electrodes, if the device file does not contain the key `pC_per_K`.
 
         Raises:
-            DeviceError: If the charges of all electrodes are 0, or if the setting contains other electrodes.
+            DeviceError: If the charges of all electrodes are 0, or if the setting states numbers for other electrodes.
         """
         # The section [common_mode] states the charge that each electrode collects if the film warms by 1 K.
         setting = None if self.common_mode is None else self.common_mode.pC_per_K
         charge_pC_per_K = self._for_each_electrode("common_mode.pC_per_K", setting, electrodes)
         if charge_pC_per_K is None:
             return 1.0
-        mean_magnitude = float(np.abs(charge_pC_per_K).mean())
-        if not mean_magnitude > 0.0:
+        mean_magnitude_pC_per_K = float(np.abs(charge_pC_per_K).mean())
+        if mean_magnitude_pC_per_K == 0.0:
             raise DeviceError(f"{self.where}: common_mode.pC_per_K: expected a number other than 0, got {setting}")
-        return charge_pC_per_K / mean_magnitude
+        return charge_pC_per_K / mean_magnitude_pC_per_K
 
     def check_gain(self, electrodes: tuple[str, ...]) -> None:
         """Check that a section `[gain]` contains numbers for exactly the given electrodes.
@@ -302,7 +305,10 @@ class Device(DeviceSections, frozen=True):
 
         Returns:
             Charge of one unit with its sign, shape (n_electrode,), pC. None if the section does not state the charge of
-            one unit.
+            one unit, which `Gain` does not allow.
+
+        Raises:
+            DeviceError: If a setting states numbers for other electrodes.
         """
         if gain.V_per_unit is None:
             return self._for_each_electrode("gain.pC_per_unit", gain.pC_per_unit, electrodes)
@@ -321,10 +327,10 @@ class Device(DeviceSections, frozen=True):
             key: Section and key of the setting, for messages.
             setting: One number for all electrodes, a dictionary of numbers by electrode name, or None if the setting is
                 not given.
-            electrodes: Names of the electrodes.
+            electrodes: Names of the electrodes, in the order of the charges.
 
         Raises:
-            DeviceError: If the dictionary contains other electrodes.
+            DeviceError: If the keys of the dictionary are not exactly the given electrodes.
         """
         if setting is None:
             return None
@@ -354,8 +360,8 @@ def load_device(path: str | Path | None) -> Device:
 def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     """Convert the content of a device file to the settings of a board.
 
-    If the section `[frames]` has no key `format`, the format of the frames is `auto`. If a section is switched off, it
-    is treated like a missing section.
+    If the section `[frames]` has no key `format`, the format of the frames is `auto`. If a section contains the key
+    `on = false`, the stage of the section is switched off, and the section is None in the result.
 
     Args:
         table: Sections and keys of the file, as the docstring of this module describes them.
@@ -366,12 +372,12 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     """
     frames = table.get("frames")
     complete_table = dict(table)
-    if isinstance(frames, Mapping):  # `convert` reports an error if it is anything else
+    if isinstance(frames, Mapping):  # `convert` adds a missing section, and reports an error if it is not a mapping
         complete_table["frames"] = {"format": "auto", **frames}
     converted_sections = convert(complete_table, DeviceSections, where, DeviceError)
     sections: dict[str, Any] = structs.asdict(converted_sections)
     for name, section in sections.items():
-        is_switched_off = isinstance(section, Rule) and not section.on  # the section has the setting `on = false`
+        is_switched_off = isinstance(section, Rule) and not section.on
         if is_switched_off:
             sections[name] = None
     return Device(**sections, table=table, where=where)
@@ -390,5 +396,5 @@ def with_settings(device: Device, section: str, **settings: Any) -> Device:
     Raises:
         DeviceError: If a key is unknown, or a value is out of its range.
     """
-    changed = {**device.table.get(section, {}), **settings}
-    return device_from_table({**device.table, section: changed}, device.where)
+    changed_section = {**device.table.get(section, {}), **settings}
+    return device_from_table({**device.table, section: changed_section}, device.where)

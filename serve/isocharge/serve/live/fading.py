@@ -4,12 +4,11 @@ The cause is either a leak of the amplifiers or creep of the film. A leak remove
 second. The logarithm of the charge Q is then a linear function of the time t since the touch, ln Q = a - t / tau. Creep
 removes the same share of the charge in every decade of time. The logarithm of the charge Q is then a linear function of
 ln t, ln Q = a + b ln t. Both functions are fitted to the charges of a press. One of the two causes is reported only if
-the fit of the other function has a much larger sum of squared residuals. The ratio of the two sums must be at least
-`MIN_RESIDUAL_RATIO`.
+the other function has a much larger sum of squared residuals: more than `MIN_RESIDUAL_RATIO` times as large.
 
 A third possible cause is creep together with a thermoelastic step (see `isocharge.serve.signal_chain.memory`). The
-third cause is reported only if the sum of squared residuals of each linear function is large enough. The ratio of each
-of these sums to the sum of the third law must be at least `MIN_RESIDUAL_RATIO`.
+third cause is reported only if the sum of squared residuals of both linear functions is more than
+`MIN_RESIDUAL_RATIO` times as large as the sum of squared residuals of the third law.
 
 The section [leak] of a device file corrects a leak, and the section [memory] corrects creep. If the section [leak] is
 used to correct creep, the error of the charges increases with time.
@@ -60,8 +59,9 @@ class Fading(NamedTuple):
     def sections(self) -> dict[str, dict[str, float]]:
         """Sections of a device file that correct the decrease of the charges, with values of two significant digits.
 
-        The section [leak] corrects a leak, and the section [memory] corrects creep. If no section can correct the
-        decrease, the dictionary is empty.
+        The result is a dictionary of sections by name. Each section is a dictionary of values by key. The section
+        [leak] corrects a leak, and the section [memory] corrects creep. If no section can correct the decrease, or if
+        its cause was not determined, the result is empty.
         """
         if self.tau_s is not None:
             return {"leak": {"tau_s": _two_digits(self.tau_s)}}
@@ -70,7 +70,7 @@ class Fading(NamedTuple):
         if self.creep >= MAX_CREEP:  # the section [memory] does not accept such a large creep
             return {}
         settings = {"creep": _two_digits(self.creep)}
-        if self.thermoelastic:
+        if self.thermoelastic > 0.0:
             settings["thermoelastic"] = _two_digits(self.thermoelastic)
         return {"memory": settings}
 
@@ -125,8 +125,8 @@ def law_of_fading(mean_magnitudes: Sequence[tuple[float, float]]) -> Fading:
             magnitude of the charges at this time, pC, which must be positive.
 
     Returns:
-        The law with its parameters. The parameters have their default values if there are fewer than `MIN_WINDOWS`
-        pairs, if the charges do not decrease, or if no law fits clearly better than the others.
+        The law with its parameters. All parameters have their default values, which state no law, if there are fewer
+        than `MIN_WINDOWS` pairs, if the charges do not decrease, or if no law fits clearly better than the others.
     """
     if len(mean_magnitudes) < MIN_WINDOWS:
         return Fading()
@@ -134,7 +134,8 @@ def law_of_fading(mean_magnitudes: Sequence[tuple[float, float]]) -> Fading:
     log_magnitude = np.log(magnitude_pC)
     leak_fit = _fit_line(held_s, log_magnitude)
     creep_fit = _fit_line(np.log(held_s), log_magnitude)
-    if max(leak_fit.slope, creep_fit.slope) >= 0.0:  # the charges do not decrease
+    is_decrease = leak_fit.slope < 0.0 and creep_fit.slope < 0.0
+    if not is_decrease:
         return Fading()
     is_leak_clearly_better = creep_fit.squared_residual > MIN_RESIDUAL_RATIO * leak_fit.squared_residual
     if is_leak_clearly_better:
@@ -149,16 +150,18 @@ def law_of_fading(mean_magnitudes: Sequence[tuple[float, float]]) -> Fading:
     is_creep_clearly_better = leak_fit.squared_residual > MIN_RESIDUAL_RATIO * creep_fit.squared_residual
     if is_creep_clearly_better:
         log_change_per_decade = creep_fit.slope * np.log(10.0)
-        return Fading(creep=-float(np.expm1(log_change_per_decade)))
+        relative_change_per_decade = float(np.expm1(log_change_per_decade))  # negative
+        return Fading(creep=-relative_change_per_decade)
     return Fading()
 
 
 def _fit_creep_and_step(held_s: Array, magnitude_pC: Array, max_squared_residual: float) -> Fading | None:
     """Fit creep with a thermoelastic step: Q = level - creep * log10(t) + step * exp(-t / warmth_s).
 
-    The time constant warmth_s describes how fast the film returns to the temperature of the air. It is set to its
-    default value. The parameters level, creep and step follow from a linear least-squares fit. The fit is physically
-    possible if the ratios creep / level and step / level are between 0 and 1.
+    Q is the mean magnitude of the charges, and t is the time since the touch in seconds. The time constant warmth_s
+    describes how fast the film returns to the temperature of the air. It is set to its default value. A linear
+    least-squares fit determines level, creep and step, which are charges in pC. The fit is physically possible if the
+    ratios creep / level and step / level are between 0 and 1, and if all fitted charges are positive.
 
     Args:
         held_s: Times since the touch, shape (n,), s.
@@ -176,8 +179,9 @@ def _fit_creep_and_step(held_s: Array, magnitude_pC: Array, max_squared_residual
     coefficients = np.linalg.lstsq(design_matrix, magnitude_pC, rcond=None)[0]
     level_pC, creep_pC, step_pC = coefficients.tolist()
     fitted_pC = design_matrix @ coefficients
-    is_possible = 0.0 < creep_pC < level_pC and 0.0 < step_pC < level_pC
-    if not is_possible or fitted_pC.min() <= 0.0:  # the logarithm below needs positive values
+    are_ratios_possible = 0.0 < creep_pC < level_pC and 0.0 < step_pC < level_pC
+    are_charges_possible = fitted_pC.min() > 0.0  # the logarithm below also needs positive values
+    if not (are_ratios_possible and are_charges_possible):
         return None
     squared_residual = float(np.square(np.log(magnitude_pC / fitted_pC)).sum())
     if squared_residual >= max_squared_residual:
@@ -188,7 +192,8 @@ def _fit_creep_and_step(held_s: Array, magnitude_pC: Array, max_squared_residual
 def cause_of_fading(mean_magnitudes: Sequence[tuple[float, float]]) -> str:
     """Return a text that states why the charges may decrease and advises the user what to do.
 
-    The text is the second part of a sentence. The message of the caller contains the first part.
+    The text is the second part of a sentence such as "the charges fall: hold the force; or the amplifier leaks". The
+    caller adds the first part.
 
     Args:
         mean_magnitudes: Pairs of a time since the touch, s, and the mean magnitude of the charges at this time, pC. The
@@ -212,11 +217,11 @@ def _fit_line(x: Array, y: Array) -> LineFit:
     mean(y)).
 
     Args:
-        x: First coordinates of the points, shape (n,).
+        x: First coordinates of the points, shape (n,). At least two of them must be different.
         y: Second coordinates of the points, shape (n,).
     """
     centred_x = x - x.mean()
     centred_y = y - y.mean()
     slope = float(centred_x @ centred_y) / float(centred_x @ centred_x)
-    squared_residual = float(np.square(centred_y - slope * centred_x).sum())
-    return LineFit(slope, squared_residual)
+    residuals = centred_y - slope * centred_x
+    return LineFit(slope, squared_residual=float(np.square(residuals).sum()))

@@ -36,9 +36,9 @@ class ChannelPicker:
 
     The section `[channels]` of the device file states the name or the number of the channel of each electrode. If the
     device file has no section `[channels]`, a channel belongs to the electrode with the same name. The name of a
-    channel may have a prefix or a suffix, as in `A_pC` or `charge.A`. If the names of the channels do not contain the
-    names of the electrodes, the first channel belongs to the first electrode, and so on. An assignment by order
-    requires as many channels as electrodes.
+    channel may have a prefix or a suffix, as in `A_pC` or `charge.A`. If an electrode has no channel with its name,
+    the channels are assigned by their order: the first channel belongs to the first electrode, and so on. An
+    assignment by order requires as many channels as electrodes.
     """
 
     def __init__(
@@ -57,42 +57,44 @@ class ChannelPicker:
         self._channels = channels
         self._reader = reader
         self._where = where
-        # Names, number of values and positions of the channels of the previous frame. `pick` uses the positions again.
-        self._names: tuple[str, ...] | None = None
-        self._n_values = -1
-        self._positions: tuple[int, ...] = ()
+        # Names, number of values and channel indices of the previous frame. `pick` uses the indices again.
+        self._previous_names: tuple[str, ...] | None = None  # None before the first frame
+        self._previous_n_values = -1
+        self._channel_indices: tuple[int, ...] = ()
 
     def pick(self, frame: Frame) -> Array:
         """Return the values of a frame in the order of the electrodes, shape (n_electrode,), in the unit of the device.
 
-        If the previous frame had the same names and the same number of values, its channel positions are used again.
+        If the previous frame had the same names and the same number of values, its channel indices are used again.
 
         Raises:
             ChargeError: If the frame has no value for an electrode.
         """
-        if frame.names != self._names or len(frame.values) != self._n_values:
-            self._positions = self.positions(frame)
-            self._names = frame.names
-            self._n_values = len(frame.values)
-        # With several positions, `itemgetter` returns a tuple. With a single position, it returns a number.
-        values = itemgetter(*self._positions)(frame.values)
+        if frame.names != self._previous_names or len(frame.values) != self._previous_n_values:
+            self._channel_indices = self.channel_indices(frame)
+            self._previous_names = frame.names
+            self._previous_n_values = len(frame.values)
+        # With several indices, `itemgetter` returns a tuple. With a single index, it returns a number, which `reshape`
+        # converts to an array with one element.
+        values = itemgetter(*self._channel_indices)(frame.values)
         return np.array(values, dtype=float).reshape(-1)
 
-    def positions(self, frame: Frame) -> tuple[int, ...]:
-        """Return the index at which each electrode's value is found in the values of a frame.
+    def channel_indices(self, frame: Frame) -> tuple[int, ...]:
+        """Return, for each electrode, the index of its channel in `frame.values`.
 
-        The docstring of the class describes how the channels are assigned to the electrodes.
+        The section `[channels]` of the device file assigns the channels. Without this section, they are assigned by
+        their names, and otherwise by their order.
 
         Raises:
             ChargeError: If the frame lacks a channel that the device file names, or if the channels cannot be assigned
                 by their names or by their order.
         """
         if self._channels:
-            return tuple(self._position(electrode, frame) for electrode in self._electrodes)
-        position_of_electrode = {electrode_of(name): position for position, name in enumerate(frame.names)}
-        if position_of_electrode.keys() >= set(self._electrodes):  # every electrode has a channel with its name
-            return tuple(position_of_electrode[electrode] for electrode in self._electrodes)
-        if len(frame.values) == len(self._electrodes):  # the channels are in the order of the electrodes
+            return tuple(self._assigned_index(electrode, frame) for electrode in self._electrodes)
+        index_of_electrode = {electrode_of(name): index for index, name in enumerate(frame.names)}
+        if all(electrode in index_of_electrode for electrode in self._electrodes):  # assigned by their names
+            return tuple(index_of_electrode[electrode] for electrode in self._electrodes)
+        if len(frame.values) == len(self._electrodes):  # assigned by their order
             return tuple(range(len(frame.values)))
         example_keys = ", ".join(f'{electrode} = "..."' for electrode in self._electrodes)
         raise ChargeError(
@@ -101,8 +103,10 @@ class ChannelPicker:
             f"which is which: [channels] {example_keys}"
         )
 
-    def _position(self, electrode: str, frame: Frame) -> int:
-        """Return the index in the values of a frame that the device file assigns to one electrode.
+    def _assigned_index(self, electrode: str, frame: Frame) -> int:
+        """Return the index in `frame.values` of the channel that the device file assigns to an electrode.
+
+        If the section `[channels]` does not contain the electrode, its channel has the name of the electrode.
 
         Args:
             electrode: Name of the electrode.
@@ -111,24 +115,24 @@ class ChannelPicker:
         Raises:
             ChargeError: If the frame has no such channel.
         """
-        name = self._channels.get(electrode, electrode)
-        position = position_of(name, frame)
-        if position is None:
+        channel = self._channels.get(electrode, electrode)
+        index = channel_index(channel, frame)
+        if index is None:
             raise ChargeError(
-                f"{self._where}: [channels] {electrode} = {dumps(cut(name))}: no channel is called that; the frames "
+                f"{self._where}: [channels] {electrode} = {dumps(cut(channel))}: no channel is called that; the frames "
                 f"have {cut(', '.join(channel_names(frame)))}, or 1 to {len(frame.values)} in their order"
             )
-        return position
+        return index
 
 
 def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> None:
-    """Check that each electrode has a channel. No frame is needed for this check.
+    """Check before the first frame arrives that each electrode has a channel.
 
-    If the device file describes the layout of the frames, the channels are known in advance, and are assigned to the
+    If the device file describes the layout of binary frames, the channels are already known. They are assigned to the
     electrodes in the same way as in a received frame.
 
-    If the device file does not describe the layout, the channels are unknown until the first frame arrives. A section
-    `[channels]` must therefore contain a key for each electrode.
+    Otherwise, the channels are determined from the first frame. Only the section `[channels]` can then be checked: if
+    the device file has this section, it must contain a key for each electrode.
 
     Args:
         device: Settings of the board.
@@ -140,7 +144,7 @@ def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> 
     """
     if isinstance(device.frames, FrameLayout):
         picker = ChannelPicker(electrodes, device.channels, reader, device.where)
-        picker.positions(device.frames.frame_of_zeros())  # raises an error if an electrode has no channel
+        picker.channel_indices(device.frames.frame_of_zeros())  # raises an error if an electrode has no channel
         return
     missing = [name for name in electrodes if name not in device.channels]
     if device.channels and missing:
@@ -157,11 +161,11 @@ def channel_names(frame: Frame) -> tuple[str, ...]:
     return tuple(str(number) for number in range(1, len(frame.values) + 1))
 
 
-def position_of(name: str, frame: Frame) -> int | None:
+def channel_index(name: str, frame: Frame) -> int | None:
     """Return the index of a channel in the values of a frame, or None if the frame has no such channel.
 
     Args:
-        name: Name of the channel, or its number from 1, such as `2` or `ch2`.
+        name: Name of the channel, or its number, such as `2` or `ch2`. The numbers begin with 1.
         frame: A frame of the board.
     """
     if name in frame.names:
@@ -169,19 +173,20 @@ def position_of(name: str, frame: Frame) -> int | None:
     number = channel_number(name)
     if number is None or number > len(frame.values):
         return None
-    return number - 1
+    return number - 1  # indices begin with 0
 
 
 def channel_number(name: str) -> int | None:
     """Return the channel number in a name such as `2` or `ch2`.
 
-    The channels are counted from 1. For a name of any other form, the function returns None.
+    The channels are counted from 1. The function returns None for the number 0, for a number of more than
+    `MAX_CHANNEL_DIGITS` digits, and for a name of any other form.
     """
     digits = name.removeprefix("ch")
     is_number = digits.isascii() and digits.isdigit() and len(digits) <= MAX_CHANNEL_DIGITS
-    if not is_number or int(digits) == 0:
-        return None
-    return int(digits)
+    if is_number and int(digits) > 0:
+        return int(digits)
+    return None
 
 
 def electrode_of(name: str) -> str:
@@ -230,8 +235,8 @@ class ReadingStream:
             chain: Settings of the signal chain. By default, the settings in the device file are used.
             parser: Parser of the frames. By default, the parser that the device file describes is used.
             gaps: Counter of missing frame numbers. By default, a new counter is created.
-            misfit: Function that returns how badly a model explains charges, in standard deviations of the noise. This
-                function is only needed if the signal chain estimates warming.
+            misfit: Function that returns the difference between given charges and those of the nearest contact of a
+                model, in standard deviations of the noise. It is only needed if the signal chain estimates warming.
             reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
 
         Raises:
@@ -278,7 +283,7 @@ class ReadingStream:
         Raises:
             ChargeError: If a frame has no value for an electrode.
             TareError: If the film is touched during the whole search for a tare.
-            NoFramesError: If the stream has contained no intact frame in many bytes.
+            NoFramesError: If the stream has contained no intact frame in more than `BYTES_TO_RECOGNISE` bytes.
         """
         frames = self.frames(chunk)
         for frame in frames:
@@ -286,9 +291,9 @@ class ReadingStream:
         self.end_chunk(frames, chunk)
 
     def frames(self, chunk: Chunk) -> list[Frame]:
-        """Return the frames whose last byte is in a chunk.
+        """Parse a chunk, and return the frames whose last byte is in the chunk.
 
-        If the chunk follows an outage, the earlier state is discarded first.
+        If the chunk follows an outage of the port, the state before the outage is discarded first.
         """
         if chunk.outage_s > 0.0:
             self._reconnect()
@@ -297,7 +302,7 @@ class ReadingStream:
     def advance(self, frame: Frame, chunk: Chunk) -> TimedReading:
         """Compute the time and the touch charges of the next frame of a chunk.
 
-        The clock of the device determines the time of the frame. Missing frames are counted by comparing the frame
+        The clock of the device determines the time of the frame. The counter of missing frames compares the frame
         number with the previous frame number. The signal chain converts the values of the electrodes to touch charges.
 
         Args:
@@ -325,7 +330,8 @@ class ReadingStream:
                 flags=flags,
             )
         except TareError as error:
-            # If nothing touches the film, the present values are the offsets of the board. The message states them.
+            # The search may have failed because the film is touched, or because the board has large offsets. In the
+            # second case, the present values are the offsets. The message therefore states them as settings.
             value_of_electrode = dict(zip(self._electrodes, values.tolist(), strict=True))
             offsets = ", ".join(f"{name} = {value:.10g}" for name, value in value_of_electrode.items())
             setting = "[gain] offset = {" + offsets + "}"
@@ -338,8 +344,7 @@ class ReadingStream:
         """Finish a chunk whose frames have been processed.
 
         If the chunk contained the end of a frame, the clock of the device is adjusted to the time of arrival of the
-        chunk. If the chunk contained no end of a frame, the method checks that the stream has contained intact frames
-        so far.
+        chunk. Otherwise, the method checks that the stream does not consist of many bytes without an intact frame.
 
         Args:
             frames: The frames that `frames` returned for the chunk.
@@ -362,10 +367,10 @@ class ReadingStream:
         _check_recognised(self.parser, max_bytes=-1)  # raises an error without a frame, even if no bytes have arrived
 
     def _reconnect(self) -> None:
-        """Discard the state of the parser, the gap counter, the clock and the tare after an outage.
+        """Discard the state of the parser, the gap counter, the clock and the tare after an outage of the port.
 
-        The earlier state is no longer valid, because frames are missing and the film may have been touched during the
-        outage. The next frame gets the flag `reconnected`.
+        The state before the outage is no longer valid, because frames are missing and the film may have been touched
+        during the outage. The next frame gets the flag `reconnected`.
         """
         self.parser.reset()
         self.gaps.reset()
@@ -375,10 +380,10 @@ class ReadingStream:
 
 
 def _check_recognised(parser: Parser, max_bytes: int = BYTES_TO_RECOGNISE) -> None:
-    """Check that the first intact frame arrives within at most `max_bytes` bytes.
+    """Raise an error if the parser has found no intact frame in more than `max_bytes` bytes.
 
     Raises:
-        NoFramesError: If more than `max_bytes` bytes have arrived without an intact frame.
+        NoFramesError: If more than `max_bytes` bytes have arrived, and none of them belonged to an intact frame.
     """
     counts = parser.counts
     if counts.frames == 0 and counts.bytes_dropped > max_bytes:

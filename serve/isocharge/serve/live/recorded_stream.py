@@ -13,7 +13,7 @@ from functools import partial
 
 from isocharge.common.errors import IsochargeError
 from isocharge.serve.live.stream import TouchStream
-from isocharge.serve.port.recording import Back, Event, Marker, NewModel, RecordedClock, Recorder, Recording
+from isocharge.serve.port.recording import Event, FilmReset, Marker, NewModel, RecordedClock, Recorder, Recording
 from isocharge.serve.port.source import Chunk
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import PredictionRecord
@@ -63,14 +63,14 @@ class RecordedStream:
         self._requests.append(self._tare)
 
     def request_film_reset(self) -> None:
-        """Request to reset the estimate of the followed film to its calibration.
+        """Request to reset the estimated pretension of the film to the value of its calibration.
 
         A signal handler may also call this method.
         """
         self._requests.append(self._reset_film)
 
     def request_recording(self, recorder: Recorder | None) -> None:
-        """Request to end the present recording, and to begin another recording.
+        """Request to end the present recording, and to begin another recording unless `recorder` is None.
 
         The new request replaces an earlier request that was not executed yet. When a recording begins, the stream is
         restarted and the tare is measured again. A replay can therefore compute the same records from the bytes of the
@@ -102,8 +102,8 @@ class RecordedStream:
         """Process and record the chunks, and yield their prediction records.
 
         Requests are executed before each chunk. A chunk is recorded after its last record has been yielded. The caller
-        must close the generator before closing the recorder, so that the present chunk is recorded even if the program
-        is interrupted.
+        must close the generator before the recorder, so that the present chunk is recorded even if the program is
+        interrupted.
 
         Args:
             chunks: Chunks of bytes from a port or from a file.
@@ -116,8 +116,7 @@ class RecordedStream:
         """
         try:
             for chunk in chunks:
-                if self._next_load or self._loading_model:
-                    self._continue_loading()
+                self._continue_loading()
                 while self._requests:
                     execute_request = self._requests.popleft()
                     execute_request()
@@ -136,7 +135,10 @@ class RecordedStream:
             self._end_recording()
 
     def _record_chunk(self) -> None:
-        """Write the latest chunk and its records to the recording, unless they were already recorded."""
+        """Write the current chunk and its records to the recording, if they were not recorded yet.
+
+        Without a recording, they are discarded.
+        """
         if self.recorder is not None and self._current_chunk is not None:
             chunk, record_lines = self._current_chunk
             self.recorder.chunk(chunk, record_lines)
@@ -145,8 +147,9 @@ class RecordedStream:
     def _begin_requested_recording(self) -> None:
         """End the present recording, and begin the requested recording if there is one.
 
-        Before a new recording begins, the stream is restarted. The records of the new recording therefore depend only
-        on the bytes in this recording. If the file of the recording cannot be created, an error is logged.
+        When a new recording begins, the stream is restarted. The records of the new recording therefore depend only on
+        the bytes in this recording. If the file of the recording cannot be created, an error is logged, and the stream
+        continues without a recording.
         """
         if not self._next_recorder:  # an earlier call of this method has already executed the latest request
             return
@@ -177,7 +180,7 @@ class RecordedStream:
             self.recorder.mark(marker)
 
     def _continue_loading(self) -> None:
-        """Use a requested model if it has been loaded, and begin to load the next requested model.
+        """Use a requested model if it has been loaded, and begin to load the next requested model if there is one.
 
         Each model is loaded in a separate thread, so that the stream does not have to wait. Only one model is loaded at
         a time.
@@ -185,27 +188,28 @@ class RecordedStream:
         if self._loading_model is not None and self._loading_model.done():
             self._use_loaded_model(self._loading_model)
             self._loading_model = None
-        if self._next_load and self._loading_model is None:
+        if self._next_load is not None and self._loading_model is None:
             load = self._next_load
             self._next_load = None
             loader = ThreadPoolExecutor(1, "model")
             self._loading_model = loader.submit(load)
             loader.shutdown(wait=False)  # the thread ends after this model
 
-    def _use_loaded_model(self, loaded: "Future[Predictor]") -> None:
-        """Use a newly loaded model for all later chunks.
+    def _use_loaded_model(self, loading_result: "Future[Predictor]") -> None:
+        """Use a newly loaded model for all later chunks, and write its label to the recording.
 
         If the new model could not be loaded or cannot be used, an error is logged, and the present model remains in
         use.
 
         Args:
-            loaded: Completed future, which contains the new model or the error that occurred while it was loaded.
+            loading_result: Completed future, which contains the new model or the error that occurred while the model
+                was loaded.
         """
         present_label = self._stream.predictor.metadata.label
         try:
-            new_predictor = loaded.result()
+            new_predictor = loading_result.result()  # raises the error if the model could not be loaded
             self._stream.use(new_predictor)
-        except Exception as error:  # after every error of the new model, the present model remains in use
+        except Exception as error:  # no error of the new model may end the stream
             log.error(
                 "%s serves on, because the new model is refused: %s: %s", present_label, type(error).__name__, error
             )
@@ -222,10 +226,10 @@ class RecordedStream:
             self.recorder.tare()
 
     def _reset_film(self) -> None:
-        """Reset the estimate of the film to its calibration, and write the request to the recording."""
+        """Reset the estimated pretension to the value of the calibration, and write the request to the recording."""
         self._stream.reset_film()
         if self.recorder is not None:
-            self.recorder.back()
+            self.recorder.film_reset()
 
 
 def replay(
@@ -239,13 +243,14 @@ def replay(
 ) -> Iterator[PredictionRecord]:
     """Compute the records of a recording again from its chunks, and yield the records.
 
-    For each chunk, the replay yields the same number of records as the recorded stream.
+    The replay also executes the recorded requests, such as a new tare. For each chunk, it yields the same number of
+    records as the recorded stream.
 
     Args:
         recording: Recording whose chunks are processed.
         stream: New stream with the model, the device and the policy of the recorded stream. Its argument `now_ns` must
             be `clock`.
-        clock: Clock that the replay sets to the times of the recording.
+        clock: Clock that the replay sets to the times of the recording, so that the records have the recorded latency.
         real_time: Whether to wait before each chunk, so that the replay takes as long as the recording.
         load: Function that loads the model with a given label. It is called when the recorded stream has changed its
             model. If `load` is None, all records are computed with the first model.
@@ -256,7 +261,7 @@ def replay(
         RecordingError: If a line other than the last one is damaged.
         ModelError: If a model of the recording cannot be loaded.
     """
-    delay_s: float | None = None  # present time minus recorded time of the first chunk; None before that chunk
+    delay_s: float | None = None  # time from the recording to this replay; None before the first chunk
     for event in recording.events():
         match event:
             case Marker():
@@ -264,7 +269,7 @@ def replay(
             case NewModel(label=label):
                 if load is not None:
                     stream.use(load(label))
-            case Back():  # the followed film was reset to its calibration
+            case FilmReset():
                 stream.reset_film()
             case Event(chunk=None):  # a new tare was requested
                 clock.set(event)
@@ -277,19 +282,19 @@ def replay(
                     due_s = chunk.timestamp + delay_s
                     time.sleep(max(0.0, due_s - time.time()))
                 recorded_count = len(latencies_us)  # the recording contains one latency for each recorded record
-                yield from _first_records(stream.feed(chunk), recorded_count)
+                yield from _recorded_part(stream.feed(chunk), recorded_count)
 
 
-def _first_records(records: Iterator[PredictionRecord], count: int) -> Iterator[PredictionRecord]:
-    """Yield the first records of a chunk, and compute the remaining records without yielding them.
+def _recorded_part(records: Iterator[PredictionRecord], recorded_count: int) -> Iterator[PredictionRecord]:
+    """Yield the records of a chunk that were recorded, and compute the remaining records without yielding them.
 
-    A chunk may have more records than the recorded stream has yielded, because the program may have ended before. The
-    remaining records are computed so that the stream processes the whole chunk.
+    If the recording program ended within a chunk, only the first records of the chunk were recorded. The remaining
+    records are computed all the same, so that the stream processes the whole chunk.
 
     Args:
         records: All records of the chunk. Each record is computed when it is requested from the iterator.
-        count: Number of records to yield.
+        recorded_count: Number of records that were recorded.
     """
     for index, record in enumerate(records):
-        if index < count:
+        if index < recorded_count:
             yield record

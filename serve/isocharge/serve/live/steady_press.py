@@ -169,21 +169,21 @@ class PressWatch:
         """Create a watch that waits for the tare, which is the charge of the untouched film.
 
         Args:
-            electrodes: Names of the electrodes, for the reasons of refusals.
-            rule: Conditions for a steady press.
+            electrodes: Names of the electrodes, which are used in the reasons why presses are refused.
+            rule: Conditions for a steady press. By default, the default values of `SteadyRule` are used.
         """
         self._electrodes = electrodes
         self._rule = rule or SteadyRule()
         self._phase = Phase.taring
-        self._rest: deque[tuple[float, Array]] = deque()  # times and charges of the latest frames without a touch
+        self._rest_frames: deque[tuple[float, Array]] = deque()  # times and charges of the latest frames without touch
 
-        # State of the present press
+        # State of the present or latest press
         self._window: deque[WindowFrame] = deque()  # the latest frames of the press
         self._rest_pC = np.zeros(len(electrodes))  # mean charges just before the press
         self._has_rest = False  # whether enough frames before the press were at rest
         self._begin_s = -np.inf  # time of the first frame of the press
         self._end_s = -np.inf  # time of the latest frame of the press
-        self._check_s = -np.inf  # time at which the window was last examined
+        self._last_check_s = -np.inf  # time at which the window was last examined
         self._reason = ""  # why the press is not steady yet
         self._min_scatter_pC = np.inf  # smallest scatter of all windows of the press
         # Time since the touch, s, and mean magnitude of the charges, pC, of each calm window
@@ -195,23 +195,24 @@ class PressWatch:
             self._phase = Phase.lift
 
     def feed(self, timed: TimedReading) -> WatchResult:
-        """Process the next reading, and return the phase of the watch.
+        """Process the next reading, and return the phase of the watch with the charges of the reading.
 
         The first phase is `taring`, which ends when the charge of the untouched film has been measured. The phase
         `waiting` follows until a touch begins. The phase `settling` follows until the press is accepted or refused. The
-        phase `lift` follows until the finger leaves the film.
+        phase `lift` follows until the finger leaves the film. The phase `waiting` then begins again.
 
         Args:
             timed: The touch charges of a frame, with their time.
 
         Returns:
-            The phase and the charges of the reading. The result contains an accepted press only for the reading with
-            which the press was accepted.
+            The phase, the charges of the reading and, if a press is refused or not steady yet, the reason. The result
+            contains an accepted press only for the reading with which the press was accepted.
         """
         reading = timed.reading
         t_s = timed.time.clock_s
-        if RECONNECTED in reading.flags or RESTART in reading.flags:  # earlier charges cannot be compared with this one
-            self._rest.clear()
+        if RECONNECTED in reading.flags or RESTART in reading.flags:
+            # The charges before the interruption cannot be compared with later charges.
+            self._rest_frames.clear()
             return self._refuse(PORT_LOST, Phase.taring)
         if reading.charge_pC is None:  # there is no tare yet, or the frame is invalid
             if TARE in reading.flags:  # the tare is being measured
@@ -231,11 +232,11 @@ class PressWatch:
         return result._replace(charge_pC=charge_pC, held_s=held_s)
 
     def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
-        """Store a frame in which nothing touches the film. Refuse a press that has ended without becoming steady.
+        """Store a frame in which nothing touches the film, and refuse a press that has ended without becoming steady.
 
-        The stored frames are used to measure the charges at rest before the next press. Frames within `edge_s` after a
+        The charges at rest before the next press are measured from the stored frames. Frames within `edge_s` after a
         press are not stored, because the finger may still touch the film. Frames within `edge_s` before a press are not
-        used, because the finger may already touch the film.
+        used, because the finger may already touch the film. A touch shorter than `min_held_s` is ignored.
 
         Args:
             charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
@@ -247,15 +248,16 @@ class PressWatch:
         self._phase = Phase.waiting
 
         if t_s > self._end_s + rule.edge_s:
-            self._rest.append((t_s, charge_pC))
+            self._rest_frames.append((t_s, charge_pC))
 
-        # Drop frames that are too old. If a press began now, its rest would be measured over a duration of `rest_s`.
-        oldest_rest_s = t_s - rule.rest_s - rule.edge_s
-        while self._rest:
-            first_rest_s, _ = self._rest[0]
+        # Drop frames that are too old. If a press began now, its rest would be measured over a duration of `rest_s`,
+        # which ends `edge_s` before now.
+        oldest_rest_s = t_s - rule.edge_s - rule.rest_s
+        while self._rest_frames:
+            first_rest_s, _ = self._rest_frames[0]
             if first_rest_s >= oldest_rest_s:
                 break
-            self._rest.popleft()
+            self._rest_frames.popleft()
 
         if is_press_unfinished and held_s >= rule.min_held_s:
             reason = self._reason or "hold it longer"
@@ -265,29 +267,32 @@ class PressWatch:
     def _begin_press(self, t_s: float) -> None:
         """Begin a press, and measure the charges at rest just before the press.
 
-        The last frames before the press are excluded, because the finger may have touched the film before the touch was
-        detected.
+        The frames of the last `edge_s` before the press are excluded, because the finger may have touched the film
+        before the touch was detected.
 
         Args:
             t_s: Time of the first frame of the press, s.
         """
         rest_end_s = t_s - self._rule.edge_s
-        rest_charges_pC = [charge_pC for frame_s, charge_pC in self._rest if frame_s <= rest_end_s]
+        rest_charges_pC = [charge_pC for frame_s, charge_pC in self._rest_frames if frame_s <= rest_end_s]
         self._has_rest = len(rest_charges_pC) >= MIN_REST_FRAMES
         self._rest_pC = np.zeros(len(self._electrodes))
         if rest_charges_pC:
             self._rest_pC = np.mean(rest_charges_pC, axis=0)
-        self._rest.clear()
+        self._rest_frames.clear()
         self._window.clear()
         self._mean_magnitudes.clear()
         self._phase = Phase.settling
         self._begin_s = t_s
-        self._check_s = t_s
+        self._last_check_s = t_s
         self._reason = ""
         self._min_scatter_pC = np.inf
 
     def _process_press(self, reading: Reading, charge_pC: Array, t_s: float) -> WatchResult:
-        """Add a frame to the window of the present press, and accept the press if it is steady.
+        """Add a frame to the window of the present press, and accept or refuse the press if this can be decided.
+
+        The press is accepted if it is steady. It is refused if an amplifier is saturated, if the film was not at rest
+        before the press, or if the press is not steady within `max_held_s`.
 
         Args:
             reading: Touch charges and flags of the frame.
@@ -310,11 +315,11 @@ class PressWatch:
         while self._window[0].t_s < t_s - rule.window_s:
             self._window.popleft()
 
-        # The window is examined several times within its length, but not in each frame.
+        # The window is examined several times within its length, but not in each frame, which would take too long.
         is_window_full = held_s >= rule.window_s and len(self._window) >= rule.min_frames
-        is_check_due = t_s - self._check_s >= rule.window_s / CHECKS_PER_WINDOW
+        is_check_due = t_s - self._last_check_s >= rule.window_s / CHECKS_PER_WINDOW
         if is_window_full and is_check_due:
-            self._check_s = t_s
+            self._last_check_s = t_s
             press = self._steady_press(reading)
             if press is not None:
                 self._phase = Phase.lift
@@ -325,11 +330,11 @@ class PressWatch:
         return WatchResult(Phase.settling, reason=self._reason)
 
     def _steady_press(self, reading: Reading) -> SteadyPress | None:
-        """Return the press in the window if the press is steady. Otherwise store the reason and return None.
+        """Return the press in the window if the press is steady. Otherwise, return None and store the reason.
 
-        A window is calm if it contains no sudden movement. Its scatter is then at most `MAX_SCATTER_RATIO` times the
-        smallest scatter in any window of the present press. If a window is not calm, neither its mean magnitude nor its
-        reason is stored.
+        A window is calm if it contains no sudden movement: its scatter is at most `MAX_SCATTER_RATIO` times the
+        smallest scatter in the earlier windows of the present press. If the window is not calm, neither its mean
+        magnitude nor the reason is stored, because they would only describe the movement.
 
         Args:
             reading: The latest frame. Its tare contains the noise of the charges at rest.
@@ -352,22 +357,24 @@ class PressWatch:
         return None
 
     def _store_mean_magnitude(self, press: SteadyPress) -> None:
-        """Store the mean magnitude of the charges in a calm window, unless it is the first window of the press.
+        """Store the mean magnitude of the charges in a calm window, and the time of its middle since the touch.
 
-        The cause of a slow decrease of the charges is determined from the stored magnitudes. In the first window of a
-        press, the force may still rise.
+        The cause of a slow decrease of the charges is determined from the stored values. A window that overlaps the
+        first window of the press is not stored, because the force may still rise in the first window.
 
         Args:
             press: The calm window.
         """
-        is_after_first_window = press.held_s >= 2.0 * press.window_s
-        if is_after_first_window:
-            middle_s = press.held_s - 0.5 * press.window_s  # time from the touch to the middle of the window
-            mean_magnitude_pC = float(np.abs(press.charge_pC).mean())
-            self._mean_magnitudes.append((middle_s, mean_magnitude_pC))
+        window_begin_s = press.held_s - press.window_s  # time from the touch to the beginning of the window
+        overlaps_first_window = window_begin_s < press.window_s
+        if overlaps_first_window:
+            return
+        window_middle_s = press.held_s - 0.5 * press.window_s
+        mean_magnitude_pC = float(np.abs(press.charge_pC).mean())
+        self._mean_magnitudes.append((window_middle_s, mean_magnitude_pC))
 
     def _measure_window(self) -> SteadyPress:
-        """Fit a straight line to each charge in the window, and return the means, the scatter and the drift.
+        """Fit a straight line to each charge in the window, and return the mean, the scatter and the drift of each.
 
         The scatter of a charge is the standard deviation of its residuals from the line. The drift of a charge is the
         change of its line from the beginning to the end of the window.
@@ -378,7 +385,7 @@ class PressWatch:
         times_s = np.array([frame.t_s for frame in self._window]) - begin_s
         charge_pC = np.array([frame.charge_pC for frame in self._window])  # shape (frames, n_electrode)
 
-        # The line is fitted by least squares with centred times. Its value at time 0 is then the mean charge.
+        # The line is fitted by least squares. Its value at the mean time of the frames is the mean charge.
         centred_s = times_s - times_s.mean()
         square_sum_s2 = max(float(centred_s @ centred_s), 1e-30)  # avoids a division by 0 if all times are equal
         slope_pC_per_s = centred_s @ charge_pC / square_sum_s2
@@ -398,7 +405,7 @@ class PressWatch:
         )
 
     def _refuse(self, reason: str, phase: Phase) -> WatchResult:
-        """Set the phase, and return a result that refuses the present press.
+        """Continue in the given phase, and return a result that refuses the present press.
 
         Args:
             reason: Reason for the refusal.
@@ -417,13 +424,13 @@ def unsteadiness(
 ) -> str:
     """Return the reason why a press is not steady, or an empty text if the press is steady.
 
-    A straight line is fitted to each charge in the window. The press is steady if each charge scatters only little
-    about its line, and if each line changes only little over the window. The limits allow for the scatter and the
-    change that noise alone causes.
+    A straight line was fitted to each charge in the window. The press is steady if the scatter of each charge about its
+    line is small, and if the change of each line over the window (the drift) is small. The limits allow for the scatter
+    and the drift that noise alone causes.
 
     Args:
         rule: Conditions for a steady press.
-        press: A window of the press.
+        press: Charges, scatter and drift in a window of the press.
         noise_pC: Standard deviation of each charge at rest, shape (n_electrode,), pC.
         electrodes: Names of the electrodes, for the reason.
         mean_magnitudes: Time since the touch, s, and mean magnitude of the charges, pC, of each calm window so far. The
@@ -437,30 +444,31 @@ def unsteadiness(
     expected_scatter_pC = np.hypot(noise_pC, rule.relative_noise * mean_magnitude_pC)
     relative_scatter = press.scatter_pC / expected_scatter_pC
     if relative_scatter.max() > rule.max_scatter_sigmas:
-        worst = int(relative_scatter.argmax())
-        return f"the charge of {electrodes[worst]} shakes by {press.scatter_pC[worst]:.2g} pC"
+        worst_index = int(relative_scatter.argmax())
+        return f"the charge of {electrodes[worst_index]} shakes by {press.scatter_pC[worst_index]:.2g} pC"
 
     # If a line is fitted to n values of noise, the standard deviation of its change is sqrt(12 / n) times the noise.
     drift_std_pC = press.scatter_pC * np.sqrt(12.0 / press.frames)
     # A charge that is smaller than the mean magnitude may change as much as a charge of the mean magnitude.
-    compared_pC = np.maximum(np.abs(press.charge_pC), mean_magnitude_pC)
-    max_drift_pC = rule.max_relative_drift * compared_pC + rule.drift_sigmas * drift_std_pC
-    if (np.abs(press.drift_pC) <= max_drift_pC).all():
+    reference_pC = np.maximum(np.abs(press.charge_pC), mean_magnitude_pC)
+    max_drift_pC = rule.max_relative_drift * reference_pC + rule.drift_sigmas * drift_std_pC
+    is_drift_small = (np.abs(press.drift_pC) <= max_drift_pC).all()
+    if is_drift_small:
         return ""
     return _drift_reason(press, mean_magnitudes)
 
 
 def _drift_reason(press: SteadyPress, mean_magnitudes: Sequence[tuple[float, float]]) -> str:
-    """Return a part of a sentence that states the probable reason for a drift of the charges.
+    """Return the probable reason for a drift of the charges, as a part of a sentence.
 
     If only the force changes, all charges change in proportion, and their relative slopes are equal. If the relative
-    slopes differ, the position of the press changes.
+    slopes differ, the position of the press changes. The charges are assumed to be positive.
 
     Args:
-        press: A window of the press. `drift_pC` is the change of each charge over the window.
+        press: Charges and drift in a window of the press. The drift is the change of each charge over the window.
         mean_magnitudes: Time since the touch, s, and mean magnitude of the charges, pC, of each calm window so far.
     """
-    magnitude_pC = np.maximum(np.abs(press.charge_pC), MIN_CHARGE_pC)
+    magnitude_pC = np.maximum(np.abs(press.charge_pC), MIN_CHARGE_pC)  # avoids a division by 0
     relative_slope = press.drift_pC / magnitude_pC / press.window_s  # shape (n_electrode,), 1/s
     mean_slope = float(relative_slope.mean())
     largest_difference = np.abs(relative_slope - mean_slope).max()

@@ -120,8 +120,8 @@ class TouchStream:
         gaps: Counter of missing frame numbers.
         clock: Clock of the device.
         counts: Numbers of records, of skipped frames and of outages.
-        predictor: The loaded model. If the film is followed, the contacts are predicted with `answering_predictor`
-            instead.
+        predictor: The loaded model. If the film is followed (the stream estimates its pretension), the contacts are
+            predicted with `answering_predictor` instead.
         frame_id: Name of the film, which each record contains.
     """
 
@@ -153,8 +153,8 @@ class TouchStream:
 
         Raises:
             DeviceError: If the device file contains settings for other electrodes than those of the model.
-            ModelError: If the device file requires that the film is followed, but the film of this model cannot be
-                followed.
+            ModelError: If the device file requires an estimate of the pretension, but the pretension of this film
+                cannot be estimated with the model.
         """
         self._readings = ReadingStream(
             predictor.metadata.electrodes,
@@ -191,20 +191,21 @@ class TouchStream:
         remains unchanged.
 
         Args:
-            predictor: Model with which the stages begin. If the film is followed, the stages change their model later.
+            predictor: Model with which the stages begin. If the pretension of the film is estimated, the stages change
+                their model later.
 
         Raises:
             ModelError: If a stage cannot use the model.
         """
         model = CurrentModel(predictor)  # shared by all stages
-        # The stages process each frame in this order.
+        # The stages process each frame in the order of this list.
         stages: list[ContactStage] = [PredictionStage(model)]
         film_stage = None
         if self._follow_rule is not None:
             film_stage = FilmStage(model, self._follow_rule, self._readings.warming_ratio)
             stages.append(film_stage)
         if self._tracker is not None:
-            stages.append(TrackingStage(self._tracker, predictor, is_film_followed=film_stage is not None))
+            stages.append(TrackingStage(self._tracker, predictor, is_pretension_estimated=film_stage is not None))
         stages.append(ChargeScaleStage(model))
         if self._touch_offset_rule is not None:
             stages.append(TouchOffsetStage(model, self._touch_offset_rule, self._readings.warming_ratio))
@@ -220,7 +221,8 @@ class TouchStream:
     def use(self, predictor: Predictor) -> None:
         """Use another model with the same electrodes from the next frame on.
 
-        The tare and the state of the signal chain are not changed.
+        The tare and the state of the signal chain are not changed. The estimates of the contact stages, for example of
+        the pretension of the film, begin again.
 
         Raises:
             ModelError: If the model has other electrodes or another order of the electrodes, or if a stage cannot use
@@ -242,15 +244,18 @@ class TouchStream:
 
     @property
     def has_film(self) -> bool:
-        """Whether the film is followed. If the film is followed, the records contain the field `film`."""
+        """Whether the film is followed, that is, whether its pretension is estimated.
+
+        If the film is followed, the records contain the field `film`.
+        """
         return self._follow_rule is not None
 
     @property
     def answering_predictor(self) -> Predictor:
         """Model with which the contacts are predicted at present.
 
-        If the film is followed, the value is the model of the film at its estimated pretension. Otherwise, the value is
-        the loaded model.
+        If the pretension of the film is estimated, the value is the model of the film at its estimated pretension.
+        Otherwise, the value is the loaded model.
         """
         return self._model.predictor
 
@@ -260,7 +265,10 @@ class TouchStream:
         self._discard_contact()
 
     def reset_film(self) -> None:
-        """Reset the estimate of the film to its calibration. If the film is not followed, nothing changes."""
+        """Reset the estimated pretension of the film to the value of its calibration.
+
+        If the pretension is not estimated, nothing changes.
+        """
         if self._film_stage is not None:
             self._film_stage.reset_film()
 
@@ -298,10 +306,13 @@ class TouchStream:
             resyncs=counts.resyncs,
         )
         count_pairs = zip(self._before_restart, since_restart, strict=True)
-        return StreamTotals(*(count_before + count_since for count_before, count_since in count_pairs))
+        sums = [count_before + count_since for count_before, count_since in count_pairs]
+        return StreamTotals(*sums)
 
     def feed(self, chunk: Chunk) -> Iterator[PredictionRecord]:
         """Process a chunk, and yield the records of the frames whose last byte is in the chunk.
+
+        With the policy `latest`, only the last frame of the chunk has a record.
 
         Raises:
             ChargeError: If a frame has no value for an electrode of the model.
@@ -312,13 +323,12 @@ class TouchStream:
             self.counts.outages += 1
             self._discard_contact()
         frames = self._readings.frames(chunk)
-        # With the policy `latest`, only the last frame of a chunk has a record. The signal chain still processes all
-        # frames. Some flags of the skipped frames are added to the record of the last frame.
-        skipped_flags: set[str] = set()
+        skipped_flags: set[str] = set()  # flags of the frames in this chunk that have no record
         for number, frame in enumerate(frames, start=1):
-            timed = self._readings.advance(frame, chunk)
+            timed = self._readings.advance(frame, chunk)  # the signal chain also processes the skipped frames
             is_last = number == len(frames)
-            if self._policy is Policy.latest and not is_last:
+            is_skipped = self._policy is Policy.latest and not is_last
+            if is_skipped:
                 self.counts.skipped += 1
                 skipped_flags.update(timed.reading.flags)
                 continue
@@ -382,7 +392,7 @@ class TouchStream:
         return charges
 
     def _misfit(self, charge_pC: Array) -> Reals:
-        """Return the misfit of the current model for the charges of each frame.
+        """Return the misfit of each frame: the difference between its charges and those of the nearest contact.
 
         Args:
             charge_pC: Charges of n frames, shape (n, n_electrode), pC.
@@ -396,7 +406,8 @@ class TouchStream:
 def _contact_fields(frame: ContactFrame) -> Mapping[str, Any]:
     """Return the names and values of those fields of a record that describe the contact.
 
-    If the frame is invalid, all values are None. If nothing touches the film, the force is 0, and the position is None.
+    If the frame has no contact because it is invalid, all values are None. If it has no contact because nothing touches
+    the film, the force is 0, and the position is None.
     """
     if frame.contact is not None:
         return frame.contact.fields()
@@ -406,7 +417,7 @@ def _contact_fields(frame: ContactFrame) -> Mapping[str, Any]:
 
 
 def _with_lasting_flags(reading: Reading, skipped_flags: set[str]) -> Reading:
-    """Return a copy of a reading with additional flags of skipped frames.
+    """Return a reading to which some flags of the skipped frames before it are added.
 
     Only the flags in `LASTING_FLAGS` are added. Each of these flags describes an event before the reading, for example
     lost frames.

@@ -41,7 +41,7 @@ MAX_RADIUS_mm = 1e4
 """Largest radius in a file, mm."""
 
 MIN_FORCE_RATIO = 1.01
-"""Smallest ratio of the largest force to the smallest force. If both are equal, the scaled logarithm is undefined."""
+"""Smallest ratio of the largest force to the smallest force. With equal forces, the scaled logarithm is undefined."""
 
 N_CORNERS = 64
 """Number of corners of the polygon that encloses the area of a series."""
@@ -69,13 +69,13 @@ class ChargeSeries:
 
     @property
     def corners_mm(self) -> Array:
-        """Corners of a regular polygon that encloses the circle of `radius_mm`, shape (64, 2), mm."""
+        """Corners (x, y) of a regular polygon that encloses the circle of `radius_mm`, shape (64, 2), mm."""
         angle = 2.0 * np.pi * np.arange(N_CORNERS) / N_CORNERS
-        corner_distance_mm = self.radius_mm / np.cos(np.pi / N_CORNERS)
+        corner_distance_mm = self.radius_mm / np.cos(np.pi / N_CORNERS)  # the sides of the polygon touch the circle
         return np.asarray(corner_distance_mm * np.column_stack([np.cos(angle), np.sin(angle)]))
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Compute the charges of contacts and their derivatives.
+        """Compute the charges of contacts, and the derivatives of the charges with respect to the contacts.
 
         The series gives ln Q, the logarithm of the charge, as a function of coordinates between -1 and 1. The contacts
         are converted to these coordinates. Outside the range of forces, ln Q is extrapolated linearly in the logarithm
@@ -99,13 +99,14 @@ class ChargeSeries:
         values = self.series.values_and_derivatives(unit_contact)
         log_charge = values[:, 0]
         log_slopes = values[:, 1:]  # shape (n, 3, n_electrode)
-        log_force_slope = log_slopes[:, -1]  # with respect to the coordinate of the force
+        log_force_slope = log_slopes[:, -1]  # with respect to the coordinate of the force, shape (n, n_electrode)
 
         unit_force = unit_contact[:, 2:]  # shape (n, 1)
         distance_from_range = unit_force - np.clip(unit_force, -1.0, 1.0)  # 0 within the range of forces
         charge_pC = np.exp(log_charge + distance_from_range * log_force_slope)  # shape (n, n_electrode)
 
-        # dQ = Q d(ln Q). The division by the scale converts the derivatives to the units of the contact.
+        # dQ = Q d(ln Q). The division by the scale converts the derivatives with respect to the coordinates into
+        # derivatives with respect to the contact.
         electrode_slopes = log_slopes.swapaxes(1, 2)  # shape (n, n_electrode, 3)
         jacobian = charge_pC[:, :, None] * electrode_slopes / scale
         return charge_pC, jacobian
@@ -134,12 +135,12 @@ def read_charges(version_folder: Path, n_electrode: int) -> ChargeSeries | None:
         return None
     data = read_companion_file(version_folder, FILE, ADVICE)
     try:
-        return _charge_series(npz_arrays(data), n_electrode)
+        return _charges_from_arrays(npz_arrays(data), n_electrode)
     except DAMAGED_FILE_ERRORS as error:
         raise ModelError(f"{path}: {cut(str(error))}; {ADVICE}") from error
 
 
-def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> ChargeSeries:
+def _charges_from_arrays(arrays: Mapping[str, np.ndarray], n_electrode: int) -> ChargeSeries:
     """Create the Chebyshev series of the charges from the arrays of a file, and check the series.
 
     The logarithm of the charge of each electrode is a Chebyshev series in x, y and the logarithm of the force. Along
@@ -197,11 +198,12 @@ def read_contact_range(arrays: Mapping[str, np.ndarray]) -> tuple[float, tuple[f
 def _check_charges(charges: ChargeSeries) -> None:
     """For some contacts, check that the charges are finite and positive, and that they depend on the contact.
 
-    The contacts lie on a circle with half of the radius of the series. Several forces are checked at each point of the
-    circle.
+    The contacts lie on a circle with half of the largest radius of the series. Several forces are checked at each point
+    of the circle.
 
     Raises:
-        ValueError: If a charge is not finite or not positive, or if no charge changes with x, with y or with the force.
+        ValueError: If a charge or a derivative is not finite, if a charge is not positive, or if all charges are
+            independent of x, of y or of the force.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, N_CHECKED_DIRECTIONS, endpoint=False)
     positions_mm = 0.5 * charges.radius_mm * np.column_stack([np.cos(angle), np.sin(angle)])

@@ -43,7 +43,8 @@ def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
     if checksums is None:
         log.warning("%s: golden.json holds no checksum of this file; whether it fits model.onnx is not verified", path)
         return data
-    expected_sha256 = checksums.get(name, "no such file")  # this text differs from every checksum
+    # If `golden.json` does not list the file, the comparison with this text fails, and the message contains the text.
+    expected_sha256 = checksums.get(name, "no such file")
     actual_sha256 = sha256_of(data)
     if actual_sha256 != expected_sha256:
         raise ModelError(

@@ -57,7 +57,7 @@ MAX_LOG_CHARGE = 100.0
 """Largest magnitude of ln Q. The charges of calibrated films are between 0.01 and 1e5 pC."""
 
 MAX_CHANGE_WITH_PRETENSION = 1e3
-"""Largest change of the mean of a direction with the pretension, 1/MPa."""
+"""Largest derivative of the mean of a direction with respect to the pretension, 1/MPa."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class FilmDirections:
         return None if self.log_charge_coefficients is None else Series(self.log_charge_coefficients)
 
     def log_changes(self, contact: Array) -> Array:
-        """Compute the change of ln Q, the logarithm of each charge, by one unit of each direction.
+        """Compute the change of ln Q, the logarithm of each charge, that one unit of each direction causes.
 
         A direction is a linear combination of the unknowns of the film. One unit of a direction is one standard
         deviation. A contact beyond the largest radius or outside the range of forces is replaced by the nearest contact
@@ -160,8 +160,9 @@ class FilmDirections:
         explained_projection = contact_slopes @ np.linalg.pinv(contact_slopes)
         unexplained_projection = np.eye(charge_pC.shape[1]) - explained_projection
 
-        # If ln Q of one electrode changes by one unit, D has the single component Q / sigma at this electrode. The
-        # misfit vector then changes by the column of the projection for this electrode, multiplied by Q / sigma.
+        # If ln Q of one electrode changes by one unit, the component of D at this electrode is Q / sigma, and all other
+        # components are 0. The misfit vector then changes by the column of the projection for this electrode,
+        # multiplied by Q / sigma.
         return np.asarray(unexplained_projection * charge_slopes[:, None, :])
 
     def _unit_contact(self, contact: Array) -> Array:
@@ -217,12 +218,12 @@ def read_film_directions(version_folder: Path, n_electrode: int) -> FilmDirectio
         return FilmDirections.none(n_electrode)
     data = read_companion_file(version_folder, FILE, ADVICE)
     try:
-        return _film_directions(npz_arrays(data), n_electrode)
+        return _directions_from_arrays(npz_arrays(data), n_electrode)
     except DAMAGED_FILE_ERRORS as error:
         raise ModelError(f"{path}: {cut(str(error))}; {ADVICE}") from error
 
 
-def _film_directions(arrays: Mapping[str, np.ndarray], n_electrode: int) -> FilmDirections:
+def _directions_from_arrays(arrays: Mapping[str, np.ndarray], n_electrode: int) -> FilmDirections:
     """Check the arrays of a file, and return the directions that they describe.
 
     A direction is a linear combination of the unknowns of the film, such as its gains. For each direction, a Chebyshev
@@ -241,18 +242,19 @@ def _film_directions(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Film
     if n_direction > MAX_DIRECTIONS:
         raise ValueError(f"series: expected up to {MAX_DIRECTIONS} directions, got the shape {coefficients.shape}")
 
-    # A Chebyshev polynomial is at most 1, so a series is at most the sum of the magnitudes of its coefficients.
-    max_log_changes = np.abs(coefficients).sum(axis=(0, 1, 2))  # shape (n_direction, n_electrode)
-    largest_log_change = float(max_log_changes.max(initial=0.0))
+    # The magnitude of a Chebyshev polynomial is at most 1. The magnitude of a series is therefore at most the sum of
+    # the magnitudes of its coefficients.
+    log_change_limits = np.abs(coefficients).sum(axis=(0, 1, 2))  # shape (n_direction, n_electrode)
+    largest_log_change = float(log_change_limits.max(initial=0.0))
     if largest_log_change > MAX_LOG_CHANGE:
         raise ValueError(f"series: expected changes of ln Q up to {MAX_LOG_CHANGE:g}, got up to {largest_log_change:g}")
 
     # Derivative of the mean of each direction with respect to the pretension of the film, shape (n_direction,), 1/MPa
     by_pretension = finite_array(arrays, "by_pretension", (n_direction,))
-    largest_change = float(np.abs(by_pretension).max(initial=0.0))
-    if largest_change > MAX_CHANGE_WITH_PRETENSION:
+    steepest_change = float(np.abs(by_pretension).max(initial=0.0))
+    if steepest_change > MAX_CHANGE_WITH_PRETENSION:
         raise ValueError(
-            f"by_pretension: expected changes up to {MAX_CHANGE_WITH_PRETENSION:g} per MPa, got {largest_change:g}"
+            f"by_pretension: expected changes up to {MAX_CHANGE_WITH_PRETENSION:g} per MPa, got {steepest_change:g}"
         )
     radius_mm, force_N = read_contact_range(arrays)
     return FilmDirections(
@@ -272,15 +274,18 @@ def _log_charge_coefficients(arrays: Mapping[str, np.ndarray], n_electrode: int)
     Raises:
         ValueError: If the array is not valid.
     """
-    if LOG_CHARGE not in arrays:  # written by an earlier version, or the film has charges of both signs
+    if LOG_CHARGE not in arrays:  # written by an earlier version, or a charge of the film is negative and has no ln Q
         return None
     coefficients = finite_array(arrays, LOG_CHARGE, (None, None, None, n_electrode))
     _check_degrees(LOG_CHARGE, coefficients)
-    # A Chebyshev polynomial is at most 1, so a series is at most the sum of the magnitudes of its coefficients.
-    max_log_charges = np.abs(coefficients).sum(axis=(0, 1, 2))  # shape (n_electrode,)
-    largest = float(max_log_charges.max(initial=0.0))
-    if largest > MAX_LOG_CHARGE:
-        raise ValueError(f"{LOG_CHARGE}: expected values of ln Q up to {MAX_LOG_CHARGE:g}, got up to {largest:g}")
+    # The magnitude of a Chebyshev polynomial is at most 1. The magnitude of a series is therefore at most the sum of
+    # the magnitudes of its coefficients.
+    log_charge_limits = np.abs(coefficients).sum(axis=(0, 1, 2))  # shape (n_electrode,)
+    largest_log_charge = float(log_charge_limits.max(initial=0.0))
+    if largest_log_charge > MAX_LOG_CHARGE:
+        raise ValueError(
+            f"{LOG_CHARGE}: expected values of ln Q up to {MAX_LOG_CHARGE:g}, got up to {largest_log_charge:g}"
+        )
     return coefficients
 
 

@@ -50,8 +50,8 @@ REFERENCE_FORCE_N = 2.0
 def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
     """Return the floors of x (mm), y (mm) and the force (N) for the outputs `contact` and `contact_std` of a model.
 
-    When two outputs are compared, the tolerance is proportional to the magnitude of the output. Below the floor, the
-    tolerance is constant.
+    A computed output may differ from the stored output by a tolerance, which is proportional to the magnitude of the
+    output. Below the floor, the tolerance is constant.
 
     For a small film, the floors have the values in `FLOORS`. The floors of x and y grow in proportion to the radius of
     the working area above `REFERENCE_RADIUS_MM`, and are at least the rms position error of the model. The floor of the
@@ -77,8 +77,8 @@ class Golden:
         sha256: Checksum of the model file.
         charge_pC: Input charges, shape (n, electrodes), pC.
         outputs: Outputs of the model by name, each of shape (n, width).
-        relative: Tolerance relative to max(|output|, floor).
-        floors: Floor for each column of an output, by output name.
+        relative_tolerance: Largest difference of two outputs, relative to max(|output|, floor).
+        floors: Floor for each column of an output, by the name of the output.
         companion_sha256: Checksums of the files that lie beside the model, by file name. None for a model that was
             written before these files had checksums.
     """
@@ -86,7 +86,7 @@ class Golden:
     sha256: str
     charge_pC: Singles
     outputs: dict[str, Singles]
-    relative: float
+    relative_tolerance: float
     floors: dict[str, tuple[float, ...]]
     companion_sha256: Mapping[str, str] | None = None
 
@@ -96,7 +96,7 @@ class Golden:
             "sha256": self.sha256,
             "tolerance": {
                 "rule": "|a - b| <= relative * max(|b|, floor)",
-                "relative": self.relative,
+                "relative": self.relative_tolerance,
                 "floor": self.floors,
             },
             "inputs": {INPUT: self.charge_pC.tolist()},
@@ -110,7 +110,7 @@ class Golden:
 def make_golden(
     session: ort.InferenceSession, onnx_model: bytes, charge_pC: Singles, contact_floor: tuple[float, float, float]
 ) -> Golden:
-    """Compute the golden vectors of a new model: the given charges, and the outputs for these charges.
+    """Compute the golden vectors of a new model, which are the given charges and the outputs for these charges.
 
     Args:
         session: Session of the model.
@@ -135,7 +135,7 @@ def make_golden(
         sha256=sha256_of(onnx_model),
         charge_pC=charge_pC,
         outputs=outputs,
-        relative=RELATIVE_TOLERANCE,
+        relative_tolerance=RELATIVE_TOLERANCE,
         floors={name: floor_of_output[name] for name in outputs},  # some models compute no correlations
     )
 
@@ -158,7 +158,7 @@ def read_golden(path: Path) -> Golden:
         sha256=content.sha256,
         charge_pC=_float32_array(content.inputs.charge_pC),
         outputs={name: _float32_array(getattr(content.outputs, name)) for name in present_outputs},
-        relative=content.tolerance.relative,
+        relative_tolerance=content.tolerance.relative,
         floors={name: getattr(content.tolerance.floor, name) for name in present_outputs},
         companion_sha256=content.files,
     )
@@ -235,21 +235,22 @@ def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> No
         where: Name or file of the model, for error messages.
 
     Raises:
-        ModelError: If an output differs by more than the tolerance. The message names the largest difference.
+        ModelError: If an output differs by more than the tolerance. The message names the largest difference of this
+            output.
     """
     for name, expected in golden.outputs.items():
         actual = outputs[name].astype(np.float64)
         # Below its floor, a value has a constant tolerance, because a relative tolerance would approach 0.
-        tolerance = golden.relative * np.maximum(np.abs(expected), golden.floors[name])
+        tolerance = golden.relative_tolerance * np.maximum(np.abs(expected), golden.floors[name])
         with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 with a tolerance of 0 is reported as a difference
             # Differences as multiples of the tolerance, shape (n, width)
-            relative_differences = np.abs(actual - expected) / tolerance
-        if (relative_differences <= 1.0).all():  # false for NaN
+            tolerance_multiples = np.abs(actual - expected) / tolerance
+        if (tolerance_multiples <= 1.0).all():  # false for NaN
             continue
 
         # The message shows the largest difference. A value that is not a number counts as an infinite difference.
-        relative_differences[np.isnan(relative_differences)] = np.inf
-        row, column = np.unravel_index(np.argmax(relative_differences), relative_differences.shape)
+        tolerance_multiples[np.isnan(tolerance_multiples)] = np.inf
+        row, column = np.unravel_index(np.argmax(tolerance_multiples), tolerance_multiples.shape)
         raise ModelError(
             f"{where}: {name}[{row}, {column}]: expected {expected[row, column]:.9g} +- {tolerance[row, column]:.1g} "
             f"(golden.json), got {actual[row, column]:.9g}; copy or export the model again"

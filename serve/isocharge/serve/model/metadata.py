@@ -45,9 +45,9 @@ class ModelNoise(Struct, frozen=True, kw_only=True):
     white_pC: NoiseLevel
     gain: NoiseLevel
 
-    def of_each(self, electrodes: int) -> tuple[Array, Array]:
-        """Return `white_pC` and `gain` with one value for each electrode, both of shape (electrodes,)."""
-        return np.broadcast_to(self.white_pC, electrodes), np.broadcast_to(self.gain, electrodes)
+    def for_each_electrode(self, n_electrode: int) -> tuple[Array, Array]:
+        """Return `white_pC` and `gain` with one value for each electrode, both of shape (n_electrode,)."""
+        return np.broadcast_to(self.white_pC, n_electrode), np.broadcast_to(self.gain, n_electrode)
 
     def variance(self, charge_pC: Array) -> Array:
         """Compute the variance of the noise of charges.
@@ -91,8 +91,10 @@ class UnnoticedPresses(Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if self.from_mm >= self.to_mm:
             raise WrongKey("to_mm", f"a number above from_mm ({self.from_mm:g})", self.to_mm)
-        if len({len(ring) for ring in self.share}) > 1 or not self.share[0]:
-            raise WrongKey("share", "as many sectors in every ring", [len(ring) for ring in self.share])
+        sector_counts = [len(ring) for ring in self.share]
+        has_different_counts = len(set(sector_counts)) > 1
+        if has_different_counts or sector_counts[0] == 0:
+            raise WrongKey("share", "as many sectors in every ring", sector_counts)
 
     @property
     def ring_edges_mm(self) -> Array:
@@ -112,19 +114,19 @@ class UnnoticedPresses(Struct, frozen=True, kw_only=True):
     @property
     def summary(self) -> str:
         """Sentence that states the share of unnoticed presses between the two circles."""
-        lightest_N, hardest_N = self.force_N
+        min_force_N, max_force_N = self.force_N
         return (
             f"{percent_text(self.total_share)} of the presses outside the working area, from {self.from_mm:.3g} to "
-            f"{self.to_mm:.3g} mm from the centre and with {lightest_N:g} to {hardest_N:g} N, are answered wrongly "
+            f"{self.to_mm:.3g} mm from the centre and with {min_force_N:g} to {max_force_N:g} N, are answered wrongly "
             "without a flag"
         )
 
 
 def percent_text(share: float) -> str:
-    """Format a share of presses, from 0 to 1, in percent with about two significant digits."""
+    """Format a share of presses, from 0 to 1, in percent. Only values below 9.5 % have a decimal."""
     percent = 100.0 * share
-    rounds_to_two_digits = percent >= 9.5
-    return f"{percent:.0f} %" if rounds_to_two_digits else f"{percent:.1f} %"
+    decimals = 1 if percent < 9.5 else 0
+    return f"{percent:.{decimals}f} %"
 
 
 class ModelMetadata(Settings, frozen=True, kw_only=True):
@@ -175,7 +177,8 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         sensor_name = self.sensor["name"]
         if not isinstance(sensor_name, str) or not sensor_name:
             raise WrongKey("sensor.name", "a text", sensor_name)
-        if len(set(self.electrodes)) < len(self.electrodes):
+        has_duplicate_names = len(set(self.electrodes)) < len(self.electrodes)
+        if has_duplicate_names:
             raise WrongKey("electrodes", "names that differ", self.electrodes)
         displayed_texts = {"electrodes": self.electrodes, "probes": self.probes, "sensor.name": (sensor_name,)}
         for key, texts in displayed_texts.items():
@@ -201,7 +204,9 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         return str(self.sensor["name"])
 
     def to_props(self) -> dict[str, str]:
-        """Return the metadata as ONNX `metadata_props`, in which every field that is not None is a JSON text.
+        """Return the metadata as ONNX `metadata_props`, a table of texts with one JSON text for each field.
+
+        Fields that are None are left out.
 
         Raises:
             ModelError: If a value, such as NaN, cannot be expressed in JSON.
@@ -244,7 +249,11 @@ class _Version(Struct):
 
 
 def _to_json(key: str, value: Any) -> str:
-    """Convert the value of a field to JSON. The name of the field is used in the error message.
+    """Convert the value of a field to JSON.
+
+    Args:
+        key: Name of the field, for the error message.
+        value: Value of the field.
 
     Raises:
         ModelError: If the value cannot be expressed in JSON.

@@ -83,7 +83,8 @@ def find_labelled_model(label: str, models: Path | None = None) -> Path:
         ModelError: If the text is not a label, or if no repository contains the model.
     """
     name, _slash, version = label.partition("/")
-    if not (NAME.fullmatch(name) and VERSION.fullmatch(version)):
+    is_label = NAME.fullmatch(name) and VERSION.fullmatch(version)
+    if not is_label:
         raise ModelError(f"model {shown(label)}: expected the label NAME/VERSION of a model; give the model by --model")
     roots = repositories(models)
     for root in roots:
@@ -114,17 +115,18 @@ def repositories(models: Path | None = None) -> list[Path]:
 
 
 def model_names(root: Path) -> list[str]:
-    """Return the names of the models in a repository in alphabetical order."""
+    """Return the names of the models in a repository, which is a folder of models, in alphabetical order."""
     return sorted(folder.name for folder in _subfolders(root) if _versions(folder))
 
 
 def _released_models() -> Path:
     """Return the folder of the released models in the installed package or at the top of a source checkout."""
+    # In a source checkout, this module is serve/isocharge/serve/model/model_folder.py.
     module = Path(__file__).resolve()
-    package_folder = module.parents[1]
-    source_checkout = module.parents[4]
+    package_folder = module.parents[1]  # isocharge/serve
+    checkout_folder = module.parents[4]
     packaged_models = package_folder / "released"  # exists only in an installed package
-    return packaged_models if packaged_models.is_dir() else source_checkout / "models"
+    return packaged_models if packaged_models.is_dir() else checkout_folder / "models"
 
 
 def _version_folder(path: Path) -> Path | None:
@@ -149,9 +151,9 @@ def _version_folder(path: Path) -> Path | None:
 
 
 def version_folders(folder: Path) -> dict[int, Path]:
-    """Return the version folders of a model in ascending order of their version numbers.
+    """Return the version folders of a model by their version numbers, in ascending order.
 
-    A version folder is a subfolder of the model folder whose name is a whole number.
+    A version folder is a subfolder of the model folder whose name is the version number.
     """
     return {version: folder / str(version) for version in sorted(_versions(folder))}
 
@@ -232,17 +234,20 @@ def load_model(folder: Path) -> Model:
 
 
 def _check_checksum(onnx_model: bytes, golden: Golden, path: Path) -> None:
-    """Raise ModelError if the checksum of `model.onnx` differs from the checksum in `golden.json`.
+    """Check that the checksum of `model.onnx` is equal to the checksum in `golden.json`.
 
     Args:
         onnx_model: Content of `model.onnx`.
         golden: Golden vectors, which contain the expected checksum.
         path: Path of `model.onnx`, for the error message.
+
+    Raises:
+        ModelError: If the checksums differ.
     """
-    actual = sha256_of(onnx_model)
-    if actual != golden.sha256:
+    actual_sha256 = sha256_of(onnx_model)
+    if actual_sha256 != golden.sha256:
         raise ModelError(
-            f"{path}: expected sha256 {golden.sha256} (golden.json), got {actual} over {len(onnx_model)} bytes; "
+            f"{path}: expected sha256 {golden.sha256} (golden.json), got {actual_sha256} over {len(onnx_model)} bytes; "
             "the file is damaged or changed: copy or export it again"
         )
 
@@ -290,10 +295,11 @@ def load_checked_model(folder: Path) -> Model:
 
     Raises:
         ModelError: If a file is missing or damaged, if a computed output differs from the golden vectors, or if the
-            name of the folder is another version than the version in the metadata.
+            name of the folder is another version number than the number in the metadata.
     """
     model = load_model(folder)
-    if folder.name.isdecimal() and folder.name != str(model.metadata.version):
+    is_version_folder = folder.name.isdecimal()
+    if is_version_folder and folder.name != str(model.metadata.version):
         raise ModelError(
             f"{folder}: expected version {folder.name}, got {model.metadata.label}; "
             "move it into a folder of that version, or export it again"
@@ -339,9 +345,9 @@ def write_model(
     session = open_session(onnx_model, where)
     check_interface(session, len(metadata.electrodes), where)
     charges = as_batch(golden_charge_pC, metadata.electrodes)
-    golden_of_model = make_golden(session, onnx_model, charges, contact_floors(metadata))
+    golden_without_companions = make_golden(session, onnx_model, charges, contact_floors(metadata))
     companion_sha256 = {name: sha256_of(content) for name, content in companion_files.items()}
-    golden = replace(golden_of_model, companion_sha256=companion_sha256)
+    golden = replace(golden_without_companions, companion_sha256=companion_sha256)
 
     # Write the version under a temporary name. `new_folder` renames it to `target` after the check has succeeded.
     with new_folder(target) as draft:
@@ -359,8 +365,7 @@ def _write_triton_config(path: Path, metadata: ModelMetadata, *, has_correlation
     """Write the file `config.pbtxt`, with which Triton can serve all versions of a model.
 
     The file may list only outputs that every version computes. If an existing file does not list the correlations, an
-    older version of the model does not compute the correlations. In this case, the new file does not list the
-    correlations either.
+    older version of the model does not compute them. In this case, the new file does not list the correlations either.
 
     Args:
         path: The file, which may exist already.
@@ -378,7 +383,7 @@ def _write_triton_config(path: Path, metadata: ModelMetadata, *, has_correlation
 def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Path:
     """Check that a new version of a model can be written, and return the folder of this version.
 
-    A training calls this function before the computation starts, in order to report an invalid folder at once.
+    Commands that train a model call this function before they begin, in order to report an invalid folder at once.
 
     Args:
         folder: The model's folder, which has the name of the model.
@@ -419,10 +424,10 @@ def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> 
     valid_texts = [triton_config(name, len(electrodes), correlation=correlation) for correlation in (False, True)]
     if text in valid_texts:
         return
-    match = re.match('name: "(.*)"', text)  # the first line of the file
-    if match and match[1] != name:
+    first_line = re.match('name: "(.*)"', text)  # contains the name of the model
+    if first_line and first_line[1] != name:
         raise ModelError(
-            f"{path}: names the model {match[1]!r}, its folder is {name!r}: was it copied or renamed? Give it "
+            f"{path}: names the model {first_line[1]!r}, its folder is {name!r}: was it copied or renamed? Give it "
             "its old name, or choose another output"
         )
     raise ModelError(
@@ -451,28 +456,28 @@ def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
     check_golden(model)
 
 
-def triton_config(name: str, electrodes: int, *, correlation: bool = True) -> str:
+def triton_config(name: str, n_electrode: int, *, correlation: bool = True) -> str:
     """Return the text of the file `config.pbtxt`, which describes the inputs and outputs of a model for Triton.
 
     Args:
         name: Name of the model.
-        electrodes: Number of electrodes.
+        n_electrode: Number of electrodes.
         correlation: Whether the output with the correlations is listed. If it is not listed, Triton can also serve
             older versions, which do not have this output.
     """
     outputs = {tensor: width for tensor, width in OUTPUTS.items() if correlation or tensor != CORRELATION}
     head = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
-    return head + _tensor_list("input", {INPUT: electrodes}) + _tensor_list("output", outputs)
+    return head + _tensor_list("input", {INPUT: n_electrode}) + _tensor_list("output", outputs)
 
 
-def _tensor_list(kind: str, widths: dict[str, int]) -> str:
+def _tensor_list(list_name: str, widths: dict[str, int]) -> str:
     """Return the part of `config.pbtxt` that lists the inputs or the outputs of a model.
 
     The list contains the widths of the tensors only, because Triton adds the batch dimension.
 
     Args:
-        kind: "input" or "output".
+        list_name: "input" or "output".
         widths: Width of each tensor by its name.
     """
     lines = [f'  {{ name: "{name}" data_type: TYPE_FP32 dims: [ {width} ] }}' for name, width in widths.items()]
-    return f"{kind} [\n" + ",\n".join(lines) + "\n]\n"
+    return f"{list_name} [\n" + ",\n".join(lines) + "\n]\n"

@@ -54,7 +54,7 @@ CALIBRATION_ADVICE = (
 """Advice to the user if the file cannot be read."""
 
 CHECKED_PRETENSIONS = 50
-"""Number of pretensions at which the misfits of a file are checked to be finite."""
+"""Number of pretensions at which a reader of the file checks that the misfits are finite."""
 
 MIN_NODE_DISTANCE_MPa = 1e-3
 """Smallest distance of two pretensions for which the interpolation is well conditioned, MPa."""
@@ -136,9 +136,10 @@ class Pretensions:
         return Perceptron(tuple(hidden_layers), output_layer, skip_weight, ACTIVATIONS[self.activation])
 
     def interpolation_weights(self, pretension_MPa: Array) -> Array:
-        """Compute the weights of the pretensions `node_MPa` (nodes) for an interpolation to other pretensions.
+        """Compute the weights with which values at the pretensions `node_MPa` are interpolated to other pretensions.
 
-        An interpolated value is the sum of the values at the k nodes, each multiplied by its weight. The weight of node
+        The pretensions `node_MPa` are called nodes. An interpolated value is the sum of the values at the k nodes, each
+        multiplied by its weight. The weight of node
         i at the pretension p is a Lagrange polynomial, which is the product of (p - p_j) / (p_i - p_j) over all nodes j
         other than i.
 
@@ -157,20 +158,23 @@ class Pretensions:
         factors = difference_MPa / denominator_MPa  # shape (n, k nodes i, k nodes j)
         return np.asarray(np.prod(factors, axis=2, where=is_other_node))
 
-    def at(self, node_MPa: Array) -> "Pretensions":
+    def at(self, pretension_MPa: Array) -> "Pretensions":
         """Return the same network with weights that are interpolated to other pretensions.
 
+        In the result, the other pretensions replace the pretensions `node_MPa`.
+
         Args:
-            node_MPa: The other pretensions, shape (n,), MPa, within `range_MPa` and in ascending order.
+            pretension_MPa: The other pretensions, shape (n,), MPa, within `range_MPa` and in ascending order.
         """
-        interpolation = self.interpolation_weights(node_MPa)  # shape (n, k)
-        weights = {}
-        for name, node_weights in self.weights.items():  # the first axis of each array has one entry for each node
-            weights[name] = np.tensordot(interpolation, node_weights, axes=1).astype(np.float32)
-        return replace(self, node_MPa=node_MPa, weights=weights)
+        interpolation = self.interpolation_weights(pretension_MPa)  # shape (n, k)
+        network_weights = {}
+        for name, node_weights in self.weights.items():  # arrays of shape (k, ...), one entry for each of `node_MPa`
+            interpolated_weights = np.tensordot(interpolation, node_weights, axes=1)  # shape (n, ...)
+            network_weights[name] = interpolated_weights.astype(np.float32)
+        return replace(self, node_MPa=pretension_MPa, weights=network_weights)
 
     def constants(self, pretension_MPa: float) -> dict[str, Singles]:
-        """Return the constants of the graph at one pretension, as a dictionary from names to arrays.
+        """Return the weights of the network at one pretension, by the names of the constants in the graph.
 
         Args:
             pretension_MPa: The pretension, MPa, within `range_MPa`.
@@ -189,8 +193,8 @@ class Pretensions:
             Misfits, shape (n,), in standard deviations of the noise.
         """
         charge_rows_pC = charge_pC[None]  # shape (1, n_electrode), because `vectors` expects several presses
-        (vectors,) = self.vectors(charge_rows_pC, pretension_MPa)
-        return np.asarray(np.linalg.norm(vectors, axis=1))
+        (misfit_vectors,) = self.vectors(charge_rows_pC, pretension_MPa)  # one array of shape (n, n_electrode)
+        return np.asarray(np.linalg.norm(misfit_vectors, axis=1))
 
     def vectors(self, charge_pC: Array, pretension_MPa: Array) -> Array:
         """Compute the misfit vectors of presses at several pretensions. The length of a misfit vector is the misfit.
@@ -223,10 +227,11 @@ class Pretensions:
         lower_vectors = (1.0 - upper_weight) * node_vectors[lower]  # shape (n, m, n_electrode)
         interpolated = lower_vectors + upper_weight * node_vectors[upper]
 
-        # Change the length of each vector from |u| to the misfit. A smallest length prevents a division by 0.
+        # Change the length of each vector from |u| to the misfit. A lower limit of |u| prevents a division by 0.
         length = np.maximum(np.linalg.norm(interpolated, axis=2, keepdims=True), MIN_LENGTH)
-        vectors = interpolated * (self.misfit_unit * np.sinh(length) / length)
-        return np.asarray(vectors.swapaxes(0, 1))  # shape (m, n, n_electrode)
+        misfit_over_length = self.misfit_unit * np.sinh(length) / length
+        misfit_vectors = interpolated * misfit_over_length  # shape (n, m, n_electrode)
+        return np.asarray(misfit_vectors.swapaxes(0, 1))  # shape (m, n, n_electrode)
 
 
 class _About(Struct):
@@ -259,13 +264,13 @@ def read_pretensions(version_folder: Path) -> Pretensions:
     path = version_folder / FILE
     data = read_companion_file(version_folder, FILE, CALIBRATION_ADVICE)
     try:
-        return _pretensions(npz_arrays(data))
+        return _pretensions_from_arrays(npz_arrays(data))
     except (ModelError, *DAMAGED_FILE_ERRORS) as error:
         advice = "copy the model's folder again, or calibrate again"
         raise ModelError(f"{path}: {cut(str(error))}; {advice}") from error
 
 
-def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
+def _pretensions_from_arrays(arrays: Mapping[str, np.ndarray]) -> Pretensions:
     """Check the arrays of a file, and return the network that they describe.
 
     Args:
@@ -299,7 +304,11 @@ def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
 
 
 def _check_misfits(pretensions: Pretensions) -> None:
-    """Raise ValueError if the network computes a misfit that is not finite at any checked pretension in its range."""
+    """Check that the misfits of three typical presses are finite at `CHECKED_PRETENSIONS` pretensions in the range.
+
+    Raises:
+        ValueError: If a misfit is not finite.
+    """
     min_MPa, max_MPa = pretensions.range_MPa
     checked_MPa = np.linspace(min_MPa, max_MPa, CHECKED_PRETENSIONS)
     charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)  # a weak, a typical and a strong press
@@ -349,7 +358,7 @@ def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: in
             is too large.
     """
     weight_names = about.constants
-    *hidden_names, skip_weight, output_bias, output_weight = weight_names
+    *hidden_names, skip_weight_name, output_bias_name, output_weight_name = weight_names
     has_pairs = len(hidden_names) % 2 == 0
     has_different_names = len(set(weight_names)) == len(weight_names)
     if not (has_pairs and has_different_names):
@@ -359,31 +368,32 @@ def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: in
     # `finite_array` raises an error if an array has another shape. The inputs of the first layer are the charges. The
     # inputs of each later layer are the neurons of the previous layer.
     n_input = n_electrode
-    hidden_weights = hidden_names[::2]
-    hidden_biases = hidden_names[1::2]
-    for weight, bias in zip(hidden_weights, hidden_biases, strict=True):
-        n_neuron = finite_array(arrays, weight, (n_node, n_input, None)).shape[2]
-        finite_array(arrays, bias, (n_node, n_neuron))
+    for weight_name, bias_name in zip(hidden_names[::2], hidden_names[1::2], strict=True):
+        n_neuron = finite_array(arrays, weight_name, (n_node, n_input, None)).shape[2]
+        finite_array(arrays, bias_name, (n_node, n_neuron))
         n_input = n_neuron
 
     # The last outputs are a vector with one component for each electrode, from which the misfit is computed.
-    n_output = finite_array(arrays, output_weight, (n_node, n_input, None)).shape[2]
-    finite_array(arrays, output_bias, (n_node, n_output))
-    finite_array(arrays, skip_weight, (n_node, n_electrode, n_output))
+    n_output = finite_array(arrays, output_weight_name, (n_node, n_input, None)).shape[2]
+    finite_array(arrays, output_bias_name, (n_node, n_output))
+    finite_array(arrays, skip_weight_name, (n_node, n_electrode, n_output))
     if n_output < n_electrode:
-        raise ValueError(f"{output_weight}: expected at least {n_electrode} outputs, got {n_output}")
+        raise ValueError(f"{output_weight_name}: expected at least {n_electrode} outputs, got {n_output}")
     _check_magnitudes(arrays, weight_names)
     return weight_names
 
 
 def _check_magnitudes(arrays: Mapping[str, np.ndarray], weight_names: list[str]) -> None:
-    """Raise ValueError if the magnitude of a weight is larger than `MAX_WEIGHT`.
+    """Check that the magnitude of every weight is at most `MAX_WEIGHT`.
 
     Args:
         arrays: Arrays of the file by name.
         weight_names: Names of the arrays that contain weights.
+
+    Raises:
+        ValueError: If a weight is larger.
     """
     for name in weight_names:
-        largest = np.abs(arrays[name].astype(float)).max()
-        if largest > MAX_WEIGHT:
-            raise ValueError(f"{name}: expected weights up to {MAX_WEIGHT:g}, got {largest:g}")
+        largest_weight = np.abs(arrays[name].astype(float)).max()
+        if largest_weight > MAX_WEIGHT:
+            raise ValueError(f"{name}: expected weights up to {MAX_WEIGHT:g}, got {largest_weight:g}")

@@ -43,9 +43,12 @@ OUTPUT_MEANINGS = {
 
 
 def output_widths(session: ort.InferenceSession) -> dict[str, int]:
-    """Return the name and the number of columns of each output of a model, in the order of `OUTPUTS`."""
-    names = {tensor.name for tensor in session.get_outputs()}
-    return {name: width for name, width in OUTPUTS.items() if name in names}
+    """Return a dictionary from the name of each output of a model to its number of columns, in the order of `OUTPUTS`.
+
+    Outputs that `OUTPUTS` does not contain are left out.
+    """
+    output_names = {tensor.name for tensor in session.get_outputs()}
+    return {name: width for name, width in OUTPUTS.items() if name in output_names}
 
 
 def open_session(
@@ -66,12 +69,12 @@ def open_session(
     """
     options = _single_thread_options()
     try:
-        # onnxruntime calls the constants of a graph initializers.
+        # In onnxruntime, the constants of a graph are called "initializers".
         initializers = {name: ort.OrtValue.ortvalue_from_numpy(values) for name, values in constants.items()}
         for name, initializer in initializers.items():
             options.add_initializer(name, initializer)
         session = ort.InferenceSession(onnx_model, options, providers=["CPUExecutionProvider"])
-        _decode_texts(session)
+        _check_texts(session)
         return session
     except Exception as error:  # onnxruntime's exceptions have no common base class of their own
         raise ModelError(
@@ -80,10 +83,11 @@ def open_session(
         ) from error
 
 
-def _decode_texts(session: ort.InferenceSession) -> None:
+def _check_texts(session: ort.InferenceSession) -> None:
     """Check that the metadata and the names of the tensors of a session are valid UTF-8.
 
-    The function only reads the texts, because onnxruntime raises an exception when it reads a text that is not valid.
+    The function only reads the texts and discards them, because onnxruntime raises an exception when a text that is not
+    valid is read.
     """
     _ = session.get_modelmeta().custom_metadata_map
     _ = [tensor.name for tensor in (*session.get_inputs(), *session.get_outputs())]
@@ -147,29 +151,31 @@ def check_output_shapes(outputs: Mapping[str, Singles], count: int, where: str) 
             )
 
 
-def check_interface(session: ort.InferenceSession, electrodes: int, where: str) -> None:
+def check_interface(session: ort.InferenceSession, n_electrode: int, where: str) -> None:
     """Check that the input and the outputs of a model have the required names, number types and shapes.
 
     The number of presses in a batch must be variable.
 
     Args:
         session: Session of the model.
-        electrodes: Number of electrodes of the model.
+        n_electrode: Number of electrodes of the model.
         where: Name or file of the model, for error messages.
 
     Raises:
-        ModelError: If the input or the outputs are not those of a model with this number of electrodes.
+        ModelError: If the input or an output is not as required.
     """
+    # Older models compute no correlations. This output is therefore expected only if the model has it.
     required_outputs = {name: width for name, width in OUTPUTS.items() if name != CORRELATION}
-    _check_tensors("input", session.get_inputs(), {INPUT: electrodes}, where)
-    _check_tensors("outputs", session.get_outputs(), required_outputs | output_widths(session), where)
+    expected_outputs = required_outputs | output_widths(session)
+    _check_tensors("input", session.get_inputs(), {INPUT: n_electrode}, where)
+    _check_tensors("outputs", session.get_outputs(), expected_outputs, where)
 
 
-def _check_tensors(kind: str, tensors: list[ort.NodeArg], widths: dict[str, int], where: str) -> None:
+def _check_tensors(role: str, tensors: list[ort.NodeArg], widths: dict[str, int], where: str) -> None:
     """Check that the inputs or the outputs of a graph have the expected names, number types and widths.
 
     Args:
-        kind: "input" or "outputs", for error messages.
+        role: "input" or "outputs", for error messages.
         tensors: The inputs or the outputs of the graph.
         widths: Expected width of each tensor by its name.
         where: Name or file of the model, for error messages.
@@ -181,7 +187,7 @@ def _check_tensors(kind: str, tensors: list[ort.NodeArg], widths: dict[str, int]
     actual = {tensor.name: (tensor.type, _row_width(tensor.shape)) for tensor in tensors}
     if actual != expected:
         raise ModelError(
-            f"{where}: expected the {kind} {_describe(expected)}, got {_describe(actual)}; "
+            f"{where}: expected the {role} {_describe_tensors(expected)}, got {_describe_tensors(actual)}; "
             "this is not a model of isocharge, or one of another version"
         )
 
@@ -195,9 +201,9 @@ def _row_width(shape: list[int | str | None]) -> object:
     return shape[1] if is_batch else shape
 
 
-def _describe(tensors: Mapping[str, tuple[str, object]]) -> str:
+def _describe_tensors(tensors: Mapping[str, tuple[str, object]]) -> str:
     """Format the names, number types and widths of tensors for an error message."""
-    return ", ".join(f"{name} {kind} [n, {width}]" for name, (kind, width) in tensors.items())
+    return ", ".join(f"{name} {number_type} [n, {width}]" for name, (number_type, width) in tensors.items())
 
 
 N_WITHOUT_CORRELATION = 7
@@ -215,23 +221,23 @@ class BoundPress:
         columns: Slice of each output in these values, by the name of the output.
     """
 
-    def __init__(self, session: ort.InferenceSession, electrodes: int) -> None:
+    def __init__(self, session: ort.InferenceSession, n_electrode: int) -> None:
         """Allocate the memory of one press, and bind it to a session.
 
         Args:
             session: Session of the model.
-            electrodes: Number of electrodes.
+            n_electrode: Number of electrodes.
         """
-        charges = np.zeros((1, electrodes), dtype=np.float32)
-        self.columns = _columns(output_widths(session))  # slice of each output, by the name of the output
+        charges = np.zeros((1, n_electrode), dtype=np.float32)
+        self.columns = _output_columns(output_widths(session))  # slice of each output, by the name of the output
         self.size = max(columns.stop for columns in self.columns.values())
         outputs = np.zeros(self.size, dtype=np.float32)
-        # The session holds only the addresses of the arrays. The views in `write` and `read` keep the arrays alive.
+        # The session stores only the addresses of the arrays. The views in `write` and `read` keep the arrays alive.
         binding = _bind(session, charges, outputs, self.columns)
         self.run: Callable[[], None] = partial(session.run_with_iobinding, binding)
 
         # Functions that write float32 numbers into the memory of the charges, and read the numbers of the outputs
-        charge_format = struct.Struct(f"={electrodes}f")
+        charge_format = struct.Struct(f"={n_electrode}f")
         output_format = struct.Struct(f"={outputs.size}f")
         self.write = partial(charge_format.pack_into, charges.data.cast("B"), 0)  # begins at byte 0
         self.read = partial(output_format.unpack, outputs.data.cast("B"))
@@ -247,7 +253,7 @@ class BoundPress:
 
         Args:
             charge_pC: Charges, shape (electrodes,), float32, pC.
-            out: Receives the values, shape (size,) or (7,), float32.
+            out: Array that receives the values, shape (size,), float32; or shape (7,) to leave out the correlations.
 
         Raises:
             AttributeError, NotImplementedError, TypeError, ValueError: If an array does not have the number type and
@@ -262,15 +268,15 @@ class BoundPress:
             target[:] = self._output_view
 
 
-def _columns(widths: Mapping[str, int]) -> dict[str, slice]:
+def _output_columns(widths: Mapping[str, int]) -> dict[str, slice]:
     """Return the slice that each output of a model occupies in the values of a `Contact`.
 
     Args:
         widths: Number of values of each output by its name.
 
     Returns:
-        Slice of each output, by the name of the output. The slices follow each other in the order of `widths`, except
-        that the slice of the correlations is the last, because the correlations are the last values of a `Contact`.
+        Slice of each output, by the name of the output. The slices follow each other in the order of `widths`, but the
+        slice of the correlations comes last, because the correlations are the last values of a `Contact`.
     """
     names = [name for name in widths if name != CORRELATION]
     if CORRELATION in widths:
@@ -316,12 +322,13 @@ def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
         values: The numbers, as many as `write` takes.
 
     Returns:
-        Whether all numbers were written and are finite. If not, the memory contains no valid charges.
+        True if all numbers were written and are finite. If False, the memory does not contain valid charges.
     """
     try:
         numbers = tuple(values)
         write(*numbers)
-        # The sum is not finite if a number is NaN or infinite. Otherwise it cannot overflow, because it is a float64.
+        # The sum is not finite if a number is NaN or infinite. Otherwise, the sum is finite, because `write` has
+        # refused numbers beyond the range of float32, and their sum is computed in float64.
         return math.isfinite(sum(numbers))
     except (struct.error, TypeError, ValueError, OverflowError):
         return False
@@ -404,7 +411,7 @@ def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...], *, is_single_
         # If the sum of the squares is not too large, all charges are finite and in the range of float32. One sum is
         # faster than a check of each charge.
         square_sum_pC2 = np.vdot(flat, flat)
-        if square_sum_pC2 <= MAX_FAST_SQUARE_SUM_pC2:
+        if square_sum_pC2 <= MAX_FAST_SQUARE_SUM_pC2:  # false for NaN
             return np.ascontiguousarray(charges, dtype=np.float32)
     return _checked_float32(charges, electrodes, is_single_press)
 

@@ -62,7 +62,7 @@ class Address:
             is_ipv6 = ":" in self.host
             family = socket.AF_INET6 if is_ipv6 else socket.AF_INET
             return socket.create_server((self.host, self.port), family=family, backlog=backlog)
-        except ListenError:  # an error of _listen_unix, whose message already states what to do
+        except ListenError:  # _listen_unix has raised this error, whose message already states what to do
             raise
         except (OSError, UnicodeError) as error:  # a host name that cannot be encoded causes a UnicodeError
             reason = str(error)
@@ -72,10 +72,13 @@ class Address:
             raise ListenError(f"cannot listen on {place}: {reason}") from error
 
     def release(self) -> None:
-        """Remove the file of a closed Unix socket, unless another server listens on the same path."""
+        """Remove the file of the closed Unix socket, unless another server listens on the same path.
+
+        If the address is not a Unix socket, the function does nothing.
+        """
         if self.uds:
             with contextlib.suppress(ListenError):
-                _remove_stale(self.uds)
+                _remove_stale_socket(self.uds)
 
     def url(self, listening: socket.socket, *, secure: bool) -> str:
         """Return the URL that clients use, or `unix:PATH` if the address is a Unix socket.
@@ -119,10 +122,14 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
     """Open a listening Unix socket that only its owner can use, and return the socket.
 
     Args:
-        path: Path of the socket. If an earlier server has left a file there, this file is removed first.
+        path: Path of the socket. If an earlier server has left a socket there, its file is removed first.
         backlog: Largest number of connections that wait to be accepted.
+
+    Raises:
+        ListenError: If the path is another file, or if a server listens on the socket.
+        OSError: If the socket cannot be created.
     """
-    _remove_stale(path)
+    _remove_stale_socket(path)
     previous_mask = os.umask(0o177)  # only the owner may read and write the file that `bind` creates
     listening = socket.socket(socket.AF_UNIX)
     try:
@@ -136,7 +143,7 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
     return listening
 
 
-def _remove_stale(path: Path) -> None:
+def _remove_stale_socket(path: Path) -> None:
     """Remove the file of a Unix socket if no server listens on the socket any more.
 
     If the file does not exist, the function does nothing.
@@ -180,7 +187,7 @@ class Tls:
         try:
             for path in paths:
                 read_whole(path)  # raises an error if the path is a pipe, from which load_cert_chain might wait forever
-            # If the key is encrypted, the empty password causes an error. Without it, OpenSSL would ask for a password.
+            # With the empty password, an encrypted key causes an error. Without a password, OpenSSL would ask the user.
             context.load_cert_chain(self.certificate, self.key, password=lambda: "")
         except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
             names = " and ".join(map(str, paths))
@@ -237,11 +244,11 @@ class Token:
             TokenError: If the header does not contain the token.
         """
         scheme, _, token = authorization.partition(b" ")
-        normalised = authorization
+        normalised_header = authorization
         if scheme.lower() == b"bearer":
-            normalised = b"Bearer " + token.lstrip(b" ")
+            normalised_header = b"Bearer " + token.lstrip(b" ")
         # The time that compare_digest takes does not depend on the number of correct characters.
-        if not hmac.compare_digest(normalised, self._expected_header):
+        if not hmac.compare_digest(normalised_header, self._expected_header):
             received = "a wrong one" if authorization else "none"
             raise TokenError(
                 f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {received}"

@@ -142,12 +142,14 @@ class BrowserCheck:
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
         """Return whether the page that has sent a request belongs to this server.
 
-        A page belongs to this server in two cases. In the first case, its origin contains the same host and the same
-        port as the header `Host`. In the second case, its host name is allowed and differs from the name in the header
-        `Host`. The names differ if a reverse proxy has replaced the header `Host`.
+        A page belongs to this server in two cases:
+
+        - Its origin contains the same host and the same port as the header `Host`.
+        - Its host name is one of `allowed_hosts` and differs from the name in the header `Host`. The names differ if a
+          reverse proxy has replaced the header `Host`.
 
         Args:
-            origin: Value of the header `Origin`, for example b"http://localhost:8000".
+            origin: Value of the header `Origin`, which is the origin of the page, such as b"http://localhost:8000".
             host: Value of the header `Host`, for example b"localhost:8000".
         """
         scheme, _, page_host = origin.decode("latin-1").lower().partition("://")
@@ -156,8 +158,8 @@ class BrowserCheck:
         requested_host = host.decode("latin-1").lower()
         if page_host == requested_host:
             return True
-        # The following names contain no ports. If the names are equal, only the ports differ. The page then belongs to
-        # another server on the same machine.
+        # The following names contain no ports. If the names are equal, only the ports of the page and of the requested
+        # host differ. The page then belongs to another server on the same machine.
         page_name = _name_in(f"//{page_host}")
         requested_name = _name_in(f"//{requested_host}")
         return page_name in self._allowed_names and page_name != requested_name
@@ -179,7 +181,7 @@ def host_name(text: str) -> str:
     """
     name = text.strip().lower()
     is_printable_ascii = name.isascii() and name.isprintable()
-    has_forbidden_character = any(character in name for character in "/@?#%* ,\\")
+    has_forbidden_character = any(character in name for character in "/@?#%* ,\\")  # no host name contains these
 
     is_bracketed = name.startswith("[") and name.endswith("]")
     if is_bracketed:

@@ -32,6 +32,7 @@ BUCKET_BOUNDS = (*(f"{ns / 1e9:g}" for ns in LATENCY_BOUNDS_NS), "+Inf")
 """Upper bounds of the buckets of the latency histogram, s, as texts."""
 
 _Counters = dict[tuple[str, str], Statistics]
+"""Counters of each version of each model, by the name of the model and the number of the version."""
 
 
 class Metrics(Collector):
@@ -105,14 +106,14 @@ def _traffic_families(traffic: Traffic) -> Iterable[Metric]:
 
 
 def _inference_families(counters: _Counters) -> Iterable[Metric]:
-    """Yield the metrics that count presses and refused requests.
+    """Yield the metrics that count presses and refused inferences.
 
     Each metric has one value for each version of a model.
 
     Args:
         counters: Counters of each version, by name and version of the model.
     """
-    # Attribute of `Statistics`, and name and description of the metric with its values
+    # For each attribute of `Statistics`: name and description of the metric that contains the values of this attribute
     metrics_of_attribute = {
         "presses": ("isocharge_presses", "Presses that were answered."),
         "checked": ("isocharge_misfit_checked", "Presses whose misfit was computed."),
@@ -139,17 +140,17 @@ def _latency_families(counters: _Counters) -> Iterable[Metric]:
         "Time to read, compute and write an inference, without the network.",
         labels=VERSION_LABELS,
     )
-    stages = CounterMetricFamily(
+    stage_times = CounterMetricFamily(
         "isocharge_inference_stage_seconds",
         "Time of each stage of an inference, under the names of Triton.",
         labels=(*VERSION_LABELS, "stage"),
     )
     for name_and_version, statistics in counters.items():
-        # The count of a bucket of Prometheus includes the counts of all lower buckets.
+        # In Prometheus, the count of a bucket includes the counts of all lower buckets.
         cumulative_counts = accumulate(statistics.latency)
         buckets = list(zip(BUCKET_BOUNDS, cumulative_counts, strict=True))
         total_s = sum(statistics.stages_ns) / 1e9
         latency.add_metric(name_and_version, buckets, total_s)
         for stage, stage_ns in zip(STAGES, statistics.stages_ns, strict=True):
-            stages.add_metric((*name_and_version, stage), stage_ns / 1e9)
-    return latency, stages
+            stage_times.add_metric((*name_and_version, stage), stage_ns / 1e9)
+    return latency, stage_times

@@ -111,7 +111,7 @@ class ModelStore:
 
         Raises:
             ModelNotFound: If the version is not loaded. The message lists the loaded versions, and states why the
-                version was refused.
+                version was refused or unloaded.
         """
         loaded = self._loaded.get((name, version))
         if loaded is None:
@@ -121,12 +121,13 @@ class ModelStore:
     def _not_found_message(self, name: str, version: str) -> str:
         """Return the error message for a model or a version that is not loaded.
 
-        The message lists all loaded versions. The message also contains the reasons why requested versions of the model
-        were refused.
+        The message lists all loaded versions. If the requested version was refused or unloaded, the message also
+        contains the reason.
 
         Args:
             name: Name of the model.
-            version: Number of the requested version as a text. An empty text means that any version was requested.
+            version: Number of the requested version as a text. An empty text means that any version was requested. The
+                message then contains the reasons for all versions of the model.
         """
         label = f"{name}/{version}" if version else name
         loaded_labels = sorted(loaded.metadata.label for loaded in self.loaded_versions())
@@ -279,10 +280,10 @@ class ModelStore:
                 new_versions[version] = _load_version(name, version, version_folder, statistics)
             except Exception as error:  # any error in one folder must not affect the other models
                 refused[name, version] = _refusal_reason(version_folder, error)
-        versions = new_versions
+        available_versions = new_versions
         if refused or not new_versions:  # keep the versions that were loaded before, unless new files replace them
-            versions = self._loaded_by_version(name) | new_versions
-        ascending_versions = [versions[version] for version in sorted(versions)]
+            available_versions = self._loaded_by_version(name) | new_versions
+        ascending_versions = [available_versions[version] for version in sorted(available_versions)]
         self._replace(name, ascending_versions, refused)
         return refused
 
@@ -291,15 +292,15 @@ class ModelStore:
         return {loaded.metadata.version: loaded for loaded in self.loaded_versions() if loaded.metadata.name == name}
 
     def _replace(self, name: str, versions: list[LoadedVersion], refused: dict[tuple[str, int], str]) -> None:
-        """Replace the loaded versions of a model, and the reasons why its versions were refused.
+        """Replace the loaded versions of a model, and the reasons why its versions were refused or unloaded.
 
         Each dictionary is replaced by a new dictionary in a single assignment. Other threads can therefore read the
         dictionaries without a lock.
 
         Args:
             name: Name of the model.
-            versions: New loaded versions of the model, in ascending order.
-            refused: Reasons why versions were refused, by name and version.
+            versions: New loaded versions of the model, in ascending order. If the list is empty, the model is removed.
+            refused: Reasons why versions were refused or unloaded, by name and version.
         """
         loaded = {
             (other_name, version): other_loaded

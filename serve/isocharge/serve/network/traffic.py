@@ -38,7 +38,7 @@ class Exchange(NamedTuple):
         status: HTTP status, or name of the gRPC status.
         model: Label `name/version` of the requested model, or None if no loaded model was requested.
         error: Name of the type of the error, or None if no error occurred.
-        ns: Time from the complete request to the complete response, ns. It is 0 if the time is unknown.
+        ns: Time from the complete request to the complete response, ns; 0 if the time is unknown.
         bytes_in: Size of the body of the request, bytes.
         bytes_out: Size of the body of the response, bytes.
         client: Address and port of the client, or a text that contains both.
@@ -119,11 +119,12 @@ class RequestLog(logging.Handler):
 
 
 class Traffic:
-    """Counters that all servers of one process share. Any thread may call any method.
+    """Counters of requests, which all servers of one process share. Any thread may call any method.
 
     Attributes:
         log: Log to which each request is written, or None if there is no log.
-        open: Function by transport, which returns the number of open connections or calls of this transport.
+        open: For each transport ("http" or "grpc"), a function that returns the number of its open connections or
+            calls.
         lost_lines: Function that returns the number of log lines that could not be written, or None if there is no log.
     """
 
@@ -135,7 +136,13 @@ class Traffic:
         self._lock = threading.Lock()
 
     def count(self, transport: str, route: str, status: int | str) -> None:
-        """Count a request that was answered, possibly with an error."""
+        """Count a request that was answered, possibly with an error.
+
+        Args:
+            transport: Transport of the request, which is "http" or "grpc".
+            route: Name of the route.
+            status: HTTP status, or name of the gRPC status.
+        """
         key = transport, route, status
         with self._lock:
             self._requests[key] = self._requests.get(key, 0) + 1

@@ -37,8 +37,8 @@ class McapOutput:
         from isocharge.serve.export.mcap_file import McapFile  # needs the extra `record`
 
         self._path = path
-        # In a replay, the file has a temporary name until it is complete. A live file has its final name at once. The
-        # stack contains the steps that end the output: it closes the file and, in a replay, gives it its final name.
+        # In a replay, the file has a temporary name until it is complete. A live file has its final name at once. When
+        # the stack is closed, it closes the file and, in a replay, gives the file its final name.
         self._stack = ExitStack()
         written_path = path if is_live else self._stack.enter_context(new_file(path))
         self._file = self._stack.enter_context(McapFile(written_path, electrodes, encoding))
@@ -54,7 +54,7 @@ class McapOutput:
             self._file.write(record)
 
     def close(self) -> None:
-        """Write the index and close the file.
+        """Write the index of the messages, and close the file.
 
         In a replay, this method also renames the file from its temporary name to its final name.
         """

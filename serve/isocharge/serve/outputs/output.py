@@ -22,8 +22,8 @@ class Output(Protocol):
     """A destination of prediction records.
 
     An output may also have a method `discard()`. If the records are incomplete because of an error, or because a replay
-    was stopped, `discard` is called instead of `close`. The method `discard` can remove a file that contains only some
-    of the records.
+    was stopped, `discard` is called instead of `close`. The method `discard` can, for example, remove a file that
+    contains only some of the records.
     """
 
     def write(self, record: PredictionRecord, /) -> None:
@@ -48,9 +48,9 @@ class _Incomplete(Exception):
 
 
 def exit_with_error(contexts: ExitStack) -> None:
-    """Leave contexts in the same way as after an error in their block.
+    """Leave contexts in the same way as after an error in their `with` block.
 
-    If a context has created a file, the context therefore removes the incomplete file.
+    A context that has created a file therefore removes this file, because it is incomplete.
 
     Args:
         contexts: The contexts that were entered.
@@ -66,7 +66,7 @@ class OutputContext:
     Attributes:
         electrodes: Names of the electrodes, in the order of the charges.
         with_tracking: Whether contacts are tracked, so that the records have the fields of a `Tracking`.
-        with_film: Whether the film is followed, so that the records have the field `film`.
+        with_film: Whether the pretension of the film is estimated, so that the records have the field `film`.
         is_live: True if the records come from a sensor, which does not wait for the outputs. False if they come from a
             recording.
         write_stdout: Function that writes a text to standard output.

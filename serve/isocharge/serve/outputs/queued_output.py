@@ -41,7 +41,7 @@ class QueuedOutput:
         return self._queue.lost
 
     def write(self, record: PredictionRecord) -> None:
-        """Append a record to the queue, from which the thread writes the record to the other output.
+        """Append a record to the queue, from which the thread takes it and writes it to the other output.
 
         Raises:
             Exception: The error of the other output, if its errors end the stream.
@@ -53,6 +53,9 @@ class QueuedOutput:
 
         If the consumer no longer accepts records, the remaining records are dropped. If the other output has raised an
         error before, the other output is discarded instead of closed.
+
+        Raises:
+            Exception: The error of the other output, if its errors end the stream.
         """
         self._queue.close()
         if self._queue.is_stuck:  # the thread is still in `write` of the other output, which therefore cannot be closed
@@ -68,7 +71,7 @@ class QueuedOutput:
     def _write(self, record: PredictionRecord) -> None:
         """Write a record to the other output, unless the other output has failed before.
 
-        The method is called by the thread of the queue.
+        The thread of the queue calls this method.
         """
         if self.has_failed:
             return
@@ -78,10 +81,11 @@ class QueuedOutput:
             self._handle_error(error)
 
     def _handle_error(self, error: Exception) -> None:
-        """Handle an error of the other output.
+        """Raise an error of the other output again, or write it to the log.
 
-        If errors of the other output end the stream, the error is raised. Otherwise, the first error of the output is
-        written to the log, and its later errors are ignored.
+        If errors of the other output end the stream, the error is raised. An error that is raised in the thread of the
+        queue reaches the caller of the next `write`. Otherwise, the first error of the output is written to the log,
+        and its later errors are ignored.
 
         Raises:
             Exception: The given error, if errors of the other output end the stream.

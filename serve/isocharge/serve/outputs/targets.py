@@ -29,11 +29,11 @@ ENTRY_POINTS = "isocharge.outputs"
 
 
 def target_forms() -> str:
-    """Return the forms of all targets that this package accepts, as a text with commas between the forms."""
+    """Return the forms of all targets that this package accepts, as one text, separated by commas."""
     return ", ".join(kind.form for kind in OUTPUT_KINDS)
 
 
-def kind_of(target: str) -> OutputKind:
+def output_kind(target: str) -> OutputKind:
     """Return the kind of output that accepts a target.
 
     The built-in kinds are tried before the kinds that other installed packages add through entry points.
@@ -48,7 +48,8 @@ def kind_of(target: str) -> OutputKind:
         if kind.accepts(target):
             return kind
 
-    added_forms = []  # for the error message
+    # No built-in kind accepts the target. Try the kinds of other packages, and collect their forms for the message.
+    added_forms = []
     for entry_point in entry_points(group=ENTRY_POINTS):
         added_kind = _load_kind(entry_point)
         if added_kind.accepts(target):
@@ -60,10 +61,10 @@ def kind_of(target: str) -> OutputKind:
 
 
 def _load_kind(entry_point: EntryPoint) -> OutputKind:
-    """Load a kind of output that another package adds, and return it.
+    """Load and return a kind of output that another package adds.
 
     Args:
-        entry_point: Entry point of the package, which refers to an OutputKind.
+        entry_point: Entry point of the package, which should refer to an `OutputKind`.
 
     Raises:
         InputError: If the package cannot be loaded, or its entry point is not an OutputKind.
@@ -83,8 +84,8 @@ def _load_kind(entry_point: EntryPoint) -> OutputKind:
     return kind
 
 
-def _failure(target: str, error: Exception) -> OutputError:
-    """Return an OutputError that tells the user which output raised an unexpected exception.
+def _unexpected_failure(target: str, error: Exception) -> OutputError:
+    """Return an `OutputError` that states which output raised an unexpected exception.
 
     The exception may come from another package that adds a kind of output.
     """
@@ -110,18 +111,19 @@ class Outputs:
             InputError: If no kind of output accepts a target, two targets are equal, or two targets write to standard
                 output.
         """
-        kinds = {target: kind_of(target) for target in targets}
-        standard_targets = [target for target in targets if kinds[target].is_standard_output]
+        kinds = {target: output_kind(target) for target in targets}
+        stdout_targets = [target for target in targets if kinds[target].is_standard_output]
         other_targets = [target for target in targets if not kinds[target].is_standard_output]
-        if len(standard_targets) > 1:
+        if len(stdout_targets) > 1:
             raise InputError(
-                f"outputs {shown(standard_targets)}: expected at most one on standard output; remove one of them"
+                f"outputs {shown(stdout_targets)}: expected at most one on standard output; remove one of them"
             )
-        if len(set(targets)) < len(targets):
+        has_equal_targets = len(set(targets)) < len(targets)
+        if has_equal_targets:
             raise InputError(f"outputs {shown(list(targets))}: expected targets that differ; remove one of them")
         # Standard output is written last: if the program that reads it has ended, the write raises an error, but all
         # other outputs have received the record before.
-        self._kinds = {target: kinds[target] for target in other_targets + standard_targets}
+        self._kinds = {target: kinds[target] for target in other_targets + stdout_targets}
         self._context = context
         self._outputs: dict[str, Output] = {}
         self.not_written: dict[str, int | None] = {}
@@ -130,17 +132,17 @@ class Outputs:
         """Open the outputs.
 
         Raises:
-            IsochargeError: If an output cannot be opened. The outputs that were opened before are discarded.
+            IsochargeError, OSError: If an output cannot be opened. The outputs that were opened before are discarded.
         """
         for target, kind in self._kinds.items():
             try:
                 output = kind.open(target, self._context)
-            except (IsochargeError, OSError, KeyboardInterrupt):
+            except (IsochargeError, OSError, KeyboardInterrupt):  # the message of such an error states the reason
                 self._discard()
                 raise
             except Exception as error:  # an unexpected error, for example of another package
                 self._discard()
-                raise _failure(target, error) from error
+                raise _unexpected_failure(target, error) from error
             # A live stream must not wait for a slow consumer, so its records are written by another thread.
             if self._context.is_live and kind.may_block:
                 output = self._queued(output, target, kind)
@@ -153,8 +155,8 @@ class Outputs:
         Args:
             output: The open output.
             target: Target of the open output, for messages.
-            kind: Kind of the open output. Only standard output can report that its reader is slow. An error of standard
-                output ends the stream.
+            kind: Kind of the open output. It decides two things: only standard output can report that its reader is
+                slow, and only an error of standard output ends the stream.
         """
         if kind.is_standard_output:
             return QueuedOutput(output, target, is_ready=self._context.stdout_is_ready, ends_stream=True)
@@ -173,11 +175,11 @@ class Outputs:
 
     @property
     def has_incomplete_file(self) -> bool:
-        """Whether at least one output other than standard output has not received all records.
+        """Whether at least one output other than standard output lacks records.
 
         The value is valid only after the outputs were closed.
         """
-        return any(not kind_of(target).is_standard_output for target in self.not_written)
+        return any(not output_kind(target).is_standard_output for target in self.not_written)
 
     def write(self, record: PredictionRecord) -> None:
         """Write a record to every output.
@@ -191,10 +193,10 @@ class Outputs:
             except (IsochargeError, OSError):  # the message of such an error already states the reason
                 raise
             except Exception as error:  # an unexpected error, for example of another package
-                raise _failure(target, error) from error
+                raise _unexpected_failure(target, error) from error
 
     def close(self) -> None:
-        """Close all open outputs, and store the number of records that each output has not received in `not_written`.
+        """Close all open outputs, and store in `not_written` how many records each output has not received.
 
         Raises:
             OSError, IsochargeError: The first error that occurred. All other outputs are closed before it is raised.
@@ -208,7 +210,7 @@ class Outputs:
             # Only a queue can lose records without raising an error.
             if isinstance(output, QueuedOutput) and output.has_failed:
                 self.not_written[target] = None  # the number is unknown, because the output has stopped
-            elif isinstance(output, QueuedOutput) and output.lost:
+            elif isinstance(output, QueuedOutput) and output.lost > 0:
                 self.not_written[target] = output.lost
         if errors:
             raise errors[0]
@@ -217,10 +219,13 @@ class Outputs:
         """Discard all open outputs, because they have not received all records."""
         for target, output in self._remove_each():
             discard(output)
-            if not kind_of(target).writes_nothing:
+            if not output_kind(target).writes_nothing:
                 self.not_written[target] = None  # the number of missing records is unknown
 
     def _remove_each(self) -> Iterator[tuple[str, Output]]:
-        """Remove the open outputs one by one in reverse order, and yield each output with its target."""
+        """Remove the open outputs one by one, the latest first, and yield each output with its target.
+
+        An output is removed before the caller closes it, so that no output is closed twice.
+        """
         while self._outputs:
             yield self._outputs.popitem()

@@ -9,29 +9,29 @@ from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, ex
 from isocharge.serve.record.csv_rows import csv_header, csv_row
 from isocharge.serve.record.record import PredictionRecord
 
-LineOf = Callable[[PredictionRecord], str]
+LineFunction = Callable[[PredictionRecord], str]
 """Function that converts a record to a line of text without the line feed."""
 
 
 class StandardOutput:
     """Output that writes one line to standard output for each record."""
 
-    def __init__(self, write: Callable[[str], object], line_of: LineOf, header: str | None = None) -> None:
-        """Write the header to standard output if there is a header.
+    def __init__(self, write: Callable[[str], object], to_line: LineFunction, header: str | None = None) -> None:
+        """Store the functions, and write the header to standard output if there is a header.
 
         Args:
             write: Function that writes a text to standard output.
-            line_of: Function that converts a record to a line of text.
+            to_line: Function that converts a record to a line of text.
             header: First line of the output, without the line feed. None if there is no header.
         """
         self._write = write
-        self._line_of = line_of
+        self._to_line = to_line
         if header is not None:
             write(header + "\n")
 
     def write(self, record: PredictionRecord) -> None:
         """Write the line of a record."""
-        self._write(self._line_of(record) + "\n")
+        self._write(self._to_line(record) + "\n")
 
     def close(self) -> None:
         """Leave standard output open."""
@@ -44,12 +44,12 @@ class TextFile:
     the file. In a replay, the file has a temporary name until the file is complete.
     """
 
-    def __init__(self, path: Path, line_of: LineOf, header: str | None = None, *, is_live: bool) -> None:
-        """Create the file.
+    def __init__(self, path: Path, to_line: LineFunction, header: str | None = None, *, is_live: bool) -> None:
+        """Create the file, and write the header if there is a header.
 
         Args:
             path: Path of the file, which must not exist yet.
-            line_of: Function that converts a record to a line of text.
+            to_line: Function that converts a record to a line of text.
             header: First line of the output, without the line feed. None if there is no header.
             is_live: Whether the records come from a sensor.
 
@@ -58,9 +58,9 @@ class TextFile:
             OutputError: If the file cannot be created.
         """
         self._path = path
-        self._line_of = line_of
-        # In a replay, the file has a temporary name until it is complete. A live file has its final name at once. The
-        # stack contains the steps that end the output: it closes the file and, in a replay, gives it its final name.
+        self._to_line = to_line
+        # In a replay, the file has a temporary name until it is complete. A live file has its final name at once. When
+        # the stack is closed, it closes the file and, in a replay, gives the file its final name.
         self._stack = ExitStack()
         written_path = path if is_live else self._stack.enter_context(new_file(path))
         self._file = AtomicWriter(written_path)
@@ -74,7 +74,7 @@ class TextFile:
         Raises:
             OutputError: If the disk is full.
         """
-        self._write_line(self._line_of(record))
+        self._write_line(self._to_line(record))
 
     def close(self) -> None:
         """Close the file. In a replay, also rename the file from its temporary name to its final name."""
@@ -93,7 +93,7 @@ def _json_line(record: PredictionRecord) -> str:
     return record.to_json()
 
 
-def _csv_line_of(context: OutputContext) -> LineOf:
+def _csv_line_function(context: OutputContext) -> LineFunction:
     return lambda record: csv_row(record, context.electrodes)
 
 
@@ -119,7 +119,7 @@ def _open_stdout_json(_: str, context: OutputContext) -> Output:
 
 
 def _open_stdout_csv(_: str, context: OutputContext) -> Output:
-    return StandardOutput(context.write_stdout, _csv_line_of(context), _csv_header(context))
+    return StandardOutput(context.write_stdout, _csv_line_function(context), _csv_header(context))
 
 
 def _open_nothing(_: str, __: OutputContext) -> Output:
@@ -131,7 +131,7 @@ def _open_json_file(target: str, context: OutputContext) -> Output:
 
 
 def _open_csv_file(target: str, context: OutputContext) -> Output:
-    return TextFile(Path(target), _csv_line_of(context), _csv_header(context), is_live=context.is_live)
+    return TextFile(Path(target), _csv_line_function(context), _csv_header(context), is_live=context.is_live)
 
 
 STDOUT_JSON = OutputKind(form="json", accepts="json".__eq__, open=_open_stdout_json, is_standard_output=True)

@@ -1,9 +1,9 @@
 """Output that sends each record as a JSON object in its own UDP datagram.
 
 The UDP server of PlotJuggler can receive the records if the protocol of the server is set to JSON. PlotJuggler expects
-one JSON object in each datagram. PlotJuggler uses the number `timestamp` as the time, ignores values that are null, and
-shows every other number as a time series. The name of a time series is the path of the number in the JSON object, such
-as `charge_pC/A`.
+one JSON object in each datagram. It uses the number `timestamp` as the time, ignores values that are null, and shows
+every other number as a time series. The name of a time series is the path of the number in the JSON object, such as
+`charge_pC/A`.
 """
 
 import socket
@@ -32,9 +32,10 @@ class UdpOutput:
         """
         host, _, port = address.rpartition(":")
         try:
-            if not 0 < int(port) <= MAX_PORT:  # int raises ValueError if this is no number
+            is_valid_port = 0 < int(port) <= MAX_PORT  # int raises ValueError if the text is not a number
+            if not is_valid_port:
                 raise ValueError(f"a port is a number from 1 to {MAX_PORT}")
-            first_address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            first_address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]  # preferred by the system
         except (OSError, ValueError) as error:  # getaddrinfo raises ValueError if a part of the name is too long
             example = f"{SCHEME}127.0.0.1:9870"
             raise InputError(
@@ -46,7 +47,7 @@ class UdpOutput:
         self._socket.setblocking(False)  # a live stream must not wait for the network
 
     def write(self, record: PredictionRecord) -> None:
-        """Send a record. If the record cannot be sent at once, it is dropped, because a live stream never waits."""
+        """Send a record. If the record cannot be sent at once, drop it, because a live stream never waits."""
         with suppress(OSError):  # the receiver is unreachable, or the buffer is full
             self._socket.sendto(record.to_json().encode(), self._address)
 

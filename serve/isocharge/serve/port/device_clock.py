@@ -84,61 +84,64 @@ class DeviceClock:
         self._is_fit_provisional = True  # whether the fit relies on the arrival of only one chunk
         self._latest_host_s = -math.inf  # host time of the latest reading
 
-    def read(self, t_us: int | None, modulus: int, arrived_s: float) -> ReadingTime:
+    def read(self, t_us: int | None, modulus: int, arrival_s: float) -> ReadingTime:
         """Return the time at which the next reading was taken, and the time since the previous reading.
 
-        The fit is a straight line that converts the clock of the device to the time of the host. If the device sends no
-        clock, the host time is the arrival time of the chunk. A chunk consists of the bytes that arrived together.
+        The clock of the device is converted to the time of the host by a straight line, which is called the fit. If the
+        device sends no clock, the host time is the arrival time of the chunk, that is, of the bytes that arrived
+        together with the reading.
 
         Args:
             t_us: Clock as the device sent it, us; None if the device sends no clock.
             modulus: Time at which the clock wraps to 0, us.
-            arrived_s: Arrival of the chunk that contains the reading, unix seconds.
+            arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
         if t_us is None:
-            return self._time_without_clock(arrived_s)
+            return self._time_without_clock(arrival_s)
 
-        step_us = self._advance(t_us, modulus)  # time since the previous reading
-        if self._is_ahead_of(arrived_s):  # no reading can be taken long after its arrival, so a clock was set
+        step_us = self._unwrap(t_us, modulus)  # time since the previous reading
+        if self._is_far_ahead_of(arrival_s):  # no reading can be taken long after its arrival, so a clock was set
             self.restarts += 1
-            self._fitted_us = None  # the fit starts again from this reading
-            step_us = 0
+            self._fitted_us = None  # discards the fit
+            step_us = 0  # the time since the previous reading is unknown
 
-        # Without a fit, begin a provisional fit in which the host time of this reading is the arrival.
+        # Without a fit, begin a provisional fit in which the host time of this reading is its arrival time, or the host
+        # time of the previous reading if that is later.
         if self._fitted_us is None:
             self._fitted_us = self._device_us
-            self._fitted_host_s = max(arrived_s, self._latest_host_s)
+            self._fitted_host_s = max(arrival_s, self._latest_host_s)
             self._is_fit_provisional = True
 
-        # The host time must not decrease, even if a correction of the fit has moved the prediction back.
+        # The host time must not decrease, even if a correction of the fit has moved the predicted host time back.
         self._latest_host_s = max(self._latest_host_s, self._predict(self._device_us))
         return ReadingTime(self._latest_host_s, self._device_us, step_us * 1e-6)
 
-    def _time_without_clock(self, arrived_s: float) -> ReadingTime:
+    def _time_without_clock(self, arrival_s: float) -> ReadingTime:
         """Return the arrival time of the chunk as the time of the reading, because the device sends no clock.
 
         Args:
-            arrived_s: Arrival of the chunk that contains the reading, unix seconds.
+            arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
         step_s = 0.0  # for the first reading
         if self._last_arrival_s is not None:
-            step_s = max(0.0, arrived_s - self._last_arrival_s)
-        self._last_arrival_s = arrived_s
-        return ReadingTime(arrived_s, None, step_s)
+            step_s = max(0.0, arrival_s - self._last_arrival_s)  # the clock of the host may have been set back
+        self._last_arrival_s = arrival_s
+        return ReadingTime(arrival_s, None, step_s)
 
-    def _is_ahead_of(self, arrived_s: float) -> bool:
-        """Return whether the predicted host time is so far ahead of an arrival time that a clock must have been set.
+    def _is_far_ahead_of(self, arrival_s: float) -> bool:
+        """Return whether the fit predicts a host time for the latest reading that is far later than its arrival.
 
-        All chunks of a file have the same arrival time, which contains no information about the clock. If the arrival
-        time equals the arrival time of the previous chunk, the result is therefore False.
+        If the difference exceeds `MAX_DEVIATION_s`, one of the two clocks must have been set. Without a fit, the result
+        is False. All chunks of a file have the same arrival time, which contains no information about the clock. The
+        result is therefore also False for the first chunk, and for a chunk with the arrival time of the previous chunk.
 
         Args:
-            arrived_s: Arrival of the chunk, unix seconds.
+            arrival_s: Arrival of the chunk that contains the latest reading, unix seconds.
         """
-        is_different_arrival = self._chunk_arrival_s is not None and self._chunk_arrival_s != arrived_s
+        is_different_arrival = self._chunk_arrival_s is not None and self._chunk_arrival_s != arrival_s
         if self._fitted_us is None or not is_different_arrival:
             return False
-        return self._predict(self._device_us) - arrived_s > MAX_DEVIATION_s
+        return self._predict(self._device_us) - arrival_s > MAX_DEVIATION_s
 
     def arrived(self, arrival_s: float) -> None:
         """Fit the clock of the device to the arrival time of a chunk.
@@ -156,13 +159,13 @@ class DeviceClock:
         is_first_arrival = previous_arrival_s is None
         is_repeated = previous_arrival_s == arrival_s
         if self._fitted_us is None or is_first_arrival or is_repeated:  # the first arrival may be that of a file
-            return
+            return  # the provisional fit of `read` remains
 
         delay_s = arrival_s - self._predict(self._device_us)  # positive if the chunk arrived later than predicted
         was_clock_set = abs(delay_s) > MAX_DEVIATION_s
         if was_clock_set:
-            self._latest_host_s = -math.inf  # the host time may decrease here
-        # A provisional fit relies on the arrival of only one chunk, and is replaced by a fit to this arrival.
+            self._latest_host_s = -math.inf  # allows the host time of the next reading to be earlier
+        # A provisional fit relies on the arrival of only one chunk. A fit that begins at this arrival replaces it.
         if was_clock_set or self._is_fit_provisional:
             self._begin_fit(arrival_s)
         else:
@@ -184,13 +187,13 @@ class DeviceClock:
     def _continue_fit(self, delay_s: float, step_s: float) -> None:
         """Correct the fit with one step of a second-order delay-locked loop (Adriaensen 2005).
 
-        The gain of the loop is w = 2 pi * bandwidth * step_s. The correction adds sqrt(2) w delay_s to the predicted
-        host time, and w^2 delay_s / step_s to the rate of the clock. The bandwidth decreases with the age of the fit.
-        The gain is limited, because the loop would become unstable with a large gain.
+        The gain of the loop is w = 2 pi * bandwidth * step_s, but at most `MAX_LOOP_GAIN`, because the loop would
+        become unstable with a larger gain. The correction adds sqrt(2) w delay_s to the predicted host time, and
+        w^2 delay_s / step_s to the rate of the clock. The bandwidth decreases with the age of the fit.
 
         Args:
             delay_s: Arrival time minus predicted arrival time, s.
-            step_s: Time on the clock of the device since the previous correction, s.
+            step_s: Time on the clock of the device since the previous correction, s. If it is 0, nothing is corrected.
         """
         self._fit_age_s += step_s
         bandwidth_Hz = max(BANDWIDTH_Hz, FIRST_BANDWIDTH_Hz / (1.0 + self._fit_age_s))
@@ -200,14 +203,18 @@ class DeviceClock:
             self.rate += loop_gain**2 * delay_s / step_s
 
     def _predict(self, device_us: int) -> float:
-        """Return the host time, unix seconds, at which the clock of the device has the value `device_us`."""
-        return self._fitted_host_s + self.rate * (device_us - (self._fitted_us or 0)) * 1e-6
+        """Return the host time, unix seconds, at which the clock of the device has the value `device_us`.
 
-    def _advance(self, t_us: int, modulus: int) -> int:
-        """Remove the wraps from the clock value of the next reading, and store the resulting value.
+        The result is only valid if there is a fit.
+        """
+        fitted_us = self._fitted_us or 0  # never None here
+        return self._fitted_host_s + self.rate * (device_us - fitted_us) * 1e-6
 
-        If the clock jumped back, or jumped ahead by more than half of its range, the device has restarted. The fit then
-        starts again.
+    def _unwrap(self, t_us: int, modulus: int) -> int:
+        """Remove the wraps from the clock value of the next reading, and store the resulting value in `_device_us`.
+
+        If the clock jumped back, or jumped ahead by half of its range or more, the device has restarted. The fit is
+        then discarded.
 
         Args:
             t_us: Clock of the reading as the device sent it, us.
@@ -219,13 +226,15 @@ class DeviceClock:
         previous_us = self._sent_us
         self._sent_us = t_us
         if previous_us is not None:
-            step_us = (t_us - previous_us) % modulus  # correct even if the clock has wrapped between the readings
+            # The modulo makes the step correct even if the clock has wrapped between the readings. If the clock jumped
+            # back, the modulo converts the negative step to a large positive step.
+            step_us = (t_us - previous_us) % modulus
             if step_us < modulus // 2:
                 self._device_us += step_us
                 return step_us
             self.restarts += 1
 
-        # This is the first reading after a start.
+        # This is the first reading after a start of the device.
         self._device_us = t_us
-        self._fitted_us = None
+        self._fitted_us = None  # discards the fit
         return 0

@@ -20,7 +20,7 @@ PARQUET_START = b"PAR1"
 PRESS_COLUMNS = frozenset({"x_mm", "y_mm", "force_N", "charge_pC.A", "flags"})
 """Columns that only tables of presses and records have."""
 
-COLUMNS_OF_BOARDS = frozenset({"seq", "t_us", "t_ms", "t_s"})
+BOARD_COLUMNS = frozenset({"seq", "t_us", "t_ms", "t_s"})
 """Columns that only lines from boards have."""
 
 
@@ -45,7 +45,7 @@ def _kind_and_advice(name: str, head: bytes) -> tuple[str, str] | None:
 
     Args:
         name: Path of the file, or - for the standard input.
-        head: First bytes of the file.
+        head: First bytes of the file. They are compared with the beginnings of known kinds of files.
 
     Returns:
         Kind and advice, as parts of a sentence; None if the bytes may come from a board.
@@ -82,7 +82,7 @@ def _is_table_of_presses(name: str, first_line: bytes) -> bool:
     """Return whether a file is a CSV table of presses or of records.
 
     The file is a table if its header contains a column that only presses or records have. A file whose name ends in
-    `.csv` is also a table if its header consists of column names that boards do not send.
+    `.csv` is also a table if its header consists only of names, and if none of the names is one that only boards send.
 
     Args:
         name: Path of the file, or - for the standard input.
@@ -93,6 +93,6 @@ def _is_table_of_presses(name: str, first_line: bytes) -> bool:
     has_press_column = bool(columns & PRESS_COLUMNS)
     if has_press_column:
         return True
-    has_board_column = bool(columns & COLUMNS_OF_BOARDS)
-    has_only_names = len(columns) > 1 and all(column[:1].isalpha() for column in columns)  # and no numbers
+    has_board_column = bool(columns & BOARD_COLUMNS)
+    has_only_names = len(columns) > 1 and all(column[:1].isalpha() for column in columns)  # numbers begin otherwise
     return name.endswith(".csv") and has_only_names and not has_board_column

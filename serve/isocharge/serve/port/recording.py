@@ -7,7 +7,7 @@ object:
     {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
     {"timestamp": ..., ...}                       a record of that chunk
     {"tare": true}                                a request for a new tare
-    {"back": true}                                a request to reset the followed film to its calibration
+    {"back": true}                                a request to reset the estimated pretension to its calibration
     {"use": "three/2"}                            the model of all records after this line
     {"marker": [timestamp, "text"]}               a moment that the user has marked
 
@@ -53,7 +53,7 @@ Nanoseconds = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 log = logging.getLogger(__name__)
 
 Line = TypeVar("Line")
-"""Type of the struct as which a line is parsed."""
+"""Type of the struct to which a line is converted."""
 
 
 class Marker(NamedTuple):
@@ -119,8 +119,8 @@ class Recorder:
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
         """Write a chunk and the records that were computed from it.
 
-        If Ctrl-C interrupts a call, the caller passes the same chunk again. If the file has grown since the first call,
-        the first call has written the chunk, and the second call writes nothing.
+        If Ctrl-C interrupts a call, the caller passes the same chunk again. If the interrupted call has already written
+        the chunk, the file has grown, and the second call writes nothing.
 
         Args:
             chunk: The chunk.
@@ -139,8 +139,8 @@ class Recorder:
         """Write a request for a new tare."""
         self._write('{"tare": true}')
 
-    def back(self) -> None:
-        """Record a request to reset the estimate of the film to its calibration."""
+    def film_reset(self) -> None:
+        """Write a request to reset the estimated pretension of the film to the value of its calibration."""
         self._write('{"back": true}')
 
     def model(self, label: str) -> None:
@@ -181,8 +181,8 @@ class Event(NamedTuple):
     latencies_us: tuple[float, ...] = ()
 
 
-class Back(NamedTuple):
-    """A recorded request to reset the estimate of the film to its calibration."""
+class FilmReset(NamedTuple):
+    """A recorded request to reset the estimated pretension of the film to the value of its calibration."""
 
 
 class NewModel(NamedTuple):
@@ -235,45 +235,50 @@ class Recording:
         self.device = header.device
         self.name = header.name
 
-    def events(self) -> Iterator[Event | Marker | NewModel | Back]:
-        """Yield all events of the recording in their order. Each chunk contains the latencies of its records.
+    def events(self) -> Iterator[Event | Marker | NewModel | FilmReset]:
+        """Yield all events of the recording in their order.
+
+        The records are not yielded. The event of a chunk contains only the latencies of the records that were computed
+        from the chunk.
 
         Raises:
             RecordingError: If a line other than the last line is damaged.
         """
-        # The records of a chunk follow the chunk. A chunk is therefore yielded when the next line that is not a record
-        # has been read, or at the end of the file.
+        # In the file, the records of a chunk follow the chunk. A chunk is therefore yielded when the next line that is
+        # not a record has been read, or at the end of the file.
         chunk: Chunk | None = None  # chunk whose records are being read
         latencies_us: list[float] = []
-        for entry in self._lines(_Entry):
+        for entry in self._parsed_lines(_Entry):
             if entry.latency_us is not None:  # only records have a latency
                 latencies_us.append(entry.latency_us)
                 continue
             if chunk is not None:
                 yield Event(chunk, tuple(latencies_us))
-            chunk = entry.recorded_chunk  # None if the line is another event
             latencies_us = []
-            if chunk is None:
+            chunk = entry.recorded_chunk
+            if chunk is None:  # the line is another event, such as a marker
                 yield entry.other_event
         if chunk is not None:
             yield Event(chunk, tuple(latencies_us))
 
-    def records(self, kind: type[Line]) -> Iterator[Line]:
+    def records(self, record_type: type[Line]) -> Iterator[Line]:
         """Yield the prediction records of the recording in their order.
 
         Args:
-            kind: Struct type whose fields are read from each record.
+            record_type: Struct type whose fields are read from each record.
 
         Raises:
             RecordingError: If a line other than the last line is damaged, or a record lacks a field of the struct.
         """
-        return self._lines(kind, beginning='{"timestamp"')
+        return self._parsed_lines(record_type, beginning='{"timestamp"')  # only records begin in this way
 
-    def _lines(self, kind: type[Line], beginning: str = "") -> Iterator[Line]:
+    def _parsed_lines(self, line_type: type[Line], beginning: str = "") -> Iterator[Line]:
         """Parse the lines after the first line, yield their content, and report the progress of reading.
 
+        An incomplete last line is ignored, because writing it was interrupted.
+
         Args:
-            kind: Struct type to which each line is converted.
+            line_type: Struct type to which each line is converted.
             beginning: First characters of the lines to parse; empty for all lines. Lines that do not begin with a brace
                 are also parsed. Such a line is damaged, and parsing it raises an error.
 
@@ -287,12 +292,13 @@ class Recording:
             with self._path.open(encoding="utf-8", errors="replace") as file:
                 for line in bounded_lines(file, LONGEST_ENTRY):
                     is_complete = line.endswith("\n")
-                    if not is_complete:
-                        return  # writing the last line was interrupted, for example by a power failure
+                    if not is_complete:  # only the last line of the file can be incomplete
+                        return
+                    is_header = line_number == 1
                     is_damaged = not line.startswith("{")
                     is_selected = line.startswith(beginning) or is_damaged
-                    if line_number > 1 and is_selected:
-                        yield parse_json(line, "", RecordingError, kind)
+                    if is_selected and not is_header:
+                        yield parse_json(line, "", RecordingError, line_type)
                     line_number += 1
                     read_characters += len(line)
                     if line_number % PROGRESS_LINES == 0:
@@ -331,9 +337,17 @@ class _Entry(Struct):
     chunk: tuple[Moment, Nanoseconds, Annotated[float, Meta(ge=0.0)], bytes] | None = None
 
     def __post_init__(self) -> None:
-        if (self.timestamp is None) != (self.latency_us is None):
+        """Check that the line contains a complete record or an event.
+
+        Raises:
+            WrongKey: If a record lacks its time or its latency, or if the line has no known key.
+        """
+        has_time = self.timestamp is not None
+        has_latency = self.latency_us is not None
+        if has_time != has_latency:  # a record has both keys, and an event has neither
             raise WrongKey("latency_us")
-        if all(key is None for key in (self.timestamp, self.tare, self.back, self.use, self.marker, self.chunk)):
+        known_keys = (self.timestamp, self.tare, self.back, self.use, self.marker, self.chunk)
+        if all(key is None for key in known_keys):
             raise WrongKey("chunk")
 
     @property
@@ -345,12 +359,12 @@ class _Entry(Struct):
         return Chunk(data, timestamp, clock_ns, outage_s)
 
     @property
-    def other_event(self) -> Event | Marker | NewModel | Back:
+    def other_event(self) -> Event | Marker | NewModel | FilmReset:
         """The event that this line contains. The line must be neither a record nor a chunk."""
         if self.marker is not None:
             return Marker(*self.marker)
         if self.back is not None:
-            return Back()
+            return FilmReset()
         if self.use is not None:
             return NewModel(self.use)
         return Event(None)  # a request for a new tare
@@ -368,15 +382,17 @@ class RecordedClock:
         """Set the clock to the arrival of a chunk, before the records of the chunk are computed again.
 
         Args:
-            event: The chunk and the latencies of its records. A request for a new tare sets the clock to 0.
+            event: The chunk and the latencies of its records. An event without a chunk (a request for a new tare) sets
+                the clock to 0.
         """
-        self._arrival_ns = event.chunk.clock_ns if event.chunk else 0
+        self._arrival_ns = event.chunk.clock_ns if event.chunk is not None else 0
         self._remaining_latencies_us = deque(event.latencies_us)
 
     def __call__(self) -> int:
         """Return the time at which the next record of the chunk was created, in ns on the clock of `Chunk.clock_ns`.
 
-        After the last record, the arrival of the chunk is returned.
+        Each call consumes the latency of one record. After the last record, the time of arrival of the chunk is
+        returned.
         """
         latency_us = self._remaining_latencies_us.popleft() if self._remaining_latencies_us else 0.0
         return self._arrival_ns + round(latency_us * 1e3)

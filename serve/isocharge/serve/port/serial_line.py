@@ -4,9 +4,9 @@ A connection is called a line. A line is either a serial port, which pyserial op
 file descriptors for serial ports, each read from a serial port needs only two system calls. Each datagram of a socket
 is one chunk.
 
-Some boards send one line of text in each datagram, without a line feed at the end. In this case, a line feed is added
-to each datagram, because text parsers need the line feed. If a datagram of the board has ended with a line feed,
-nothing is added to later datagrams.
+Some boards send a text without a line feed at the end in each datagram. In this case, a line feed is added to each
+datagram, because text parsers need the line feed. If a datagram of the board has ended with a line feed, nothing is
+added to later datagrams.
 
 On a connection with only two wires, each end also receives the bytes that it sends itself. On such a connection, the
 received bytes begin with an echo of the request, and the echo must be removed. The next request is sent only after the
@@ -78,8 +78,8 @@ class Requester:
     def wait_s(self) -> float:
         """Return the time until the next request is due, s, or 0 if a request is due now.
 
-        At least 1 / `rate_Hz` must pass between two requests. After a request without an answer, at least
-        `REPEAT_TIME_s` must pass. After the latest received byte, at least `QUIET_TIME_s` must pass.
+        At least 1 / `rate_Hz` must pass between two requests. After a request without an answer, also at least
+        `REPEAT_TIME_s` must pass. After the latest received byte, also at least `QUIET_TIME_s` must pass.
         """
         now_s = self._now_s()
         due_s = self._requested_s + 1.0 / self._request.rate_Hz
@@ -90,7 +90,10 @@ class Requester:
         return max(0.0, due_s - now_s, quiet_end_s - now_s)
 
     def next_request(self) -> bytes:
-        """Return the bytes of the next request, which the caller must send now, and store the time of the request."""
+        """Return the bytes of the next request, which the caller must send now.
+
+        The method stores the time of the request, and expects an echo of it.
+        """
         self._requested_s = self._now_s()
         self._request_count += 1
         self._expected_echo = self._request.data
@@ -109,10 +112,10 @@ class Requester:
             return b""
         self._received_s = self._now_s()
 
-        # The received bytes may be shorter than the expected echo, or may continue after it.
-        echo_length = min(len(received), len(self._expected_echo))
-        is_echo = received[:echo_length] == self._expected_echo[:echo_length]
-        if echo_length == 0 or not is_echo:
+        # The received bytes may be shorter than the expected echo, or may continue after it. Compare their common part.
+        echo_length = min(len(received), len(self._expected_echo))  # 0 if no echo is expected
+        is_echo = echo_length > 0 and received[:echo_length] == self._expected_echo[:echo_length]
+        if not is_echo:
             self._expected_echo = b""  # the answer has begun, so no echo can follow
             return received
 
@@ -153,7 +156,7 @@ class SerialLine:
     """An open connection to a board through a serial port or another port that pyserial supports."""
 
     def __init__(self, url: str, baud: int) -> None:
-        """Open the line, and configure the system to deliver received bytes without a delay.
+        """Open the line, and configure the system to deliver received bytes without a delay if this is possible.
 
         Args:
             url: Device path, or a URL that pyserial accepts.
@@ -167,7 +170,7 @@ class SerialLine:
         if url.startswith("tcp://"):  # pyserial has another name for this scheme
             url = url.replace("tcp://", "socket://", 1)
         self._serial: Any = serial.serial_for_url(url, baudrate=baud, exclusive=True)
-        # Without this mode, USB adapters collect bytes for 16 ms.
+        # Without this mode, USB adapters collect bytes for 16 ms. Some systems and ports do not have the mode.
         with suppress(AttributeError, NotImplementedError, OSError, ValueError):
             self._serial.set_low_latency_mode(True)
         # Lines that exist only inside pyserial have no file descriptor.
@@ -220,7 +223,7 @@ class SerialLine:
         Returns:
             All bytes that have arrived; empty if no byte arrives in time.
         """
-        if timeout_s != self._serial.timeout:  # each assignment of the timeout costs a system call
+        if timeout_s != self._serial.timeout:  # avoids a needless assignment, which costs a system call
             self._serial.timeout = timeout_s
         data: bytes = self._serial.read(1)  # waits until a byte arrives or the timeout has passed
         if data:
@@ -256,8 +259,8 @@ class UdpSocket:
         addresses = socket.getaddrinfo(
             parts.hostname or "", parts.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
         )
-        family, kind, protocol, _canonical_name, address = addresses[0]  # the address that the system prefers
-        self._socket = socket.socket(family, kind, protocol)
+        family, socket_type, protocol, _canonical_name, address = addresses[0]  # the address that the system prefers
+        self._socket = socket.socket(family, socket_type, protocol)
         try:
             self._socket.bind(address)
         except OSError:
@@ -286,7 +289,7 @@ class UdpSocket:
         while self._is_ready(max(0.0, deadline_s - time.monotonic())):
             data, self._peer = self._socket.recvfrom(MAX_READ_BYTES)
             if data:
-                return self._end_line(data)
+                return self._with_line_feed(data)
         return b""
 
     def write(self, data: bytes) -> None:
@@ -303,9 +306,10 @@ class UdpSocket:
         readable, _, _ = select.select([self._socket], [], [], timeout_s)
         return bool(readable)
 
-    def _end_line(self, data: bytes) -> bytes:
-        """Add a line feed to a datagram of text, unless the board ends its datagrams with line feeds.
+    def _with_line_feed(self, data: bytes) -> bytes:
+        """Return a datagram of text with a line feed at its end.
 
+        If this datagram or an earlier datagram of the board ends with a line feed, the datagram is returned unchanged.
         A datagram is text if it is valid UTF-8 without control characters. Other datagrams are returned unchanged.
 
         Args:

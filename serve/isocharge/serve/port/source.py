@@ -108,7 +108,7 @@ class Port:
     def __enter__(self) -> Self:
         """Open the port, and discard the bytes in its buffer.
 
-        If the port cannot be opened, try again until `wait` seconds have passed.
+        If the port cannot be opened, try again until `wait` seconds have passed. A wrong URL is not tried again.
 
         Raises:
             PortError: If the port cannot be opened within `wait` seconds, or its URL is wrong.
@@ -143,7 +143,7 @@ class Port:
                 self._line = UdpSocket(self.url)
             else:
                 self._line = SerialLine(self.url, self._baud)
-            self._line.reset_input_buffer()  # opening a terminal also discards it, opening a socket does not
+            self._line.reset_input_buffer()  # needed for a socket; opening a terminal has discarded the bytes already
         except OPEN_ERRORS as error:
             self._close()
             raise self._opening_error(error, is_path=is_path) from error
@@ -225,7 +225,7 @@ class Port:
             reason: Exception that states why the port was lost.
 
         Raises:
-            PortLost: The exception `reason`, if `reconnect` is false.
+            PortLost: The exception `reason`, if the port must not be opened again (`reconnect` is false).
         """
         if not self._reconnect:
             raise reason
@@ -238,7 +238,7 @@ class Port:
             try:
                 self._open()
                 return self._read()
-            except PortError:  # also PortLost, if no bytes arrive after opening
+            except PortError:  # or its subclass PortLost, if no bytes arrive after opening
                 continue
 
     def _read(self) -> bytes:
@@ -282,7 +282,7 @@ class Port:
             ) from error
 
     def _receive_answer(self, line: SerialLine | UdpSocket, requester: Requester, timeout_s: float) -> bytes:
-        """Send each request when it is due, until an answer arrives, and return the answer.
+        """Send requests whenever they are due until an answer arrives, and return the answer.
 
         Args:
             line: The open line to the board.
@@ -299,7 +299,7 @@ class Port:
                 return b""
             if requester.wait_s() == 0.0:
                 line.write(requester.next_request())
-            # Wait for bytes, at most until the next request is due.
+            # Wait for bytes, at most until the next request is due or the timeout has passed.
             received = line.receive(min(requester.wait_s(), remaining_s))
             answer = requester.remove_echo(received)
             if answer:
@@ -371,6 +371,8 @@ def open_source(
 ) -> Chunks:
     """Return a context manager that opens a port, a file or the standard input as a source of chunks.
 
+    The function waits until the path exists. The port or the file is opened when the context is entered.
+
     Args:
         url: Device path or URL of a port, path of a file or of a named pipe, or - for the standard input.
         baud: Baud rate of a serial port, bit/s.
@@ -386,7 +388,7 @@ def open_source(
     if url == STDIN:
         return contextlib.nullcontext(FileSource(sys.stdin.fileno(), STDIN))
 
-    # Wait until the path exists, because only an existing path shows whether it is a file or a port.
+    # Wait until the path exists, because the type of a missing path (a file or a port) is unknown.
     is_path = "://" not in url
     deadline_s = time.monotonic() + wait
     while is_path and not Path(url).exists() and time.monotonic() < deadline_s:

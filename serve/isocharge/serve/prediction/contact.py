@@ -56,8 +56,9 @@ class Contact(NamedTuple):
         """Return the contact with standard deviations and correlations that include an additional independent error.
 
         The additional error changes x, y and the force together. The changes of x, y and the force are therefore fully
-        correlated. The additional error increases the variance of x by the square of the change of x. It increases the
-        covariance of x and y by the product of the changes of x and y.
+        correlated. The additional error increases the variance of x by the square of the change of x, and the
+        covariance of x and y by the product of the changes of x and y. The position, the force and the misfit are not
+        changed. Correlations that are NaN remain NaN.
 
         Args:
             shift: Changes of x (mm), y (mm) and the force (N) that one standard deviation of the additional error
@@ -97,8 +98,9 @@ class Contact(NamedTuple):
     def _rounded(self) -> Iterator[tuple[str, str, str]]:
         """Yield the name, the rounded value and the rounded standard deviation of x, of y and of the force.
 
-        The number of decimals is chosen so that the standard deviation has two significant digits. The value has as
-        many decimals as its standard deviation.
+        The number of decimals is chosen so that the standard deviation has two significant digits, but is at least 0
+        and at most `MAX_DECIMALS`. The value has as many decimals as its standard deviation. If the standard deviation
+        is not positive and finite, both have `MAX_DECIMALS` decimals.
         """
         stds = {"x_mm": self.x_std_mm, "y_mm": self.y_std_mm, "force_N": self.force_std_N}
         for name, std in stds.items():
@@ -140,11 +142,11 @@ class Sensitivity:
     def shift(
         self, contact: Contact, parameter_change: float, predict_after_step: Callable[[], Contact]
     ) -> tuple[float, float, float]:
-        """Compute how a change of the parameter shifts the position and the force of a contact.
+        """Compute how a change of an uncertain parameter of the film shifts the position and the force of a contact.
 
         The contact is assumed to change in proportion to the parameter. A second prediction gives the change of the
         contact for one step of the parameter. This change is stored. If a later contact is close to the contact for
-        which the change was stored, no second prediction is made.
+        which the change was stored, the stored change is used again, and no second prediction is made.
 
         Args:
             contact: The contact at the present value of the parameter.
@@ -162,13 +164,16 @@ class Sensitivity:
                 contact_after_step.y_mm - contact.y_mm,
                 contact_after_step.force_N - contact.force_N,
             )
-        x_shift, y_shift, force_shift = self._shift_per_step
-        step_count = parameter_change / self._parameter_step
-        return step_count * x_shift, step_count * y_shift, step_count * force_shift
+        x_shift_per_step, y_shift_per_step, force_shift_per_step = self._shift_per_step
+        step_count = parameter_change / self._parameter_step  # need not be a whole number
+        return step_count * x_shift_per_step, step_count * y_shift_per_step, step_count * force_shift_per_step
 
 
 def is_close(contact: Contact, reference: Contact | None) -> bool:
-    """Return whether a contact is close enough to a reference for the same sensitivity to apply to both.
+    """Return whether the sensitivity that was computed for a reference contact may also be used for another contact.
+
+    A sensitivity describes how a contact changes with a parameter of the film. Two contacts have nearly the same
+    sensitivity if their positions and forces are close to each other.
 
     Args:
         contact: The contact that is compared with the reference.
@@ -291,7 +296,7 @@ class Validity:
         return float(IMPLAUSIBLE_FACTOR * circumscribed_radius_mm) ** 2, IMPLAUSIBLE_FACTOR * max_force_N
 
     def is_touch(self, charge_pC: Array) -> Booleans:
-        """Compute for each press whether a charge exceeds the noise on at least one electrode.
+        """Compute for each press whether the charge of at least one electrode exceeds the noise.
 
         A charge exceeds the noise if its magnitude is larger than `TOUCH_LIMIT` standard deviations of the white noise.
 
@@ -311,13 +316,16 @@ class Validity:
 
     @cached_property
     def area_text(self) -> str:
-        """Description of the working area for messages: its radius, or its bounding box if it is not centred."""
+        """Description of the working area for messages.
+
+        The text states the radius of the area if its centre is close to the origin, and its bounding box otherwise.
+        """
         if self.is_centred:
             return f"up to {self.radius_mm:.3g} mm"
         # The limits are the corners of the bounding box of the working area.
-        left, bottom = self.corners_mm.min(axis=0)
-        right, top = self.corners_mm.max(axis=0)
-        return f"from ({left:.3g}, {bottom:.3g}) to ({right:.3g}, {top:.3g}) mm"
+        left_mm, bottom_mm = self.corners_mm.min(axis=0)
+        right_mm, top_mm = self.corners_mm.max(axis=0)
+        return f"from ({left_mm:.3g}, {bottom_mm:.3g}) to ({right_mm:.3g}, {top_mm:.3g}) mm"
 
     def is_beyond(self, contact: Contact) -> bool:
         """Return whether a contact is so far outside the domain that it cannot be a measurement.
@@ -339,27 +347,27 @@ class Validity:
         The squared radius is the squared distance from the origin to the nearest edge of the working area. If the
         origin is outside the working area, the squared radius is 0.
         """
-        origin_x_mm = np.zeros(1)  # `inside_polygon` takes arrays of points, here of one point
-        origin_y_mm = np.zeros(1)
-        is_origin_inside = inside_polygon(origin_x_mm, origin_y_mm, self.corners_mm)[0]
+        origin_coordinate_mm = np.zeros(1)  # x and also y; `inside_polygon` takes arrays of points, here of one point
+        is_origin_inside = inside_polygon(origin_coordinate_mm, origin_coordinate_mm, self.corners_mm)[0]
         if not is_origin_inside:
             return 0.0
 
         # The nearest point of each edge is the projection of the origin onto the edge, limited to the ends of the edge.
         start = self.corners_mm  # start of each edge, shape (edges, 2)
         edge = np.roll(start, -1, axis=0) - start  # the last edge ends at the first corner
-        edge_length_squared = np.maximum((edge * edge).sum(axis=1), 1e-30)  # the last corner may repeat the first one
+        # If the last corner repeats the first corner, one edge has the length 0. The limit avoids a division by 0.
+        edge_length_squared = np.maximum((edge * edge).sum(axis=1), 1e-30)
         projection = -(start * edge).sum(axis=1) / edge_length_squared  # as a fraction of the edge, shape (edges,)
-        fraction = np.clip(projection, 0.0, 1.0)
-        nearest_point = start + fraction[:, np.newaxis] * edge
+        limited_projection = np.clip(projection, 0.0, 1.0)
+        nearest_point = start + limited_projection[:, np.newaxis] * edge
         distance_squared_mm2 = (nearest_point**2).sum(axis=1)
         return float(distance_squared_mm2.min())
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
-        """Return the flags of one contact.
+        """Return the flags of one contact, which are the reasons why the contact may be wrong.
 
-        For most contacts, the method takes about a microsecond. For a contact near the edge of the working area, the
-        method takes about 30 us, because the contact is compared with the polygon of the area.
+        For most contacts, the method takes about a microsecond. A contact near the edge of the working area must be
+        compared with the polygon of the area, which takes about 30 us.
 
         Args:
             contact: Contact that the model computed.
@@ -410,9 +418,10 @@ class Validity:
         is_outside = is_outside_area | is_outside_forces
         has_misfit = contacts.misfit > self.misfit_limit
         is_above_yield = contacts.force_N > self.yield_force_N
-        # Every contact beyond the implausible limits is also outside, so `is_beyond` need not be tested here.
-        if not (is_outside | has_misfit | is_above_yield).any():  # no contact has a flag
-            return [()] * len(is_outside)
+        # A contact beyond the implausible limits is also outside. The flag `beyond` therefore adds no flagged contact.
+        has_flag = is_outside | has_misfit | is_above_yield
+        if not has_flag.any():
+            return [()] * len(has_flag)
 
         centre_x_mm, centre_y_mm = self.centre_mm
         max_distance_squared_mm2, implausible_force_N = self.implausible_limits
@@ -450,8 +459,8 @@ def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
     """Compute whether points lie inside a polygon.
 
     A point is inside the polygon if a horizontal ray from the point to the right crosses an odd number of edges. The
-    ray crosses an edge if exactly one end of the edge is above the ray, and the edge intersects the horizontal line to
-    the right of the point.
+    ray crosses an edge under two conditions. Exactly one end of the edge is above the ray, and the edge intersects the
+    horizontal line to the right of the point.
 
     Args:
         x: First coordinates of the points, shape (n,), in the unit of the corners.
@@ -466,7 +475,7 @@ def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
     x_start, y_start = corners.T[..., np.newaxis]
     x_end, y_end = edge_ends.T[..., np.newaxis]
     crosses_height = (y_start > y) != (y_end > y)  # the edge crosses the horizontal line through the point
-    with np.errstate(divide="ignore", invalid="ignore"):  # horizontal edges have no crossing
+    with np.errstate(divide="ignore", invalid="ignore"):  # the division by 0 of a horizontal edge has no effect
         crossing_x = x_start + (y - y_start) * (x_end - x_start) / (y_end - y_start)
     is_to_the_right = x < crossing_x
     crossing_count = np.count_nonzero(crosses_height & is_to_the_right, axis=0)

@@ -90,11 +90,11 @@ class Predictor:
         Raises:
             ModelError: If the graph contains no constant with one of the names, or a new value has another shape.
         """
-        other = copy(self)
-        other._constants = constants  # keeps the arrays alive, because onnxruntime uses their memory
-        other._session = open_session(self._graph, self.metadata.label, constants)
-        other._press = BoundPress(other._session, len(self.metadata.electrodes))
-        return other
+        new_predictor = copy(self)
+        new_predictor._constants = constants  # keeps the arrays alive, because onnxruntime uses their memory
+        new_predictor._session = open_session(self._graph, self.metadata.label, constants)
+        new_predictor._press = BoundPress(new_predictor._session, len(self.metadata.electrodes))
+        return new_predictor
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
         """Compute the contact of one press. Call `flags` to find out whether the contact is valid.
@@ -141,14 +141,16 @@ class Predictor:
         return self.validity.flags(contact)
 
     def predict_into(self, charge_pC: Singles, out: Singles) -> None:
-        """Compute the contact of one press, and write the contact into an existing array without checking the charges.
+        """Compute the contact of one press, and write the contact into an existing array.
+
+        The values of the charges are not checked, so that the call is fast.
 
         Args:
             charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. If a
                 charge is NaN, the result is NaN.
-            out: Array of float32 for the values of the contact in the order of the attributes of `Contact`. With the
-                shape (10,), it receives all values. With the shape (7,), it receives the values without correlations. A
-                model that computes no correlations needs the shape (7,).
+            out: Array of float32 for the values of the contact in the order of the attributes of `Contact`. An array of
+                shape (10,) receives all values. An array of shape (7,) receives the values without correlations. If the
+                model computes no correlations, the shape must be (7,).
 
         Raises:
             ChargeError: If an array is not float32 or has another shape. Nothing is written in this case.
@@ -170,21 +172,22 @@ class Predictor:
         """Compute the contacts of n presses.
 
         Args:
-            charge_pC: Touch charges, shape (n, electrodes), pC; n may be 0.
+            charge_pC: Touch charges, shape (n, electrodes), pC, in the order of `metadata.electrodes`; n may be 0.
 
         Raises:
             ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
         """
-        columns_of_output = self._press.columns  # the columns of a contact that each output of the graph contains
+        # For each output of the graph, the columns in the table below that this output fills
+        columns_by_output = self._press.columns
         charges = as_batch(charge_pC, self.metadata.electrodes)
-        outputs = run(self._session, charges, tuple(columns_of_output))
+        outputs = run(self._session, charges, tuple(columns_by_output))
 
-        # One row for each press and one column for each attribute of `Contact`. Correlations remain NaN if the model
-        # computes no correlations.
-        contacts = np.full((len(charges), len(Contact._fields)), np.nan, np.float32)
-        for name, columns in columns_of_output.items():
-            contacts[:, columns] = outputs[name]
-        return Contacts(*contacts.T)
+        # Table with one row for each press and one column for each attribute of `Contact`. The columns of the
+        # correlations remain NaN if the model computes no correlations.
+        contact_table = np.full((len(charges), len(Contact._fields)), np.nan, np.float32)
+        for output_name, columns in columns_by_output.items():
+            contact_table[:, columns] = outputs[output_name]
+        return Contacts(*contact_table.T)
 
     def __repr__(self) -> str:
         """Return a text with the label, the sensor, the electrodes and the valid domain of the model."""
@@ -227,8 +230,9 @@ def _describe(value: object) -> str:
 def _check_bound_memory(press: BoundPress, model: Model) -> None:
     """Check that this version of onnxruntime reads and writes the bound memory itself, and not a copy of the memory.
 
-    The contact of one press is computed in the bound memory, and again with `session.run`, which copies the arrays. The
-    results must agree within a small tolerance.
+    Bound memory is memory that onnxruntime uses for the inputs and outputs of all calls. The contact of one press is
+    computed in the bound memory, and again with `session.run`, which copies the arrays. The results must agree within a
+    small tolerance.
 
     Args:
         press: Bound memory for one press of the model.
@@ -240,10 +244,9 @@ def _check_bound_memory(press: BoundPress, model: Model) -> None:
     charges = model.golden.charge_pC[:1]  # shape (1, electrodes)
     press.write(*charges[0])
     press.run()
-    # `press.read` returns the outputs in the order of `press.columns`.
+    actual = press.read()  # contains the outputs in the order of `press.columns`
     outputs = run(model.session, charges, tuple(press.columns))
     expected = np.concatenate([rows[0] for rows in outputs.values()])
-    actual = press.read()
     if not np.allclose(actual, expected, rtol=1e-4, atol=1e-4):
         raise ModelError(
             f"{model.folder}: onnxruntime {ort.__version__} computes {actual} in bound memory and "

@@ -141,14 +141,14 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     errors = press_errors(predictor, presses)
     is_bad = _bad_presses(errors)
     is_selected = errors.is_compared & ~is_bad
-    count = int(is_selected.sum())
-    agreement = Agreement.of(errors, is_selected)
+    selected_count = int(is_selected.sum())
+    agreement = Agreement.from_errors(errors, is_selected)
     position = _position_summary(errors, is_selected)
     force = _force_summary(errors, is_selected)
-    misfit_text = _misfit_statement(errors, is_selected, metadata)  # empty if there are not too many large misfits
+    misfit_text = _misfit_statement(errors, is_selected, metadata)  # empty unless too many presses have a large misfit
 
-    fits = None  # there are too few presses for a verdict
-    if count >= MIN_PRESSES:
+    fits = None  # remains None if there are too few presses for a verdict
+    if selected_count >= MIN_PRESSES:
         fits = agreement.acceptable and not misfit_text
 
     # Collect the explanations for the user.
@@ -162,12 +162,12 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     return PressCheck(
         model=metadata.label,
         presses=len(presses),
-        compared=count,
+        compared=selected_count,
         position_mm=position,
         force_percent=force,
         agreement=agreement,
         fits=fits,
-        verdict=_verdict(fits, count, position, force, misfit_text),
+        verdict=_verdict(fits, selected_count, position, force, misfit_text),
         notes=tuple(notes),
         errors=errors,
     )
@@ -176,9 +176,9 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
 def _bad_presses(errors: PressErrors) -> Booleans:
     """Find bad presses. A bad press has an improbable error, although all other presses agree with the model.
 
-    No press is considered bad in three cases: if all presses together agree with the model, if too many presses have
-    improbable errors, or if the other presses do not agree with the model either. One bad press is never too many, even
-    among few presses.
+    Presses are considered bad only if three conditions hold. All presses together do not agree with the model, only a
+    few presses have improbable errors, and the other presses agree with the model. A single press always counts as few.
+    At least `MIN_PRESSES` presses must remain.
 
     Args:
         errors: Errors of all presses.
@@ -188,27 +188,28 @@ def _bad_presses(errors: PressErrors) -> Booleans:
     """
     is_compared = errors.is_compared
     no_bad_press = np.zeros_like(is_compared)
-    if Agreement.of(errors, is_compared).acceptable:
+    if Agreement.from_errors(errors, is_compared).acceptable:
         return no_bad_press
 
     is_improbable = _improbable_presses(errors, is_compared)
     compared_count = int(is_compared.sum())
     improbable_count = int(is_improbable.sum())
     max_bad_count = max(1.0, MAX_BAD_FRACTION * compared_count)
-    are_few_improbable = 0 < improbable_count <= max_bad_count
-    are_enough_other = compared_count - improbable_count >= MIN_PRESSES
-    if not (are_few_improbable and are_enough_other):
+    few_are_improbable = 0 < improbable_count <= max_bad_count
+    enough_others_remain = compared_count - improbable_count >= MIN_PRESSES
+    if not (few_are_improbable and enough_others_remain):
         return no_bad_press
 
-    do_others_agree = Agreement.of(errors, is_compared & ~is_improbable).acceptable
-    return is_improbable if do_others_agree else no_bad_press
+    others_agree = Agreement.from_errors(errors, is_compared & ~is_improbable).acceptable
+    return is_improbable if others_agree else no_bad_press
 
 
 def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
     """Find the compared presses whose errors are very unlikely to be caused by noise and rig.
 
-    The limit of the probability is divided by the number of compared presses (Bonferroni correction). If all presses
-    are good, the probability that at least one press exceeds the limit is therefore about `BAD_PRESS_PROBABILITY`.
+    A press has improbable errors if the probability of such large errors is below a limit. The limit is divided by the
+    number of compared presses (Bonferroni correction). If all presses are good, the probability that at least one press
+    has improbable errors is therefore at most `BAD_PRESS_PROBABILITY`.
 
     Args:
         errors: Errors of all presses.
@@ -217,17 +218,18 @@ def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
     Returns:
         Whether each press has improbable errors, shape (n,).
     """
-    max_probability = BAD_PRESS_PROBABILITY / max(1, int(is_compared.sum()))
+    probability_limit = BAD_PRESS_PROBABILITY / max(1, int(is_compared.sum()))
     # Squared errors of x, y and the force, relative to their expected variances, shape (n, 3); NaN where unknown. The
-    # sum over one press has a chi-squared distribution. Its probability is only computed if the sum is large.
+    # sum over one press has a chi-squared distribution. Its probability is only computed if the sum is large, to save
+    # time.
     squared_ratio = errors.squared_ratio
     is_candidate = is_compared & (np.nansum(squared_ratio, axis=1) > BAD_PRESS_MIN_CHI_SQUARED)
     is_improbable = np.zeros_like(is_compared)
-    for press in np.flatnonzero(is_candidate):
-        press_ratio = squared_ratio[press]
-        known_ratio = press_ratio[~np.isnan(press_ratio)]
-        probability = chi_squared_survival(float(known_ratio.sum()), known_ratio.size)
-        is_improbable[press] = probability < max_probability
+    for press_index in np.flatnonzero(is_candidate):
+        press_ratios = squared_ratio[press_index]
+        known_ratios = press_ratios[~np.isnan(press_ratios)]
+        probability = chi_squared_survival(float(known_ratios.sum()), known_ratios.size)
+        is_improbable[press_index] = probability < probability_limit
     return is_improbable
 
 
@@ -244,7 +246,7 @@ def _position_summary(errors: PressErrors, is_selected: Booleans) -> ErrorSummar
     is_known = is_selected & ~np.isnan(errors.position_error_mm)
     noise_variance = errors.noise_std[is_known, X] ** 2 + errors.noise_std[is_known, Y] ** 2
     rig_variance = errors.rig_std[is_known, X] ** 2 + errors.rig_std[is_known, Y] ** 2
-    return ErrorSummary.of(errors.position_error_mm[is_known], noise_variance, rig_variance)
+    return ErrorSummary.from_errors(errors.position_error_mm[is_known], noise_variance, rig_variance)
 
 
 def _force_summary(errors: PressErrors, is_selected: Booleans) -> ErrorSummary | None:
@@ -261,11 +263,11 @@ def _force_summary(errors: PressErrors, is_selected: Booleans) -> ErrorSummary |
     is_known = is_selected & ~np.isnan(error_percent)
     noise_variance = (100.0 * errors.noise_std[is_known, FORCE]) ** 2
     rig_variance = (100.0 * errors.rig_std[is_known, FORCE]) ** 2
-    return ErrorSummary.of(error_percent[is_known], noise_variance, rig_variance)
+    return ErrorSummary.from_errors(error_percent[is_known], noise_variance, rig_variance)
 
 
 def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: ModelMetadata) -> str:
-    """Return a statement if chance cannot explain the number of presses with a large misfit.
+    """Return a statement for the user if more presses have a large misfit than chance can explain.
 
     The misfit is the distance between the measured charges and the nearest charges of a single contact. A misfit is
     large if it is above the limit of the model, which 1 % of good presses exceed.
@@ -276,34 +278,36 @@ def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: Mode
         metadata: Metadata of the model.
 
     Returns:
-        The statement; empty if the number of large misfits can be attributed to chance.
+        The statement; empty if chance can explain the number of presses with a large misfit.
     """
     has_large_misfit = np.array([MISFIT in flags for flags in errors.flags], dtype=np.bool_)
-    count = int(is_selected.sum())
+    selected_count = int(is_selected.sum())
     misfit_count = int((has_large_misfit & is_selected).sum())
-    probability_of_as_many = 1.0 - _probability_of_fewer(misfit_count, count)
+    probability_of_as_many = 1.0 - _probability_of_fewer(misfit_count, selected_count)  # as many, or more
     if probability_of_as_many >= MISFIT_PROBABILITY:
         return ""
     limit = misfit_limit(metadata)
-    return f"{misfit_count} of {count} presses have a misfit above {limit:.3g}, which 1 % of good ones have"
+    return f"{misfit_count} of {selected_count} presses have a misfit above {limit:.3g}, which 1 % of good ones have"
 
 
-def _probability_of_fewer(misfit_count: int, count: int) -> float:
-    """Compute the probability that fewer than `misfit_count` of `count` good presses have a large misfit.
+def _probability_of_fewer(misfit_count: int, press_count: int) -> float:
+    """Compute the probability that fewer than `misfit_count` of `press_count` good presses have a large misfit.
 
-    The number of presses with a large misfit has a binomial distribution with n = `count` and p = `MISFIT_FRACTION`.
-    The result is the sum of binomial(n, k) (p / (1 - p))^k (1 - p)^n over k from 0 to `misfit_count` - 1. The terms are
-    computed from their logarithms, because the binomial coefficients would overflow.
+    Each good press has a large misfit with the probability p = `MISFIT_FRACTION`. The number of such presses has a
+    binomial distribution. With n = `press_count`, the result is the sum of binomial(n, k) (p / (1 - p))^k (1 - p)^n
+    over k from 0 to `misfit_count` - 1. The terms are computed from their logarithms, because the binomial coefficients
+    would overflow.
 
     Args:
         misfit_count: Number of presses with a large misfit.
-        count: Number of all presses.
+        press_count: Number of all presses.
     """
     log_odds = math.log(MISFIT_FRACTION / (1.0 - MISFIT_FRACTION))
-    log_probability_of_none = count * math.log1p(-MISFIT_FRACTION)
+    log_probability_of_none = press_count * math.log1p(-MISFIT_FRACTION)
     probability = 0.0
     for k in range(misfit_count):
-        log_binomial = math.lgamma(count + 1) - math.lgamma(k + 1) - math.lgamma(count - k + 1)
+        # lgamma(m + 1) is the logarithm of the factorial of m
+        log_binomial = math.lgamma(press_count + 1) - math.lgamma(k + 1) - math.lgamma(press_count - k + 1)
         probability += math.exp(log_binomial + k * log_odds + log_probability_of_none)
     return probability
 
@@ -314,7 +318,7 @@ def _verdict(
     """Return a sentence that states the result of the comparison.
 
     Args:
-        fits: Whether noise and rig explain the errors; None if there are too few presses.
+        fits: Whether the model fits the presses; None if there are too few presses for a verdict.
         count: Number of compared presses.
         position: Errors of the positions; None if no position is known.
         force: Errors of the forces; None if no force is known.
@@ -356,6 +360,7 @@ def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: Err
         options.append(f"--force-std {0.01 * _explaining_rig_std(force):.2g}")
     yield f"the errors would be the rig's if that were as uncertain as {' '.join(options)}"
 
+    # A sensor that was never calibrated may also have the section `calibration`, but without gains and rotation.
     calibration = metadata.sensor.get("calibration")
     is_calibrated = False
     if isinstance(calibration, dict):
@@ -390,13 +395,17 @@ def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[s
         errors: Errors of all presses, with the reason why each press was excluded.
         metadata: Metadata of the model.
     """
-    reason_of_press = errors.exclusion_reasons
-    different_reasons = set(reason_of_press) - {""}  # a press that is compared has an empty reason
+    reason_of_each_press = errors.exclusion_reasons
+    different_reasons = set(reason_of_each_press) - {""}  # a press that is compared has an empty reason
     for reason in sorted(different_reasons):
-        lines = [line for line, line_reason in zip(errors.lines, reason_of_press, strict=True) if line_reason == reason]
+        lines = [
+            line
+            for line, reason_of_press in zip(errors.lines, reason_of_each_press, strict=True)
+            if reason_of_press == reason
+        ]
         list_of_lines = row_words(lines, errors.row_noun, MAX_LISTED_PRESSES)  # such as "lines 2, 5 and 4 more"
         explanation = _explain_exclusion(reason, metadata)
-        yield f"{len(lines)} of {len(reason_of_press)} presses do not count: {explanation} ({list_of_lines})"
+        yield f"{len(lines)} of {len(reason_of_each_press)} presses do not count: {explanation} ({list_of_lines})"
 
 
 def _explain_exclusion(reason: str, metadata: ModelMetadata) -> str:
@@ -451,9 +460,9 @@ def _misfit_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]
 
 
 def _common_notes(agreement: Agreement) -> Iterator[str]:
-    """Yield a note about a common shift of all positions and a note about a common scale factor of all forces.
+    """Yield a note about a common shift of all positions, and a note about a common scale factor of all forces.
 
-    A note about a common error is only yielded if the error is significant.
+    Each of the two notes is only yielded if the shift or the deviation of the scale factor from 1 is significant.
 
     Args:
         agreement: Tests of the errors, which contain the common errors of x, y and the force.

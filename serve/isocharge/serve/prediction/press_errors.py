@@ -88,29 +88,31 @@ class PressErrors:
         """Distances between predicted and measured positions, shape (n,), mm; NaN if a position is unknown."""
         return np.hypot(self.error[:, X], self.error[:, Y])
 
-    def row(self, press: int) -> dict[str, Any]:
-        """Return the values of one press as a dictionary whose keys contain the units.
+    def row(self, press_index: int) -> dict[str, Any]:
+        """Return the contact, the errors and the flags of one press as a dictionary whose keys contain the units.
+
+        The correlations of the contact are not included.
 
         Args:
-            press: Index of the press; the first press has the index 0.
+            press_index: Index of the press; the first press has the index 0.
         """
-        error = self.error[press]  # x and y in mm, and the force relative to the measured force
-        noise_std = self.noise_std[press]
-        rig_std = self.rig_std[press]
+        error = self.error[press_index]  # x and y in mm, and the force relative to the measured force
+        noise_std = self.noise_std[press_index]
+        rig_std = self.rig_std[press_index]
         contact_names = Contacts._fields[:N_WITHOUT_CORRELATION]
-        contact_values = self.predicted[press, :N_WITHOUT_CORRELATION].tolist()
+        contact_values = self.predicted[press_index, :N_WITHOUT_CORRELATION].tolist()
         return {
-            "line": self.lines[press],
+            "line": self.lines[press_index],
             **dict(zip(contact_names, contact_values, strict=True)),
             "x_error_mm": error[X],
             "y_error_mm": error[Y],
-            "position_error_mm": self.position_error_mm[press],
+            "position_error_mm": self.position_error_mm[press_index],
             "force_error_percent": 100.0 * error[FORCE],
             "noise_std_percent": 100.0 * noise_std[FORCE],
             "position_std_mm": rig_std[X],
             "force_std_percent": 100.0 * rig_std[FORCE],
-            "flags": list(self.flags[press]),
-            "left_out": self.exclusion_reasons[press] or None,
+            "flags": list(self.flags[press_index]),
+            "left_out": self.exclusion_reasons[press_index] or None,  # None if the press is compared
         }
 
 
@@ -129,9 +131,9 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     measured = model_presses.contact  # x, y and force, shape (n, 3)
     predicted = _predicted_contacts(predictor, model_presses.charge_pC)
 
-    # Errors of x and y are in mm. Errors of the force are divided by the measured force.
-    unit = np.ones((len(model_presses), 3))
-    unit[:, FORCE] = measured[:, FORCE]
+    # Differences of x and y are errors in mm. Differences of the force are divided by the measured force.
+    divisor = np.ones((len(model_presses), 3))
+    divisor[:, FORCE] = measured[:, FORCE]
 
     # Standard deviations of the measured values. The standard deviation of the force is already relative.
     position_std_mm = model_presses.position_std_mm
@@ -141,10 +143,10 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
         lines=model_presses.lines,
         row_noun=model_presses.row_noun,
         predicted=predicted,
-        error=(predicted[:, VALUE_COLUMNS] - measured) / unit,
-        noise_std=np.where(is_unknown, np.nan, predicted[:, STD_COLUMNS] / unit),
+        error=(predicted[:, VALUE_COLUMNS] - measured) / divisor,
+        noise_std=np.where(is_unknown, np.nan, predicted[:, STD_COLUMNS] / divisor),
         rig_std=np.where(is_unknown, np.nan, rig_std),
-        flags=_flags(metadata, predicted),
+        flags=_flags_of_presses(metadata, predicted),
         exclusion_reasons=_exclusion_reasons(metadata, model_presses),
     )
 
@@ -174,10 +176,11 @@ def _predicted_contacts(predictor: Predictor, charge_pC: Array) -> Array:
     return predicted
 
 
-def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], ...]:
-    """Return the flags `outside` and `misfit` of predicted contacts.
+def _flags_of_presses(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], ...]:
+    """Return which of the flags `outside` and `misfit` each predicted contact has.
 
-    The limit for the flag `misfit` is the result of `misfit_limit`, which is lower than the limit in `Validity`.
+    The limit for the flag `misfit` is the misfit that 1 % of good presses exceed. This limit is lower than the limit in
+    `Validity`, which only 0.1 % of good presses exceed.
 
     Args:
         metadata: Metadata of the model.
@@ -187,24 +190,26 @@ def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], 
         The flags of each press.
     """
     contacts = Contacts(*predicted.astype(np.float32).T)
-    batch_flags = Validity.of(metadata).batch_flags(contacts)
+    validity_flags_of_presses = Validity.of(metadata).batch_flags(contacts)
     has_contact = np.asarray(~np.isnan(predicted).all(axis=1))  # a press with an unknown charge has no contact
     has_misfit = np.asarray(predicted[:, MISFIT_COLUMN] > misfit_limit(metadata))
-    all_flags = []
-    for press, validity_flags in enumerate(batch_flags):
+    flags_of_presses = []
+    for press_index, validity_flags in enumerate(validity_flags_of_presses):
         flags = []
-        if OUTSIDE in validity_flags and has_contact[press]:  # without a contact, NaN counts as outside
+        # A position of NaN counts as outside, so the flag of a press without a contact has no meaning.
+        if OUTSIDE in validity_flags and has_contact[press_index]:
             flags.append(OUTSIDE)
-        if has_misfit[press]:
+        if has_misfit[press_index]:
             flags.append(MISFIT)
-        all_flags.append(tuple(flags))
-    return tuple(all_flags)
+        flags_of_presses.append(tuple(flags))
+    return tuple(flags_of_presses)
 
 
 def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tuple[str, ...]:
     """For each press, return why the press is excluded from the comparison, or an empty text if it is compared.
 
-    The measured position and the measured force determine whether a press lies in the domain of the model.
+    The model is compared with presses in its domain, which consists of the working area and the range of forces. The
+    measured position and the measured force determine whether a press lies in this domain.
 
     Args:
         metadata: Metadata of the model, which contain the working area and the range of forces.
@@ -265,8 +270,10 @@ class ErrorSummary:
     beyond: float
 
     @classmethod
-    def of(cls, absolute_error: Array, noise_variance: Array, rig_variance: Array) -> "ErrorSummary | None":
+    def from_errors(cls, absolute_error: Array, noise_variance: Array, rig_variance: Array) -> "ErrorSummary | None":
         """Summarise errors, and compare the mean square error with the variances that noise and rig cause.
+
+        The rig is the machine that sets the position and the force of each press.
 
         Args:
             absolute_error: Absolute error of each press, shape (n,).
@@ -282,7 +289,8 @@ class ErrorSummary:
         mean_noise_variance = float(np.mean(noise_variance))
         mean_rig_variance = float(np.mean(rig_variance))
         explained_variance = mean_noise_variance + mean_rig_variance
-        unexplained_variance = max(mean_square - mean_noise_variance - mean_rig_variance, 0.0)  # 0 if it is negative
+        # The errors may happen to be smaller than expected. Nothing is unexplained in this case.
+        unexplained_variance = max(mean_square - mean_noise_variance - mean_rig_variance, 0.0)
         return cls(
             presses=absolute_error.size,
             rms=math.sqrt(mean_square),
@@ -311,10 +319,12 @@ class CommonError:
     significance: float
 
     @classmethod
-    def of(cls, error: Array, variance: Array) -> "CommonError":
-        """Estimate the error that is common to all presses.
+    def from_errors(cls, error: Array, variance: Array) -> "CommonError":
+        """Estimate the error that is common to all presses, such as a shift of all positions.
 
-        The estimate is the mean of the errors, weighted with the inverse of their expected variances.
+        The estimate is the mean of the errors, weighted with the inverse of their expected variances. The significance
+        is the mean divided by a standard error. The rig, which is the machine that makes the presses, may have an error
+        that is equal in all presses. The standard error includes this error.
 
         Args:
             error: Error of each press, shape (n,); NaN where unknown.
@@ -330,14 +340,17 @@ class CommonError:
         mean = float(weight @ known_error) / total_weight
         mean_variance = 1.0 / total_weight
 
-        # If the errors scatter more than their expected variances, the standard error of the mean is increased.
+        # If the errors scatter more than their expected variances, the standard error of the mean is increased. One
+        # degree of freedom is used for the mean.
         chi_squared = float(weight @ (known_error - mean) ** 2)
         chi_squared_per_degree = chi_squared / max(count - 1, 1)
         std = math.sqrt(mean_variance * max(chi_squared_per_degree, 1.0))
 
-        # For the significance, the variance of the mean includes a constant error of the rig, whose standard deviation
-        # is `COMMON_RATIO` times the standard deviation of a single press. Averaging does not reduce this error.
-        std_with_rig = math.sqrt(mean_variance * (1.0 + COMMON_RATIO**2 * count))
+        # For the significance, the variance of the mean includes an error of the rig that is equal in all presses, so
+        # that averaging does not reduce it. Its standard deviation is `COMMON_RATIO` times that of a single press.
+        press_variance = count * mean_variance  # typical variance of a single press
+        common_rig_variance = COMMON_RATIO**2 * press_variance
+        std_with_rig = math.sqrt(mean_variance + common_rig_variance)
         return cls(mean, std, significance=mean / std_with_rig)
 
 
@@ -347,7 +360,7 @@ class Agreement:
 
     Attributes:
         chi_squared: Sum of the squared errors divided by their expected variances.
-        degrees: Number of known errors, which is the number of degrees of freedom of the sum.
+        degrees: Number of degrees of freedom of the sum, which is the number of known errors.
         p_value: Probability that noise and rig alone cause a larger sum; NaN without presses.
         shift_x: Common error of x, mm.
         shift_y: Common error of y, mm.
@@ -364,26 +377,28 @@ class Agreement:
     common_p_value: float
 
     @classmethod
-    def of(cls, errors: PressErrors, is_selected: Booleans) -> "Agreement":
+    def from_errors(cls, errors: PressErrors, is_selected: Booleans) -> "Agreement":
         """Test whether noise and rig explain the errors of the selected presses.
 
-        The statistic of the first test is the sum of all squared errors divided by their expected variances. The
-        statistic of the second test is the sum of the squared significances of the common errors of x, y and the force.
-        Both statistics have a chi-squared distribution if noise and rig explain the errors.
+        The rig is the machine that makes the presses. The statistic of the first test is the sum of all squared errors
+        divided by their expected variances. The second test uses the errors of x, y and the force that are common to
+        all presses. The statistic of this test is the sum of their squared significances. Both statistics have a
+        chi-squared distribution if noise and rig explain the errors.
 
         Args:
             errors: Errors of all presses; NaN where a measured value is unknown.
             is_selected: Whether each press is selected, shape (n,).
         """
+        # The columns are x, y and the force.
         error = errors.error[is_selected]
         variance = errors.variance[is_selected]
         chi_squared = float(np.nansum(errors.squared_ratio[is_selected]))
         degrees = int(np.count_nonzero(~np.isnan(error)))
-        shift_x = CommonError.of(error[:, X], variance[:, X])
-        shift_y = CommonError.of(error[:, Y], variance[:, Y])
-        force = CommonError.of(error[:, FORCE], variance[:, FORCE])
-        known_errors = [common for common in (shift_x, shift_y, force) if not math.isnan(common.mean)]
-        squared_significance = sum(common.significance**2 for common in known_errors)
+        shift_x = CommonError.from_errors(error[:, X], variance[:, X])
+        shift_y = CommonError.from_errors(error[:, Y], variance[:, Y])
+        force = CommonError.from_errors(error[:, FORCE], variance[:, FORCE])
+        known_common_errors = [common for common in (shift_x, shift_y, force) if not math.isnan(common.mean)]
+        squared_significance = sum(common.significance**2 for common in known_common_errors)
         return cls(
             chi_squared=chi_squared,
             degrees=degrees,
@@ -391,17 +406,20 @@ class Agreement:
             shift_x=shift_x,
             shift_y=shift_y,
             force=force,
-            common_p_value=_p_value(squared_significance, len(known_errors)),
+            common_p_value=_p_value(squared_significance, len(known_common_errors)),
         )
 
     @property
     def acceptable(self) -> bool:
-        """Whether noise and rig explain the errors.
+        """Whether the noise of the charges and the uncertainty of the rig explain the errors.
 
-        Each of the two tests rejects good presses with a probability of `SIGNIFICANCE` / 2. The probability that one of
-        the tests rejects good presses is therefore at most `SIGNIFICANCE`. The expected variances are not known
-        exactly, and for many presses even a small error of these variances would be significant. The scatter is
-        therefore also accepted if `chi_squared` exceeds its expected value `degrees` by only a few percent.
+        The first test rejects a large scatter of the errors, and the second test rejects large common errors. Each test
+        rejects good presses with a probability of `SIGNIFICANCE` / 2. The probability that one of the tests rejects
+        good presses is therefore at most `SIGNIFICANCE`.
+
+        The expected variances are not known exactly, and for many presses even a small error of these variances would
+        be significant. The scatter is therefore also accepted if `chi_squared` exceeds its expected value `degrees` by
+        only a few percent.
         """
         max_p_value = 0.5 * SIGNIFICANCE
         max_accepted_chi_squared = MAX_ACCEPTED_CHI_SQUARED * self.degrees
@@ -411,7 +429,9 @@ class Agreement:
 
 
 def _p_value(chi_squared: float, degrees: int) -> float:
-    """Return the probability that a chi-squared variable exceeds a value, or NaN if it has no degrees of freedom.
+    """Return the probability that a variable with a chi-squared distribution exceeds a given value.
+
+    If the distribution has no degrees of freedom, the result is NaN.
 
     Args:
         chi_squared: The value, not negative.
@@ -445,10 +465,11 @@ def chi_squared_survival(statistic: float, degrees: int) -> float:
         smallest_log_term += 0.5 * math.log(4.0 * half_statistic / math.pi)
 
     # Each term is the previous term times x / s. Logarithms are added, because products of the factors may overflow.
+    # For one degree of freedom, there are no terms, and the slice [:0] removes the leading 0.
     term_count = degrees // 2
-    exponents = smallest_exponent + np.arange(1, term_count)
-    log_ratio_to_smallest = np.concatenate([[0.0], np.cumsum(np.log(half_statistic / exponents))])
-    log_terms = smallest_log_term + log_ratio_to_smallest[:term_count]  # no term for one degree of freedom
+    later_exponents = smallest_exponent + np.arange(1, term_count)
+    log_ratio_to_smallest = np.concatenate([[0.0], np.cumsum(np.log(half_statistic / later_exponents))])
+    log_terms = smallest_log_term + log_ratio_to_smallest[:term_count]
     probability = float(np.exp(log_terms).sum())
     if is_odd:
         probability += math.erfc(math.sqrt(half_statistic))

@@ -1,8 +1,8 @@
 """Reading of charges from a file, and writing of contacts as CSV or as prediction records.
 
-The header of a file of charges contains the names of the electrodes in any order, and may contain names of other
-columns. Each row contains touch charges in pC. No tare is subtracted from the charges. If the charges of a row do not
-exceed the noise, no contact is reported for the row.
+A file of charges has a header with the names of the electrodes in any order, and may have other columns. Each row
+contains touch charges in pC. No tare is subtracted from the charges. If the charges of a row do not exceed the noise,
+no contact is reported for the row.
 """
 
 import csv
@@ -52,7 +52,7 @@ def read_charges(
             `MAX_CHARGE_ROWS`.
     """
     table = CsvTable(lines, electrodes, where, ChargeError, _expected_header(electrodes))
-    return _charges(table, electrodes, warn)
+    return _read_electrode_charges(table, electrodes, warn)
 
 
 def read_charge_file(path: Path, electrodes: tuple[str, ...], warn: Callable[[str], None] = lambda _: None) -> Array:
@@ -72,7 +72,7 @@ def read_charge_file(path: Path, electrodes: tuple[str, ...], warn: Callable[[st
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     with open_table(path, electrodes, ChargeError, _expected_header(electrodes)) as table:
-        return _charges(table, electrodes, warn)
+        return _read_electrode_charges(table, electrodes, warn)
 
 
 def _expected_header(electrodes: tuple[str, ...]) -> str:
@@ -80,8 +80,8 @@ def _expected_header(electrodes: tuple[str, ...]) -> str:
     return f"a header with one column for each of the electrodes {electrodes} and charges in pC"
 
 
-def _charges(table: NumberTable, electrodes: tuple[str, ...], warn: Callable[[str], None]) -> Array:
-    """Read the charges of all electrodes from an open table.
+def _read_electrode_charges(table: NumberTable, electrodes: tuple[str, ...], warn: Callable[[str], None]) -> Array:
+    """Read the charges of the given electrodes from an open table.
 
     Args:
         table: The table. Its header must contain the names of the electrodes.
@@ -90,14 +90,19 @@ def _charges(table: NumberTable, electrodes: tuple[str, ...], warn: Callable[[st
 
     Returns:
         Charges in the order of `electrodes`, shape (n, electrodes), pC.
+
+    Raises:
+        ChargeError: If a column is missing or occurs twice, a cell is not a finite number, or there are more rows than
+            `MAX_CHARGE_ROWS`.
     """
     charge_rule = replace(CHARGE_RULE, may_be_empty=False)  # a model needs the charges of all electrodes
-    column_rules = table.choose_columns(dict.fromkeys(electrodes, charge_rule))  # the same rule for each electrode
+    rule_of_each_electrode = dict.fromkeys(electrodes, charge_rule)
+    column_rules = table.choose_columns(rule_of_each_electrode)
     ignored_names = [name for name in table.header if name not in electrodes]
     if ignored_names:
         warn(ignored_columns_message(table.where, ignored_names))
-    content = table.read(column_rules, MAX_CHARGE_ROWS)
-    return np.column_stack([content.values[name] for name in electrodes])
+    columns = table.read(column_rules, MAX_CHARGE_ROWS)
+    return np.column_stack([columns.values[name] for name in electrodes])
 
 
 def write_contacts(
@@ -115,7 +120,7 @@ def write_contacts(
         charge_pC: Charges of the presses, shape (n, electrodes), pC. If the charges and `validity` are given, a press
             whose charges do not exceed the noise has the force 0, and its other cells are empty.
     """
-    is_touch = np.ones(len(contacts.x_mm), dtype=bool)
+    is_touch = np.ones(len(contacts.x_mm), dtype=bool)  # whether each press is a touch; without charges, all are
     if validity is not None and charge_pC is not None:
         is_touch = validity.is_touch(charge_pC)
 
@@ -143,15 +148,15 @@ def _contact_rows(contact_values: Singles, is_touch: Booleans, validity: Validit
         validity: Domain of the model. If it is given, the last cell contains the flags, separated by blanks.
     """
     names = Contacts._fields[:N_WITHOUT_CORRELATION]
-    cells_without_contact = tuple("0.000000" if name == "force_N" else "" for name in names)
+    cells_without_touch = tuple("0.000000" if name == "force_N" else "" for name in names)
     values_of_presses = contact_values[:, :N_WITHOUT_CORRELATION].tolist()
     flags_of_presses: list[tuple[str, ...]] = [()] * len(contact_values)
     if validity is not None:
         flags_of_presses = validity.batch_flags(Contacts(*contact_values.T))
-    for values, has_contact, flags in zip(values_of_presses, is_touch.tolist(), flags_of_presses, strict=True):
-        cells = cells_without_contact
+    for values, is_press_touch, flags in zip(values_of_presses, is_touch.tolist(), flags_of_presses, strict=True):
+        cells = cells_without_touch
         flag_text = ""
-        if has_contact:
+        if is_press_touch:
             cells = tuple(f"{value:.6f}" for value in values)
             flag_text = " ".join(flags)
         if validity is not None:
@@ -176,8 +181,8 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
     """Yield a prediction record for each row of charges.
 
     A table contains no times, no counters and no raw charges. The fields of the records for times, counters and raw
-    charges are therefore None. If the charges of a row do not exceed the noise of the model, the record has the force 0
-    and no position.
+    charges are therefore None. If the charges of a row do not exceed the noise of the model, the record has the force
+    0, no position and no flags.
 
     Args:
         charge_pC: Charges, shape (n, electrodes), pC.

@@ -2,9 +2,10 @@
 
 Every division of the bytes of a frame into fields has a score in bits. The score is the sum of two numbers. The first
 number states how many bits are needed to encode the values of a frame if the previous frame is known. The second number
-is the sum of the `Weights` of the fields. The division with the lowest score is chosen. Because of the weights, a
-simple division has a lower score than a complicated division. A division is simple, for example, if all channels are
-adjacent and have the same type. The script `tests/benchmarks/fit_recognition.py` fits the weights to random boards.
+is the sum of the `Weights` of the fields. The program chooses the division with the lowest score. Because of the
+weights, a simple division has a lower score than a complicated division. A division is simple, for example, if all
+channels are adjacent and have the same type. The script `tests/benchmarks/fit_recognition.py` fits the weights to
+random boards.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,7 +26,7 @@ The share is less than 1, because frames may be lost and counters may restart.
 """
 
 STEADY_SPREAD = 0.7
-"""Largest deviation of a regular step of a clock from the median step, relative to the median step."""
+"""Largest deviation of a regular step of a counter or clock from the median step, relative to the median step."""
 
 CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
     tick_rate_Hz: ("t_us", 1e6 / tick_rate_Hz)
@@ -59,7 +60,7 @@ def steady_step(steps: Array) -> float:
     return float(regular_steps.mean())
 
 
-def clock_of(steps: Array, frame_rate_Hz: float) -> tuple[str, float] | None:
+def identify_clock(steps: Array, frame_rate_Hz: float) -> tuple[str, float] | None:
     """Identify a clock by comparing its tick rate with the usual tick rates of boards.
 
     Args:
@@ -80,17 +81,19 @@ def clock_of(steps: Array, frame_rate_Hz: float) -> tuple[str, float] | None:
 
 @dataclass(frozen=True)
 class Weights:
-    """Contribution that each kind of part of a frame makes to the score of a division, in bits.
+    """Contributions of the parts of a frame to the score of a division, in bits.
+
+    The fields, the padding and the checksum are parts of a frame. The division with the lowest score is chosen.
 
     Attributes:
-        row: Contribution of a row of adjacent channels of one type.
+        channel_group: Contribution of a group of adjacent channels of one type.
         channel: Contribution of a channel, in addition to the bits of its steps.
         constant: Contribution of a constant byte without a meaning, or of a constant channel.
         noise: Contribution of a varying byte without a meaning, and of a byte outside of all frames.
         fraction: Share of the bits of a floating-point number that belong to its significant digits, dimensionless.
     """
 
-    row: float = 4.0
+    channel_group: float = 4.0
     channel: float = 1.65
     constant: float = 0.8
     noise: float = 8.0
@@ -100,29 +103,35 @@ class Weights:
 class Part(NamedTuple):
     """A part of a frame.
 
+    Adjacent channels of one type form a group of channels.
+
     Attributes:
-        role: Meaning of the part.
-        kind: Type of the number, as in device files.
+        role: Meaning of the part: padding, frame counter, clock or channel.
+        type_name: Type of the number, as in device files.
         size: Number of bytes.
-        score: Contribution to the score, without the contribution of a row that the part begins, bits.
-        is_constant: Whether the part is a channel with a constant value. Such a channel does not begin a row.
-        name: Name of the field in a device file; empty for channels.
+        score: Contribution of the part to the score of a division, bits. If the part begins a group of channels, the
+            contribution of the group is not included.
+        is_constant: Whether the part is a channel with a constant value. Such a channel does not begin a group.
+        name: Name of the field in a device file; empty for channels and padding.
         scale: Value of one tick of a clock, in the unit of its name.
-        row: Type that the channels of a row have in common; empty for a part that is not a channel.
     """
 
     role: Literal["pad", "seq", "clock", "channel"]
-    kind: str
+    type_name: str
     size: int
     score: float
     is_constant: bool = False
     name: str = ""
     scale: float = 1.0
-    row: str = ""
+
+    @property
+    def channel_type(self) -> str:
+        """Type of the channel; empty for a part that is not a channel."""
+        return self.type_name if self.role == "channel" else ""
 
 
 @np.errstate(all="ignore")
-def parts_of(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights: Weights) -> list[list[Part]]:
+def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights: Weights) -> list[list[Part]]:
     """List the possible parts of a frame that begin at each byte.
 
     A part is a single byte without a meaning (padding), or a number of one of the types `TYPES`. The first byte of the
@@ -130,8 +139,8 @@ def parts_of(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights: Weigh
     the following bytes.
 
     Args:
-        rows: Bytes of each frame and of the next frame, shape (n, 2 * length). The frames may begin at any position of
-            a row.
+        rows: Bytes of two consecutive frames in each row, shape (n, 2 * length). The frames may begin at any position
+            of a row, but they begin at the same position in all rows.
         order: Byte order of the numbers.
         frame_rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
         weights: Contributions to the score.
@@ -144,49 +153,55 @@ def parts_of(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights: Weigh
     row_length = rows.shape[1]
     length = row_length // 2  # a row has the bytes of two frames
     byte_step = 1 if order == "little" else -1  # reverses big-endian numbers, so that the lowest byte comes first
-    parts_at: list[list[Part]] = []
+    parts_at_each_byte: list[list[Part]] = []
     for position in range(length):
         pad_score = weights.constant if is_constant[position] else weights.noise
         parts = [Part("pad", "pad", 1, pad_score)]  # one byte of padding
-        for kind in TYPES:  # such as "u16", whose size is 16 bits
-            size = int(kind[1:]) // 8  # in bytes
+        for type_name in TYPES:  # such as "u16", whose size is 16 bits
+            size = int(type_name[1:]) // 8  # in bytes
             end = position + size
             if end <= row_length:
                 # The bytes of the number in all frames, shape (n, size), and the properties of each byte, shape (size,)
                 number_bytes = rows[:, position:end][:, ::byte_step]
                 byte_is_constant = is_constant[position:end][::byte_step]
                 byte_is_zero = is_zero[position:end][::byte_step]
-                parts += _number_parts(number_bytes, byte_is_constant, byte_is_zero, kind, frame_rate_Hz, weights)
-        parts_at.append(parts)
-    return parts_at
+                parts += _number_parts(number_bytes, byte_is_constant, byte_is_zero, type_name, frame_rate_Hz, weights)
+        parts_at_each_byte.append(parts)
+    return parts_at_each_byte
 
 
 def _number_parts(
-    number_bytes: Bytes, is_constant: Booleans, is_zero: Booleans, kind: str, frame_rate_Hz: float, weights: Weights
+    number_bytes: Bytes,
+    is_constant: Booleans,
+    is_zero: Booleans,
+    type_name: str,
+    frame_rate_Hz: float,
+    weights: Weights,
 ) -> Iterator[Part]:
     """Yield the possible parts of a frame for bytes that contain a number of a given type.
 
-    Every number may be a channel. A number may also be the frame counter or a clock if its steps are regular. Nothing
-    is yielded for floating-point numbers that are implausibly small or large.
+    Every number may be a channel. A number may also be the frame counter or a clock if its steps, the differences
+    between consecutive frames, are regular. Nothing is yielded for floating-point numbers that are implausibly small or
+    large. Each part has a score, which is lower for a more probable part.
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
         is_constant: Whether each byte is constant, shape (size,).
         is_zero: Whether each byte is always 0, shape (size,).
-        kind: Type of the number, such as "u16", "i16" or "f32".
+        type_name: Type of the number, such as "u16", "i16" or "f32".
         frame_rate_Hz: Number of frames per second, Hz.
         weights: Contributions to the score.
     """
     size = len(is_constant)  # bytes
     if is_constant.all():
-        yield Part("channel", kind, size, weights.constant, is_constant=True, row=kind)
+        yield Part("channel", type_name, size, weights.constant, is_constant=True)
         return
-    is_float = kind[0] == "f"
-    is_unsigned = kind[0] == "u"
-    is_signed = kind[0] == "i"
-    values = _values(number_bytes, kind)
+    is_float = type_name[0] == "f"
+    is_unsigned = type_name[0] == "u"
+    is_signed = type_name[0] == "i"
+    values = _values(number_bytes, type_name)
     steps = np.diff(values)
-    counter_steps = steps
+    counter_steps = steps  # steps if the number is a counter or a clock, which may overflow
     magnitude = float(np.median(np.abs(values)))
     unit = 1.0  # smallest step that the number can represent
     if is_float:
@@ -194,8 +209,9 @@ def _number_parts(
         if not min_magnitude < magnitude < max_magnitude:
             return
         # The share `weights.fraction` of the bytes contains digits. Low bytes that are always 0 contain no digits.
-        zero_byte_count = np.argmin(is_zero)
-        unit = magnitude * 256.0 ** (zero_byte_count - weights.fraction * size)
+        low_zero_byte_count = np.argmin(is_zero)  # index of the lowest byte that is not always 0
+        digit_byte_count = weights.fraction * size - low_zero_byte_count
+        unit = magnitude * 256.0**-digit_byte_count
     if is_unsigned:
         half_range = 1 << (8 * size - 1)
         counter_steps = (steps + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
@@ -205,31 +221,33 @@ def _number_parts(
     can_be_counter = is_unsigned and size != 3
     can_be_clock = not is_signed and size not in (1, 3)
     if can_be_counter and steady_step(counter_steps) == 1.0:
-        yield Part("seq", kind, size, 0.0, name="seq")
+        yield Part("seq", type_name, size, 0.0, name="seq")  # the values of a counter need no bits
     elif can_be_clock:
-        clock = clock_of(counter_steps, frame_rate_Hz)
+        clock = identify_clock(counter_steps, frame_rate_Hz)
         if clock is not None:
             name, tick_duration = clock
             clock_score = _bits(counter_steps - np.median(counter_steps), unit, size)
-            yield Part("clock", kind, size, clock_score, name=name, scale=tick_duration)
+            yield Part("clock", type_name, size, clock_score, name=name, scale=tick_duration)
 
     # The magnitude is counted as one more step. The score of a type is therefore lower if the values in this type are
     # close to 0 or, for an unsigned type, close to the middle of its range.
     channel_score = weights.channel + _bits(np.append(steps, magnitude), unit, size)
-    yield Part("channel", kind, size, channel_score, row=kind)
+    yield Part("channel", type_name, size, channel_score)
 
 
 def split_frame(
-    parts_at: Sequence[Sequence[Part]], sync_lengths: Iterable[int], weights: Weights
+    parts_at_each_byte: Sequence[Sequence[Part]], sync_lengths: Iterable[int], weights: Weights
 ) -> tuple[float, int, tuple[Part, ...]]:
     """Divide a frame into parts so that the score of the division is as low as possible.
 
-    The division is found by dynamic programming, from the last byte to the first.
+    The frame begins with the sync pattern, a constant pattern of bytes that marks the beginning of the frame. The best
+    division of the other bytes is found by dynamic programming. For every position, the best division of the bytes
+    after this position is computed once and stored.
 
     Args:
-        parts_at: Parts that may begin at each byte before the checksum.
-        sync_lengths: Possible lengths of the sync pattern, bytes. If several lengths have the lowest score, the
-            shortest of them is chosen.
+        parts_at_each_byte: Parts that may begin at each byte before the checksum.
+        sync_lengths: Possible lengths of the sync pattern, bytes; 0 if the frame has no sync pattern. If several
+            lengths have the lowest score, the shortest of them is chosen.
         weights: Contributions to the score.
 
     Returns:
@@ -237,35 +255,36 @@ def split_frame(
     """
 
     @cache
-    def best_division(position: int, row: str) -> tuple[float, tuple[Part, ...]]:
+    def best_division(position: int, previous_channel_type: str) -> tuple[float, tuple[Part, ...]]:
         """Find the division with the lowest score for the bytes from a given position to the end.
 
         The function tries each part that may begin at the position, and calls itself for the bytes after the part.
-        Adjacent channels of one type form a row. A channel that begins a row adds `weights.row` to the score. A channel
-        with a constant value cannot begin a row.
+        Adjacent channels of one type form a group. A channel that begins a group adds `weights.channel_group` to the
+        score. A channel with a constant value cannot begin a group.
 
         Args:
             position: Position of the first byte.
-            row: Type of the channel that ends just before this byte; empty if no channel ends there.
+            previous_channel_type: Type of the channel that ends just before this byte; empty if no channel ends there.
 
         Returns:
             The score and the parts of the division. The score is infinite if no division ends exactly at the last byte.
         """
-        if position == len(parts_at):
+        byte_count = len(parts_at_each_byte)
+        if position == byte_count:
             return 0.0, ()
-        if position > len(parts_at):  # the part before this position is too long
+        if position > byte_count:  # the part before this position is too long
             return np.inf, ()
         best_score = np.inf
         best_parts: tuple[Part, ...] = ()
-        for part in parts_at[position]:
-            is_channel = part.row != ""
-            begins_row = is_channel and part.row != row
-            if begins_row and part.is_constant:
+        for part in parts_at_each_byte[position]:
+            is_channel = part.role == "channel"
+            begins_group = is_channel and part.channel_type != previous_channel_type
+            if begins_group and part.is_constant:
                 continue
-            rest_score, rest_parts = best_division(position + part.size, part.row)
+            rest_score, rest_parts = best_division(position + part.size, part.channel_type)
             score = part.score + rest_score
-            if begins_row:
-                score = part.score + weights.row + rest_score
+            if begins_group:
+                score = part.score + weights.channel_group + rest_score
             if score < best_score:
                 best_score = score
                 best_parts = (part, *rest_parts)
@@ -277,21 +296,21 @@ def split_frame(
         if sync_length == 1:  # a sync of a single byte is rare
             score += weights.constant
         scored_sync_lengths.append((score, sync_length))
-    lowest_score, best_sync_length = min(scored_sync_lengths)
+    lowest_score, best_sync_length = min(scored_sync_lengths)  # of equal scores, the one with the shortest pattern
     _, best_parts = best_division(best_sync_length, "")
     return lowest_score, best_sync_length, best_parts
 
 
-def _values(number_bytes: Bytes, kind: str) -> Array:
+def _values(number_bytes: Bytes, type_name: str) -> Array:
     """Decode one number in all frames, and return its values, shape (n,).
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
-        kind: Type of the number: "f" for floating-point, "u" for unsigned or "i" for signed, and the size in bits.
+        type_name: Type of the number: "f" for floating-point, "u" for unsigned or "i" for signed, and the size in bits.
     """
     size = number_bytes.shape[1]
-    is_float = kind[0] == "f"
-    is_unsigned = kind[0] == "u"
+    is_float = type_name[0] == "f"
+    is_unsigned = type_name[0] == "u"
     if is_float:
         little_endian_type = f"<f{size}"
         floats = np.ascontiguousarray(number_bytes).view(little_endian_type)  # shape (n, 1)
@@ -320,5 +339,6 @@ def _bits(steps: Array, unit: float, size: int) -> float:
         size: Size of the number, bytes.
     """
     step_bits = np.log2(1.0 + np.abs(steps) / unit)
-    limited_bits = np.fmin(step_bits, 8 * size)  # also replaces NaN by the size
+    number_bits = 8 * size
+    limited_bits = np.fmin(step_bits, number_bits)  # `fmin` also replaces NaN by `number_bits`
     return float(limited_bits.mean())

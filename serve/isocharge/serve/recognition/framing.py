@@ -1,9 +1,10 @@
 """Recognition of where the frames in a stream begin, how long they are, and which checksum they have.
 
-A stream with byte stuffing is split at its delimiters. In a stream without byte stuffing, some bytes are usually the
-same in every frame, and repeat at a distance of one frame length. For each repeated pair of bytes, frames are assumed
-to begin at every repetition. The pair is chosen whose frames would cover the largest part of the stream. The position
-of the chosen pair within a frame is determined later.
+Byte stuffing is an encoding that marks the ends of frames with a delimiter. A stream with byte stuffing is split at its
+delimiters. In a stream without byte stuffing, some bytes are usually the same in every frame, and repeat at a distance
+of one frame length. For each repeated pair of bytes, frames are assumed to begin at every repetition. The program
+chooses the pair whose frames would cover the largest part of the stream. The position of the chosen pair within a frame
+is determined later.
 
 Checksums with a name are tried for every possible position of the first byte that they cover. For cyclic redundancy
 checks without a name, only the polynomials have to be tried, because the effect of all other parameters is a constant.
@@ -41,13 +42,13 @@ MAX_EXAMINED_BYTES = 1 << 16
 """Largest number of bytes of a stream that are examined."""
 
 STUFFED_SHARE = 0.9
-"""Smallest share of the pieces between delimiters that must have the same length, dimensionless."""
+"""Smallest share of the frames between delimiters that must have the same length, dimensionless."""
 
 COVERED_SHARE = 0.4
 """Smallest share of a stream that frames of one length must cover, dimensionless."""
 
 SINGLE_BYTE_PENALTY = 0.05
-"""Share of a stream by which a single byte must cover more than a pair of bytes, in order to be chosen.
+"""Share by which frames that begin at a single byte must cover more of a stream than frames that begin at a pair.
 
 A pair of bytes rarely repeats by chance, but a single byte often does.
 """
@@ -62,8 +63,8 @@ The share is less than 1, because some frames may be damaged.
 """
 
 
-class Windows(NamedTuple):
-    """Windows of bytes in a stream whose frames all have the same length.
+class FrameDivision(NamedTuple):
+    """Division of a stream into windows of bytes, one window for each frame. All frames have the same length.
 
     A window has the length of a frame. All windows begin at the same position within a frame, but this position need
     not be the first byte of the frame.
@@ -71,24 +72,25 @@ class Windows(NamedTuple):
     Attributes:
         framing: Kind of framing, one of `isocharge.serve.frames.frame_layout.Framing`.
         stream: All bytes of the stream, shape (n,).
-        starts: Positions at which the windows begin, shape (frames,).
-        length: Number of bytes in a window.
+        window_starts: Positions in the stream at which the windows begin, shape (frames,).
+        length: Number of bytes in a window, which is the length of a frame.
     """
 
     framing: str
     stream: Bytes
-    starts: NDArray[np.int64]
+    window_starts: NDArray[np.int64]
     length: int
 
     def rows(self) -> Bytes:
         """Return the bytes of each window and the same number of bytes after it, shape (frames, 2 * length).
 
-        Two lengths are needed, because the position in a window at which the next frame begins is unknown. Windows that
-        are too close to the end of the stream are excluded.
+        A window has the length of a frame. Two lengths are needed, because the position in a window at which the next
+        frame begins is unknown. Windows that are too close to the end of the stream are excluded.
         """
         row_length = 2 * self.length
-        starts = self.starts[self.starts + row_length <= len(self.stream)]
-        positions = starts[:, None] + np.arange(row_length)  # positions in the stream, shape (frames, 2 * length)
+        has_whole_row = self.window_starts + row_length <= len(self.stream)
+        row_starts = self.window_starts[has_whole_row]
+        positions = row_starts[:, None] + np.arange(row_length)  # positions in the stream, shape (frames, 2 * length)
         return np.asarray(self.stream[positions])
 
 
@@ -106,8 +108,11 @@ def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
     return usual, share_of_frames >= CONSTANT_SHARE
 
 
-def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Windows]:
+def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[FrameDivision]:
     """Yield all possible divisions of a stream into frames, from the most certain to the least certain division.
+
+    Datagrams of whole frames are the most certain division, followed by frames with byte stuffing. Frames that begin at
+    a repeated byte or pair of bytes are the least certain division.
 
     Args:
         chunks: The bytes of the stream.
@@ -115,66 +120,79 @@ def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Window
     """
     data = b"".join(chunks)[:MAX_EXAMINED_BYTES]
     if are_datagrams:
-        # The length of a frame divides the length of every datagram, so it divides their greatest common divisor.
-        greatest_divisor = gcd(*map(len, chunks))
-        max_length = min(greatest_divisor, MAX_FRAME_BYTES)
+        # The length of a frame divides the length of every datagram. It therefore also divides the greatest common
+        # divisor of these lengths.
+        divisible_length = gcd(*map(len, chunks))
+        max_length = min(divisible_length, MAX_FRAME_BYTES)
         for length in range(MIN_FRAME_BYTES, max_length + 1):
-            if greatest_divisor % length == 0:
+            if divisible_length % length == 0:
                 yield _adjacent_frames(DATAGRAM, data, length)
     for name, stuffing in STUFFINGS.items():
         yield from _stuffed_frames(name, stuffing, data)
     yield from _synchronised_frames(np.frombuffer(data, np.uint8))
 
 
-def _adjacent_frames(framing: str, data: bytes, length: int) -> Windows:
-    """Divide a stream that consists of whole frames of one length into its frames."""
+def _adjacent_frames(framing: str, data: bytes, length: int) -> FrameDivision:
+    """Divide a stream that consists only of whole frames of one length into its frames.
+
+    Args:
+        framing: Kind of framing, which is stored in the result.
+        data: Bytes of the stream.
+        length: Length of each frame, bytes.
+    """
     stream = np.frombuffer(data, np.uint8)
-    starts = np.arange(0, len(data), length)
-    return Windows(framing, stream, starts, length)
+    window_starts = np.arange(0, len(data), length)
+    return FrameDivision(framing, stream, window_starts, length)
 
 
-def _stuffed_frames(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
-    """If most pieces between the delimiters of a byte stuffing are frames of one length, yield these frames.
+def _stuffed_frames(name: str, stuffing: Stuffing, data: bytes) -> Iterator[FrameDivision]:
+    """Decode a stream with a byte stuffing. If most of the decoded frames have the same length, yield these frames.
+
+    A byte stuffing is an encoding that marks the ends of frames with a delimiter. At most one division is yielded.
 
     Args:
         name: Name of the byte stuffing.
         stuffing: Delimiter and functions of the byte stuffing.
         data: Bytes of the stream.
     """
-    whole_pieces = data.split(stuffing.delimiter)[1:-1]  # the first and the last piece may be incomplete
-    pieces = [piece for piece in whole_pieces if piece]  # two adjacent delimiters have an empty piece between them
-    decoded_pieces = []
-    for piece in pieces:
-        with suppress(ValueError):  # for a piece that no encoder produces
-            decoded_pieces.append(stuffing.decode(piece))
-    length, count = _most_common_length(decoded_pieces)
+    whole_frames = data.split(stuffing.delimiter)[1:-1]  # the first and the last frame may be incomplete
+    encoded_frames = [frame for frame in whole_frames if frame]  # nothing is between two adjacent delimiters
+    decoded_frames = []
+    for encoded_frame in encoded_frames:
+        with suppress(ValueError):  # the frame is damaged, because no encoder produces it
+            decoded_frames.append(stuffing.decode(encoded_frame))
+    length, count = _most_common_length(decoded_frames)
     has_frame_length = MIN_FRAME_BYTES <= length <= MAX_FRAME_BYTES
-    if count < STUFFED_SHARE * len(pieces) or not has_frame_length:
+    if count < STUFFED_SHARE * len(encoded_frames) or not has_frame_length:
         return
 
-    # If the lengths are as regular without decoding, there is no stuffing, and frames begin with this byte by chance.
-    # COBS is an exception, because it makes all frames of one length longer by the same number of bytes.
-    _, count_without_decoding = _most_common_length(pieces)
+    # If the lengths are as regular without decoding, there is no stuffing, and the delimiter is a byte that only
+    # happens to begin every frame. COBS is an exception, because it adds the same number of bytes to all frames of one
+    # length.
+    _, count_without_decoding = _most_common_length(encoded_frames)
     if name == "cobs" or count > count_without_decoding:
-        frames = [piece for piece in decoded_pieces if len(piece) == length]
+        frames = [frame for frame in decoded_frames if len(frame) == length]
         yield _adjacent_frames(name, b"".join(frames), length)
 
 
-def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
-    """Return the most frequent length of the pieces, and the number of pieces with this length."""
-    if not pieces:
+def _most_common_length(frames: Sequence[bytes]) -> tuple[int, int]:
+    """Return the most frequent length of the frames, and the number of frames with this length.
+
+    Both numbers are 0 if there are no frames.
+    """
+    if not frames:
         return 0, 0
-    return Counter(map(len, pieces)).most_common(1)[0]
+    return Counter(map(len, frames)).most_common(1)[0]
 
 
-def _synchronised_frames(stream: Bytes) -> Iterator[Windows]:
+def _synchronised_frames(stream: Bytes) -> Iterator[FrameDivision]:
     """Yield divisions of a stream into frames that begin at a repeated byte or a repeated pair of bytes.
 
     If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. Frames are
-    therefore assumed to begin at every repetition of a byte or pair. The assumption is rated by the share of the stream
-    that these frames would cover. The share of a single byte is reduced by a penalty, because single bytes often repeat
-    by chance. For each frame length, the byte or pair with the largest share is chosen. The `MAX_FRAME_LENGTHS` frame
-    lengths with the largest shares are yielded.
+    therefore assumed to begin at every repetition of a byte or pair. The score of this assumption is the share of the
+    stream that these frames would cover. The score of a single byte is reduced by a penalty, because single bytes often
+    repeat by chance. For each frame length, the byte or pair with the highest score is chosen. The divisions with the
+    `MAX_FRAME_LENGTHS` highest scores are yielded.
 
     Args:
         stream: Bytes of the stream, shape (n,).
@@ -182,34 +200,35 @@ def _synchronised_frames(stream: Bytes) -> Iterator[Windows]:
     single_bytes = stream.astype(np.int64)
     byte_pairs = 256 * single_bytes[:-1] + single_bytes[1:]
 
-    # For each length of a frame, the largest share so far, and the positions at which the frames begin
-    best_share: dict[int, float] = {}
+    # For each length of a frame, the highest score so far, and the positions at which the frames begin
+    best_score: dict[int, float] = {}
     best_starts: dict[int, NDArray[np.int64]] = {}
     for codes, penalty in ((byte_pairs, 0.0), (single_bytes, SINGLE_BYTE_PENALTY)):
-        for length, starts in _frequent_distances(codes):
-            share = len(starts) * length / len(stream) - penalty
-            share_to_exceed = best_share.get(length, COVERED_SHARE - penalty)  # the default is for a new length
-            if share > share_to_exceed:
-                best_share[length] = share
-                best_starts[length] = starts
+        for length, frame_starts in _frequent_distances(codes):
+            covered_share = len(frame_starts) * length / len(stream)
+            score = covered_share - penalty
+            if covered_share > COVERED_SHARE and score > best_score.get(length, -np.inf):
+                best_score[length] = score
+                best_starts[length] = frame_starts
 
-    def largest_share_first(length: int) -> tuple[float, int]:
-        """Return the key for sorting lengths by decreasing share, and equal shares by increasing length.
+    def best_first(length: int) -> tuple[float, int]:
+        """Return the key for sorting lengths by decreasing score, and equal scores by increasing length.
 
-        The shares are rounded to 10 %, so that of two lengths with about equal shares the shorter length comes first.
+        The scores are rounded to 0.1, so that of two lengths with about equal scores the shorter length comes first.
         """
-        return -round(best_share[length], 1), length
+        return -round(best_score[length], 1), length
 
-    best_lengths = sorted(best_share, key=largest_share_first)[:MAX_FRAME_LENGTHS]
+    best_lengths = sorted(best_score, key=best_first)[:MAX_FRAME_LENGTHS]
     for length in best_lengths:
-        yield Windows(SYNC, stream, best_starts[length], length)
+        yield FrameDivision(SYNC, stream, best_starts[length], length)
 
 
 def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
     """Yield each frequent distance from a code to the next equal code, and the positions from which it is measured.
 
     A code is a byte, or a pair of bytes as a number. Only distances that can be the length of a frame are yielded. A
-    distance is frequent if frames of this length at the yielded positions would cover a large share of the stream.
+    distance is frequent if frames of this length at the yielded positions would cover a large share of the stream. The
+    same distance may be yielded several times, for different codes.
 
     Args:
         codes: Code at each position of the stream, shape (n,).
@@ -226,13 +245,15 @@ def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray
     positions = sorted_positions[:-1][is_selected]
     distances = distances_to_next[is_selected]
 
-    # Count how often each pair of code and distance occurs. Each pair is encoded as one number.
-    distance_count = MAX_FRAME_BYTES + 1
-    code_distance_pairs = codes[positions] * distance_count + distances
+    # Count how often each pair of a code and a distance occurs. Each pair is encoded as one number, in which the last
+    # digit is the distance. The base of the digits is larger than every distance.
+    base = MAX_FRAME_BYTES + 1
+    code_distance_pairs = codes[positions] * base + distances
     different_pairs, pair_counts = np.unique(code_distance_pairs, return_counts=True)
     for pair, count in zip(different_pairs, pair_counts, strict=True):
-        distance = int(pair) % distance_count  # decodes the distance
-        if count * distance >= COVERED_SHARE * len(codes):  # the frames would cover a large share
+        distance = int(pair) % base
+        covered_positions = count * distance
+        if covered_positions >= COVERED_SHARE * len(codes):
             yield distance, positions[code_distance_pairs == pair]
 
 
@@ -248,7 +269,8 @@ CRC_POLYNOMIALS = {
 def _crcs_of_size(size: int) -> list[Crc]:
     """Return all cyclic redundancy checks without a name that have a given size in bytes.
 
-    Each check is returned with both bit orders. The initial value and the final value of all checks are 0.
+    For each polynomial, two checks are returned, one for each bit order. The initial value and the final value of all
+    checks are 0.
     """
     bit_count = 8 * size
     polynomials = CRC_POLYNOMIALS[size]
@@ -300,7 +322,7 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
 
     The checksum is at the end of each frame. The checksum covers the other bytes of the frame. Constant bytes at the
     beginning, such as a sync pattern, need not be covered. For each size and byte order, at most one checksum is
-    yielded.
+    yielded. If there are fewer than `MIN_CHECKED_FRAMES` different frames, no checksum is yielded.
 
     Args:
         rows: Bytes of the frames, shape (n, length).
@@ -311,19 +333,21 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     frames = [row.tobytes() for row in checked_rows]
     _usual, is_constant = usual_bytes(checked_rows)  # `is_constant` has the shape (length,)
     length = len(is_constant)
-    # Number of constant bytes at the beginning of the frames, which is the position of the first False
+    # Number of constant bytes at the beginning of the frames, at most `MAX_FIRST_COVERED_BYTE`. It is the position of
+    # the first False.
     leading_constant_count = int(np.argmin([*is_constant[:MAX_FIRST_COVERED_BYTE], False]))
     for size in UNNAMED_CRCS:  # in bytes, from the widest to the narrowest
         is_too_wide = size + 2 > length  # at least two bytes must remain
-        if is_too_wide or is_constant[-size:].all():  # a checksum differs from frame to frame
+        last_bytes_are_constant = is_constant[-size:].all()  # a checksum would differ from frame to frame
+        if is_too_wide or last_bytes_are_constant:
             continue
 
         # Try each position for the first covered byte, up to the first byte that is not constant.
-        last_begin = min(leading_constant_count, length - size - 1)  # the checksum covers at least one byte
-        begins = range(last_begin + 1)
+        last_possible_start = min(leading_constant_count, length - size - 1)  # the checksum covers at least one byte
+        possible_starts = range(last_possible_start + 1)
         orders = ORDERS if size > 1 else ORDERS[:1]  # a single byte has no byte order
         for order in orders:
-            named_checks = _named_checks(frames, size, order, begins)
+            named_checks = _named_checks(frames, size, order, possible_starts)
             unnamed_checks = _unnamed_checks(frames, size, order)
             first_check = next(chain(named_checks, unnamed_checks), None)
             if first_check is not None:
@@ -331,19 +355,20 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
 
 
 def _drawn_rows(rows: Bytes) -> Bytes:
-    """Return at most `MAX_CHECKED_FRAMES` different frames, which are drawn at random.
+    """Draw at most `MAX_CHECKED_FRAMES` different frames at random.
 
-    The frames are drawn at random, because neighbours in a sorted array differ in a few bits only.
+    The first frames of the sorted array would be unsuitable. They differ in a few bits only, so a wrong checksum could
+    fit all of them by chance. The result is always the same for the same frames.
 
     Args:
         rows: Bytes of the frames, shape (n, length).
     """
     different_rows = np.unique(rows, axis=0)  # sorted
-    drawn = np.random.default_rng(0).permutation(len(different_rows))[:MAX_CHECKED_FRAMES]
-    return np.asarray(different_rows[drawn])
+    drawn_indices = np.random.default_rng(0).permutation(len(different_rows))[:MAX_CHECKED_FRAMES]
+    return np.asarray(different_rows[drawn_indices])
 
 
-def _named_checks(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> Iterator[Check]:
+def _named_checks(frames: list[bytes], size: int, order: ByteOrder, possible_starts: range) -> Iterator[Check]:
     """Yield the checksums with a name that fit most of the frames.
 
     Different positions are tried for the first byte that a checksum covers. A checksum is yielded once for each
@@ -353,27 +378,28 @@ def _named_checks(frames: list[bytes], size: int, order: ByteOrder, begins: rang
         frames: The frames, which are of one length.
         size: Number of bytes of the checksum.
         order: Byte order of the checksum.
-        begins: Positions of the first covered byte that are tried.
+        possible_starts: Positions in a frame that are tried for the first covered byte.
     """
     names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
-    for begin in begins:
+    for start in possible_starts:
         for name in names:
-            if _fits(CHECKSUMS[name].compute, frames, begin, size, order):
+            if _fits(CHECKSUMS[name].compute, frames, start, size, order):
                 keys: dict[str, Any] = {"checksum": name}  # keys of the checksum in a device file
-                if begin > 0:
-                    keys["checksum_from"] = begin
+                if start > 0:  # the default is that the checksum covers a frame from its first byte
+                    keys["checksum_from"] = start
                 yield Check(size, order, keys)
 
 
-def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size: int, order: ByteOrder) -> bool:
+def _fits(compute: Callable[[bytes], int], frames: list[bytes], start: int, size: int, order: ByteOrder) -> bool:
     """Return whether most frames end with the checksum of the covered bytes.
 
-    To save time, the remaining frames are not examined if the checksum fits too few of the first frames.
+    The checksum covers the bytes from a given position to the checksum. To save time, the remaining frames are not
+    examined if the checksum fits too few of the first frames.
 
     Args:
         compute: Function that computes the checksum of bytes.
         frames: The frames, which are of one length.
-        begin: Position of the first byte that the checksum covers.
+        start: Position of the first byte that the checksum covers.
         size: Number of bytes of the checksum.
         order: Byte order of the checksum.
     """
@@ -382,7 +408,7 @@ def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size
         """Return the number of frames that end with the computed checksum."""
         count = 0
         for frame in some_frames:
-            computed_checksum = compute(frame[begin:-size])
+            computed_checksum = compute(frame[start:-size])
             sent_checksum = int.from_bytes(frame[-size:], order)
             if computed_checksum == sent_checksum:
                 count += 1
@@ -396,9 +422,9 @@ def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size
 def _unnamed_checks(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check]:
     """Yield the cyclic redundancy checks without a name that fit most of the frames.
 
-    A board may use any initial value and any final value, but all checks are computed with 0 for both values. For
-    frames of one length, other initial and final values only change every check by an exclusive or with one constant.
-    If the polynomial is right, the computed check and the sent check therefore differ by the same constant in all
+    A board may use any initial value and any final value, but this function computes all checks with 0 for both values.
+    For frames of one length, other initial and final values combine every check with the same constant by an exclusive
+    or. If the polynomial is right, the computed check and the sent check therefore differ by this constant in all
     frames. The final value of the yielded check is set to this constant.
 
     Args:
@@ -413,8 +439,8 @@ def _unnamed_checks(frames: list[bytes], size: int, order: ByteOrder) -> Iterato
             computed_value = crc(frame[:-size])
             sent_value = int.from_bytes(frame[-size:], order)
             difference_counts[computed_value ^ sent_value] += 1
-        most_frequent_difference, count = difference_counts.most_common(1)[0]
-        if count >= FITTING_SHARE * len(frames):
+        most_frequent_difference, fitting_count = difference_counts.most_common(1)[0]
+        if fitting_count >= FITTING_SHARE * len(frames):
             parameters = {
                 "width": crc.width,
                 "reflected": crc.reflected,

@@ -16,15 +16,15 @@ from isocharge.serve.frames.frame_field import PADDING, ByteOrder
 from isocharge.serve.frames.frame_layout import SYNC
 from isocharge.serve.frames.text import Layout, TextParser
 from isocharge.serve.frames.text_lines import Notation
-from isocharge.serve.recognition.fields import Part, Weights, clock_of, parts_of, split_frame, steady_step
+from isocharge.serve.recognition.fields import Part, Weights, identify_clock, possible_parts, split_frame, steady_step
 from isocharge.serve.recognition.framing import (
     MAX_EXAMINED_BYTES,
     MIN_FRAMES,
     ORDERS,
     Check,
-    Windows,
+    FrameDivision,
     find_checks,
-    framings,
+    possible_divisions,
     usual_bytes,
 )
 
@@ -41,14 +41,15 @@ WEIGHTS = Weights()
 """Weights that were fitted to random boards."""
 
 
-def described_frames(
+def described_frames_section(
     chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False, weights: Weights = WEIGHTS
 ) -> dict[str, Any] | None:
-    """Return the section `[frames]` that describes frames of fixed length, or None if no such frames are recognised.
+    """Recognise frames of fixed length, and return the section `[frames]` of a device file that describes them.
 
-    The kinds of framing are tried from the most certain to the least certain kind, until the frames can be described
-    with one of them. If several descriptions with the same kind of framing are possible, the description with the
-    lowest score is returned.
+    The function tries the kinds of framing from the most certain to the least certain kind, until the frames can be
+    described with one of them. A framing is the way in which the beginnings of frames are marked. If several
+    descriptions with the same kind of framing are possible, the description with the lowest score is returned. The
+    result is None if no such frames are recognised.
 
     Args:
         chunks: Received bytes, divided as they arrived.
@@ -59,11 +60,12 @@ def described_frames(
     byte_count = sum(len(chunk) for chunk in chunks)
     examined_share = min(1.0, MAX_EXAMINED_BYTES / max(1, byte_count))  # 1 if there are no bytes
     examined_seconds = seconds * examined_share
-    possible_windows = framings(chunks, are_datagrams=are_datagrams)  # windows of one framing follow each other
-    for _, windows_of_framing in groupby(possible_windows, key=lambda windows: windows.framing):
+    # Divisions with the same framing follow each other, so `groupby` collects all of them in one group.
+    divisions = possible_divisions(chunks, are_datagrams=are_datagrams)
+    for _framing, divisions_of_framing in groupby(divisions, key=lambda division: division.framing):
         scored_sections: list[tuple[float, dict[str, Any]]] = []
-        for windows in windows_of_framing:
-            scored_sections += _scored_sections(windows, examined_seconds, weights)
+        for division in divisions_of_framing:
+            scored_sections += _scored_sections(division, examined_seconds, weights)
         if scored_sections:
             _, best_section = min(scored_sections, key=lambda score_and_section: score_and_section[0])
             return best_section
@@ -71,38 +73,45 @@ def described_frames(
 
 
 def _sync_lengths(may_be_sync: Booleans, start: int) -> Sequence[int]:
-    """Return the possible lengths of the sync pattern of a frame, in bytes.
+    """Return the possible lengths of the sync pattern with which a frame begins, in bytes.
+
+    A window is a sequence of bytes with the length of a frame. The frame begins at any byte of the window, and
+    continues at the beginning of the window after the last byte.
 
     Args:
         may_be_sync: Whether each byte of a window may belong to a sync pattern, shape (length,).
-        start: Position of the first byte of the frame.
+        start: Position of the first byte of the frame in the window.
     """
     may_be_sync_from_start = np.roll(may_be_sync, -start)[:MAX_SYNC_BYTES]
-    max_length = int(np.argmin([*may_be_sync_from_start, False]))  # the position of the first False
+    # The position of the first False is the number of possible sync bytes at the beginning of the frame.
+    max_length = int(np.argmin([*may_be_sync_from_start, False]))
     return range(1, max_length + 1)
 
 
-def _scored_sections(windows: Windows, seconds: float, weights: Weights) -> Iterator[tuple[float, dict[str, Any]]]:
+def _scored_sections(
+    division: FrameDivision, seconds: float, weights: Weights
+) -> Iterator[tuple[float, dict[str, Any]]]:
     """Yield the score of each possible description of the frames, together with its section `[frames]`.
 
     At most one description is yielded for each combination of a first byte, a checksum and a byte order. Descriptions
-    without a checksum are tried only if no checksum fits. The score is the number of bits per byte of the stream,
-    including the bytes outside of all frames. The scores of descriptions with different frame lengths can therefore be
-    compared.
+    without a checksum are tried only if no checksum fits. Descriptions without a channel are not yielded.
+
+    The score is the number of bits per byte of the stream, including the bytes outside of all frames. The scores of
+    descriptions with different frame lengths can therefore be compared.
 
     Args:
-        windows: Frames of one length in the stream.
+        division: Division of the stream into windows. A window is a sequence of bytes with the length of a frame.
         seconds: Time in which the stream arrived, s.
         weights: Contributions to the score.
     """
-    length = windows.length
-    rows = windows.rows()[:MAX_EXAMINED_FRAMES]  # each row contains a frame and the bytes of the next frame
-    if len(rows) < MIN_FRAMES - 1:  # the last frame has no row, because no frame follows it
+    length = division.length
+    rows = division.rows()[:MAX_EXAMINED_FRAMES]  # each row contains a window and the bytes of the next window
+    if len(rows) < MIN_FRAMES - 1:  # the last window has no row, because no window follows it
         return
 
     # Find the possible first bytes of a frame in a window. A frame with a sync pattern may begin at any byte that may
     # belong to the pattern. With any other framing, the window begins with the frame.
-    has_sync = windows.framing == SYNC
+    has_sync = division.framing == SYNC
     usual, is_constant = usual_bytes(rows[:, :length])
     may_be_sync = is_constant & (usual != 0)  # shape (length,); zeros are mostly the high bytes of numbers
     starts = [0]
@@ -114,14 +123,15 @@ def _scored_sections(windows: Windows, seconds: float, weights: Weights) -> Iter
     has_check = bool(starts_and_checks)
 
     # For each byte order and each pair, find the division of the frame into parts with the lowest score.
-    covered_share = min(1.0, len(windows.starts) * length / len(windows.stream))  # share of the bytes inside frames
-    frame_rate_Hz = len(windows.stream) / length / seconds  # as if all bytes of the stream belonged to frames
+    stream_bytes = len(division.stream)
+    covered_share = min(1.0, len(division.window_starts) * length / stream_bytes)  # share of the bytes inside frames
+    frame_rate_Hz = stream_bytes / length / seconds  # as if all bytes of the stream belonged to frames
     for order in ORDERS:
-        parts_at = parts_of(rows, order, frame_rate_Hz, weights)  # possible parts at each byte of a window
+        parts_in_window = possible_parts(rows, order, frame_rate_Hz, weights)  # parts that may begin at each byte
         if not has_check:  # try frames without a checksum
             starts_and_checks = [(start, Check(0, order, {})) for start in starts]
         for start, check in starts_and_checks:
-            parts_from_start = parts_at[start:] + parts_at[:start]  # from the first byte of the frame
+            parts_from_start = parts_in_window[start:] + parts_in_window[:start]  # from the first byte of the frame
             parts_before_check = parts_from_start[: length - check.size]
             sync_lengths = _sync_lengths(may_be_sync, start) if has_sync else [0]
             score, sync_length, parts = split_frame(parts_before_check, sync_lengths, weights)
@@ -130,27 +140,27 @@ def _scored_sections(windows: Windows, seconds: float, weights: Weights) -> Iter
                 sync = np.roll(usual, -start)[:sync_length].tobytes()
                 # Each byte outside of all frames contributes `weights.noise` bits.
                 bits_per_byte = covered_share * score / length + (1.0 - covered_share) * weights.noise
-                yield bits_per_byte, _frames_section(windows, sync, check, order, parts)
+                yield bits_per_byte, _frames_section(division, sync, check, order, parts)
 
 
 def _frames_section(
-    windows: Windows, sync: bytes, check: Check, order: ByteOrder, parts: Sequence[Part]
+    division: FrameDivision, sync: bytes, check: Check, order: ByteOrder, parts: Sequence[Part]
 ) -> dict[str, Any]:
     """Convert a description of the frames to the section `[frames]` of a device file.
 
     Args:
-        windows: Frames of one length in the stream.
+        division: Division of the stream into frames, with the framing and the length of the frames.
         sync: The sync pattern; empty if the frames have no sync pattern.
         check: The checksum, whose size is 0 if the frames have no checksum.
         order: Byte order of the numbers.
         parts: Parts of a frame between the sync pattern and the checksum.
     """
     section: dict[str, Any] = {"format": "described"}
-    if windows.framing == SYNC:  # the default framing, which needs no key
+    if division.framing == SYNC:  # the default framing, which needs no key
         section["sync"] = sync.hex(" ").upper()
     else:
-        section["framing"] = windows.framing
-    section["length"] = windows.length
+        section["framing"] = division.framing
+    section["length"] = division.length
     section["byte_order"] = order
     section |= check.keys
     if check.size > 1 and check.order != order:  # a checksum of one byte has no byte order
@@ -172,13 +182,13 @@ def _field_tables(parts: Sequence[Part]) -> list[dict[str, Any]]:
         role_count = roles.count(part.role)  # number of parts with this role so far, including this part
         is_first_counter_or_clock = part.role in ("seq", "clock") and role_count == 1
         if part.role == "channel":
-            fields.append({"name": f"ch{role_count}", "type": part.kind})
+            fields.append({"name": f"ch{role_count}", "type": part.type_name})
         elif is_first_counter_or_clock:
-            field: dict[str, Any] = {"name": part.name, "type": part.kind}
-            if part.scale != 1.0:
+            field: dict[str, Any] = {"name": part.name, "type": part.type_name}
+            if part.scale != 1.0:  # 1 is the default value of the key
                 field["scale"] = part.scale
             fields.append(field)
-        elif fields and fields[-1]["type"] == PADDING:  # the part extends the padding before it
+        elif fields and fields[-1]["type"] == PADDING:  # the part becomes padding and extends the padding before it
             previous_padding = fields[-1]
             previous_count = previous_padding.get("count", 1)  # padding without a count is one byte
             previous_padding["count"] = previous_count + part.size
@@ -200,7 +210,7 @@ The share is much less than 1, because the other bytes may be echoes of requests
 def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False) -> dict[str, Any] | None:
     """Recognise the format of a board, and return the section `[frames]` that describes this format in a device file.
 
-    The binary frames of isocharge, lines of text, and frames of fixed length are tried in this order.
+    The function first tries the binary frames of isocharge, then lines of text, and then other frames of fixed length.
 
     Args:
         chunks: Received bytes, divided as they arrived.
@@ -217,7 +227,8 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     text_section = None
     text_parser = TextParser()
     all_text_frames, text_share = _parse_all(text_parser, chunks)
-    # Earlier frames have another number of values if a header later names one of the columns as counter or clock.
+    # Use only the frames with as many values as the last frame. Earlier frames have another number of values if a
+    # header later names one of the columns as counter or clock.
     text_frames = [frame for frame in all_text_frames if len(frame.values) == len(all_text_frames[-1].values)]
     if text_parser.layout is not None and len(text_frames) >= MIN_FRAMES:
         frame_rate_Hz = len(text_frames) / seconds
@@ -226,7 +237,7 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
             return text_section
 
     # If most of the bytes are not lines of one layout, the board may send binary frames that resemble text in places.
-    described_section = described_frames(chunks, seconds, are_datagrams=are_datagrams)
+    described_section = described_frames_section(chunks, seconds, are_datagrams=are_datagrams)
     return described_section or text_section
 
 
@@ -242,7 +253,8 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
     """Return the keys that describe the counter, the clock and the columns of lines of text in a device file.
 
     If each line contains names, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for its
-    counter and its clock. Otherwise, the key `columns` lists the names of all columns.
+    counter and its clock. Otherwise, the key `columns` lists the names of all columns. No keys are needed if the board
+    sends no names, no counter and no clock.
 
     Args:
         layout: Layout of the lines.
@@ -283,8 +295,8 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
 def _meanings(frames: Sequence[Frame], frame_rate_Hz: float) -> dict[int, str]:
     """Determine which values of the frames are the frame counter and the clock.
 
-    If the parser has already recognised a counter, the function does not search for another counter. The same applies
-    to the clock.
+    A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. If the parser has
+    already recognised a counter, the function does not search for another counter. The same applies to the clock.
 
     Args:
         frames: Frames with the same number of values.
@@ -302,7 +314,7 @@ def _meanings(frames: Sequence[Frame], frame_rate_Hz: float) -> dict[int, str]:
             meanings[position] = SEQ
             has_counter = True
             continue
-        clock = clock_of(value_steps, frame_rate_Hz)
+        clock = identify_clock(value_steps, frame_rate_Hz)
         if clock is not None and not has_clock:
             clock_name, tick_duration = clock
             if tick_duration == 1.0:  # a device file for lines of text cannot state another duration

@@ -10,7 +10,7 @@ from isocharge.serve.record.record import DECIMALS, PredictionRecord, selected_f
 
 
 def csv_header(electrodes: Sequence[str], *, with_tracking: bool = False, with_film: bool = False) -> str:
-    """Return the header for the rows that `csv_row` returns.
+    """Return the header of a CSV file of records, which contains the names of the columns, without the line end.
 
     A field with several numbers has one column for each number, such as `charge_pC.A` for the electrode A.
 
@@ -30,7 +30,7 @@ def csv_header(electrodes: Sequence[str], *, with_tracking: bool = False, with_f
 
 
 def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
-    """Convert a record to a row of a CSV file.
+    """Convert a record to a line of a CSV file, without the line end.
 
     Numbers have six decimals, flags are separated by blanks, and the cells of unknown values are empty.
 
@@ -55,9 +55,10 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
 
 
 def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str] | None:
-    """Return the names of the parts of a field that has several columns.
+    """Return the names of the parts of a field that has several columns in a CSV file.
 
-    The parts are the charges of the electrodes, or the fields of an object.
+    If the value of the field is a set of charges, the parts are the charges of the electrodes. If the value is an
+    object, the parts are the fields of the object. Each part has one column.
 
     Args:
         field: Field of a record.

@@ -57,10 +57,10 @@ def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
 def _flat_fields(struct: type[Struct]) -> Iterator[Field]:
     """Yield the fields of a struct, in the order of their declaration.
 
-    A field may contain another struct. If the field is marked as `is_flattened`, the fields of the other struct are
-    yielded in its place. Otherwise, a single field of the kind `object` is yielded, whose parts are the fields of the
-    other struct. In both cases, the yielded fields form a group with the name of the field that contains the struct. A
-    record has the fields of a group only if it has the other struct.
+    The value of a field may be a nested struct. If the field is marked as `is_flattened`, the fields of the nested
+    struct are yielded in its place. Otherwise, a single field of the kind `object` is yielded, whose parts are the
+    fields of the nested struct. In both cases, the group of the yielded fields is the name of the field that contains
+    the nested struct. A record has the fields of a group only if it has this nested struct.
     """
     annotations = get_type_hints(struct, include_extras=True)  # with the metadata of `Annotated`
     for name in struct.__struct_fields__:
@@ -103,7 +103,8 @@ def _without_none(declared_type: Any) -> tuple[Any, bool]:
     if not is_union:
         return declared_type, False
     alternatives = get_args(declared_type)
-    (value_type,) = [alternative for alternative in alternatives if alternative is not NoneType]  # exactly one
+    # The fields of a record have only unions of None and one other type.
+    (value_type,) = [alternative for alternative in alternatives if alternative is not NoneType]
     return value_type, True
 
 

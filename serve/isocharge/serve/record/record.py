@@ -225,11 +225,14 @@ NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
 def selected_fields(*, with_tracking: bool, with_film: bool) -> tuple[Field, ...]:
     """Return the fields that every record has, and the fields of the selected optional groups.
 
+    There are two optional groups. The first group contains the fields that the tracking of contacts adds. The second
+    group contains the field of the film follower, which estimates the parameters of the film from the touches.
+
     Args:
         with_tracking: Whether to include the fields of the tracking.
-        with_film: Whether to include the fields of the film follower.
+        with_film: Whether to include the field of the film follower.
     """
-    selected_groups = {""}  # the fields that every record has belong to no group
+    selected_groups = {""}  # the group of fields that every record has is empty
     if with_tracking:
         selected_groups.add("tracking")
     if with_film:
@@ -264,7 +267,9 @@ _ENCODE = json.JSONEncoder(allow_nan=False).encode
 
 
 def _json_value(value: Any) -> Any:
-    """Convert the value of a field for JSON. Numbers are rounded to six decimals, and a struct becomes a dictionary.
+    """Convert the value of a field to a value that JSON can represent.
+
+    Floating-point numbers are rounded to six decimals, and a struct becomes a dictionary.
 
     The function compares the class of the value, because this comparison is faster than a call of `isinstance`. The
     speed matters, because the function is called for every field of every record.

@@ -33,7 +33,7 @@ def record_table() -> str:
 
 
 def _rows(fields: Iterable[Field], prefix: str = "", group: str = "") -> Iterator[str]:
-    """Yield a row of the table for each field.
+    """Yield a row of the Markdown table for each field.
 
     If a field is an object, the rows of the object's fields follow the row of the field.
 

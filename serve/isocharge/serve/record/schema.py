@@ -59,13 +59,13 @@ def _object(electrodes: Sequence[str], *, allows_null: bool) -> dict[str, Any]:
 
 
 def _property(field: Field, electrodes: Sequence[str], *, allows_null: bool) -> dict[str, Any]:
-    """Return the schema of one field.
+    """Return the JSON Schema of one field.
 
     Args:
         field: Field of the record.
         electrodes: Names of the electrodes.
-        allows_null: Whether unknown values are null. If they are, the schema allows null for every field that may be
-            unknown, and for every number in an object.
+        allows_null: Whether the schema allows null for every field that may be unknown, and for every number in an
+            object. If not, the schema declares only the type of known values.
     """
     json_type = JSON_TYPES[field.kind]
     number_in_object: dict[str, Any] = {"type": "number"}  # schema of a number in an object

@@ -133,7 +133,7 @@ class SignalChain:
         """
         self._settings = settings
         self._gain = Gain(settings.gain_pC, settings.zero)
-        self._invalid_s = 0.0  # time of the invalid frames since the last valid one
+        self._skipped_s = 0.0  # duration of the invalid frames since the last valid frame
         stages: list[Stage] = [self._gain]
         if settings.limit_pC is not None:
             stages.append(Limit(settings.limit_pC))
@@ -168,7 +168,8 @@ class SignalChain:
     ) -> Reading:
         """Process the next frame with all stages, and return its touch charges and its flags.
 
-        A frame with a value that cannot be a charge is flagged, and does not change the state of the stages.
+        A frame with a value that cannot be a charge gets the flag `invalid`, and does not change the state of the
+        stages. The reading of such a frame, and of a frame before the first tare, has no touch charges.
 
         Args:
             values: Values as the device sent them, in the unit of the device, shape (electrodes,).
@@ -183,18 +184,18 @@ class SignalChain:
         magnitude = math.hypot(*values.tolist())  # at least the largest absolute value; NaN if a value is NaN
         is_valid = magnitude <= self._settings.largest  # false for NaN
         if not is_valid:
-            self._invalid_s += dt_s
-            with np.errstate(over="ignore"):  # a value may be the largest number that a double holds
+            self._skipped_s += dt_s
+            with np.errstate(over="ignore"):  # a value may be so large that its conversion overflows
                 raw_pC = self._gain.convert(values)
-            return Reading(raw_pC, None, None, contact=False, flags=(*flags, INVALID))
+            return Reading(raw_pC, charge_pC=None, tare=None, contact=False, flags=(*flags, INVALID))
 
-        step_s = dt_s + self._invalid_s  # time since the previous valid frame
-        self._invalid_s = 0.0
-        frame = ChainFrame(values, t_s, step_s, limited, self._touch_stage.is_contact, list(flags))
+        valid_dt_s = dt_s + self._skipped_s  # time since the previous valid frame
+        self._skipped_s = 0.0
+        frame = ChainFrame(values, t_s, valid_dt_s, limited, self._touch_stage.is_contact, list(flags))
         for stage in self.stages:
             stage.step(frame)
             if frame.is_finished:  # there is no tare yet, so there are no touch charges
-                return Reading(frame.raw_pC, None, None, contact=False, flags=tuple(frame.flags))
+                return Reading(frame.raw_pC, charge_pC=None, tare=None, contact=False, flags=tuple(frame.flags))
         return Reading(
             frame.raw_pC,
             frame.charge_pC,
@@ -211,7 +212,9 @@ class SignalChain:
 
 
 def _leak_or_memory_stage(settings: Chain) -> LeakStage | MemoryStage | None:
-    """Return the stage that corrects the leak of the amplifiers and, with its settings, the memory of the film.
+    """Return the stage that corrects the leak of the amplifiers, or the leak and the memory of the film together.
+
+    The memory of the film (creep and the thermoelastic step) is only corrected if the settings describe it.
 
     Args:
         settings: Settings of all stages.

@@ -1,8 +1,9 @@
-"""Detection of a touch by the total charge. The detection has a hysteresis.
+"""Detection of a touch by the total charge, which is the sum of the charges of all electrodes.
 
-A touch begins when the total charge exceeds a threshold that is derived from the noise. A touch ends when the total
-charge falls below a given share of the largest total charge of this touch. With an absolute threshold, a touch would
-never end after the charge at rest has drifted above the threshold.
+The detection has a hysteresis. A touch begins when the total charge exceeds a threshold that is derived from the noise.
+A touch ends when the total charge falls below a given share of the largest total charge of this touch. If the threshold
+for the end did not depend on the touch, a touch would never end after the charge at rest has drifted above this
+threshold.
 """
 
 import math
@@ -66,11 +67,11 @@ def update_contact(
     """Return the state of the touch detection after the next frame.
 
     A touch begins when the total charge exceeds the base by the touch threshold. The base is the smallest total charge
-    since the last release.
+    since the last release. If the total charge is far below zero, the state has the mark `is_negative`.
 
-    A touch ends when the total charge falls below the release threshold. The release threshold is a share of the peak
-    of the press, increased by the uncertainty of the total charge, but at least half of the touch threshold. The peak
-    is the largest total charge that two consecutive frames of the press have reached.
+    A touch ends when the total charge falls below the release threshold. The release threshold is a given share of the
+    peak, plus the uncertainty of the total charge. It is at least half of the touch threshold. The peak is the largest
+    total charge that two consecutive frames of the touch have reached.
 
     Args:
         rule: The thresholds.
@@ -79,8 +80,8 @@ def update_contact(
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
         decay: Factor by which the base has decayed since the previous frame. It is below 1 if the charge at rest
             decays.
-        scale_std: Relative standard deviation that all charges have in common, because the memory of the film is not
-            known exactly.
+        scale_std: Relative standard deviation that all charges have in common, because the memory of the film (creep
+            and the thermoelastic step) is not known exactly.
     """
     total_noise_pC = math.sqrt(float(np.dot(noise_pC, noise_pC)))  # standard deviation of the total charge at rest
     touch_threshold_pC = rule.floor_pC + rule.sigmas * total_noise_pC
@@ -88,7 +89,8 @@ def update_contact(
         two_frame_peak_pC = min(total_pC, touch.last_pC)  # a spike of a single frame is not a peak
         peak_pC = max(touch.peak_pC, two_frame_peak_pC)
         uncertainty_pC = SCALE_STD_FACTOR * scale_std * total_pC
-        release_threshold_pC = max(rule.release_share * peak_pC + uncertainty_pC, 0.5 * touch_threshold_pC)
+        min_release_threshold_pC = 0.5 * touch_threshold_pC
+        release_threshold_pC = max(rule.release_share * peak_pC + uncertainty_pC, min_release_threshold_pC)
         if total_pC < release_threshold_pC:
             return Touch(last_pC=total_pC, base_pC=total_pC)  # after a release, the base begins at the present charge
         return Touch(contact=True, peak_pC=peak_pC, last_pC=total_pC)

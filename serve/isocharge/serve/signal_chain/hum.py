@@ -92,6 +92,8 @@ def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) 
         error_pC = raw_pC - hum.raw_pC - expected_change_pC
         # Clipping limits the influence of a touch, which may change the charges by more than the hum.
         clipped_error_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
+        # The charges contain only the real part of the product. With a gain of 1, a frame therefore corrects only half
+        # of the error of the phasor on average. With the factor 2, the time constant of the estimate is `settle_s`.
         gain = min(1.0, 2.0 * dt_s / rule.settle_s)
         correction_per_error = gain / squared_step * phasor_step.conjugate()
         channel_phasor_pC = channel_phasor_pC + clipped_error_pC * correction_per_error

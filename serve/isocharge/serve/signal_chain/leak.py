@@ -14,8 +14,8 @@ Frames of a touch must not change the estimated inflow. Therefore, three rules a
 During a touch, the correction uses the inflow that was estimated `look_back_s` before the touch. After a release, the
 estimate of the inflow pauses for the time `hold_off_s`.
 
-While nothing touches the film, the computed touch charge decays exponentially to zero, because any charge at this time
-is an error or comes from a slow warming of the film.
+While nothing touches the film, any charge is an error or comes from a slow warming of the film. The computed touch
+charge therefore decays exponentially to zero.
 """
 
 import math
@@ -82,7 +82,7 @@ class Leak(NamedTuple):
 def undo_leak(
     rule: LeakRule, tau_s: Array, leak: Leak, output_pC: Array, noise_pC: Array, dt_s: float, *, contact: bool
 ) -> Leak:
-    """Compute the touch charge of the next frame, and return the state after this frame.
+    """Correct the leak of the amplifiers in the next frame, and return the state with the touch charge of this frame.
 
     The output v of an amplifier decays with its time constant tau. The innovation i of frame n is the difference
     between the output and the decayed previous output,
@@ -90,7 +90,8 @@ def undo_leak(
         i[n] = v[n] - exp(-dt / tau) v[n-1].
 
     The innovation consists of the inflow b dt (a slow current into the amplifier), noise and new touch charge. The
-    touch charge is therefore q[n] = q[n-1] + i[n] - b dt.
+    touch charge is therefore q[n] = q[n-1] + i[n] - b dt. Out of contact, the touch charge also decays to zero, and the
+    inflow is estimated.
 
     Args:
         rule: Settings of the estimate of the inflow.
@@ -103,10 +104,10 @@ def undo_leak(
     """
     decayed_output_pC = np.exp(-dt_s / tau_s) * leak.output_pC  # output that would remain without new charge
     innovation_pC = output_pC - decayed_output_pC
-    surplus_pC = innovation_pC - leak.inflow_pC_per_s * dt_s
+    surplus_pC = innovation_pC - leak.inflow_pC_per_s * dt_s  # new touch charge and noise
     charge_pC = leak.charge_pC + surplus_pC
     if contact:
-        return in_touch(leak, charge_pC, output_pC, rule.hold_off_s)
+        return state_in_touch(leak, charge_pC, output_pC, rule.hold_off_s)
 
     # Out of contact, any charge is an error. The charge therefore decays to zero.
     decayed_charge_pC = charge_pC * math.exp(-dt_s / rule.relax_s)
@@ -119,10 +120,11 @@ def undo_leak(
     return learn_inflow(rule, relaxed_leak, surplus_pC, noise_pC, dt_s)
 
 
-def in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) -> Leak:
+def state_in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) -> Leak:
     """Return the state of the leak compensation after a frame in contact.
 
-    During a contact, the inflow is not estimated. The last trusted estimate is used instead.
+    The inflow is the slow current into each amplifier. During a contact, the inflow is not estimated. Instead, the last
+    trusted estimate is used. The trusted estimate is so old that the touch cannot have affected this value.
 
     Args:
         leak: State after the previous frame.

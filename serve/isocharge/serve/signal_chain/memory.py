@@ -1,13 +1,13 @@
 """Correction of the memory of the film (creep, thermoelastic step and warmth) and of the leak of the amplifiers.
 
-After a step of the touch charge q, the charge of the film changes by the size of the step times
+If the touch charge q changes suddenly, the charge of the film changes by the same amount times
 
     h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / warmth_s).
 
-The creep of the film is proportional to the logarithm of time, and is zero one second after the step. Stretching cools
-the film. The pyroelectric charge of this cooling disappears when the film has returned to the temperature of the air.
-The logarithm is approximated by a Prony series, which is a sum of exponentials with one time constant in each decade.
-The ripple of the Prony series is 2 % of `creep`. The charge of the film is then
+where t is the time since the change. The creep of the film is proportional to the logarithm of time, and is zero one
+second after the change. Stretching cools the film. The pyroelectric charge of this cooling disappears when the film has
+returned to the temperature of the air. The logarithm is approximated by a Prony series, which is a sum of exponentials
+with one time constant in each decade. The ripple of the Prony series is 2 % of `creep`. The charge of the film is then
 
     y[n] = h(0) q[n] - sum_j w_j r_j[n] + d[n],     r_j[n] = e r_j[n-1] + (1 - e) q[n-1],     e = exp(-dt / tau_j)
 
@@ -34,7 +34,7 @@ import numpy as np
 from msgspec import Meta
 
 from isocharge.common.arrays import Array
-from isocharge.serve.signal_chain.leak import Leak, LeakRule, in_touch, learn_inflow
+from isocharge.serve.signal_chain.leak import Leak, LeakRule, learn_inflow, state_in_touch
 from isocharge.serve.signal_chain.memory_state import (
     CHARGE_ROW,
     INITIAL_PROPAGATION,
@@ -145,6 +145,8 @@ class Memory(NamedTuple):
     def start(cls, rule: MemoryRule, output_pC: Array) -> "Memory":
         """Return the state at the first frame after the tare, without warmth and without a memory of earlier presses.
 
+        The warmth is the charge of each electrode due to a change of temperature.
+
         Args:
             rule: Memory of the film.
             output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
@@ -155,15 +157,15 @@ class Memory(NamedTuple):
         film = Film.with_memory(rule.creep, rule.thermoelastic, variances)
         # Without warmth and memory, the output is the touch charge multiplied by the response to a step.
         leak = Leak.start(output_pC)._replace(charge_pC=output_pC / film.step_response)
-        warmth_pC = rows_pC[WARMTH_ROWS]  # the warmth and its slope, which are 0
+        warmth_and_slope = rows_pC[WARMTH_ROWS]  # 0
         return cls(
             film,
             leak,
             film_pC=output_pC,
             rows_pC=rows_pC,
-            trusted_pC=warmth_pC,
-            candidate_pC=warmth_pC,
-            expected_pC=warmth_pC,
+            trusted_pC=warmth_and_slope,
+            candidate_pC=warmth_and_slope,
+            expected_pC=warmth_and_slope,
         )
 
 
@@ -198,7 +200,8 @@ def undo_memory(
     film = memory.film
     leak = memory.leak
 
-    # The surplus is the charge that the film has added since the previous frame.
+    # The surplus is the charge that the film has added since the previous frame. If the amplifiers leak, the output
+    # also changes because of the leak and the inflow.
     if tau_s is None:
         surplus_pC = output_pC - leak.output_pC
         film_pC = output_pC
@@ -207,7 +210,7 @@ def undo_memory(
         surplus_pC = output_pC - decayed_output_pC - leak.inflow_pC_per_s * dt_s
         film_pC = memory.film_pC + surplus_pC
 
-    # Solve the equation of the film for the touch charge.
+    # Predict the state, in which the touch charge is still 0, and solve the equation of the film for the touch charge.
     propagation = state_propagation(rule.warmth_s, dt_s)
     rows_pC = propagation.dot(memory.rows_pC)
     residual_pC = film_pC - film.response.dot(rows_pC)
@@ -215,17 +218,20 @@ def undo_memory(
     unseen_s = memory.unseen_s + dt_s
     if contact or memory.is_recently_touched:
         rows_pC[CHARGE_ROW] = charge_pC
-        warmth_pC = rows_pC[WARMTH_ROWS]
+        warmth_and_slope = rows_pC[WARMTH_ROWS]
+        learn_s = memory.learn_s - dt_s
+        if contact:  # after the release, wait for `RELEASE_S`, then learn for `LEARN_S`
+            learn_s = LEARN_S + RELEASE_S
         return Memory(
             film,
-            in_touch(leak, charge_pC, output_pC, leak_rule.hold_off_s),
+            state_in_touch(leak, charge_pC, output_pC, leak_rule.hold_off_s),
             film_pC,
             rows_pC,
-            trusted_pC=warmth_pC,
-            candidate_pC=warmth_pC,
-            expected_pC=warmth_pC,
+            trusted_pC=warmth_and_slope,
+            candidate_pC=warmth_and_slope,
+            expected_pC=warmth_and_slope,
             unseen_s=unseen_s,
-            learn_s=LEARN_S + RELEASE_S if contact else memory.learn_s - dt_s,
+            learn_s=learn_s,
         )
 
     # Out of contact, the warmth and the inflow are updated. The slope and the inflow pause after a release.
@@ -247,22 +253,22 @@ def undo_memory(
     if is_learning:
         learn_s -= dt_s
         expected_pC = propagation[WARMTH_ROWS, WARMTH_ROWS].dot(expected_pC)
-    after = Memory(
+    next_memory = Memory(
         film,
         leak,
         film_pC,
         rows_pC,
-        memory.trusted_pC,
-        memory.candidate_pC,
-        expected_pC,
-        memory.trusted_s + dt_s,
-        memory.candidate_s + dt_s,
-        unseen_s,
-        learn_s,
+        trusted_pC=memory.trusted_pC,
+        candidate_pC=memory.candidate_pC,
+        expected_pC=expected_pC,
+        trusted_s=memory.trusted_s + dt_s,
+        candidate_s=memory.candidate_s + dt_s,
+        unseen_s=unseen_s,
+        learn_s=learn_s,
     )
     if is_learning and leak.hold_s <= 0.0:
-        after = _learn_film(after, dt_s)
-    return _replace_trusted_warmth(after, leak_rule.look_back_s)
+        next_memory = _learn_film(next_memory, dt_s)
+    return _replace_trusted_warmth(next_memory, leak_rule.look_back_s)
 
 
 def _observe_warmth(
@@ -313,10 +319,11 @@ def _is_inflow_observable(rule: LeakRule, leak: Leak, rows_pC: Array) -> bool:
 
 
 def _replace_trusted_warmth(memory: Memory, look_back_s: float) -> Memory:
-    """If the candidate for the trusted warmth is old enough, return a state in which it has become the trusted warmth.
+    """Replace the trusted warmth by its candidate if the candidate is old enough, and return the resulting state.
 
-    In this state, the present warmth is the next candidate. If the candidate is not old enough, return the state
-    unchanged.
+    The trusted warmth is the estimate from which the warmth during a touch is predicted. It is so old that the touch
+    cannot have affected it. The present warmth becomes the next candidate. If the candidate is not old enough, the
+    state is returned unchanged.
 
     Args:
         memory: State of this frame.
@@ -333,12 +340,14 @@ def _replace_trusted_warmth(memory: Memory, look_back_s: float) -> Memory:
 
 
 class RemainingCharge(NamedTuple):
-    """Charge that remains after a release, reduced to one number.
+    """Charge that remains on the film after a release, reduced to one number.
 
-    The charge is a measurement of the errors of creep and thermoelastic step.
+    The remaining charge is a measurement of the errors of the settings for creep and for the thermoelastic step. Creep
+    is the slow decrease of the charge of a held press. The thermoelastic step is an additional charge at the beginning
+    of a press.
 
     The charges of all electrodes form a vector, which is projected onto the direction of the predicted charges. The
-    predicted charge of an electrode is the sum of the charges of creep and thermoelastic step.
+    predicted charge of an electrode is the sum of the charges of creep and of the thermoelastic step.
 
     Attributes:
         creep_pC: Projection of the predicted charge of creep.
@@ -392,10 +401,12 @@ def _remaining_charge(memory: Memory, creep_pC: Array, step_pC: Array) -> Remain
 def _learn_film(memory: Memory, dt_s: float) -> Memory:
     """Update the scale factors of creep and thermoelastic step with the charge that remains after a release.
 
-    After a release, creep and the thermoelastic step leave a charge on the film. The measurement is the difference
-    between this charge and its prediction, reduced to one number. The difference is modelled as the sum of the
-    predicted charges of creep and of the step, each multiplied by the error of its scale factor. A Kalman filter
-    updates the two scale factors with the measurement.
+    Creep (slow decrease of the charge of a held press) and the thermoelastic step (additional charge at the beginning
+    of a press) leave a charge on the film after the release. The measurement is the difference between this charge and
+    its prediction, reduced to one number. The model of the difference has two terms: the predicted charge of creep and
+    the predicted charge of the step, each multiplied by the error of its scale factor. A Kalman filter updates the two
+    scale factors with the measurement. The charge that the updated scale factors explain is subtracted from the warmth,
+    to which this charge was attributed before.
 
     All frames in the time `LEARN_S` after a release together count as one measurement. The variance of each frame is
     therefore multiplied by the number of these frames.
@@ -453,7 +464,7 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
 
     The warmth is the charge of each electrode due to a change of temperature. The touch may have changed the latest
     estimate of the warmth before the touch was detected. The warmth is therefore predicted from the trusted estimate,
-    whose age is at least `look_back_s`.
+    whose age is at least `look_back_s`. The touch charge is then computed again.
 
     Args:
         rule: Memory of the film.
@@ -491,9 +502,9 @@ def add_warmth(
 ) -> Memory:
     """Assign a part of the touch charge to the warmth, and return the resulting state.
 
-    The charge of the film is h q + d, where h is the response to a step, q is the touch charge and d is the warmth, the
-    charge due to a change of temperature. The charge of the film stays the same if the touch charge is decreased by c
-    and the warmth is increased by h c.
+    The charge of the film is h q + d, plus terms that depend only on earlier touch charges. Here h is the response to a
+    step, q is the touch charge and d is the warmth, the charge due to a change of temperature. The charge of the film
+    stays the same if the touch charge is decreased by c and the warmth is increased by h c.
 
     Args:
         memory: The state.
@@ -518,9 +529,10 @@ def add_warmth(
 def charge_scale_std(memory: Memory) -> float:
     """Return the relative standard deviation that is common to all touch charges, dimensionless.
 
-    Errors of the two scale factors change the touch charge in proportion to the charges of creep and of the
-    thermoelastic step. Let c and s be the charges of creep and of the thermoelastic step, relative to the touch charge.
-    The relative variance of the touch charge is c^2 var(creep) + s^2 var(step) + 2 c s cov(creep, step).
+    Creep (slow decrease of the charge of a held press) and the thermoelastic step (additional charge at the beginning
+    of a press) each have an uncertain scale factor. An error of a scale factor changes the touch charge in proportion
+    to the charge of creep or of the step. Let c and s be these two charges, relative to the touch charge. The relative
+    variance of the touch charge is c^2 var(creep) + s^2 var(step) + 2 c s cov(creep, step).
 
     Without a touch, the result is 0.
 

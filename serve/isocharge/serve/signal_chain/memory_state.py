@@ -69,9 +69,9 @@ class Film(NamedTuple):
     def with_memory(cls, creep: float, thermoelastic: float, variances: ScaleVariances) -> "Film":
         """Return the properties of a film with a given creep and thermoelastic step.
 
-        The state of a film has one row for each of its terms: the creep terms, the thermoelastic term, the warmth
-        (charge due to a change of temperature), the slope of the warmth, and the touch charge. The charge of the film
-        is the sum of all rows, each multiplied by its response.
+        The rows of the state are the creep terms, the thermoelastic term, the warmth (charge due to a change of
+        temperature), the slope of the warmth, and the touch charge. The charge of the film is the sum of all rows, each
+        multiplied by its response.
 
         Args:
             creep: Share of a charge that is lost in each decade of time.

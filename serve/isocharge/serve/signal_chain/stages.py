@@ -96,7 +96,7 @@ class HumStage(Stage):
 
 
 class TareStage(OffsetStage):
-    """Measures the charge at rest in quiet frames, and subtracts it from all later frames."""
+    """Measures the charge at rest in quiet frames, and subtracts this charge from all later frames."""
 
     def __init__(self, rule: TareRule | None, n_electrode: int) -> None:
         """Begin without a tare.
@@ -107,9 +107,9 @@ class TareStage(OffsetStage):
         """
         self._rule = rule
         self._tare: Tare | None = None
-        self._waiting_pC = np.empty((0, n_electrode))  # charges of the latest frames, from which the tare is measured
+        self._latest_pC = np.empty((0, n_electrode))  # charges of the latest frames, from which the tare is measured
         self._searched_frames = 0  # number of frames since the beginning of the search
-        self._gives_up = True  # whether the search ends with an error after too many frames
+        self._is_search_limited = True  # whether the search ends with an error after too many frames
 
     @property
     def tare(self) -> Tare | None:
@@ -143,9 +143,9 @@ class TareStage(OffsetStage):
         Unlike the first search for a tare, the new search does not end with an error.
         """
         self._tare = None
-        self._waiting_pC = self._waiting_pC[:0]
+        self._latest_pC = self._latest_pC[:0]  # without any frame
         self._searched_frames = 0
-        self._gives_up = False
+        self._is_search_limited = False
 
     def add_warming(self, change: WarmingChange) -> None:
         """Add the warming to the tare."""
@@ -153,25 +153,28 @@ class TareStage(OffsetStage):
         self._tare = self._tare._replace(charge_pC=self._tare.charge_pC + change.charge_pC)
 
     def _search(self, charge_pC: Array) -> None:
-        """Add a frame to the waiting frames, and measure the tare if the waiting frames are enough and quiet.
+        """Add a frame to the stored latest frames, and measure the tare if these frames are enough and quiet.
 
-        The tare is subtracted from the frames after this frame. If the settings contain no conditions for a tare, the
-        tare is 0.
+        The tare is the charge at rest, which is subtracted from all later frames. If the settings contain no conditions
+        for a tare, the tare is 0.
 
         Args:
             charge_pC: Charges of this frame, shape (electrodes,), pC.
+
+        Raises:
+            TareError: If the film is touched during the whole search for a tare.
         """
         if self._rule is None:
             zero_pC = np.zeros_like(charge_pC)
             self._tare = Tare(charge_pC=zero_pC, noise_pC=zero_pC, frames=0)
             return
-        latest_pC = np.vstack([self._waiting_pC, charge_pC])
-        self._waiting_pC = latest_pC[-self._rule.frames :]  # at most as many frames as a tare needs
-        if self._gives_up:  # only then does the search end with an error after too many frames
+        stored_pC = np.vstack([self._latest_pC, charge_pC])
+        self._latest_pC = stored_pC[-self._rule.frames :]  # at most as many frames as a tare needs
+        if self._is_search_limited:  # otherwise the count remains 0, and the search never ends with an error
             self._searched_frames += 1
-        self._tare = look_for_tare(self._rule, self._waiting_pC, self._searched_frames)
+        self._tare = look_for_tare(self._rule, self._latest_pC, self._searched_frames)
         if self._tare is not None:
-            self._waiting_pC = self._waiting_pC[:0]  # no frame is waiting any more
+            self._latest_pC = self._latest_pC[:0]  # the frames are not needed any more
 
 
 class LeakStage(OffsetStage):
@@ -189,7 +192,7 @@ class LeakStage(OffsetStage):
         self._leak: Leak | None = None
 
     def step(self, frame: ChainFrame) -> None:
-        """Replace the output of the amplifiers by the touch charge.
+        """Replace the output of the amplifiers by the touch charge, in which the leak of the amplifiers is corrected.
 
         Args:
             frame: The frame, which is changed in place. Its charges are the output above the tare.
@@ -237,22 +240,25 @@ class MemoryStage(OffsetStage):
         self._memory: Memory | None = None
 
     def step(self, frame: ChainFrame) -> None:
-        """Replace the output of the amplifiers by the touch charge, and correct the memory of the film.
+        """Replace the output of the amplifiers by the touch charge.
+
+        The leak of the amplifiers and the memory of the film (creep and the thermoelastic step) are corrected. The
+        values that the detection of touches needs are also written into the frame.
 
         Args:
             frame: The frame, which is changed in place. Its charges are the output above the tare.
         """
         output_pC = frame.charge_pC
-        previous = self._memory
-        if previous is None:  # the first frame after the tare
+        previous_memory = self._memory
+        if previous_memory is None:  # the first frame after the tare
             self._memory = Memory.start(self._rule, output_pC)
         else:
-            frame.is_base_held = previous.is_recently_touched
+            frame.is_base_held = previous_memory.is_recently_touched  # a finger may still be leaving the film
             self._memory = undo_memory(
                 self._rule,
                 self._leak_rule,
                 self._tau_s,
-                previous,
+                previous_memory,
                 output_pC,
                 frame.noise_pC,
                 frame.dt_s,
@@ -264,7 +270,14 @@ class MemoryStage(OffsetStage):
         self._report(frame)
 
     def begin_touch(self, frame: ChainFrame) -> None:
-        """Replace the warmth in this frame by a prediction from its values before the touch."""
+        """Replace the warmth in this frame by a prediction from its values before the touch.
+
+        The warmth is the charge due to a change of temperature. Its latest estimate is wrong, because the touch began
+        before it was detected.
+
+        Args:
+            frame: The first frame of the touch. Its touch charge is computed again.
+        """
         assert self._memory is not None
         self._memory = begin_touch(self._rule, self._memory)
         self._report(frame)
@@ -279,7 +292,7 @@ class MemoryStage(OffsetStage):
         self._memory = add_warmth(self._memory, change.charge_pC, change.rate_pC_per_s, is_learned=change.is_learned)
 
     def _report(self, frame: ChainFrame) -> None:
-        """Write the touch charge and the relative standard deviation of its scale into a frame."""
+        """Write the touch charge, and the relative standard deviation that all touch charges share, into a frame."""
         assert self._memory is not None
         frame.charge_pC = self._memory.leak.charge_pC
         frame.charge_scale_std = charge_scale_std(self._memory)
@@ -386,7 +399,7 @@ class Warming(Stage):
         ratios: Array | float = 1.0,
         warmth_s: float | None = None,
     ) -> None:
-        """Store the settings, and begin without any warming.
+        """Store the settings, and begin with an estimated warming of zero.
 
         Args:
             rule: Settings of the estimate of warming.
@@ -406,7 +419,8 @@ class Warming(Stage):
     def step(self, frame: ChainFrame) -> None:
         """Estimate the warming of a frame in contact, subtract its change from the charges, and add the flags.
 
-        Earlier changes of the warming have already been subtracted by the stage that stores the charge at rest.
+        The stage that stores the charge at rest has already subtracted the earlier changes of the warming. It also
+        receives the present change. While an amplifier is saturated, the warming is not estimated.
 
         Args:
             frame: The frame, which is changed in place.
@@ -414,7 +428,7 @@ class Warming(Stage):
         if not frame.touch.contact:
             self._drift = NO_DRIFT
             return
-        if frame.is_saturated:  # the charges of a saturated amplifier fit no contact, whatever the warming is
+        if frame.is_saturated:  # for any value of the warming, the charges of a saturated amplifier fit no contact
             return
         previous_pC = self._drift.charge_pC
         drift = track_thermal_drift(
@@ -424,7 +438,7 @@ class Warming(Stage):
 
         # After a touch with a large warming, the stage of the film's memory must not learn the properties of the film.
         is_large = abs(drift.charge_pC) >= self._rule.tell_pC
-        if drift.charge_pC != previous_pC:
+        if drift.charge_pC != previous_pC:  # most frames do not change the estimate
             change_pC = (drift.charge_pC - previous_pC) * self._ratios
             frame.charge_pC = frame.charge_pC - change_pC
             rate_pC_per_s = drift.rate_pC_per_s * self._ratios

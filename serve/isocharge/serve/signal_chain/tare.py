@@ -44,14 +44,14 @@ class Tare(NamedTuple):
     frames: int
 
 
-def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None:
-    """Measure the tare, which is the charge at rest, from the latest frames.
+def look_for_tare(rule: TareRule, latest_pC: Array, searched_frames: int) -> Tare | None:
+    """Measure the tare, which is the charge at rest, from the latest frames if these frames are quiet.
 
     Args:
         rule: Number of frames that a tare needs, limits of their noise and offset, and `patience`, the number of frames
             after which the search ends with an error (0 for a search without end).
-        waiting_pC: Charges of the latest frames, at most `rule.frames`, shape (k, electrodes), pC.
-        frames: Number of frames since the search began.
+        latest_pC: Charges of the latest frames, at most `rule.frames`, shape (k, electrodes), pC.
+        searched_frames: Number of frames since the search began.
 
     Returns:
         The tare; None if there are too few frames, or the frames are not quiet.
@@ -59,13 +59,13 @@ def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None
     Raises:
         TareError: If the frames are not quiet, and the search has lasted for `rule.patience` frames.
     """
-    if len(waiting_pC) < rule.frames:
+    if len(latest_pC) < rule.frames:
         return None
     try:
-        return measure_tare(rule, waiting_pC)
+        return measure_tare(rule, latest_pC)
     except TareError:
         has_time_limit = rule.patience > 0
-        if has_time_limit and frames >= rule.patience:
+        if has_time_limit and searched_frames >= rule.patience:
             raise
         return None  # search again with the next frame
 

@@ -95,7 +95,8 @@ def track_thermal_drift(
     After each time interval `every_s`, a change of the charge p is estimated. Several trial values of the change are
     subtracted from the charges. The misfit of a trial value is the distance of the remaining charges from the nearest
     single contact. A parabola is fitted to the squared misfits. The minimum of the parabola is the estimate. A Kalman
-    filter weights this estimate by its variance and by the predicted variance of p.
+    filter weights this estimate by its variance and by the predicted variance of p. If the parabola is too flat, p is
+    not changed, and the state is marked as `blind`.
 
     Args:
         rule: Settings of the estimate of warming.
@@ -153,9 +154,8 @@ def _predicted_variances(
     The rate decays with the time constant `warmth_s`, and random changes are added to the rate (white process noise).
     If this time constant is not known, p is a random walk without a rate.
 
-    With the time t since the last estimate, the decay e = exp(-t / warmth_s) of the rate, the change
-    g = warmth_s (1 - e) of p for a rate of 1, and the variance r that the process noise adds to the rate, the
-    prediction is
+    Let t be the time since the last estimate. The rate decays by the factor e = exp(-t / warmth_s). A rate of 1 changes
+    p by g = warmth_s (1 - e). Let r be the variance that the process noise adds to the rate. The prediction is
 
         var(p)       <- var(p) + 2 g cov(p, rate) + g^2 var(rate) + r t^2 / 3,
         cov(p, rate) <- e (cov(p, rate) + g var(rate)) + r t / 2,
@@ -174,7 +174,8 @@ def _predicted_variances(
         random_walk_variance_pC2 = state.variance_pC2 + rule.wander_pC**2 * waited_s
         return random_walk_variance_pC2, 0.0, 0.0
 
-    # In one second, r t^2 / 3 is the square of `wander_pC`, so p changes by `wander_pC` (standard deviation).
+    # The variance r is proportional to t. After one second, the variance r t^2 / 3 that is added to p is the square of
+    # `wander_pC`, which is by definition the standard deviation of the change of p in one second.
     added_rate_variance = 3.0 * rule.wander_pC**2 * waited_s
     decay = math.exp(-waited_s / warmth_s)
     rate_effect_s = warmth_s * (1.0 - decay)

@@ -100,7 +100,8 @@ class Hub:
         """Carry out the request of a viewer, or pass the request to the reader of the stream.
 
         Args:
-            request: The request. A request of the type `ReplayRequest` is carried out here.
+            request: The request. A request of the type `ReplayRequest` only concerns the position of the viewer, and is
+                carried out here. A request of the type `LiveRequest` is passed to the reader.
             viewer: The viewer that has sent the request.
 
         Returns:
@@ -140,7 +141,7 @@ class Hub:
             self._update_state({"has_ended": True})
 
     def _update_progress(self) -> None:
-        """For a recording, store in the state which part of the recording has been read so far."""
+        """For a recording, store in the state which part of the recording has been read so far, if it has grown."""
         if isinstance(self.tape, RecordedTape) and self.state.get("samples") != self.tape.total:
             self._update_state({"samples": self.tape.total, "span": self.tape.span(), "overview": self.tape.overview()})
 
@@ -192,8 +193,12 @@ class Viewer:
         self._latest_advance_s = now_s  # Unix time at which the position was last advanced
 
     def confirm(self, number: int) -> None:
-        """Store that the page has drawn all messages up to the given number."""
-        self._confirmed_messages = max(self._confirmed_messages, min(number, self._sent_messages))
+        """Store that the page has drawn all messages up to the given number.
+
+        A number that was not sent yet counts as the number of the latest message.
+        """
+        valid_number = min(number, self._sent_messages)
+        self._confirmed_messages = max(self._confirmed_messages, valid_number)
         self.wake.set()
 
     def apply(self, request: ReplayRequest) -> None:
@@ -205,12 +210,16 @@ class Viewer:
     def messages(self, now_s: float) -> list[bytes | str]:
         """Return the messages that are due now. While too many messages are unconfirmed, return an empty list.
 
+        Messages without samples are JSON texts: the state of the stream if it has changed, and the position in a
+        recording if it has changed.
+
         Args:
             now_s: Unix time, s.
         """
         if self._playhead is not None:
             self._advance(self._playhead, now_s)
-        if self._sent_messages - self._confirmed_messages >= MAX_UNCONFIRMED_MESSAGES:
+        unconfirmed_messages = self._sent_messages - self._confirmed_messages
+        if unconfirmed_messages >= MAX_UNCONFIRMED_MESSAGES:
             return []
 
         # The number of samples in a message is limited in proportion to the time since the previous message.
@@ -223,9 +232,9 @@ class Viewer:
         if self._state_version != self._hub.version:
             self._state_version = self._hub.version
             messages.append(json.dumps({"state": self._hub.state}))
-        samples = self._next_samples_message(max_samples, now_s)
-        if samples is not None:
-            messages.append(samples)
+        message_with_samples = self._next_samples_message(max_samples, now_s)
+        if message_with_samples is not None:
+            messages.append(message_with_samples)
         if self._playhead is not None and self._must_send_playhead:
             messages.append(json.dumps({"play": self._playhead.to_json()}))
             self._must_send_playhead = False
@@ -238,7 +247,7 @@ class Viewer:
             max_samples: Largest number of samples in the message. If there are more new samples, they are coalesced.
             now_s: Unix time, s.
         """
-        # Determine the samples from `start` to `stop` that are sent.
+        # The samples with the numbers from `start` to `stop` - 1 are sent.
         tape = self._hub.tape
         self._begin_anew_after_jump()
         stop = self._first_hidden_sample()
@@ -259,8 +268,8 @@ class Viewer:
     def _begin_anew_after_jump(self) -> None:
         """If the viewer has selected another position in a recording, let the next message replace all plots.
 
-        The next message then begins with the samples of the last `HISTORY_S` seconds before the new position. Otherwise
-        the method does nothing.
+        The next message then begins with the samples of the last `HISTORY_S` seconds before the new position. If the
+        viewer has not selected another position, nothing changes.
         """
         playhead = self._playhead
         tape = self._hub.tape
@@ -275,7 +284,7 @@ class Viewer:
         """Return the number of the first sample that must not be sent to the viewer yet.
 
         In a recording, the result is the number of the first sample after the position of the viewer. In a live stream,
-        the result is the number of the next sample that will arrive.
+        no sample is hidden. The result is then the number of the next sample that will arrive.
         """
         tape = self._hub.tape
         if self._playhead is None or not tape.total:
@@ -290,10 +299,11 @@ class Viewer:
             playhead: The position of the viewer, which is changed.
             now_s: Unix time, s.
         """
-        step_s = max(now_s - self._latest_advance_s, 0.0)
+        step_s = max(now_s - self._latest_advance_s, 0.0)  # the clock may have been set back
         self._latest_advance_s = now_s
-        is_complete = self._hub.state.get("is_complete", False)
-        if playhead.advance(step_s, self._length_s(), is_complete=is_complete):
+        is_completely_read = self._hub.state.get("is_complete", False)
+        has_just_ended = playhead.advance(step_s, self._length_s(), is_complete=is_completely_read)
+        if has_just_ended:  # the page must show that playing has stopped
             self._must_send_playhead = True
 
     def _length_s(self) -> float:

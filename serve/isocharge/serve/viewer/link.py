@@ -78,15 +78,15 @@ class ReaderEnd(LinkEnd):
     waits: bool = False
 
     def send_sample(self, sample: bytes) -> None:
-        """Send a sample. If the pipe is full, the sample is discarded.
+        """Send a sample. If the pipe is full, discard and count the sample.
 
-        However, after `enable_waiting` was called, the method waits until the pipe has room for the sample.
+        After `enable_waiting` was called, the method instead waits until the pipe has room for the sample.
         """
         try:
             os.write(self.samples.fileno(), sample)
         except BlockingIOError:
             self.dropped += 1
-        except OSError:
+        except OSError:  # the process of the page has ended
             self.is_open = False
 
     def enable_waiting(self) -> None:
@@ -131,6 +131,8 @@ class PageEnd(LinkEnd):
     def receive_samples(self, size: int) -> bytes:
         """Return the bytes of all complete samples that have already arrived. The method does not wait.
 
+        If the reader has ended, the method sets `is_open` to False.
+
         Args:
             size: Size of a sample, bytes. The bytes of an incomplete sample are kept for the next call.
         """
@@ -168,7 +170,7 @@ def make_link() -> tuple[ReaderEnd, PageEnd]:
     """
     page_pipe, reader_pipe = Pipe(duplex=False)  # the page receives, and the reader sends
     for pipe_end in (page_pipe, reader_pipe):
-        os.set_blocking(pipe_end.fileno(), False)
+        os.set_blocking(pipe_end.fileno(), False)  # neither end waits
     with suppress(OSError):  # a smaller pipe is sufficient if the system does not allow this size
         fcntl.fcntl(reader_pipe.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
     reader_socket, page_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -143,7 +143,7 @@ class SampleFormat:
         """Convert a record to the bytes of a sample.
 
         If the record contains a tracked contact, the sample contains the tracked contact instead of the contact of the
-        frame. Numbers that are unknown become NaN.
+        frame. Unknown numbers become NaN. Numbers that are too large for the type float32 are limited to its range.
         """
         flag_bits = CONTACT_BIT if record.contact else 0
         for flag in record.flags:
@@ -155,7 +155,7 @@ class SampleFormat:
             if record.tracked is not None:
                 value = getattr(record.tracked, name, value)  # the tracked contact has only some of the numbers
             values.append(value)
-        # The field `other` is another contact that explains the charges equally well.
+        # The field `other` is another contact that explains the charges equally well, if there is one.
         values += [None if record.other is None else getattr(record.other, name) for name in OTHER_NUMBERS]
         numbers = [math.nan if value is None else value for value in values]
 
@@ -166,12 +166,12 @@ class SampleFormat:
         record_count = 1  # `coalesce` adds the counts of the samples that it replaces by a single sample
         try:
             return self._struct.pack(timestamp, *numbers, flag_bits, record_count, *charge_pC)
-        except OverflowError:  # a number is beyond the range of float32
+        except OverflowError:  # a number is beyond the range of float32, which is so rare that it is not checked before
             return self._struct.pack(timestamp, *_clip(numbers), flag_bits, record_count, *_clip(charge_pC))
 
 
 def _clip(values: Sequence[float]) -> list[float]:
-    """Limit each number to the range of the type float32, and return the results."""
+    """Limit each number to the range of the type float32, and return the results. NaN stays NaN."""
     return [min(max(value, -MAX_FLOAT32), MAX_FLOAT32) for value in values]
 
 
@@ -197,10 +197,11 @@ def coalesce(samples: Samples, max_samples: int) -> Samples:
     chosen: Samples = samples[_chosen_indices(samples, run_edges)]
     contact_bit = chosen["flags"] & CONTACT_BIT
 
-    # `reduceat` combines the values of each run, from its first sample to the first sample of the next run.
+    # `reduceat` combines the values of each run, from its first sample to the last sample before the next run.
     run_starts = run_edges[:-1]
-    other_flags = np.bitwise_or.reduceat(samples["flags"], run_starts) & ~np.uint32(CONTACT_BIT)
-    chosen["flags"] = other_flags | contact_bit
+    flags_of_run = np.bitwise_or.reduceat(samples["flags"], run_starts)
+    flags_without_contact = flags_of_run & ~np.uint32(CONTACT_BIT)
+    chosen["flags"] = flags_without_contact | contact_bit
     chosen["records"] = np.add.reduceat(samples["records"], run_starts)
     chosen["latency_us"] = np.fmax.reduceat(samples["latency_us"], run_starts)  # ignores latencies that are NaN
     return chosen
@@ -223,10 +224,10 @@ def _chosen_indices(samples: Samples, run_edges: np.ndarray) -> np.ndarray:
     known_force_N = np.nan_to_num(samples["force_N"], nan=0.0)
     # Samples without contact get a negative value, so that the largest value of a run is a contact if there is one.
     force_N = np.where(is_contact, known_force_N, -1.0)
-    latest = run_edges[1:] - 1
-    strongest = np.array([start + int(force_N[start:stop].argmax()) for start, stop in pairwise(run_edges)])
-    contact_has_ended = ~is_contact[latest] & is_contact[strongest]
-    return np.where(contact_has_ended, strongest, latest)
+    latest_indices = run_edges[1:] - 1
+    strongest_indices = np.array([start + int(force_N[start:stop].argmax()) for start, stop in pairwise(run_edges)])
+    has_contact_ended = ~is_contact[latest_indices] & is_contact[strongest_indices]
+    return np.where(has_contact_ended, strongest_indices, latest_indices)
 
 
 HEADER = struct.Struct("<BBHIdII")
@@ -251,7 +252,7 @@ class Tare(PageRequest):
 
 
 class Back(PageRequest):
-    """Request to reset the followed film to its calibration."""
+    """Request to reset the estimated pretension of the film to the value of its calibration."""
 
 
 class Record(PageRequest):
@@ -320,7 +321,9 @@ def samples_message(number: int, sent_s: float, samples: Samples, missed: int, *
         begin_anew: Whether the page discards all earlier samples.
     """
     options = BEGIN_ANEW_OPTION if begin_anew else 0
-    header = HEADER.pack(SAMPLES_KIND, 0, len(samples), number & 0xFFFFFFFF, sent_s, missed & 0xFFFFFFFF, options)
+    number_field = number & 0xFFFFFFFF  # the fields have 32 bits, and wrap to 0
+    missed_field = missed & 0xFFFFFFFF
+    header = HEADER.pack(SAMPLES_KIND, 0, len(samples), number_field, sent_s, missed_field, options)
     return header + samples.tobytes()
 
 
@@ -342,12 +345,12 @@ DEFLECTION_FILE = "deflection.json"
 """Name of the file with the deflection field in a version folder."""
 
 
-def find_field(version_folder: Path, metadata: ModelMetadata) -> DeflectionField | None:
+def find_deflection_field(version_folder: Path, metadata: ModelMetadata) -> DeflectionField | None:
     """Return the deflection field of the film for which a model was trained, or None if no such field is available.
 
-    If the version folder of the model contains a deflection field, the function returns this field. Otherwise, the
-    function searches the deflection fields that are included in isocharge. The included deflection fields belong to the
-    films of the released models.
+    The deflection field describes the shape of the pressed film, which the page draws. If the version folder of the
+    model contains a deflection field, the function returns this field. Otherwise, the function searches the deflection
+    fields that are included in isocharge. These belong to the films of the released models.
 
     Args:
         version_folder: Folder of the version of the model.
@@ -407,7 +410,7 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
 
 
 def _electrode_polygons(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[list[float]]]]:
-    """Return the polygons of each electrode after a calibration has corrected their position.
+    """Return the polygons of each electrode at the place that a calibration has determined, if there is one.
 
     The first polygon of an electrode is its pad. All further polygons describe additional metal that belongs to the
     electrode, such as leads.
@@ -450,12 +453,12 @@ class _Polygon(Struct):
 
 
 def _designed_polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]:
-    """Return the designed polygons of an electrode, which ignore the results of a calibration.
+    """Return the polygons of an electrode according to its design, before a calibration has corrected them.
 
     If the design contains only a point for the electrode, the electrode is a square around this point.
 
     Args:
-        parts: Section `electrodes` of a sensor file: a point (x, y) or a polygon for each electrode name, and the side
+        parts: Section `electrodes` of a sensor file: a point (x, y) or polygons for each electrode name, and the side
             of the squares under the key `side_mm`.
         name: Name of the electrode.
 
@@ -477,7 +480,7 @@ def _designed_polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]
 def _calibrated_corners(corners: list[Point], calibration: Any) -> list[list[float]]:
     """Rotate and shift the corners of a polygon by the results of a calibration.
 
-    The corners are first rotated about the centre of the film and then shifted.
+    The corners are first rotated about the centre of the film, from the x axis towards the y axis, and then shifted.
 
     Args:
         corners: Corners (x, y) of the designed polygon, mm.

@@ -71,7 +71,7 @@ def playground_html(models: tuple[str, ...] = MODELS) -> str:
         "data": _as_json(_page_data(series, models)),
     }
 
-    # The template contains a placeholder for each part, which is the name of the part in double braces.
+    # The template contains a placeholder for each part. It is the name of the part in double braces.
     html = template
     for name, text in parts.items():
         html = html.replace("{{" + name + "}}", text)
@@ -79,7 +79,7 @@ def playground_html(models: tuple[str, ...] = MODELS) -> str:
 
 
 def _page_data(series: StressSeries, models: tuple[str, ...]) -> dict[str, Any]:
-    """Return the data of the page, namely the stress of the film, the models, and the meanings of the flags."""
+    """Return the data of the page: the stress of the film, the models, and the meanings of the flags it can show."""
     return {
         "stress": series.to_json(),
         "models": [_describe_model(model, series) for model in models],
@@ -109,7 +109,7 @@ def _describe_model(name: str, series: StressSeries) -> dict[str, Any]:
     description = describe_film(metadata.name, metadata, None)
     outlines = description["outlines_mm"]
     corner_counts = [len(outlines.get(electrode, ())) for electrode in metadata.electrodes]
-    if any(corner_count != QUADRILATERAL for corner_count in corner_counts):
+    if any(corner_count != QUADRILATERAL for corner_count in corner_counts):  # the page cannot integrate other shapes
         raise ModelError(f"{name}: expected electrodes with four corners, got {outlines}; choose another model")
     validity = Validity.of(metadata)
     network = (model.folder / "model.onnx").read_bytes()

@@ -21,15 +21,15 @@ class Playhead:
     is_playing: bool = True
     has_jumped: bool = True
 
-    def advance(self, step_s: float, end_s: float, *, is_complete: bool) -> bool:
+    def advance(self, step_s: float, read_s: float, *, is_complete: bool) -> bool:
         """Advance the position if the recording is being played, and stop playing at the end of the recording.
 
-        While the recording is still being read, the position stays within the part that has already been read. Playing
-        then continues.
+        The position stays within the part of the recording that has already been read. If it reaches the end of this
+        part while the recording is still being read, it waits there, and the recording counts as being played.
 
         Args:
             step_s: Time that has passed since the previous call, s.
-            end_s: Length of the part of the recording that has been read, s.
+            read_s: Length of the part of the recording that has been read, s.
             is_complete: Whether the whole recording has been read.
 
         Returns:
@@ -37,29 +37,31 @@ class Playhead:
         """
         if not self.is_playing:
             return False
-        self.at_s = min(self.at_s + step_s * self.speed, end_s)
-        self.is_playing = not (is_complete and self.at_s >= end_s)
-        return not self.is_playing
+        self.at_s = min(self.at_s + step_s * self.speed, read_s)
+        has_reached_end = is_complete and self.at_s >= read_s
+        if has_reached_end:
+            self.is_playing = False
+        return has_reached_end
 
-    def apply(self, request: ReplayRequest, end_s: float) -> None:
+    def apply(self, request: ReplayRequest, read_s: float) -> None:
         """Carry out a request of the page.
 
-        If the position is at the end of the recording, a request to play starts again at the beginning.
+        A request to play starts again at the beginning if the position is at the end of the part that has been read.
 
         Args:
             request: Request to change the speed, to go to another position, to pause, or to play.
-            end_s: Length of the part of the recording that has been read, s.
+            read_s: Length of the part of the recording that has been read, s.
         """
         match request:
             case Speed(value=value):
                 self.speed = value
             case Seek(value=value):
-                self._jump(min(value, end_s))
+                self._jump(min(value, read_s))
             case Pause():
                 self.is_playing = False
             case Play():
                 self.is_playing = True
-                if self.at_s >= end_s:
+                if self.at_s >= read_s:
                     self._jump(0.0)
 
     def _jump(self, at_s: float) -> None:

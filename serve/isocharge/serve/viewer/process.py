@@ -63,7 +63,8 @@ class Page:
 def page_process(page: Page) -> Iterator[str]:
     """Return a context manager that serves the page in a separate process until the `with` block ends.
 
-    The calling process is the reader of the stream. The new process ends when the reader closes its end of the link.
+    The calling process is the reader of the stream. It must close its end of the link before the block ends. The new
+    process then ends by itself.
 
     Args:
         page: Settings of the page.
@@ -78,17 +79,17 @@ def page_process(page: Page) -> Iterator[str]:
     # The new process sends the URL of the page, or an error, through a pipe.
     context = get_context("spawn")
     url_receiver, url_sender = context.Pipe(duplex=False)
-    process = context.Process(target=_run, args=(page, url_sender), name="page", daemon=True)
+    process = context.Process(target=_run_and_send_url, args=(page, url_sender), name="page", daemon=True)
     with _interrupts_ignored():
         process.start()
-    # The new process has its own copies of the following two ends. They are closed here, because the other ends only
-    # notice that the new process has ended if no copies are open in this process.
+    # The new process has its own copies of the following two ends. This process closes its copies, because it can only
+    # notice the end of the new process if no copy is open any more.
     url_sender.close()
     page.link.close_here()
     try:
         yield _receive_url(url_receiver)
     finally:
-        # The reader has closed the link, so the process ends by itself. If it does not, it is terminated.
+        # The reader has closed the link, so that the process ends by itself. If it does not, it is terminated.
         process.join(STOP_TIMEOUT_S)
         if process.is_alive():
             process.terminate()
@@ -111,31 +112,33 @@ def run_page(page: Page, announce: Callable[[str], object]) -> None:
     access = Access(token, page.address.host)
     tls_context = None if page.tls is None else page.tls.context()
     hub = Hub(page.link, page.description, is_recording=page.is_recording)
-    with closing(hub), page.address.listen(BACKLOG) as listening:
-        announce(page.address.url(listening, secure=page.tls is not None))
+    with closing(hub), page.address.listen(BACKLOG) as listening_socket:
+        announce(page.address.url(listening_socket, secure=page.tls is not None))
         server = PageServer(hub, access)
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-            runner.run(_serve(server, hub, listening, tls_context))
+            runner.run(_serve(server, hub, listening_socket, tls_context))
 
 
-async def _serve(server: PageServer, hub: Hub, listening: socket.socket, tls_context: ssl.SSLContext | None) -> None:
+async def _serve(
+    server: PageServer, hub: Hub, listening_socket: socket.socket, tls_context: ssl.SSLContext | None
+) -> None:
     """Answer the requests of browsers until the reader of the stream has ended.
 
     Args:
         server: Server of the page.
         hub: Hub that distributes the samples of the stream to the viewers.
-        listening: Socket on which the server accepts connections.
+        listening_socket: Socket on which the server accepts connections.
         tls_context: TLS context of the server, or None for HTTP without TLS.
     """
-    async with server.listening(listening, tls_context):
+    async with server.answering(listening_socket, tls_context):
         await hub.run()  # ends when the reader has ended
 
 
-def _run(page: Page, url_sender: Connection) -> None:
-    """Serve the page. This function is the target of the separate process of the page.
+def _run_and_send_url(page: Page, url_sender: Connection) -> None:
+    """Serve the page, and send its URL to the process of the reader when the server listens.
 
-    The function sends the URL of the page to the process of the reader. If the page cannot be served, the function
-    sends the error instead.
+    The separate process of the page runs this function. If the page cannot be served, the function sends the error
+    instead of the URL.
 
     Args:
         page: Settings of the page.

@@ -2,11 +2,10 @@
 
 The server sends the files of the page and the description of the film over HTTP. It sends the samples over a WebSocket.
 
-The server is based on the package `websockets`, which answers one HTTP request on each connection. The package
-`websockets` limits the size of each line of a request to 8 KiB, and the number of lines to 128. The package also limits
-the duration of a request and the size of a message. The package also sends pings to each viewer. This module limits the
-number of viewers and the rate at which a viewer may send data. This module also disconnects a viewer that has not read
-its messages for too long.
+The server is based on the package `websockets`, which answers one HTTP request on each connection. The package limits
+the size of each line of a request to 8 KiB, the number of lines to 128, the duration of a request, and the size of a
+message. It also sends pings to each viewer. This module limits the number of viewers and the rate at which a viewer may
+send data. It also disconnects a viewer that has not read its messages for too long.
 
 A browser cannot send an Authorization header when it opens a WebSocket. The page therefore sends its token as a
 subprotocol that consists of `bearer.` and the token in base64url. Other clients send the Authorization header. The
@@ -87,8 +86,8 @@ class Access:
 def _authorization_from(subprotocols: Iterable[str]) -> bytes:
     """Convert the subprotocol that contains the token to the value of an Authorization header.
 
-    A browser cannot set headers when it opens a WebSocket. The page therefore sends the token as a subprotocol. The
-    token is encoded in base64url, without padding characters.
+    A browser cannot set headers when it opens a WebSocket. The page therefore sends the token as a subprotocol, which
+    consists of `BEARER` and the token in base64url without padding characters.
 
     Args:
         subprotocols: Subprotocols that the client offers.
@@ -99,10 +98,10 @@ def _authorization_from(subprotocols: Iterable[str]) -> bytes:
     """
     for subprotocol in subprotocols:
         if subprotocol.startswith(BEARER):
-            text = subprotocol.removeprefix(BEARER)
-            padding = "=" * (-len(text) % 4)  # the decoder needs a multiple of four characters
+            encoded_token = subprotocol.removeprefix(BEARER)
+            padding = "=" * (-len(encoded_token) % 4)  # the decoder needs a multiple of four characters
             try:
-                return b"Bearer " + base64.b64decode(text + padding, altchars=b"-_", validate=True)
+                return b"Bearer " + base64.b64decode(encoded_token + padding, altchars=b"-_", validate=True)
             except (binascii.Error, ValueError):
                 return b"Bearer"  # a header without a token is refused in the same way as a wrong token
     return b""
@@ -174,39 +173,39 @@ class RateLimit:
         self._available_bytes = burst_bytes
         self._latest_s = now_s
 
-    def allows(self, count: int, now_s: float) -> bool:
+    def allows(self, received_bytes: int, now_s: float) -> bool:
         """Count received data, and return whether the client has stayed within the limit.
 
-        The allowance of the client grows by `bytes_per_s` up to at most `burst_bytes`. Received data reduce the
-        allowance. The client has exceeded the limit if the allowance becomes negative.
+        The allowance of the client grows by `bytes_per_s` in each second, up to at most `burst_bytes`. Received data
+        reduce the allowance. The client has exceeded the limit if the allowance becomes negative.
 
         Args:
-            count: Size of the received data, bytes.
+            received_bytes: Size of the received data, bytes.
             now_s: Present time on the same monotonic clock, s.
         """
         elapsed_s = max(now_s - self._latest_s, 0.0)
         refilled_bytes = min(self._burst_bytes, self._available_bytes + elapsed_s * self._bytes_per_s)
-        self._available_bytes = refilled_bytes - count
+        self._available_bytes = refilled_bytes - received_bytes
         self._latest_s = now_s
         return self._available_bytes >= 0.0
 
 
 class PageConnection(ServerConnection):
-    """Connection of a client, which is ended if the client sends too much data.
+    """Connection of a client, which the server ends if the client sends too much data.
 
-    The limit counts all received data, including control frames such as pings.
+    All received data count, including control frames such as pings.
     """
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Create the limit on received data, because the connection begins."""
+        """Create the limit on received data when the connection begins."""
         self._rate_limit = RateLimit(MAX_BURST_BYTES, MAX_BYTES_PER_S, time.monotonic())
         super().connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
         """Process received data, or end the connection if the client has sent too much data.
 
-        If the client does not read the responses, asyncio pauses writing. While writing is paused, the method also
-        pauses reading, because the responses to further data would fill the memory.
+        If the client does not read the responses, asyncio pauses writing. The method then also pauses reading, because
+        the responses to further data would fill the memory. `resume_writing` resumes reading.
         """
         if not self._rate_limit.allows(len(data), time.monotonic()):
             self.transport.abort()
@@ -237,18 +236,18 @@ class PageServer:
         self._id = secrets.token_hex(8)
 
     @contextlib.asynccontextmanager
-    async def listening(
-        self, listening: socket.socket, tls_context: ssl.SSLContext | None = None
+    async def answering(
+        self, listening_socket: socket.socket, tls_context: ssl.SSLContext | None = None
     ) -> AsyncIterator[None]:
         """Return an asynchronous context manager that answers requests on a socket until its block ends.
 
         Args:
-            listening: Socket on which the server accepts connections.
+            listening_socket: Socket on which the server accepts connections.
             tls_context: TLS context of the server, or None for HTTP without TLS.
         """
         async with serve(
             self._serve_viewer,
-            sock=listening,
+            sock=listening_socket,
             ssl=tls_context,
             process_request=self._http_response,
             select_subprotocol=_select_subprotocol,
@@ -265,24 +264,24 @@ class PageServer:
             yield
 
     def _http_response(self, _connection: ServerConnection, request: http11.Request) -> http11.Response | None:
-        """Return the response to an HTTP request, or None if the request opens a WebSocket.
+        """Return the response to an HTTP request, or None if the request may open a WebSocket.
 
-        A request for a file of the page needs no token. A request for the description of the stream, or for a
-        WebSocket, must contain the token in its Authorization header. When a browser opens a WebSocket, it sends the
-        token in a subprotocol instead.
+        A request for a file of the page needs no token. If the page has a token, a request for the description of the
+        stream or for a WebSocket must contain the token in its Authorization header. When a browser opens a WebSocket,
+        it sends the token in a subprotocol instead.
 
         Args:
             _connection: Connection of the request, which is not used.
             request: The request, of which only the path and the headers are known.
         """
         try:
-            path = request.path.partition("?")[0]
+            path, _, _query = request.path.partition("?")
             if path in self._files:
                 return _last_response(self._files[path])
             if path not in (SESSION_PATH, LIVE_PATH):
                 raise UnknownPath(f"nothing is served under {path[:200]!r}; the page is /")
-            items = request.headers.raw_items()
-            headers = {name.lower().encode(): value.encode("ascii", "surrogateescape") for name, value in items}
+            header_items = request.headers.raw_items()
+            headers = {name.lower().encode(): value.encode("ascii", "surrogateescape") for name, value in header_items}
             # A request may have several headers with subprotocols, and each header may list several subprotocols.
             subprotocol_list = ",".join(request.headers.get_all("Sec-WebSocket-Protocol"))
             subprotocols = [subprotocol.strip() for subprotocol in subprotocol_list.split(",")]
@@ -297,12 +296,13 @@ class PageServer:
 
     def _session(self) -> Response:
         """Return the response with the description of the stream, which the page reads before the first sample."""
+        flags = [{"word": flag, "bit": FLAG_BITS[flag], "says": meaning} for flag, meaning in MEANINGS.items()]
         response = json_response(
             {
                 "id": self._id,
                 "is_replay": self._hub.is_recording,
                 "film": self._hub.description,
-                "flags": [{"word": word, "bit": FLAG_BITS[word], "says": says} for word, says in MEANINGS.items()],
+                "flags": flags,
             }
         )
         response.headers.append((b"cache-control", b"no-store"))
@@ -323,7 +323,7 @@ class PageServer:
             sender.cancel()
 
     async def _send(self, viewer: Viewer, connection: ServerConnection) -> None:
-        """Send messages to a viewer until the stream ends, and disconnect a viewer that does not read the messages.
+        """Send messages to a viewer until the stream ends. If the viewer does not read the messages, disconnect it.
 
         Args:
             viewer: The viewer. Its event `wake` is set when there may be messages to send.
@@ -343,7 +343,7 @@ class PageServer:
             pass
 
     async def _handle_message(self, viewer: Viewer, connection: ServerConnection, message: str | bytes) -> None:
-        """Handle a confirmation or a request of the page. If the message is invalid, the error is sent to the page.
+        """Handle a confirmation or a request of the page. If this is impossible, send the reason to the page.
 
         Args:
             viewer: The viewer that has sent the message.
@@ -383,9 +383,9 @@ def page_files() -> dict[str, Response]:
     """
     folder = Path(__file__).with_name("page")
     paths = [path for path in folder.rglob("*") if path.is_file()]
-    responses = {f"/{path.relative_to(folder).as_posix()}": _file_response(path) for path in paths}
-    responses["/"] = responses["/index.html"]
-    return responses
+    response_of_path = {f"/{path.relative_to(folder).as_posix()}": _file_response(path) for path in paths}
+    response_of_path["/"] = response_of_path["/index.html"]
+    return response_of_path
 
 
 def _file_response(path: Path) -> Response:

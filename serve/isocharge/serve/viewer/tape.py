@@ -49,19 +49,16 @@ class Tape:
         return max(0, self.total - len(self._ring))
 
     def append(self, samples: Samples) -> None:
-        """Append samples. If the buffer is full, the new samples replace the oldest samples."""
+        """Append samples, shape (n,). If the buffer is full, the new samples replace the oldest samples."""
         capacity = len(self._ring)
-        latest = samples[-capacity:]  # earlier samples would be overwritten at once
-        total = self.total + len(samples)
-        numbers = np.arange(total - len(latest), total)
-        self._ring[numbers % capacity] = latest
-        self.total = total
+        lasting_samples = samples[-capacity:]  # earlier samples would be overwritten at once
+        new_total = self.total + len(samples)
+        sample_numbers = np.arange(new_total - len(lasting_samples), new_total)
+        self._ring[sample_numbers % capacity] = lasting_samples
+        self.total = new_total
 
     def samples(self, start: int, stop: int) -> Samples:
-        """Return the samples with the numbers from `start` to `stop` - 1.
-
-        Samples that were overwritten are left out.
-        """
+        """Return the samples with the numbers from `start` to `stop` - 1, except those that were overwritten."""
         numbers = np.arange(max(start, self.oldest), stop)
         return self._ring[numbers % len(self._ring)]
 
@@ -90,7 +87,7 @@ class Tape:
 class RecordedTape(Tape):
     """Tape that stores all samples of a recording in a temporary file.
 
-    If the time of a sample is earlier than the time of the previous sample, the time of the previous sample is stored.
+    If the time of a sample is earlier than the time of the previous sample, the previous time is stored instead.
     """
 
     def __init__(self, dtype: "np.dtype[Any]") -> None:
@@ -120,7 +117,7 @@ class RecordedTape(Tape):
         if not len(samples):
             return
         ordered = samples.copy()
-        _, latest_stored_s = self.span()
+        _, latest_stored_s = self.span()  # 0 if no sample is stored yet
         times_s = np.nan_to_num(samples["timestamp"], nan=0.0)  # a missing time becomes 0, which is never the largest
         largest_so_far_s = np.maximum.accumulate(times_s)
         ordered["timestamp"] = np.maximum(largest_so_far_s, latest_stored_s)
@@ -155,15 +152,15 @@ class RecordedTape(Tape):
             self._join_pieces()
 
         # Append new pieces up to the piece that contains the last sample.
-        piece_of_sample = (elapsed_s / self._piece_s).astype(int)  # index of the piece that contains the sample
+        piece_of_sample = (elapsed_s / self._piece_s).astype(int)  # index of the piece that contains each sample
         piece_count = int(piece_of_sample[-1]) + 1
-        new_piece_count = piece_count - len(self._max_force_N)
+        new_piece_count = piece_count - len(self._max_force_N)  # may be 0
         self._max_force_N += [0.0] * new_piece_count
 
         # Compute the largest force of the samples in each piece. These samples are neighbours, because the times do not
         # decrease. They are called a run here. `reduceat` computes the largest force of every run in one call.
         force_N = np.nan_to_num(samples["force_N"], nan=0.0)
-        begins_run = np.diff(piece_of_sample, prepend=-1) != 0  # true for the first sample, because no piece is -1
+        begins_run = np.diff(piece_of_sample, prepend=-1) != 0  # True for the first sample, because no piece is -1
         run_starts = np.flatnonzero(begins_run)
         run_pieces = piece_of_sample[run_starts].tolist()
         run_max_N = np.maximum.reduceat(force_N, run_starts).tolist()
@@ -173,7 +170,10 @@ class RecordedTape(Tape):
             self._max_force_N[piece] = max(self._max_force_N[piece], max_force_N)
 
     def _join_pieces(self) -> None:
-        """Join neighbouring pieces of the overview in pairs, and double the duration of a piece."""
+        """Join neighbouring pieces of the overview in pairs, and double the duration of a piece.
+
+        If the number of pieces is odd, the last piece remains alone.
+        """
         pairs = [self._max_force_N[first : first + 2] for first in range(0, len(self._max_force_N), 2)]
         self._max_force_N = [max(pair) for pair in pairs]
         self._piece_s *= 2.0

@@ -45,16 +45,17 @@ class PseudoPort:
         Returns:
             Whether all data were written.
         """
-        # The operating system writes the number of bytes that the reader has not read yet into this array.
-        unread_bytes = array.array("i", [0])
-        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, unread_bytes)
-        if unread_bytes[0] + len(data) > PORT_BUFFER_BYTES:
+        # The operating system writes the number of bytes that the reader has not read yet into this array of one
+        # integer.
+        unread_count = array.array("i", [0])
+        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, unread_count)
+        if unread_count[0] + len(data) > PORT_BUFFER_BYTES:
             return False
         try:
-            written_bytes = os.write(self._writer, data)
+            written_count = os.write(self._writer, data)
         except BlockingIOError:  # the buffer is full
             return False
-        return written_bytes == len(data)
+        return written_count == len(data)
 
     def received(self) -> bytes:
         """Return the bytes that the reader has sent since the last call, without waiting."""

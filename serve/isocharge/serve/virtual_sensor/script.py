@@ -57,8 +57,15 @@ class Script:
     rate_Hz: float
 
     def __post_init__(self) -> None:
+        """Check that the arrays have one element for each frame, and that the frame rate is positive.
+
+        Raises:
+            SceneError: If the arrays have different shapes, more than one dimension or no elements, or if the frame
+                rate is not positive.
+        """
         shapes = {self.x_mm.shape, self.y_mm.shape, self.force_N.shape}
-        if len(shapes) != 1 or self.force_N.ndim != 1 or not self.force_N.size:
+        have_same_shape = len(shapes) == 1
+        if not have_same_shape or self.force_N.ndim != 1 or self.force_N.size == 0:
             raise SceneError(f"script: expected three arrays of one length above 0, got the shapes {sorted(shapes)}")
         if not self.rate_Hz > 0.0:
             raise SceneError(f"script: expected a positive rate, got {self.rate_Hz} Hz")
@@ -142,9 +149,16 @@ class VirtualScript(Settings, frozen=True):
     limit_pC: Annotated[float, Meta(ge=1.0)] | None = None
 
     def __post_init__(self) -> None:
+        """Check the times of the rows of `presses`, between which the presses are interpolated.
+
+        Raises:
+            WrongKey: If there is only one row, or the times do not increase.
+        """
+        if not self.presses:  # the presses are random
+            return
         times_s = [row[0] for row in self.presses]
         is_rising = all(time_s < next_time_s for time_s, next_time_s in pairwise(times_s))
-        if self.presses and not (len(times_s) >= 2 and is_rising):
+        if len(times_s) < 2 or not is_rising:
             raise WrongKey("presses", "two rows or more with growing seconds", self.presses)
 
     def script(self, rate_Hz: float) -> Script | None:
@@ -161,22 +175,22 @@ class VirtualScript(Settings, frozen=True):
         """
         if not self.presses:
             return None
-        row_s, row_x_mm, row_y_mm, row_force_N = np.array(self.presses).T  # each of shape (rows,)
-        start_s = row_s[0]
-        end_s = row_s[-1]
+        row_time_s, row_x_mm, row_y_mm, row_force_N = np.array(self.presses).T  # each of shape (rows,)
+        start_s = row_time_s[0]
+        end_s = row_time_s[-1]
         duration_s = end_s - start_s
         is_short_enough = duration_s * rate_Hz <= MAX_SCRIPT_FRAMES  # false for a rate of NaN
         if not is_short_enough:
             raise SceneError(
                 f"script: expected at most {MAX_SCRIPT_FRAMES} frames, got {duration_s:g} s at {rate_Hz:g} Hz"
             )
-        frame_s = np.arange(start_s, end_s, 1.0 / rate_Hz)
-        force_N = np.interp(frame_s, row_s, row_force_N)
+        frame_time_s = np.arange(start_s, end_s, 1.0 / rate_Hz)
+        force_N = np.interp(frame_time_s, row_time_s, row_force_N)
 
         # A position is only defined while something touches.
         is_touch = force_N > 0.0
-        x_mm = np.where(is_touch, np.interp(frame_s, row_s, row_x_mm), np.nan)
-        y_mm = np.where(is_touch, np.interp(frame_s, row_s, row_y_mm), np.nan)
+        x_mm = np.where(is_touch, np.interp(frame_time_s, row_time_s, row_x_mm), np.nan)
+        y_mm = np.where(is_touch, np.interp(frame_time_s, row_time_s, row_y_mm), np.nan)
         return Script(x_mm, y_mm, force_N, rate_Hz)
 
 
@@ -200,7 +214,7 @@ def wander(
     """Create a script of random presses that move over the film, with a pause after each press.
 
     The position and the logarithm of the force vary smoothly within a press. The forces stay within the given range,
-    because a forward map is only valid in a range of forces.
+    because a forward map is only valid in a range of forces. The script begins with `INITIAL_REST_S` without a press.
 
     Args:
         seed: Seed of all random choices.
@@ -305,7 +319,7 @@ def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
     Returns:
         The bytes after the damage.
     """
-    pieces = [bytes([byte]) for byte in data]
+    bytes_after_damage = [bytes([byte]) for byte in data]  # for each byte, the bytes that replace it
     is_damaged = rng.random(len(data)) < fraction
     for byte_index in np.flatnonzero(is_damaged).tolist():
         byte = data[byte_index]
@@ -313,9 +327,9 @@ def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
         random_byte = int(rng.integers(256))
         if kind_of_damage == 0:  # one bit is flipped
             flipped_bit = 1 << (random_byte % BITS_PER_BYTE)
-            pieces[byte_index] = bytes([byte ^ flipped_bit])
+            bytes_after_damage[byte_index] = bytes([byte ^ flipped_bit])
         elif kind_of_damage == 1:  # the byte is dropped
-            pieces[byte_index] = b""
+            bytes_after_damage[byte_index] = b""
         else:  # the byte is followed by a random byte
-            pieces[byte_index] = bytes([byte, random_byte])
-    return b"".join(pieces)
+            bytes_after_damage[byte_index] = bytes([byte, random_byte])
+    return b"".join(bytes_after_damage)

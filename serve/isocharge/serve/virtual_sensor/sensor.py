@@ -184,9 +184,9 @@ class VirtualSensor:
         return self._frame_count - self.withheld - self.lost
 
     def use(self, charges: Charges, script: Script, charges_per_K: Charges | None = None) -> None:
-        """From its start, play another script with the same frame rate. The amplifier keeps its state.
+        """Replace the script by another script with the same frame rate, and play the new script from its beginning.
 
-        The change takes effect within `BLOCK_S`.
+        The change takes effect within `BLOCK_S`. The amplifier keeps its state.
 
         Args:
             charges: Forward map.
@@ -203,7 +203,8 @@ class VirtualSensor:
     def frames(self) -> Iterator[bytes]:
         """Compute the frames of the script, and yield the bytes of each frame without waiting until the frame is due.
 
-        The bytes are empty if the frame is lost because of a fault.
+        The bytes are empty if the frame is lost because of a fault. The counters of lost and corrupted frames are reset
+        to 0 at the beginning.
 
         The charges are computed in blocks of frames. A new script takes effect at the beginning of a block. The script
         is repeated without end until another script is given.
@@ -219,12 +220,14 @@ class VirtualSensor:
                 self._first_frame_of_script = first_frame_of_block
             first_row = first_frame_of_block - self._first_frame_of_script
             rows = range(first_row, first_row + block_size)
-            sent_pC = self._measured_charges(rows) + self._offset_pC
-            for frame_number, charge_pC in enumerate(sent_pC.tolist(), start=first_frame_of_block):
+            block_pC = self._measured_charges(rows) + self._offset_pC  # shape (block_size, electrodes)
+            for frame_number, charge_pC in enumerate(block_pC.tolist(), start=first_frame_of_block):
                 yield self._frame_bytes(frame_number, tuple(charge_pC))
 
     def _measured_charges(self, rows: range) -> Array:
         """Return the output of the amplifier for a block of frames, shape (n, electrodes), pC.
+
+        If the sensor has no amplifier, the result is the touch charges without noise.
 
         Args:
             rows: Rows of the script for the n frames. After its last row, the script begins again at row 0.
@@ -238,7 +241,7 @@ class VirtualSensor:
         return self._noise(clean_pC, self._rng, clean_pC_per_K)
 
     def _frame_bytes(self, frame_number: int, charge_pC: tuple[float, ...]) -> bytes:
-        """Encode a frame, and apply the faults of the transmission to its bytes.
+        """Encode a frame, and apply the faults of the transmission to its bytes. Count lost and damaged frames.
 
         Args:
             frame_number: Number of the frame since the start of the sensor.
@@ -248,10 +251,12 @@ class VirtualSensor:
             The bytes that the sensor sends; empty if the frame is lost because of a fault.
         """
         faults = self._faults
-        is_silent = faults.is_silent(self._script_time_s(frame_number))
-        # If no frames are to be lost, no random number is drawn here, because this would change the noise that belongs
-        # to the seed.
-        if is_silent or (faults.lose_share and self._rng.random() < faults.lose_share):
+        is_lost = faults.is_silent(self._script_time_s(frame_number))
+        # A random number is drawn only if random frames are to be lost. Otherwise, it would change the noise that
+        # belongs to the seed.
+        if not is_lost and faults.lose_share > 0.0:
+            is_lost = self._rng.random() < faults.lose_share
+        if is_lost:
             self.lost += 1
             return b""
         device_us_per_s = 1e6 + faults.clock_ppm  # an error of 1 ppm is 1 us in a second
@@ -281,8 +286,8 @@ class VirtualSensor:
         """
         # Several frames may have this counter, because the counter wraps. Find the latest of these frames.
         latest_number = self._frame_count - 1
-        frames_since = (latest_number - seq) % SEQ_MODULUS
-        frame_number = latest_number - frames_since
+        later_frame_count = (latest_number - seq) % SEQ_MODULUS  # number of frames after the frame with this counter
+        frame_number = latest_number - later_frame_count
         if frame_number < 0 or not 0 <= seq < SEQ_MODULUS:
             raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest_number, SEQ_MODULUS - 1)}")
         script = self._script
@@ -296,7 +301,7 @@ class VirtualSensor:
         )
 
     def __enter__(self) -> Self:
-        """Open the port, and start the thread that writes the frames.
+        """Reset the counters, open the port, and start the thread that writes the frames.
 
         Raises:
             InputError: If the link cannot be created.
@@ -351,7 +356,7 @@ class VirtualSensor:
 
             self._plug_or_unplug(frame_number)
             if self._port is not None:  # otherwise the frame is discarded because of an outage
-                self._answer(self._port, data)
+                self._write_or_withhold(self._port, data)
 
     def _plug_or_unplug(self, frame_number: int) -> None:
         """Close the port if an outage has begun, or open a new port if an outage has ended.
@@ -365,10 +370,11 @@ class VirtualSensor:
             self._open_port()
             self.unplugged += 1
 
-    def _answer(self, port: PseudoPort, data: bytes) -> None:
-        """Read the requests of the reader, and write a frame. Count the frame if it is withheld.
+    def _write_or_withhold(self, port: PseudoPort, data: bytes) -> None:
+        """Read the requests of the reader, and write a frame to the port. Count the frame if it is withheld.
 
-        A frame is withheld if the reader has not requested it, or if the buffer of the port is full.
+        A frame is withheld if the buffer of the port is full. If the sensor sends frames only on request, a frame is
+        also withheld if there was no request since the previous frame.
 
         Args:
             port: The open port.
@@ -416,7 +422,7 @@ class VirtualSensor:
         return True
 
     def _open_port(self) -> PseudoPort:
-        """Open a new port. If the sensor has a link, let the link point to the new port.
+        """Open a new port as the port of the sensor. If the sensor has a link, create the link to the new port.
 
         Returns:
             The open port.
@@ -428,7 +434,7 @@ class VirtualSensor:
         try:
             if self._link:
                 self._link.symlink_to(port.url)
-        except OSError as error:
+        except OSError as error:  # for example, a file with the name of the link exists already
             port.close()
             raise InputError(
                 f"{self._link}: the link cannot be made ({error.strerror}); choose another path"

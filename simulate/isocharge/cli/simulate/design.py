@@ -191,8 +191,8 @@ def refuse_search_options(*, electrodes: int | None, keep: str | None, goal: str
 def _guard_table(guard_design: GuardDesign) -> str:
     """Return the table that the command prints for a guard electrode.
 
-    The table contains the position of the guard electrode. For the sensor without and with the guard electrode, the
-    table also contains the share of the presses outside the working area that are not noticed, and the limits of the
+    The table contains the position of the guard electrode. It also contains two results for the sensor without and with
+    the guard electrode: the share of the presses outside the working area that are not noticed, and the limits of the
     position error in the working area.
 
     Args:

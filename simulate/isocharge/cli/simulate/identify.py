@@ -66,11 +66,11 @@ def identify_command(
     if not 0.0 < error < inf:
         raise InputError(f"--error: expected a positive number of mm, got {error}")
     described_sensor = load_sensor(sensor)
-    footprint = parse_probe(probe)  # the probe, whose footprint is the area of contact
+    parsed_probe = parse_probe(probe)
     noise_level = noise_model(noise)
     with shown_progress(), executor_for(workers, None) as pool:
         identification = identify(
-            described_sensor, footprint, noise_level, force_range=force, radius=radius, error=error, executor=pool
+            described_sensor, parsed_probe, noise_level, force_range=force, radius=radius, error=error, executor=pool
         )
     results = identification.to_dict()
 

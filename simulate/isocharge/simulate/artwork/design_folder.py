@@ -31,7 +31,7 @@ def write_design(design: Design, folder: Path) -> None:
         OutputError: If the files cannot be written.
     """
     case = design.case
-    errors = design.errors_after.to_dict()["with_nuisances"]
+    errors = design.errors_after.to_dict()["with_nuisances"]  # includes the errors by uncertain nuisance parameters
     sensor_comment = [
         f"Positions searched for {case.electrodes} electrodes over {case.radius:g} mm, goal {case.goal_name}:",
         f"lower limit of the position error {errors['worst_mm']:.3f} mm at worst, {errors['rms_mm']:.3f} mm rms.",
@@ -77,7 +77,7 @@ def _write_folder(
         folder: Folder that is created.
         sensor: The designed sensor.
         sensor_comment: Comment lines at the beginning of the sensor file.
-        results: Content of `design.json` without the sentence about the leads, which this function adds.
+        results: Content of `design.json`. This function adds a sentence about the leads.
         pictures: Contents of PNG files by file name.
     """
     leads = straight_leads(sensor)

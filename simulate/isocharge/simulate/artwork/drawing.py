@@ -51,9 +51,10 @@ MARGIN = 5.0
 
 
 def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
-    """Create a drawing of the film, the electrodes with their leads and names, and a ruler.
+    """Create a drawing of the film, the electrodes, their names and leads, the metal of the back, and a ruler.
 
-    The electrodes are closed polylines at their nominal positions. The leads are polylines with a width.
+    The electrodes are closed polylines at their nominal positions. The leads are polylines with a width. The layer
+    `BACK` exists only if the back is not completely covered with metal.
 
     Args:
         sensor: Sensor with the layout.
@@ -118,7 +119,7 @@ def _draw_ruler(space: Any, y: float) -> None:
     right_end = 0.5 * RULER_LENGTH
     attributes = {"layer": "RULER"}
     space.add_line((left_end, y), (right_end, y), dxfattribs=attributes)
-    n_ticks = round(RULER_LENGTH / TICK_DISTANCE) + 1
+    n_ticks = round(RULER_LENGTH / TICK_DISTANCE) + 1  # both ends of the ruler have a tick
     for tick in range(n_ticks):
         x = left_end + TICK_DISTANCE * tick
         space.add_line((x, y), (x, y - TICK_LENGTH), dxfattribs=attributes)
@@ -154,9 +155,9 @@ def to_svg(document: Drawing) -> str:
 
 @contextmanager
 def _fixed_metadata() -> Iterator[None]:
-    """Return a context manager within which ezdxf writes fixed dates and identifiers.
+    """Return a context manager within which ezdxf writes the same dates and identifiers into every file.
 
-    Equal drawings therefore result in equal files.
+    Equal drawings therefore result in equal files. The setting of ezdxf is restored afterwards.
     """
     options: Any = ezdxf.options
     previous_setting = options.write_fixed_meta_data_for_testing

@@ -49,7 +49,8 @@ class Leads:
 def straight_leads(sensor: Sensor, width: float = 0.3, clearance: float = 0.3) -> Leads:
     """Find straight leads for all electrodes at their nominal positions.
 
-    The leads are placed one after the other, beginning with the electrode that is farthest from the centre.
+    The leads are placed one after the other, beginning with the electrode that is farthest from the centre. The leads
+    of outer electrodes are short, and therefore obstruct few other leads.
 
     Args:
         sensor: Sensor with the layout.
@@ -105,6 +106,8 @@ def _possible_paths(centre: Array, radius: float) -> Array:
 
 def _clearance(path: Array, width: float, electrodes: list[Electrode], leads: list[Array]) -> float:
     """Return the smallest gap between a lead and electrodes or other leads.
+
+    An electrode is represented by the bounding boxes of its polygons. The gap may therefore be underestimated.
 
     Args:
         path: Start and end (x, y) of the centre line of the lead, shape (2, 2), mm.

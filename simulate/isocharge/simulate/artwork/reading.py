@@ -35,15 +35,18 @@ def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") ->
     """Read the electrodes of a DXF drawing, such as a drawing that `isocharge simulate design` wrote.
 
     Closed lines are polygons of metal, and open polylines with a width are traces. Polygons and traces that touch or
-    overlap form one electrode. The name of an electrode is the text that is nearest to its first polygon. If two
-    electrodes have the same nearest text, all electrodes are named A, B, C and so on. If a drawing has no unit, its
-    unit is assumed to be mm.
+    overlap form one electrode. The name of an electrode is the text that is nearest to its first polygon. If there are
+    no texts, or two electrodes have the same nearest text, all electrodes are named A, B, C and so on. If a drawing has
+    no unit, its unit is assumed to be mm.
 
     Args:
         path: Path of the DXF file.
         layer: Name of the layer with the metal of the front.
         back: Name of the layer with the metal of the back, which all electrodes share. If it is empty, the whole back
             is covered with metal.
+
+    Returns:
+        The electrodes, in the order of their first polygons.
 
     Raises:
         SensorError: If the file or a layer cannot be read, or if an object of a layer is not a line, crosses itself, or
@@ -55,7 +58,7 @@ def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") ->
         raise SensorError(f"{path}: expected a DXF file: {error}") from error
     unit = InsertUnits(document.units or InsertUnits.Millimeters)  # `units` is zero if the drawing has no unit
     scale = conversion_factor(unit, InsertUnits.Millimeters)  # length of a unit of the drawing, mm
-    groups = _touching_groups(_polygons(document, layer, scale, path))
+    polygons_of_electrodes = _touching_groups(_polygons(document, layer, scale, path))
 
     # Read the polygons of the back, which all electrodes share.
     back_corners: tuple[Corners, ...] = ()
@@ -63,10 +66,10 @@ def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") ->
         back_corners = tuple(polygon.corners for polygon in _polygons(document, back, scale, path))
 
     electrodes = []
-    names = _names(document, groups, scale)  # there may be more names than groups
-    for name, (first_polygon, *other_polygons) in zip(names, groups, strict=False):
-        more = tuple(polygon.corners for polygon in other_polygons)
-        electrodes.append(Electrode(name, first_polygon.corners, more=more, back=back_corners))
+    names = _names(document, polygons_of_electrodes, scale)  # there may be more names than electrodes
+    for name, (first_polygon, *other_polygons) in zip(names, polygons_of_electrodes, strict=False):
+        other_corners = tuple(polygon.corners for polygon in other_polygons)
+        electrodes.append(Electrode(name, first_polygon.corners, more=other_corners, back=back_corners))
     return tuple(electrodes)
 
 
@@ -111,38 +114,42 @@ def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list
         path: Path of the file for error messages.
 
     Returns:
-        The pads, followed by the traces. The name of each electrode states where its line is in the drawing, for error
-        messages.
+        The pads, followed by the traces. The name of each electrode states the layer and the handle of its line in the
+        drawing, because error messages contain this name.
 
     Raises:
         SensorError: If the layer has no lines, or an object of the layer cannot be an electrode.
     """
+    # The texts of the drawing are not metal, but may be names of electrodes; see `_names`.
     shapes = [shape for shape in document.modelspace() if shape.dxftype() not in TEXT_TYPES]
     pads = []
     traces = []
     for shape in shapes:
         if shape.dxf.layer.lower() != layer.lower():
             continue
-        where = f"{path}: layer {layer!r}: {shape.dxftype()} #{shape.dxf.handle}"
+        label = f"{path}: layer {layer!r}: {shape.dxftype()} #{shape.dxf.handle}"  # for error messages
         if shape.dxftype() not in LINE_TYPES:
-            raise SensorError(f"{where}: expected one of {', '.join(LINE_TYPES)}; redraw or explode it, or delete it")
-        path_of_shape = make_path(shape)
-        is_closed = shape.closed if shape.dxftype() == "LWPOLYLINE" else path_of_shape.is_closed
+            raise SensorError(f"{label}: expected one of {', '.join(LINE_TYPES)}; redraw or explode it, or delete it")
+
+        # A polyline of the type LWPOLYLINE is closed only if its flag says so, because a trace may end at its start.
+        # Any other line is closed if its ends coincide.
+        curve = make_path(shape)
+        is_closed = shape.closed if shape.dxftype() == "LWPOLYLINE" else curve.is_closed
 
         # Compute points of the line in mm. Arcs are replaced by chords.
-        chord_ends = path_of_shape.flattening(ARC_TOLERANCE / scale)
+        chord_ends = curve.flattening(ARC_TOLERANCE / scale)
         points = tuple((scale * point.x, scale * point.y) for point in chord_ends)
         width = scale * _width(shape)
         if is_closed:
             corners = _anticlockwise_corners(points)
-            check_polygon(where, corners)
-            pads.append(Electrode(where, corners))
+            check_polygon(label, corners)
+            pads.append(Electrode(label, corners))
         elif width > 0.0:
             # `with_trace` converts the centre line into the polygon of the trace, which is the only item of `more`.
-            (trace_corners,) = Electrode(where, ()).with_trace(points, width).more
-            traces.append(Electrode(where, trace_corners))
+            (trace_corners,) = Electrode(label, ()).with_trace(points, width).more
+            traces.append(Electrode(label, trace_corners))
         else:
-            raise SensorError(f"{where} is open and has no width; close it, or give it the width of a trace")
+            raise SensorError(f"{label} is open and has no width; close it, or give it the width of a trace")
     if not pads and not traces:
         layers_with_lines = ", ".join(sorted({shape.dxf.layer for shape in shapes if shape.dxftype() in LINE_TYPES}))
         raise SensorError(f"{path}: layer {layer!r} has no lines; the layers with lines are {cut(layers_with_lines)}")
@@ -162,9 +169,9 @@ def _anticlockwise_corners(points: Corners) -> Corners:
 
 
 def _width(line: Any) -> float:
-    """Return the width of a polyline in the unit of the drawing.
+    """Return the width of a line in the unit of the drawing.
 
-    The width is 0 if the polyline has no width, or if its width is not constant.
+    The width is 0 if the line is not of the type LWPOLYLINE, has no width, or has a width that is not constant.
     """
     if line.dxftype() != "LWPOLYLINE":
         return 0.0

@@ -1,4 +1,4 @@
-"""Candidates for the position at which contours meet, and a grid from which the starting points of a search are chosen.
+"""Candidates for the position at which contours meet, and a grid of possible starting points for their search.
 
 Each press has several candidates, and the module `triangulation` improves the candidates of many presses at once.
 """
@@ -48,7 +48,7 @@ class Candidates:
 
     @classmethod
     def from_starting_points(cls, press: Integers, contact: Array) -> "Candidates":
-        """Convert the starting points of a search into candidates with an infinite spread.
+        """Convert starting points into candidates with an infinite spread, because no spread has been computed yet.
 
         Args:
             press: Index of the press to which each starting point belongs, shape (n,).
@@ -61,7 +61,7 @@ class Candidates:
         return Candidates(self.press[rows], self.contact[rows], self.spread[rows])
 
     def joined_with(self, other: "Candidates") -> "Candidates":
-        """Return candidates that contain these candidates, followed by the candidates of another object."""
+        """Return these candidates, followed by the candidates of another object."""
         return Candidates(
             press=np.concatenate([self.press, other.press]),
             contact=np.concatenate([self.contact, other.contact]),
@@ -84,10 +84,10 @@ class Candidates:
         """Sort the candidates by press and by spread, and remove duplicates.
 
         A candidate is a duplicate if it is near a candidate of the same press that has a smaller spread and is not a
-        duplicate itself.
+        duplicate itself. The forces of the candidates are not compared.
 
         Args:
-            tolerance: Largest distance at which two candidates are near to each other, mm.
+            tolerance: Largest distance between the positions of two candidates that are near to each other, mm.
 
         Returns:
             The remaining candidates in the new order.
@@ -99,20 +99,23 @@ class Candidates:
         worst_rank = int(rank.max(initial=0))
 
         # Compare the candidates of each rank with the better candidates of their press, for all presses at once. The
-        # candidates of a press are in consecutive rows, in the order of their ranks.
+        # candidates of a press are in consecutive rows, in the order of their ranks. A better candidate is therefore
+        # `rank_difference` rows earlier.
         for candidate_rank in range(1, worst_rank + 1):
             rows = np.flatnonzero(rank == candidate_rank)
             for rank_difference in range(1, candidate_rank + 1):
                 better_rows = rows - rank_difference
-                offset = (ordered.contact[rows] - ordered.contact[better_rows])[:, :2]
-                is_near = np.linalg.norm(offset, axis=1) <= tolerance
+                position_difference = (ordered.contact[rows] - ordered.contact[better_rows])[:, :2]
+                is_near = np.linalg.norm(position_difference, axis=1) <= tolerance
                 is_distinct[rows] &= ~(is_near & is_distinct[better_rows])
         return ordered[np.flatnonzero(is_distinct)]
 
 
 @dataclass(frozen=True)
 class SeedGrid:
-    """Charges at the nodes of a square grid over a disk. The starting points of a search are chosen from the nodes.
+    """Charges at the nodes of a square grid over a disk.
+
+    The search for the contacts at which contours meet starts at some of the nodes.
 
     Attributes:
         position: Positions (x, y) of the nodes, shape (n_node, 2), mm.
@@ -122,7 +125,7 @@ class SeedGrid:
         node_charges: Charges at each node for each force, shape (n_force, n_node, n_electrode), pC.
         slope: Magnitude of the gradient of each charge with respect to the position at the middle force, shape (n_node,
             n_electrode), pC/mm. It is at least `MIN_SLOPE` times its median over the nodes.
-        relative_size: Root mean square of all charges at each force, divided by that at the middle force, shape
+        relative_rms_charge: Root mean square of all charges at each force, divided by that at the middle force, shape
             (n_force,), dimensionless.
     """
 
@@ -132,11 +135,13 @@ class SeedGrid:
     log_forces: Array
     node_charges: Array
     slope: Array
-    relative_size: Array
+    relative_rms_charge: Array
 
     @classmethod
-    def of(cls, charge_map: ChargeMap) -> "SeedGrid":
+    def from_charge_map(cls, charge_map: ChargeMap) -> "SeedGrid":
         """Create a grid over the domain of a charge map, and compute the charges at its nodes.
+
+        The forces are equally spaced in ln F. There is a single force if the domain of the map has a single force.
 
         Args:
             charge_map: Map that computes the charges of contacts.
@@ -147,7 +152,7 @@ class SeedGrid:
         min_force, max_force = charge_map.domain.force_range
         n_force = FORCES if max_force > min_force else 1
         log_forces = np.linspace(np.log(min_force), np.log(max_force), n_force)
-        forces = np.clip(np.exp(log_forces), min_force, max_force)
+        forces = np.clip(np.exp(log_forces), min_force, max_force)  # otherwise rounding may leave the domain
         contacts = [np.column_stack([position, np.full(len(position), force)]) for force in forces]
         node_charges = np.stack([charge_map.charges(contact) for contact in contacts])
 
@@ -164,19 +169,19 @@ class SeedGrid:
             log_forces=log_forces,
             node_charges=node_charges,
             slope=np.maximum(gradient_length, MIN_SLOPE * median_length),
-            relative_size=rms_charge / rms_charge[middle],
+            relative_rms_charge=rms_charge / rms_charge[middle],
         )
 
-    def relative_size_at(self, force: Array) -> Array:
-        """Interpolate the size of the charges at given forces, relative to the size at the middle force.
+    def relative_rms_charge_at(self, force: Array) -> Array:
+        """Interpolate the ratio of the root mean square charge at given forces to that at the middle force.
 
         Args:
             force: Forces, any shape, N.
 
         Returns:
-            Relative sizes, of the shape of `force`, dimensionless.
+            Ratios, of the shape of `force`, dimensionless.
         """
-        return np.interp(np.log(force), self.log_forces, self.relative_size)
+        return np.interp(np.log(force), self.log_forces, self.relative_rms_charge)
 
     def charge(self, force: Array) -> Array:
         """Interpolate the charges at all nodes for given forces, linearly in ln F.
@@ -187,7 +192,8 @@ class SeedGrid:
         Returns:
             Charges, shape (n, n_node, n_electrode), pC.
         """
-        # Find the tabulated forces below and above each force. A grid with a single force has only one tabulated force.
+        # Find the tabulated forces below and above each force. The index below is at most `n_force - 2`, so that there
+        # is a tabulated force above it. In a grid with a single force, both indices are 0.
         n_force = self.log_forces.size
         fractional_index = np.interp(np.log(force), self.log_forces, np.arange(n_force))
         index_below = np.minimum(fractional_index.astype(int), max(n_force - 2, 0))
@@ -204,7 +210,8 @@ class SeedGrid:
     def matching_force(self, charge: Array) -> Array:
         """Find the force at which the total charge of each node is equal to the total charge of each press.
 
-        The total charge is the sum of the charges of all electrodes.
+        The total charge is the sum of the charges of all electrodes. If no tabulated force is small or large enough,
+        the smallest or the largest one is returned.
 
         Args:
             charge: Charges of the presses, shape (n, n_electrode), pC.
@@ -234,7 +241,7 @@ class SeedGrid:
         """
         # To first order, the distance from a contour is the difference of the charges divided by the slope. The slope
         # increases with the force like the charges.
-        slope = self.relative_size_at(force)[..., None] * self.slope
+        slope = self.relative_rms_charge_at(force)[..., None] * self.slope
         distance = (self.charge(force) - charge[:, None]) / slope
         return np.asarray(np.sqrt(np.mean(distance**2, axis=2)))
 
@@ -295,7 +302,7 @@ class SeedGrid:
 def _nodes_on_disk(radius: float) -> tuple[int, Integers, Array]:
     """Select the nodes of a square grid that lie in a disk or slightly outside it.
 
-    The nodes slightly outside the disk are moved onto its edge.
+    The nodes slightly outside the disk are moved to its edge.
 
     Args:
         radius: Radius of the disk, mm.
@@ -308,6 +315,7 @@ def _nodes_on_disk(radius: float) -> tuple[int, Integers, Array]:
     coordinates = np.linspace(-radius, radius, side)
     square_grid = np.stack(np.meshgrid(coordinates, coordinates, indexing="ij"), axis=-1).reshape(-1, 2)
     grid_x, grid_y = square_grid.T
-    index = np.flatnonzero(np.hypot(grid_x, grid_y) <= radius * (1.0 + 1.0 / side))
+    margin = radius / side  # about half of the distance between neighbouring nodes
+    index = np.flatnonzero(np.hypot(grid_x, grid_y) <= radius + margin)
     position = onto_disk(square_grid[index], INNER_RADIUS * radius)
     return side, index, position

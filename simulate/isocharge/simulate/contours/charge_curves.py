@@ -81,9 +81,9 @@ class Mapping:
         """
         centre = sensor.electrodes[electrode_index(sensor, electrode)].centre
         x, y = sensor.calibration.place(np.array(centre))
-        inwards = np.arctan2(-y, -x) % (2.0 * np.pi)  # direction from the electrode to the centre of the film
+        inward_angle = np.arctan2(-y, -x) % (2.0 * np.pi)  # direction from the electrode to the centre of the film
         if angles is None:
-            angles = (inwards - HALF_ANGLE, inwards + HALF_ANGLE)
+            angles = (inward_angle - HALF_ANGLE, inward_angle + HALF_ANGLE)
         first_angle, last_angle = angles
         are_angles_valid = -np.inf < first_angle <= last_angle < np.inf and 0.0 < angle_step < np.inf
         if not (are_angles_valid and 0.0 < step <= length < np.inf):

@@ -139,7 +139,8 @@ def _chord_crossings(first: Array, second: Array) -> Integers:
     start_difference = second[None, :-1] - first[:-1, None]  # start of the second chord minus that of the first chord
 
     # Compute the fractions of the lengths of both chords at which their lines cross (Cramer's rule). For parallel
-    # chords, the determinant is zero, and the fractions are infinite or NaN. Such chords do not cross.
+    # chords, the determinant is zero, and the fractions are infinite or NaN. Such chords do not cross. The fraction 1
+    # is excluded, because the end of a chord is the start of the next chord.
     with np.errstate(divide="ignore", invalid="ignore"):
         determinant = _cross_product(first_chord, second_chord)
         first_fraction = _cross_product(start_difference, second_chord) / determinant
@@ -181,14 +182,15 @@ def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnCo
     """
     # Find the distance from the electrode on each line; NaN if the charge does not occur on the line.
     mapping = curves.mapping
-    distances = np.array([_root(polynomial, charge, mapping.distance) for polynomial in curves.polynomials(degree)])
+    polynomials = curves.polynomials(degree)
+    distances = np.array([_distance_with_charge(polynomial, charge, mapping.distance) for polynomial in polynomials])
     direction = np.stack([np.cos(mapping.angle), np.sin(mapping.angle)], axis=1)  # unit vectors, shape (n_line, 2)
     points = np.array(mapping.origin) + distances[:, None] * direction
     knots = points[np.isfinite(distances)]
     return DrawnContour(mapping.electrode, charge, knots) if len(knots) > 1 else None
 
 
-def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) -> float:
+def _distance_with_charge(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) -> float:
     """Find the smallest distance on a line at which the polynomial of the line has a given charge.
 
     The distance must lie between half of the distance of the first press and the distance of the last press. Outside
@@ -278,7 +280,7 @@ class DrawnTriangulation:
         charge = as_charges(charge, self.electrodes)
         locations = [self._locate_one(press_charge) for press_charge in charge]
         position = np.array([location.position for location in locations]).reshape(-1, 2)
-        force = np.full(len(charge), self.curves[0].force)
+        force = np.full(len(charge), self.curves[0].force)  # all curves and presses have the same force
         return Fix(
             contact=np.column_stack([position, force]),
             spread=np.array([location.spread for location in locations]),
@@ -289,7 +291,8 @@ class DrawnTriangulation:
         """Estimate the position of one press.
 
         Each triple of contours that meets results in a position with a spread. The position of the press is the mean of
-        the positions of all triples. The spread of the press is the largest spread of all triples.
+        these positions, and its spread is the largest of these spreads. If a contour cannot be drawn, or no triple
+        meets, the position is NaN.
 
         Args:
             charge: Touch charges, shape (n_electrode,), pC.
@@ -303,20 +306,21 @@ class DrawnTriangulation:
         crossings = {}
         for first, second in combinations(indices, 2):
             crossings[first, second] = contours[first].crossings(contours[second])
-        meetings = []
+        triple_locations = []
         for triple in combinations(indices, 3):
             crossings_of_pairs = [crossings[pair] for pair in combinations(triple, 2)]
-            meetings.append(self._meeting(crossings_of_pairs))
+            triple_locations.append(self._locate_triple(crossings_of_pairs))
 
-        met = [meeting for meeting in meetings if meeting.status is Meeting.met]
-        if not met:
-            status = max(meeting.status for meeting in meetings)  # `Meeting.twice` is larger than `Meeting.apart`
+        met_locations = [location for location in triple_locations if location.status is Meeting.met]
+        if not met_locations:
+            # Report `Meeting.twice` rather than `Meeting.apart`, which is the smaller number.
+            status = max(location.status for location in triple_locations)
             return _Location(NOWHERE, np.nan, status)
-        mean_position = np.mean([meeting.position for meeting in met], axis=0)
-        largest_spread = max(meeting.spread for meeting in met)
+        mean_position = np.mean([location.position for location in met_locations], axis=0)
+        largest_spread = max(location.spread for location in met_locations)
         return _Location(mean_position, largest_spread, Meeting.met)
 
-    def _meeting(self, crossings_of_pairs: list[Array]) -> _Location:
+    def _locate_triple(self, crossings_of_pairs: list[Array]) -> _Location:
         """Find the point at which three contours meet.
 
         For each of the three pairs of contours, one crossing is chosen, such that the three crossings are nearest to
@@ -328,7 +332,8 @@ class DrawnTriangulation:
         Returns:
             The point with its spread, or the reason why there is no such point.
         """
-        # Create all combinations of one crossing of each pair, shape (n_combination, 3, 2).
+        # Create all combinations of one crossing of each pair, shape (n_combination, 3, 2). There are none if the
+        # contours of a pair do not cross.
         combined_crossings = np.array(list(product(*crossings_of_pairs))).reshape(-1, 3, 2)
         mean = combined_crossings.mean(axis=1)
         spread = np.linalg.norm(combined_crossings - mean[:, None], axis=2).max(axis=1)

@@ -192,7 +192,8 @@ class Triangulation:
         is_ambiguous = second_spread <= np.maximum(AMBIGUOUS_RATIO * smallest_spread, AMBIGUOUS_SPREAD)
         status[is_ambiguous] = Meeting.twice
 
-        # Only presses with the status `met` have a contact. The contacts of all other presses are NaN.
+        # Only presses with the status `met` have a position. The positions of all other presses are NaN, and so are
+        # their forces, unless the forces are given.
         is_met = status == Meeting.met
         contact = np.full((n_press, 3), np.nan)
         contact[is_met] = candidates.contact[first_row[is_met]]
@@ -210,7 +211,7 @@ class Triangulation:
     @cached_property
     def _grid(self) -> SeedGrid:
         """Grid of positions from which the starting points of the search are chosen."""
-        return SeedGrid.of(self._charges)
+        return SeedGrid.from_charge_map(self._charges)
 
     def _starting_points(self, charge: Array, force: Array | None) -> Candidates:
         """Choose the nodes of the grid at which the distance from the contours of a press is a local minimum.
@@ -226,8 +227,9 @@ class Triangulation:
         # There is one force for each press and node, shape (n, n_node), or one force for each press, shape (n, 1).
         grid = self._grid
         forces = grid.matching_force(charge) if force is None else force[:, None]
-        press, node = grid.local_minima(grid.distance(charge, forces), MAX_SEEDS)
-        start_force = forces[press, node] if force is None else force[press]
+        distance = grid.distance(charge, forces)  # shape (n, n_node)
+        press, node = grid.local_minima(distance, MAX_SEEDS)
+        start_force = np.broadcast_to(forces, distance.shape)[press, node]
         return Candidates.from_starting_points(press, np.column_stack([grid.position[node], start_force]))
 
     def _second_starting_points(self, solutions: Candidates, *, is_force_fixed: bool) -> Candidates:
@@ -298,7 +300,7 @@ class Triangulation:
 
         # Accumulate the sum of the means, the number of triples that meet, and the largest spread for each candidate.
         position_sum = np.zeros((len(candidates.press), 2))
-        n_meeting = np.zeros_like(candidates.press)
+        n_meeting_triples = np.zeros_like(candidates.press)
         spread = np.zeros_like(candidates.spread)
         for triple in combinations(range(n_electrode), 3):
             triple_crossings = np.stack([crossings[pair] for pair in combinations(triple, 2)], axis=1)
@@ -307,10 +309,11 @@ class Triangulation:
             is_meeting = distance <= self.tolerance  # False if a pair does not cross, because its distance is NaN
             position_sum[is_meeting] += mean[is_meeting]
             spread[is_meeting] = np.maximum(spread[is_meeting], distance[is_meeting])
-            n_meeting += is_meeting
-        position = position_sum / np.maximum(n_meeting, 1)[:, None]  # mean over the triples that meet
+            n_meeting_triples += is_meeting
+        position = position_sum / np.maximum(n_meeting_triples, 1)[:, None]  # mean over the triples that meet
         contact = np.column_stack([position, candidates.contact[:, 2]])
-        return Candidates(candidates.press, contact, spread)[n_meeting > 0].without_duplicates(MIN_DISTANCE)
+        moved_candidates = Candidates(candidates.press, contact, spread)
+        return moved_candidates[n_meeting_triples > 0].without_duplicates(MIN_DISTANCE)
 
     def _crossings_of_pair(self, charge: Array, candidates: Candidates, pair: tuple[int, int]) -> Array:
         """Use Newton's method to find the crossing of the contours of two electrodes near each candidate.
@@ -368,7 +371,7 @@ class Triangulation:
 
         # The typical slope of each electrode is its median slope on the grid, which was computed for the middle force.
         # The slopes at another force are larger or smaller by the same factor as the charges.
-        slope_factor = self._grid.relative_size_at(contact[:, 2])[:, None]
+        slope_factor = self._grid.relative_rms_charge_at(contact[:, 2])[:, None]
         typical_slope = np.median(self._grid.slope, axis=0) * slope_factor  # shape (n, n_electrode), pC/mm
 
         # The slope is the length of the gradient with respect to x and y. Where the charge has an extremum, the
@@ -422,6 +425,6 @@ def gauss_newton_step(slopes: Array, distance: Array) -> Array:
 
     # Shorten steps that are longer than `MAX_STEP`.
     length = np.linalg.norm(step, axis=1)
-    factor = np.minimum(1.0, MAX_STEP / np.maximum(length, 1e-300))  # the lower bound avoids a division by zero
-    step *= factor[:, None]
+    shortening = np.minimum(1.0, MAX_STEP / np.maximum(length, 1e-300))  # the lower bound avoids a division by zero
+    step *= shortening[:, None]
     return step

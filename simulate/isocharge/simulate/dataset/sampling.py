@@ -8,7 +8,8 @@ There are three kinds of sampling:
     grid    every force with every orientation at every position of a square lattice, at most the requested number
 
 The positions of Sobol and random presses are uniformly distributed over the disk, and so are the logarithms of their
-forces over the range of forces. Successive presses of a sweep use the probes in turn.
+forces over the range of forces. A sweep is a simulation of many presses. If it has several probes, successive presses
+cycle through the probes.
 """
 
 from collections.abc import Sequence
@@ -46,7 +47,7 @@ Orientation = Literal["fixed", "random"]
 
 @dataclass(frozen=True)
 class SweepPresses:
-    """Presses of a sweep, in the order of the sweep.
+    """Presses of a sweep, which is a simulation of many presses.
 
     Attributes:
         probe: Index of the probe of each press, shape (n,).
@@ -98,9 +99,9 @@ class Sweep:
         if not 1 <= self.samples <= MAX_SAMPLES:
             bound = "at least 1" if self.samples < 1 else f"at most {MAX_SAMPLES}"
             raise SceneError(f"samples: expected {bound}, got {self.samples}")
-        low, high = self.force_range
-        if not 0.0 < low <= high < np.inf:
-            raise SceneError(f"force: expected 0 < smallest <= largest force in N, got {low:g} and {high:g}")
+        min_force, max_force = self.force_range
+        if not 0.0 < min_force <= max_force < np.inf:
+            raise SceneError(f"force: expected 0 < smallest <= largest force in N, got {min_force:g} and {max_force:g}")
         if self.orientation not in get_args(Orientation):
             raise SceneError(f"orientation: expected 'fixed' or 'random', got {self.orientation!r}")
         if self.sampling not in get_args(Sampling):
@@ -113,7 +114,7 @@ class Sweep:
     def over(self, probes: Sequence[Probe]) -> SweepPresses:
         """Return the presses of a sweep with several probes.
 
-        Successive presses use the probes in turn.
+        Successive presses cycle through the probes.
 
         Args:
             probes: Probes of the sweep.
@@ -149,7 +150,8 @@ class Sweep:
         if self.sampling == "grid":
             position, force, rotation = self._grid(self.samples // n_probe, period)
         else:
-            count = len(range(probe_index, self.samples, n_probe))  # every n_probe-th press of the sweep
+            # The probe has every n_probe-th press of the sweep, beginning with the press number `probe_index`.
+            count = len(range(probe_index, self.samples, n_probe))
             position, force, rotation = self._draw(count, probe_index)
         contact = np.stack([position.real, position.imag, force], axis=1)
         return SweepPresses(np.full(position.size, probe_index), contact, rotation)
@@ -158,7 +160,8 @@ class Sweep:
         """Draw the presses of one probe with Sobol points or random numbers.
 
         The positions are uniformly distributed over the disk. The logarithms of the forces are uniformly distributed
-        over the range of forces.
+        over the range of forces. The rotations are uniformly distributed over a full turn, or zero if the orientation
+        is "fixed".
 
         Args:
             count: Number of presses.
@@ -190,7 +193,7 @@ class Sweep:
             return rng.random((count, 4))
 
         # A Sobol sequence is balanced if the number of points is a power of two. Draw the next larger power of two, and
-        # use the first `count` points.
+        # use the first `count` points. A probe may have no presses if there are more probes than presses.
         log2_count = int(np.ceil(np.log2(max(count, 2))))
         points = scipy.stats.qmc.Sobol(4, rng=rng).random_base2(log2_count)
         return np.asarray(points[:count])
@@ -211,8 +214,8 @@ class Sweep:
     def _grid(self, max_count: int, period: float) -> tuple[Complexes, Array, Array]:
         """Return the presses of a grid with every combination of a position, a force and a rotation.
 
-        First, the same number of steps is assumed for each dimension of the grid. After that, the number of forces is
-        increased as far as the largest number of presses allows.
+        The number of steps is at first the same in each dimension of the grid. Then the number of forces is increased
+        as far as the largest number of presses allows.
 
         Args:
             max_count: Largest number of presses in the grid.
@@ -224,18 +227,18 @@ class Sweep:
         # The grid has two dimensions for the position, one for the force if it varies, and one for the rotation if it
         # varies.
         min_force, max_force = self.force_range
-        has_forces = min_force < max_force
-        has_rotations = self.orientation == "random" and period > 0.0
-        n_dimension = 2 + int(has_forces) + int(has_rotations)
+        is_force_varied = min_force < max_force
+        is_rotation_varied = self.orientation == "random" and period > 0.0
+        n_dimension = 2 + int(is_force_varied) + int(is_rotation_varied)
         steps_per_dimension = max(1, round(max_count ** (1.0 / n_dimension)))
-        n_rotation = steps_per_dimension if has_rotations else 1
-        initial_n_force = steps_per_dimension if has_forces else 1
+        n_rotation = steps_per_dimension if is_rotation_varied else 1
+        initial_n_force = steps_per_dimension if is_force_varied else 1
 
         # The lattice may have fewer positions than requested. The number of forces is therefore computed from the
         # actual number of positions.
         max_positions = max_count // (n_rotation * initial_n_force)
         positions: Complexes = self.radius * lattice(max_positions)
-        n_force = max_count // (positions.size * n_rotation) if has_forces else 1
+        n_force = max_count // (positions.size * n_rotation) if is_force_varied else 1
         middle_fraction = np.array([0.5])  # a single force is the geometric mean of the range
         force_fractions = np.linspace(0.0, 1.0, n_force) if n_force > 1 else middle_fraction
         forces = self._force(force_fractions)

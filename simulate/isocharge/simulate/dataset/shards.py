@@ -70,7 +70,7 @@ class Samples:
         return len(self.x_mm)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return a dictionary from the names of the columns to their arrays."""
+        """Return the array of each column, by the name of the column."""
         return {name: getattr(self, name) for name in COLUMNS}
 
 
@@ -243,34 +243,38 @@ def _flattened_items(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
             yield key, value
 
 
-def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
-    """Raise an error if the columns of a shard have wrong shapes, types or values.
+def _check_samples(samples: Samples, n_electrode: int, shard_label: str) -> None:
+    """Raise an error if a shard has no samples, or its columns have wrong shapes, types or values.
 
     Args:
         samples: Samples of a shard.
         n_electrode: Number of electrodes of the sensor.
-        where: Name of the shard for error messages.
+        shard_label: Name of the shard for error messages.
 
     Raises:
-        DatasetError: If a column has a wrong shape or type, or contains a number that is not finite.
+        DatasetError: If there are no samples, or if a column has a wrong shape or type, or contains a number that is
+            not finite.
     """
     shapes = {name: column.shape for name, column in samples.columns().items()}
     has_rows = samples.x_mm.ndim > 0  # an array without dimensions contains a single number and has no length
     count = len(samples) if has_rows else 0
-    expected = dict.fromkeys(COLUMNS, (count,)) | {"charge_pC": (count, n_electrode)}
-    if shapes != expected or count == 0:
-        raise DatasetError(f"{where}: expected columns of shapes {expected}, at least one sample, got {shapes}")
+    expected_shapes = dict.fromkeys(COLUMNS, (count,)) | {"charge_pC": (count, n_electrode)}
+    if shapes != expected_shapes or count == 0:
+        raise DatasetError(
+            f"{shard_label}: expected columns of shapes {expected_shapes}, at least one sample, got {shapes}"
+        )
     for name, column in samples.columns().items():
         is_text = name == "probe"
         expected_kinds = "U" if is_text else "fiu"  # U: text; f, i, u: floats, signed and unsigned integers
+        expected_content = "text" if is_text else "numbers"
         if column.dtype.kind not in expected_kinds:
-            raise DatasetError(
-                f"{where}: column {name}: expected {'text' if is_text else 'numbers'}, got {column.dtype}"
-            )
+            raise DatasetError(f"{shard_label}: column {name}: expected {expected_content}, got {column.dtype}")
         if not is_text and not np.isfinite(column).all():
             first_bad_index = np.argwhere(~np.isfinite(column))[0]
             row = int(first_bad_index[0])
-            raise DatasetError(f"{where}: column {name} holds {column[row]} in row {row}; every number must be finite")
+            raise DatasetError(
+                f"{shard_label}: column {name} holds {column[row]} in row {row}; every number must be finite"
+            )
 
 
 def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
@@ -279,6 +283,9 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
     Args:
         folder: Folder of the dataset.
         sensor: Expected sensor. If it is None, the dataset may belong to any sensor.
+
+    Returns:
+        The dataset, with the samples of all shards. Its manifest also contains the entries that this function ignores.
 
     Raises:
         DatasetError: If the folder is not a dataset, has a different format version or sensor, or is damaged or

@@ -64,7 +64,7 @@ def run_sweep(
     Args:
         folder: Folder that is created. It must not exist yet.
         sensor: Sensor whose charges are computed.
-        probes: Probes, which successive presses use in turn.
+        probes: Probes. Successive presses cycle through them.
         sweep: Definition of the presses.
         settings: Accuracy, theory and mesh of the solver.
         executor: Executor that runs the tasks, such as a process pool or the executor of a Dask cluster; None for this
@@ -191,12 +191,13 @@ def _manifest_entries(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any
 def _finish_shards(
     run: ResumableRun, maps: Sequence[ForwardMap], presses: SweepPresses, executor: Executor | None, shard_size: int
 ) -> list[dict[str, Any]]:
-    """Compute and save the shards that an interrupted run has not saved yet.
+    """Compute and save the shards of a sweep that have not been saved yet.
 
-    A shard is one file of the dataset. The progress is reported.
+    A shard is one file of the dataset. An interrupted run of the same sweep may have saved some shards. The progress is
+    reported.
 
     Args:
-        run: Run whose folder contains the shards.
+        run: Run of the program that computes the sweep. Its folder contains the saved shards.
         maps: Forward map of each probe.
         presses: All presses of the sweep.
         executor: Executor that computes the charges; None for this process.

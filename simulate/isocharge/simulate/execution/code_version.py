@@ -22,7 +22,7 @@ def code_fingerprint() -> str:
     checksum = hashlib.sha256()
     for path in sources():
         relative_path = path.relative_to(PACKAGE).as_posix()
-        checksum.update(relative_path.encode() + b"\0" + path.read_bytes())
+        checksum.update(relative_path.encode() + b"\0" + path.read_bytes())  # a zero byte ends the path
     short_checksum = checksum.hexdigest()[:12]
     isocharge_version = importlib.metadata.version("isocharge")
     libraries = [f"{name} {importlib.metadata.version(name)}" for name in LIBRARIES]

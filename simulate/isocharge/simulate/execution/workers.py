@@ -70,8 +70,8 @@ def in_order(
         for job in jobs:
             with _executor_errors():
                 pending.append(executor.submit(task, job))
-            # Yield the oldest result if too many jobs are pending, or if no job is running any more. In the second
-            # case, the next job can be submitted after the caller has processed the results.
+            # Yield the oldest result if too many jobs are pending, or if all pending jobs are done. In the second case,
+            # the results are available without waiting.
             while pending and (len(pending) >= max_pending or all(future.done() for future in pending)):
                 yield _result(pending.popleft())
         while pending:
@@ -94,7 +94,7 @@ def _result(future: Future[Result]) -> Result:
 
 @contextmanager
 def _executor_errors() -> Iterator[None]:
-    """Return a context manager that raises WorkersLost if the executor has lost its workers.
+    """Convert the exceptions of a `with` block that mean that an executor has lost its workers into WorkersLost.
 
     All other exceptions, such as the exceptions of a job, are raised unchanged.
     """
@@ -140,7 +140,7 @@ def cores() -> int:
 
 @contextmanager
 def local_workers(count: int) -> Iterator[Executor | None]:
-    """Return a context manager that starts worker processes on this machine and provides their executor.
+    """Start worker processes on this machine for the duration of a `with` block, and provide their executor.
 
     The workers end when the `with` block ends, and also if this process is killed.
 
@@ -233,7 +233,7 @@ def _end_with_parent(worker_end: Connection) -> None:
 
 @contextmanager
 def dask_workers(address: str) -> Iterator[Executor]:
-    """Return a context manager that connects to a Dask cluster and provides the executor of its workers.
+    """Connect to a Dask cluster for the duration of a `with` block, and provide the executor of its workers.
 
     The workers must have the same version of isocharge as this process. If a worker is killed, Dask runs its tasks on
     the other workers.

@@ -96,7 +96,7 @@ class Domain:
         return contact
 
     @property
-    def places(self) -> str:
+    def _allowed_positions(self) -> str:
         """Description of the allowed positions for error messages."""
         return f"at most {self.radius:g} mm from the centre"
 
@@ -139,7 +139,7 @@ class Domain:
             low, high = self.force_range
             raise SceneError(
                 f"press {first_outside} at ({x:.4g}, {y:.4g}) mm with {force:.4g} N is outside the {source}: expected "
-                f"{self.places} and {low:g} to {high:g} N"
+                f"{self._allowed_positions} and {low:g} to {high:g} N"
             )
         return contact
 

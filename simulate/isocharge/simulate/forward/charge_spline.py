@@ -138,8 +138,8 @@ class ChargeSpline:
                 was built.
             radius: Largest distance of a press from the centre of the film, mm; None for the largest distance of the
                 forward map.
-            spacing: Distance between the knots near the electrodes, mm. If None, the distance is a sixth of the reach
-                of the probe, but at most `MAX_KNOT_SPACING`.
+            spacing: Largest distance between the knots near the electrodes, mm. If None, it is a sixth of the reach of
+                the probe, but at most `MAX_KNOT_SPACING`. The reach is the radius of a circular probe.
 
         Raises:
             SceneError: If the radius is not positive or is larger than the radius of the forward map.
@@ -316,7 +316,7 @@ class ChargeSpline:
 
 
 def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
-    """Return splines in place of a forward map, because splines compute derivatives faster.
+    """Replace a forward map by splines, because splines compute derivatives faster.
 
     The fit takes a few seconds. A charge map of another class is returned unchanged.
     """
@@ -368,7 +368,7 @@ def _fit_positions(cells: int) -> Array:
 
 @dataclass(frozen=True)
 class _ScaledCharges:
-    """Scaled charges of a forward map without crosstalk, to which splines are fitted.
+    """Computation of the scaled charges to which splines are fitted. The scaled charges do not include crosstalk.
 
     Attributes:
         forward_map: Forward map that computes the charges.
@@ -378,11 +378,12 @@ class _ScaledCharges:
     forward_map: ForwardMap
     force: Array
 
-    def at(self, position: Array, is_needed: Booleans) -> Array:
+    def charges_at(self, position: Array, is_needed: Booleans) -> Array:
         """Compute the scaled charges that presses at given positions cause.
 
         A scaled charge is a charge divided by the squared amplitude of the press. At each position, the charges are
-        computed for every force at which splines are fitted.
+        computed for every force at which splines are fitted. The charges consist of the stress charges, which the
+        stress causes by d31, d32 and d12, and the pressure charges, which the contact pressure causes by d33.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
@@ -400,7 +401,7 @@ class _ScaledCharges:
         if forward_map.sensor.piezo.d33 == 0.0:
             return scaled_stress_charge
 
-        # A sensor with d33 has more spline forces than solved forces. Interpolate from the solved forces to them.
+        # A sensor with d33 has more spline forces than solved forces. Interpolate the charges to the spline forces.
         nodes = np.log(solved_force)
         force_weights = lagrange_values(nodes, barycentric_weights(nodes), np.log(self.force))
         scaled_charge = force_weights @ scaled_stress_charge  # shape (n, n_force, n_electrode)
@@ -427,7 +428,7 @@ def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.
     knots = spline_knots(-radius, radius, cells)
     position = radius * _fit_positions(cells)
     all_electrodes = np.ones(len(samples.forward_map.electrodes), dtype=bool)
-    charge = samples.at(position, all_electrodes)
+    charge = samples.charges_at(position, all_electrodes)
     # No coefficients are fixed at zero, because the charges do not vanish at the edge of the disk.
     return fit_spline(position, charge, (knots, knots), fixed=0)
 
@@ -473,9 +474,9 @@ def _fit_patch(
     # Fit the error of the coarse spline for this electrode. Two coefficients at each end of an axis are fixed at zero.
     # The correction and its first derivatives are therefore zero on the edges of the rectangle.
     is_needed = np.arange(len(sensor.electrodes)) == electrode
-    residual = (samples.at(position, is_needed) - coarse(position))[:, :, electrode]
-    table = fit_spline(position, residual, (x_knots, y_knots), fixed=2)
-    return Patch(electrode, lower_left, upper_right, table)
+    residual = (samples.charges_at(position, is_needed) - coarse(position))[:, :, electrode]
+    fine_spline = fit_spline(position, residual, (x_knots, y_knots), fixed=2)
+    return Patch(electrode, lower_left, upper_right, fine_spline)
 
 
 def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, radius: float, edge_count: int) -> Array:

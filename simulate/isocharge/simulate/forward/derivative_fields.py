@@ -35,7 +35,8 @@ def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor
     """
     sensor = forward_map.sensor
     film = sensor.film
-    family = Family.spread(forward_map.domain, film.radius, NODE_COUNTS, period=0.0)  # a circle has no orientation
+    # Choose the distances and forces of the presses. A circular probe has no orientation.
+    family = Family.spread(forward_map.domain, film.radius, NODE_COUNTS, period=0.0)
     theory = replace(forward_map.theory, stretching=True)  # `read` needs a theory that includes stretching
     settings = SolveSettings(theory=theory, resolution=forward_map.resolution, layer=forward_map.layer)
 

@@ -169,10 +169,10 @@ class Family:
         The family has N evenly spaced rotations. Let t be the angle between the interpolated rotation and a rotation of
         the family. The weight of this rotation of the family is the Dirichlet kernel
 
-            (1 + 2 cos(t) + 2 cos(2 t) + ...) / N
+            (1 + 2 cos(t) + 2 cos(2 t) + ...) / N.
 
-        with all harmonics up to N / 2. If N is even, the highest harmonic has the amplitude 1 instead of 2, because the
-        sine of the highest harmonic is zero at every rotation of the family.
+        It contains all harmonics up to N / 2. If N is even, the highest harmonic has the amplitude 1 instead of 2,
+        because its sine is zero at every rotation of the family.
 
         Args:
             rotation: Rotations of the probe relative to the direction of the press, shape (n,), rad.
@@ -261,8 +261,8 @@ class CheckPress(NamedTuple):
         return self.distance * math.cos(self.angle), self.distance * math.sin(self.angle)
 
 
-def check_presses(domain: Domain, count: int) -> list[CheckPress]:
-    """Return presses that are distributed over the distances and forces of a domain.
+def spread_check_presses(domain: Domain, count: int) -> list[CheckPress]:
+    """Return presses, distributed over the distances and forces of a domain, at which an interpolation is checked.
 
     The last press lies at the largest distance. The distances of the other presses are the square roots of Chebyshev
     nodes. The square root distributes the presses over the area of the disk.
@@ -411,8 +411,9 @@ def solve_films(
         Values that `read` computes for each press, shape (*grid.shape, n_value).
     """
     # The values of the grid are dimensionless: lengths are divided by the radius of the film, tensions by Young's
-    # modulus, and forces by the product of Young's modulus, the thickness and the radius. Each chain begins with the
-    # largest force.
+    # modulus, and forces by the product of Young's modulus, the thickness and the radius. A chain contains the presses
+    # with all forces at one distance on one film. It begins with the largest force, and each further solve starts from
+    # the equilibrium under the previous force.
     radius = film.radius
     chains = []
     for distance, tension, thickness, reach in product(grid.distance, grid.tension, grid.thickness, grid.reach):

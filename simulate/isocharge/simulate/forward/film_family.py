@@ -124,7 +124,7 @@ class FilmFamily:
         domain = Domain(radius, force_range)
         film = prior.sensor.film
         surface = prior.sensor.surface
-        limits = _limits_of(prior, domain)
+        limits = _needed_limits(prior, domain)
         smallest_reach, largest_reach = limits["reach"]
         smallest_probe = Circle(smallest_reach * film.radius)
         largest_probe = Circle(largest_reach * film.radius)
@@ -134,7 +134,7 @@ class FilmFamily:
         # All solves use the mesh that the smallest probe needs, because the smallest probe needs the finest mesh.
         min_force, max_force = force_range
         middle_force = float(np.sqrt(min_force * max_force))
-        layer = layer_for(film, middle_force)
+        layer = layer_for(film, middle_force)  # width of the thin rings of the mesh at the rim
         settings = SolveSettings(theory=THEORY, layer=layer)
         resolution = needed_resolution(film, smallest_probe, (radius, 0.0), middle_force, settings)
         settings = replace(settings, resolution=resolution)
@@ -404,12 +404,12 @@ def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) 
         angle = 2.4 * index
         force = float(min_force * (max_force / min_force) ** rng.random())
         check = CheckPress(float(distance), angle, force, rotation=0.0)
-        direct = direct_charges(sensor, probe, forward_map.settings, check)
-        errors.append(forward_map.relative_error(check, direct))
+        direct_charge = direct_charges(sensor, probe, forward_map.settings, check)
+        errors.append(forward_map.relative_error(check, direct_charge))
     return max(errors)
 
 
-def _limits_of(prior: FilmPrior, domain: Domain) -> FilmLimits:
+def _needed_limits(prior: FilmPrior, domain: Domain) -> FilmLimits:
     """Compute the smallest and largest values of the dimensionless parameters that a family must cover.
 
     Args:

@@ -341,13 +341,13 @@ class FilmModes:
         coefficients, components = decompose(changes, MAX_TRUNCATION_ERROR)
         return cls(grid, coefficients, components)
 
-    def mode_map(self, film: ForwardMap, names: Sequence[str] = tuple(MODES)) -> ModeMap:
+    def mode_map(self, forward_map: ForwardMap, names: Sequence[str] = tuple(MODES)) -> ModeMap:
         """Return a map that computes the charges caused by the imperfection modes of one film.
 
         Only the stress fields that the requested modes need are interpolated.
 
         Args:
-            film: Forward map of the film, from the same family.
+            forward_map: Forward map of the film, from the same family.
             names: Names of the requested modes, from `MODES`.
 
         Raises:
@@ -357,11 +357,11 @@ class FilmModes:
         if unknown:
             raise SceneError(f"modes: expected some of {', '.join(MODES)}, got {', '.join(unknown)}")
         # A mode needs all stress fields of one kind of imperfection. A mode that needs no field has the kind "", which
-        # no field has.
+        # is not in `KINDS`.
         needed_kinds = {MODES[name].field for name in names}
         field_numbers = tuple(number for number, kind in enumerate(KINDS) if kind in needed_kinds)
-        fields = self._field_map(film, field_numbers) if field_numbers else None
-        return ModeMap(tuple(names), film, fields, field_numbers)
+        fields = self._field_map(forward_map, field_numbers) if field_numbers else None
+        return ModeMap(tuple(names), forward_map, fields, field_numbers)
 
     def _field_map(self, forward_map: ForwardMap, field_numbers: tuple[int, ...]) -> ForwardMap:
         """Interpolate stress fields for one film, and return them as a forward map.
@@ -416,7 +416,8 @@ class FilmModes:
         Returns:
             Arrays by their names. The coefficients and the components ("parts") are divided by scales and rounded to
             integers. The array "part_scale", shape (n_component, 1), is the product of the scales of both. The array
-            "node_size" contains the size of the stress at each node, by which the components are divided before.
+            "node_size" contains the size of the stress at each node. The components are divided by this size before
+            they are rounded.
         """
         # Round the coefficients. Each component has one scale for its coefficients at all nodes of the grid.
         axes_of_grid = tuple(range(len(AXES)))
@@ -474,8 +475,8 @@ class FilmModes:
 def _check_shapes(arrays: Mapping[str, Any], field_size: int) -> None:
     """Raise an error if the arrays of film modes have inconsistent shapes.
 
-    The arrays describe stress fields at the nodes of a mesh. The fields are weighted sums of components, which are
-    called parts in the file. Each component contains all fields.
+    The arrays describe stress fields at the nodes of a mesh. For each press, the fields are a weighted sum of
+    components, which are called parts in the file. Each component contains all fields.
 
     Args:
         arrays: Arrays of a file with the names of `FilmModes.to_arrays`.

@@ -21,7 +21,7 @@ from isocharge.common.errors import SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain, as_contacts, differences
-from isocharge.simulate.forward.family import NODE_COUNTS, CheckPress, Family, check_family, check_presses
+from isocharge.simulate.forward.family import NODE_COUNTS, CheckPress, Family, check_family, spread_check_presses
 from isocharge.simulate.forward.press_chunk import PressChunk
 from isocharge.simulate.forward.readout import ReadoutPoints, contact_charge, touch_charge
 from isocharge.simulate.forward.readout_rules import ReadoutRules
@@ -133,7 +133,7 @@ class ForwardMap:
         # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared at
         # the check presses, which are solved directly in the first pass of the loop. If the error is very large, the
         # next number of nodes would not suffice either and is skipped.
-        checks = check_presses(domain, CHECK_COUNT)
+        checks = spread_check_presses(domain, CHECK_COUNT)
         check_charges: list[Array] = []
         error = np.inf
         remaining_counts = list(NODE_COUNTS)
@@ -196,7 +196,7 @@ class ForwardMap:
         """
         contact = as_contacts(contact, "forward map")
 
-        # A press without a force may lie anywhere. It is replaced by a valid press before the domain is checked.
+        # A press without a force may lie anywhere. Only for the check of the domain, it is replaced by a valid press.
         has_no_force = contact[:, 2] == 0.0
         min_force, _ = self.domain.force_range
         valid_contact = (0.0, 0.0, min_force)
@@ -226,7 +226,7 @@ class ForwardMap:
         contact = self.domain.check(contact, "forward map")
         return differences(self._unrotated_charges, contact)
 
-    def relative_error(self, check: CheckPress, direct: Array) -> float:
+    def relative_error(self, check: CheckPress, direct_charge: Array) -> float:
         """Compute the largest relative difference between the interpolated and the directly solved charges of a press.
 
         The difference at each electrode is divided by the directly solved charge of the electrode. The divisor is at
@@ -234,7 +234,7 @@ class ForwardMap:
 
         Args:
             check: Press at which the charges are compared.
-            direct: Directly solved charges of this press, shape (n_electrode,), pC.
+            direct_charge: Directly solved charges of this press, shape (n_electrode,), pC.
 
         Returns:
             The largest relative difference of an electrode, dimensionless.
@@ -242,8 +242,8 @@ class ForwardMap:
         x, y = check.position
         contact = np.array([[x, y, check.force]])  # a single press
         (interpolated_charge,) = self.charges(contact, check.rotation)
-        charge_scale = np.maximum(np.abs(direct), CHARGE_FLOOR * np.abs(direct).max())
-        return float((np.abs(interpolated_charge - direct) / charge_scale).max())
+        divisor = np.maximum(np.abs(direct_charge), CHARGE_FLOOR * np.abs(direct_charge).max())
+        return float((np.abs(interpolated_charge - direct_charge) / divisor).max())
 
     def field_charges(self, contact: Array, is_odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
         """Compute the charges of each stress field in the table, for a circular probe.
@@ -305,7 +305,7 @@ class ForwardMap:
         with single_threaded_blas():  # faster for the many small matrices of a chunk
             for start in range(0, complex_position.size, chunk_size):
                 chunk = complex_position[start : start + chunk_size]
-                rules = tuple((readout, pairs & is_needed) for readout, pairs in self._readout_rules.select(chunk))
+                rules = tuple((rule, uses_rule & is_needed) for rule, uses_rule in self._readout_rules.select(chunk))
                 force = np.full(chunk.size, first_force)
                 charges.append(stacked_map._integrate_fields(chunk, force, orientation, is_odd, rules))
 
@@ -331,9 +331,9 @@ class ForwardMap:
 
     @cached_property
     def _stacked_forces(self) -> "ForwardMap":
-        """Map with a single force. Its table contains the stress under each force of the family as a separate field.
+        """Forward map whose table contains the stress under each force of the family as a separate stress field.
 
-        The table has single precision.
+        The map itself has a single force. The table has single precision.
         """
         n_distance = self.family.distance.size
         n_force = self.family.force.size
@@ -448,13 +448,13 @@ class ForwardMap:
         _, pairs_of_first_rule = rules[0]
         pairs_shape = pairs_of_first_rule.shape  # (n, n_electrode), the same for all rules
         scaled_charge = np.zeros((*pairs_shape, is_odd.size))
-        for readout, uses_rule in rules:
+        for rule, uses_rule in rules:
             # Electrodes with the same number of points are integrated together, because their arrays have equal shapes.
-            for n_point in np.unique(readout.count):
-                press_index, electrode = np.nonzero(uses_rule & (readout.count == n_point))
-                points_mm = readout.points[electrode, :n_point] @ np.array([1.0, 1j])  # (x, y) becomes x + iy
+            for n_point in np.unique(rule.count):
+                press_index, electrode = np.nonzero(uses_rule & (rule.count == n_point))
+                points_mm = rule.points[electrode, :n_point] @ np.array([1.0, 1j])  # (x, y) becomes x + iy
                 points = points_mm / film.radius
-                weights = readout.weights[electrode, :n_point]
+                weights = rule.weights[electrode, :n_point]
                 scaled_charge[press_index, electrode] = presses.scaled_charges(press_index, points, weights, is_odd)
 
         # Multiply by the unit of the scaled stress in the table.
@@ -476,8 +476,8 @@ class ForwardMap:
         distance = np.abs(position)
         direction = np.angle(position)  # from the centre of the film to the press, rad
         rotation = orientation - direction  # of the probe relative to the direction of the press
-        weights = self.family.weights(distance, force, rotation).astype(self.table.dtype)
-        nodal_fields = weights @ self.table
+        weights = self.family.weights(distance, force, rotation)
+        nodal_fields = weights.astype(self.table.dtype) @ self.table  # in the precision of the table
         mesh = template_for(self.probe, self.resolution)
         placement = Placement.of(mesh, self.probe, distance, self.sensor.film.radius, self.layer, rotation)
         return PressChunk(mesh, placement, nodal_fields, direction, rotation + self.probe.angle)

@@ -54,11 +54,11 @@ class PressChunk:
             frame_angle = frame_angle + self.probe_angle[press_index]
 
         charge = np.empty((len(stress), is_odd.size))
-        for field_index, odd in enumerate(is_odd):
-            field_stress = stress[:, :, field_index]
+        for field_index, is_field_odd in enumerate(is_odd):
+            field_stress = stress[:, :, field_index]  # shape (n_pair, n_point, 3)
             # At reflected points, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
-            sign_changes = slice(0, 2) if odd else slice(2, 3)
-            field_stress[is_mirrored, sign_changes] *= -1.0
+            reversed_components = slice(0, 2) if is_field_odd else slice(2, 3)
+            field_stress[is_mirrored, reversed_components] *= -1.0
             film_stress = rotate_stress(field_stress, frame_angle[:, None])
             # For each pair (index k), sum over the points (p) and the stress components (c).
             charge[:, field_index] = np.einsum("kpc,kpc->k", film_stress, weights)
@@ -83,11 +83,13 @@ class PressChunk:
         mesh = self.mesh
         rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]
         position, is_mirrored = mesh.into_meshed_half(rotated_points)
-        element, xi, eta = locate_points(self.placement[press_index], mesh, position)
+        element, first_local, second_local = locate_points(self.placement[press_index], mesh, position)
 
-        # Interpolate the values of all fields from the nodes of this element to the point.
+        # Interpolate the values of all fields from the nodes of this element to the point. The basis functions depend
+        # on the two local coordinates of the point in its element.
         n_value = 3 * n_field  # number of values at a node
-        basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel()).astype(self.field.dtype)
+        basis_values = tensor_values(mesh.resolution.order, first_local.ravel(), second_local.ravel())
+        basis_values = basis_values.astype(self.field.dtype)
         field_by_element = self.field.reshape(len(self.field), mesh.n_element, -1, n_value)
         nodal_stress = field_by_element[press_index[:, None], element]  # shape (n_pair, n_point, n_local, n_value)
         flat_stress = nodal_stress.reshape(*basis_values.shape, n_value)  # shape (n_pair * n_point, n_local, n_value)

@@ -149,7 +149,7 @@ def _layout_points(electrodes: tuple[Electrode, ...], readout: Readout, per_side
     rules = [electrode_rule(electrode, readout, per_side) for electrode in electrodes]
     counts = np.array([len(shares) for _, shares in rules])
     points = np.zeros((len(electrodes), counts.max(), 2))
-    areas = np.zeros((len(electrodes), counts.max(), 3))
+    areas = np.zeros((len(electrodes), counts.max(), 3))  # an area for each component of the stress (s11, s22, s12)
     for index, electrode in enumerate(electrodes):
         electrode_points, shares = rules[index]
         n_point = counts[index]
@@ -239,7 +239,8 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     The charge per area is the coefficient d33 times the mean of the stress s33 over the thickness. The stress s33 is
     minus the contact pressure at the probe, and zero at the free back of the film. The mean of s33 over the thickness
     is therefore minus half of the contact pressure. The charge of an electrode is therefore -d33 / 2 times the part of
-    the force that acts on the electrode. The coefficient d33 of PVDF is negative, so the charge is positive.
+    the force that acts on the electrode, times the gain of the electrode. The coefficient d33 of PVDF is negative, so
+    the charge is positive.
 
     Args:
         sensor: Sensor with the electrodes.
@@ -311,8 +312,8 @@ def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
         weights of a point are equal. The sum of each weight over all points is 1.
     """
     if electrode.square:  # the product of two one-dimensional Gauss rules
-        unit_points, shares = gauss_square(per_side)
-        lower_left, _, upper_right, _ = np.array(electrode.corners)
+        unit_points, shares = gauss_square(per_side)  # coordinates from 0 to 1
+        lower_left, _, upper_right, _ = np.array(electrode.corners)  # anticlockwise
         points = lower_left + unit_points * (upper_right - lower_left)
     elif len(electrode.parts) == 1:
         points, shares = gauss_polygon(electrode.parts[0], per_side)

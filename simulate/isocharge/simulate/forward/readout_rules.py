@@ -83,8 +83,8 @@ class ReadoutRules:
         clamp_distance = self.sensor.film.radius - np.abs(position)
         is_inner = clamp_distance >= MIN_CLAMP_DISTANCE * self.probe.reach  # shape (n,)
         is_far = ~is_near & is_distant & is_inner[:, None] & self.has_smooth_far_field
-        is_between = ~is_near & ~is_far
-        return (self.fine, is_near), (self.coarse, is_between), (self.far, is_far)
+        is_neither = ~is_near & ~is_far
+        return (self.fine, is_near), (self.coarse, is_neither), (self.far, is_far)
 
     def is_near(self, position: Complexes) -> Booleans:
         """Return whether each electrode is so near to each press that the fine rule is needed.
@@ -99,7 +99,7 @@ class ReadoutRules:
 
     @cached_property
     def has_smooth_far_field(self) -> bool:
-        """Whether the mesh is fine enough to use the rule with few points for electrodes far from the probe."""
+        """Whether the mesh is so fine that the rule with few points suffices for electrodes far from the probe."""
         # The radii of the rings increase by a constant ratio from the edge of the probe to the rim of the film.
         ring_ratio = (self.sensor.film.radius / self.probe.reach) ** (1.0 / self.resolution.rings)
         return bool(ring_ratio <= MAX_RING_RATIO)

@@ -4,11 +4,11 @@ A side force (Fx, Fy) of the probe on the film changes the charges to first orde
 
     dQ = jacobian @ (Fx, Fy).
 
-A side force has two stress fields. The first field is the stress change that a side force along the direction of the
-press causes, and the second field is the stress change that a side force across the direction of the press causes. The
-stress fields are computed from the tangent of the equilibrium (see `solver.sensitivity`) at a few distances and forces.
-Between the solved presses, the stress fields are interpolated as in a forward map. If the side force is at most 0.2
-times the force of the press, the terms of second order are smaller than 1 % of dQ.
+A side force has two stress fields. The first field is the change of the stress by a side force along the direction of
+the press. The second field is the change of the stress by a side force across this direction. The stress fields are
+computed from the tangent of the equilibrium (see `solver.sensitivity`) at a few distances and forces. Between the
+solved presses, the stress fields are interpolated as in a forward map. If the side force is at most 0.2 times the force
+of the press, the terms of second order are smaller than 1 % of dQ.
 
 Example:
 
@@ -54,29 +54,31 @@ class SideForceMap:
     holding: Array
 
     @classmethod
-    def build(cls, film: ForwardMap, *, executor: Executor | None = None) -> "SideForceMap":
+    def build(cls, forward_map: ForwardMap, *, executor: Executor | None = None) -> "SideForceMap":
         """Solve a few presses in the domain of a forward map, and compute the stress fields of a side force.
 
         The solves take about ten seconds. The map also contains the holding force of each press, which is the side
         force that prevents the film from slipping under the probe.
 
         Args:
-            film: Forward map of the film under a circular probe. It provides the domain, the mesh and the readout.
+            forward_map: Forward map of the film under a circular probe. It provides the domain, the mesh and the
+                readout.
             executor: Executor that runs the solves; None for this process.
 
         Raises:
             SceneError: If the probe is not axisymmetric.
             SolveError: If a press has no equilibrium.
         """
-        if not film.probe.is_axisymmetric:
+        if not forward_map.probe.is_axisymmetric:
             raise SceneError(
-                f"side forces: expected a circular probe, got {film.probe.notation}; use `press(..., side_force=...)` "
-                "or `isocharge simulate point --side-force` for other probes"
+                f"side forces: expected a circular probe, got {forward_map.probe.notation}; use "
+                "`press(..., side_force=...)` or `isocharge simulate point --side-force` for other probes"
             )
-        # The table contains the stress fields and, in the last column, the ratio of the holding force to the force.
-        derivative_map = solve_derivatives(film, _side_force_changes, executor)
+        # The table contains the stress fields and, in the last column, the holding force divided by the force of the
+        # press.
+        derivative_map = solve_derivatives(forward_map, _side_force_changes, executor)
         stress_table, holding_column = np.split(derivative_map.table, [-1], axis=1)
-        return cls(film, replace(derivative_map, table=stress_table), holding_column.ravel())
+        return cls(forward_map, replace(derivative_map, table=stress_table), holding_column.ravel())
 
     def jacobian(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to the side force (Fx, Fy) that the probe exerts.
@@ -92,6 +94,8 @@ class SideForceMap:
         """
         contact = self.film.domain.check(contact, "side forces")
         scaled_charges = self.fields.field_charges(contact, SIDE_FORCE_IS_ODD, self._readout)
+
+        # The stress fields are derivatives with respect to the side force in units of `force_unit`.
         film = self.film.sensor.film
         force_unit = side_force_unit(film, amplitude_squared(film, contact[:, 2]))
         charge_per_newton = scaled_charges / force_unit[:, None, None]
@@ -160,7 +164,7 @@ class SideForceMap:
 
 
 def _side_force_changes(solved: Equilibrium, surface: Surface) -> Array:
-    """For one press, compute how a side force changes the stress, and which holding force keeps the probe in place.
+    """For one press, compute how a side force changes the stress, and which side force prevents slipping.
 
     Args:
         solved: Equilibrium of the film under a press on the positive x axis.
@@ -169,7 +173,8 @@ def _side_force_changes(solved: Equilibrium, surface: Surface) -> Array:
     Returns:
         One array, as the interpolation between presses requires. It contains all changes of the scaled stress, which
         `side_force_stress` computes, and then the holding force divided by the force of the press. Shape
-        (n_change + 1,), dimensionless. The holding force is positive if it points away from the centre.
+        (n_change + 1,), dimensionless. The holding force is the side force that prevents the film from slipping under
+        the probe. It is positive if it points away from the centre.
     """
     # The second component is zero, because the press is symmetric about the x axis.
     outward_force, _ = holding_force(solved)

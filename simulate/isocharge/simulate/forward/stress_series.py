@@ -109,7 +109,7 @@ def _nodes(count: int) -> Array:
 
 
 def _automorphism(distance: float, probe_radius: float) -> tuple[float, float]:
-    """Compute the disk automorphism that maps a circle around the centre of the disk to the edge of the probe.
+    """Compute the conformal map of the unit disk onto itself that maps a circle around the centre to the probe's edge.
 
     The map has the form (z + c) / (1 + c z) with a parameter c. On the diameter through the probe, the map is a
     translation of atanh(z) by atanh(c).
@@ -184,7 +184,7 @@ def _coefficients(values: Array) -> Array:
 
 
 def main() -> None:
-    """Fit the series of the built-in film, and write them to the file that the first command-line argument names."""
+    """Fit the series of the built-in film, and write them to a file. Its path is the first command-line argument."""
     forward_map = ForwardMap.build(load_sensor(SENSOR), PROBE, MAX_DISTANCE_mm, FORCE_RANGE_N)
     write_whole(Path(sys.argv[1]), json.dumps(stress_series(forward_map).to_json()).encode())
 

@@ -4,9 +4,9 @@ A change of the pretension by (T11, T22, T12) changes the charges to first order
 
     dQ = tension_jacobian @ (T11, T22, T12).
 
-The stress change that a change of the pretension causes is computed from the tangent of the equilibrium (see
-`solver.sensitivity`), at a few distances and forces. Between the solved presses, the stress change is interpolated as
-in a forward map. If the film becomes warmer than its ring, the pretension of the film changes. The module
+A change of the pretension changes the stress. The change of the stress is computed from the tangent of the equilibrium
+(see `solver.sensitivity`), at a few distances and forces. Between the solved presses, it is interpolated as in a
+forward map. If the film becomes warmer than its ring, the pretension of the film changes. The module
 `mechanics.film_temperature` computes the change of the pretension.
 
 Example:
@@ -45,22 +45,23 @@ class TensionMap:
     fields: ForwardMap
 
     @classmethod
-    def build(cls, film: ForwardMap, *, executor: Executor | None = None) -> "TensionMap":
+    def build(cls, forward_map: ForwardMap, *, executor: Executor | None = None) -> "TensionMap":
         """Solve a few presses in the domain of a forward map, and compute the stress fields of a pretension change.
 
         The solves take about ten seconds.
 
         Args:
-            film: Forward map of the film under a circular probe. It provides the domain, the mesh and the readout.
+            forward_map: Forward map of the film under a circular probe. It provides the domain, the mesh and the
+                readout.
             executor: Executor that runs the solves; None for this process.
 
         Raises:
             SceneError: If the probe is not axisymmetric.
             SolveError: If a press has no equilibrium.
         """
-        if not film.probe.is_axisymmetric:
-            raise SceneError(f"temperature of the film: expected a circular probe, got {film.probe.notation}")
-        return cls(film, solve_derivatives(film, tension_stress, executor))
+        if not forward_map.probe.is_axisymmetric:
+            raise SceneError(f"temperature of the film: expected a circular probe, got {forward_map.probe.notation}")
+        return cls(forward_map, solve_derivatives(forward_map, tension_stress, executor))
 
     def tension_jacobian(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to the pretension (T11, T22, T12) in the axes x and y.

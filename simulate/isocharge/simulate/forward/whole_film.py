@@ -53,6 +53,8 @@ def whole_film_map(
 ) -> ForwardMap:
     """Build a coarse forward map of nearly the whole film. The solves take about 3 s of CPU time.
 
+    The error of the interpolation is not computed. The attribute `error` of the map is the constant `COARSE_ERROR`.
+
     Args:
         sensor: Sensor with an axisymmetric film.
         probe: Probe that presses the film.

@@ -59,7 +59,8 @@ class AmbiguousPairs:
     Attributes:
         first: First contact (x, y, F) of each pair, shape (n, 3), mm and N.
         second: Second contact (x, y, F) of each pair, shape (n, 3), mm and N.
-        distance: Difference of the charges of each pair, shape (n,), in standard deviations of the noise.
+        distance: Distance between the charges of the two contacts of each pair, shape (n,), in standard deviations of
+            the noise.
     """
 
     first: Array
@@ -130,18 +131,18 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     charge = charge_map.charges(contact)
     position_std = limits_at(charge_map, contact, noise).position
     min_distance = np.maximum(MIN_DISTANCE, MIN_DISTANCE_SIGMAS * position_std)
-    first_index, start = _candidates(charge_map, noise, position, charge, min_distance)
+    first_index, candidates = _candidates(charge_map, noise, position, charge, min_distance)
     if not first_index.size:
         return AmbiguousPairs.none()
 
     # Improve the candidates for the second contacts. Then select the pairs whose contacts are still distant, and whose
     # charges agree within the noise.
-    first = contact[first_index]
-    second, charge_difference = nearest_contact(charge_map, noise, charge[first_index], start)
-    x_difference, y_difference, _ = (second - first).T
+    first_contact = contact[first_index]
+    second_contact, charge_difference = nearest_contact(charge_map, noise, charge[first_index], candidates)
+    x_difference, y_difference, _ = (second_contact - first_contact).T
     is_distant = np.hypot(x_difference, y_difference) > min_distance[first_index]
     is_ambiguous = is_distant & (charge_difference < INDISTINGUISHABLE_SIGMAS)
-    pairs = AmbiguousPairs(first[is_ambiguous], second[is_ambiguous], charge_difference[is_ambiguous])
+    pairs = AmbiguousPairs(first_contact[is_ambiguous], second_contact[is_ambiguous], charge_difference[is_ambiguous])
     order = np.argsort(pairs.outer_radius, kind="stable")
     return AmbiguousPairs(pairs.first[order], pairs.second[order], pairs.distance[order])
 
@@ -182,12 +183,12 @@ def _candidates(
 
         # Compute the squared distance of the charges in standard deviations of the noise, shape (n,). Then select the
         # best distant positions at which the squared distance is a local minimum.
-        chi2 = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)
-        is_local_minimum = chi2 <= chi2[neighbours].min(axis=1)
+        squared_distance = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)
+        is_local_minimum = squared_distance <= squared_distance[neighbours].min(axis=1)
         x_difference, y_difference = (position - position[first_index]).T
         is_distant = np.hypot(x_difference, y_difference) > min_distance[first_index]
         candidates = np.flatnonzero(is_local_minimum & is_distant)
-        best_candidates = candidates[np.argsort(chi2[candidates])[:MAX_CANDIDATES]]
+        best_candidates = candidates[np.argsort(squared_distance[candidates])[:MAX_CANDIDATES]]
         first_indices.append(np.full(best_candidates.size, first_index))
         second_contacts.append(np.column_stack([position[best_candidates], np.exp(log_force[best_candidates])]))
     return np.concatenate(first_indices), np.concatenate(second_contacts)

@@ -1,6 +1,6 @@
 """Cramer-Rao limit: the smallest error with which an unbiased estimator can determine a contact from noisy charges.
 
-Let J = d(Q)/d(x, y, ln F, ...) be the matrix of the derivatives of the charges Q, and let the vector i contain the
+Let J = d(Q)/d(x, y, ln F, ...) be the matrix of the derivatives of the charges Q. Let the vector i contain the
 information that one reading provides about each charge (`NoiseModel.information`). The Fisher information is the matrix
 J' diag(i) J. The covariance of an unbiased estimate is at least the inverse of the Fisher information (Kay 1993,
 chapter 3). An estimator that uses a prior distribution may have smaller errors where the charges provide little
@@ -110,11 +110,12 @@ def _invert(information: Array) -> Array:
         Inverse matrices, shape (n, p, p).
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
+    # The lower bound avoids a division by zero if there is no information about a parameter.
     parameter_scale = np.sqrt(np.maximum(diagonal, MIN_INFORMATION))  # shape (n, p)
     matrix_scale = parameter_scale[:, :, None] * parameter_scale[:, None, :]
     eigenvalues, eigenvectors = np.linalg.eigh(information / matrix_scale)  # the diagonal elements are 1
     inverse_eigenvalues = 1.0 / np.maximum(eigenvalues, MIN_EIGENVALUE)
 
-    # If V contains the eigenvectors, the inverse of each matrix (index n) is V diag(1 / eigenvalues) V'.
+    # If V contains the eigenvectors, the inverse of each scaled matrix (index n) is V diag(1 / eigenvalues) V'.
     scaled_inverse = np.einsum("nik,nk,njk->nij", eigenvectors, inverse_eigenvalues, eigenvectors)
     return np.asarray(scaled_inverse / matrix_scale)

@@ -9,11 +9,11 @@ Contacts on opposite sides of a singular point therefore have the same charges (
 The orientation is reversed between two contacts a and b if det(J(a)' W J(b)) < 0, where the diagonal matrix W contains
 the inverse variances of the charges. For three electrodes, this determinant has the same sign as the product det J(a)
 det J(b). For more electrodes, the criterion is reliable only if the two contacts are close to each other. Between
-distant contacts, such as contacts on opposite sides of an electrode, the map may turn by more than a right angle even
-if there is no fold. If the orientation is reversed between the ends of a segment, the segment is therefore bisected
-until it is shorter than `SEGMENT_LENGTH`, or until the orientation is reversed in neither half. A fold may be smaller
-than the spacing of the grid. In order to find such folds, the module searches for positions where the smallest singular
-value of J has a minimum.
+distant contacts, the directions of the derivatives may change by more than a right angle even if there is no fold. An
+example are contacts on opposite sides of an electrode. If the orientation is reversed between the ends of a segment,
+the segment is therefore bisected. The bisection ends when the segment is shorter than `SEGMENT_LENGTH`, or when the
+orientation is reversed in neither half. A fold may be smaller than the spacing of the grid. In order to find such
+folds, the module searches for positions where the smallest singular value of J has a minimum.
 
 If all electrodes of an isotropic film lie on one circle, a press and its mirror image in this circle cause nearly the
 same charges. The map therefore has a fold near the circle for any number of electrodes.
@@ -150,7 +150,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
 
     Args:
         charge_map: Map that computes the charges of contacts.
-        rings: Positions between which folds are searched for. A fold may be smaller than their spacing.
+        rings: Positions between which folds are searched for. A fold may be smaller than the spacing of the positions.
         force: Force of the contacts, N.
         noise: Noise of the readings.
 
@@ -234,9 +234,9 @@ class _FoldSearch:
         # A radial fold lies between two neighbouring rings. A ring fold lies between two positions on the same ring.
         has_radial_fold = has_reversed_orientation(scaled_jacobian[:-1], scaled_jacobian[1:])
         has_ring_fold = has_reversed_orientation(scaled_jacobian, next_jacobian_on_ring)
-        first = np.concatenate([position[:-1][has_radial_fold], position[has_ring_fold]])
-        second = np.concatenate([position[1:][has_radial_fold], next_on_ring[has_ring_fold]])
-        return self._bisect(first, second)
+        first_end = np.concatenate([position[:-1][has_radial_fold], position[has_ring_fold]])
+        second_end = np.concatenate([position[1:][has_radial_fold], next_on_ring[has_ring_fold]])
+        return self._bisect(first_end, second_end)
 
     def _bisect(self, first: Array, second: Array) -> Array:
         """Bisect segments until they are shorter than `SEGMENT_LENGTH`.
@@ -296,12 +296,12 @@ class _FoldSearch:
         n_ring, n_angle, _, _ = scaled_jacobian.shape
         jacobian_of_positions = scaled_jacobian.reshape(-1, *scaled_jacobian.shape[2:])
         _, smaller_singular_value = singular_values(jacobian_of_positions).T
-        smallest = smaller_singular_value.reshape(n_ring, n_angle)
+        value_on_rings = smaller_singular_value.reshape(n_ring, n_angle)
 
         # The filter returns the smallest value among 3 x 3 positions: the position itself and its neighbours on the
         # same ring and on the two neighbouring rings. The angles are periodic.
-        smallest_of_neighbours = scipy.ndimage.minimum_filter(smallest, 3, mode=("nearest", "wrap"))
-        is_minimum = smallest == smallest_of_neighbours
+        neighbourhood_minimum = scipy.ndimage.minimum_filter(value_on_rings, 3, mode=("nearest", "wrap"))
+        is_minimum = value_on_rings == neighbourhood_minimum
 
         # The first step of a search is the larger distance between neighbouring positions: on the same ring or between
         # rings. The distance between rings is equal to the radius of the innermost ring.
@@ -309,7 +309,7 @@ class _FoldSearch:
         spacing_between_rings = rings.distance[0]
         first_step = np.maximum(spacing_between_rings, spacing_on_ring)
         ring, _ = np.nonzero(is_minimum)
-        return self._minimise(rings.position[is_minimum], smallest[is_minimum], first_step[ring])
+        return self._minimise(rings.position[is_minimum], value_on_rings[is_minimum], first_step[ring])
 
     def folds_near(self, position: Array) -> Array:
         """Select the positions at which the orientation of the charge map is reversed.

@@ -106,21 +106,22 @@ class LimitMap:
     def statistics(self) -> dict[str, float]:
         """Return a dictionary for JSON with the median, the root mean square and the maximum of the errors.
 
-        The weight of a position is the area that it represents. Errors of the force are in percent of the force.
+        The weight of a position is the area that it represents. Errors of the force are in percent of the force. The
+        dictionary also contains the force and the largest condition number.
         """
         # The area that a position represents is proportional to its distance from the centre.
         n_angle = self.position.shape[1]
         area = np.repeat(self.rings.distance, n_angle)
-        position = self.position.ravel()
-        force = 100.0 * self.relative_force.ravel()
+        position_error = self.position.ravel()
+        force_error_percent = 100.0 * self.relative_force.ravel()
         return {
             "force_N": self.force,
-            "position_median_mm": _median(position, area),
-            "position_rms_mm": float(np.sqrt(np.average(position**2, weights=area))),
-            "position_worst_mm": float(position.max()),
-            "force_median_percent": _median(force, area),
-            "force_rms_percent": float(np.sqrt(np.average(force**2, weights=area))),
-            "force_worst_percent": float(force.max()),
+            "position_median_mm": _median(position_error, area),
+            "position_rms_mm": float(np.sqrt(np.average(position_error**2, weights=area))),
+            "position_worst_mm": float(position_error.max()),
+            "force_median_percent": _median(force_error_percent, area),
+            "force_rms_percent": float(np.sqrt(np.average(force_error_percent**2, weights=area))),
+            "force_worst_percent": float(force_error_percent.max()),
             "condition_worst": float(self.condition.max()),
         }
 

@@ -3,8 +3,8 @@
 A press in the mirror region lies outside the working area and has the same charges as a press inside the working area.
 Therefore no method can conclude from the charges that the press lies outside the working area. If all electrodes lie on
 one circle of radius R, the mirror region covers almost the whole film. An inversion in this circle preserves the ratios
-of the distances to the points of the circle. A point load at the distance r from the centre therefore has nearly the
-same influence on the points of the circle as a point load at the distance R^2 / r.
+of the distances to the points of the circle. Point loads at the distances r and R^2 / r from the centre therefore have
+nearly the same influence on the points of the circle.
 """
 
 from concurrent.futures import Executor
@@ -52,7 +52,7 @@ charges.
 
 @dataclass(frozen=True)
 class MirrorRegion:
-    """For each position outside the working area, the share of presses with the charges of a press in this area.
+    """Share of the presses at each position outside the working area that have the charges of a press inside it.
 
     Attributes:
         inner: Radius of the working area, mm.
@@ -107,7 +107,7 @@ class MirrorRegion:
 
     @property
     def total_share(self) -> float:
-        """Share of the presses outside the working area whose charges agree with those of a press in this area.
+        """Share of the presses outside the working area whose charges agree with those of a press inside it.
 
         The weight of a press is the area of its sector.
         """
@@ -151,9 +151,11 @@ def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
     Returns:
         Whether a press inside the domain causes the charges of each row, shape (n,).
     """
-    nearest_contact, residual = search(inside, charge, noise.sigma(charge), candidates=N_CANDIDATES)
+    contact, residual = search(inside, charge, noise.sigma(charge), candidates=N_CANDIDATES)
     is_same_charge = np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS
-    return np.asarray(is_same_charge & is_interior(inside.domain, nearest_contact))
+
+    # If a search stopped at the edge of the domain, the contact on the edge does not explain the charges.
+    return np.asarray(is_same_charge & is_interior(inside.domain, contact))
 
 
 def is_interior(domain: Domain, contact: Array) -> Booleans:

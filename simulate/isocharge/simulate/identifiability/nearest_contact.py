@@ -52,7 +52,10 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
     """
 
     def predicted_sigma(_: Integers, predicted: Array) -> Array:
-        """Return the standard deviation of the noise of each predicted charge, shape (k, n_electrode), pC."""
+        """Return the standard deviation of the noise of each predicted charge, shape (k, n_electrode), pC.
+
+        It does not depend on the indices of the rows, which are the first argument.
+        """
         return noise.sigma(predicted)
 
     contact, residual = _descend(charge_map, charge, predicted_sigma, start, STEPS)
@@ -89,7 +92,7 @@ def explain(
 def _descend(
     charge_map: ChargeMap,
     charge: Array,
-    sigma_of: Callable[[Integers, Array], Array],
+    compute_sigma: Callable[[Integers, Array], Array],
     start: Array,
     max_steps: int,
     min_change: float = MIN_CHANGE,
@@ -102,8 +105,8 @@ def _descend(
     Args:
         charge_map: Map that computes the charges of contacts.
         charge: Given charges, shape (n, n_electrode), pC.
-        sigma_of: Function that computes standard deviations, shape (k, n_electrode), pC. Its arguments are the indices
-            of k rows of the given charges, and the predicted charges for these rows.
+        compute_sigma: Function that computes standard deviations, shape (k, n_electrode), pC. Its arguments are the
+            indices of k rows of the given charges, and the predicted charges for these rows.
         start: Contacts (x, y, F) from which the descents start, shape (n, 3), mm and N.
         max_steps: Largest number of steps of a descent.
         min_change: A descent ends if the squared distance changes by less than `min_change` times 1 + its value.
@@ -139,7 +142,7 @@ def _descend(
         """
         # The slopes are the derivatives of the charges with respect to x, y and ln F, shape (k, n_electrode, 3).
         predicted, slopes = linearised(charge_map, to_contact(unit_coordinates))
-        sigma = sigma_of(rows, predicted)
+        sigma = compute_sigma(rows, predicted)
         derivatives = -slopes * half_width / sigma[..., None]  # the small derivative of sigma is neglected
         return (charge[rows] - predicted) / sigma, derivatives.swapaxes(1, 2)
 
@@ -159,7 +162,7 @@ def search(
     candidates: int = CANDIDATES,
     min_change: float = MIN_CHANGE,
 ) -> tuple[Array, Array]:
-    """Find the contacts whose charges are nearest to given charges, and choose the starting points.
+    """Find the contacts whose charges are nearest to given charges, without given starting points.
 
     Candidates are contacts that are distributed over the domain. The function compares the given charges with the
     charges of the candidates. For each row of charges, least-squares descents start from the candidates with the
@@ -186,7 +189,7 @@ def search(
     is_neighbour = scipy.spatial.distance.cdist(positions, positions) < START_SEPARATION
 
     # Find the candidates with the nearest charges for each row of charges. If there are no charges, the loop processes
-    # one empty chunk.
+    # one empty chunk, because at least one array is needed for the concatenation.
     nearest_candidates = []
     for chunk_start in range(0, max(len(charge), 1), CHUNK):
         chunk = slice(chunk_start, chunk_start + CHUNK)

@@ -101,9 +101,9 @@ def working_area(
 ) -> WorkingArea:
     """Find the working area within the domain of a charge map.
 
-    The radius of the working area is the smallest of four radii: the radius at which the position error exceeds its
-    limit, the distance from the centre to the nearest fold, the radius of the nearest ambiguous pair, and the radius of
-    the domain.
+    The radius of the working area is the smallest of four radii. Two of them are the distance from the centre at which
+    the position error first exceeds its limit, and the distance of the nearest fold. The other two are the radius of
+    the nearest ambiguous pair, and the radius of the domain.
 
     A forward map is first replaced by splines, because splines are faster. Any other charge map, such as a fit to
     measured charges, is evaluated for about 400,000 contacts. Without the search for ambiguous pairs, the charge map is
@@ -183,7 +183,8 @@ def _confirm_error_radius(
         Radius within which the error does not exceed its limit on the finer rings either, mm. There are at most
         `MAX_CONFIRMATIONS` evaluations.
     """
-    # If the given radius is that of the domain, the rings within it are those that were evaluated before.
+    # If the given radius is that of the domain, the rings within it are those that were evaluated before. A second
+    # evaluation would not change the result.
     if radius >= charge_map.domain.radius:
         return radius
     for _ in range(MAX_CONFIRMATIONS):

@@ -81,7 +81,8 @@ class WeightMap:
     def weigh(self, presses: Array) -> Array:
         """Compute the weights of presses by linear interpolation between the rows of the table.
 
-        If the table does not cover the position of a press, the press has the weight of the nearest row.
+        Each row contains a position and its weight. If the table does not cover the position of a press, the press has
+        the weight of the nearest row.
 
         Args:
             presses: Positions (x, y), shape (n, 2), mm.
@@ -89,15 +90,17 @@ class WeightMap:
         Returns:
             Weights, shape (n,), dimensionless.
         """
-        positions = self.table[:, :2]
-        values = self.table[:, 2]
-        nearest_weights = scipy.interpolate.NearestNDInterpolator(positions, values)(presses)
+        table_positions = self.table[:, :2]
+        table_weights = self.table[:, 2]
+        nearest_weights = scipy.interpolate.NearestNDInterpolator(table_positions, table_weights)(presses)
 
-        # Linear interpolation needs a triangulation of the positions, which does not exist if they lie on one line.
-        spans_plane = np.linalg.matrix_rank(positions - positions[0]) == 2
+        # Linear interpolation needs a triangulation of the table, which does not exist if all positions lie on one
+        # line.
+        spans_plane = np.linalg.matrix_rank(table_positions - table_positions[0]) == 2
         if not spans_plane:
             return np.asarray(nearest_weights)
-        linear_weights = scipy.interpolate.LinearNDInterpolator(positions, values)(presses)  # NaN outside the table
+        interpolate = scipy.interpolate.LinearNDInterpolator(table_positions, table_weights)
+        linear_weights = interpolate(presses)  # NaN outside the convex hull of the table
         return np.asarray(np.where(np.isnan(linear_weights), nearest_weights, linear_weights))
 
 
@@ -112,7 +115,7 @@ weighted root mean square with the weights of a `WeightMap`.
 
 
 def read_goal(text: str) -> Goal:
-    """Convert the value of the option `--goal` into a goal.
+    """Convert the value of the option `--goal` into the goal of a design, which is the quantity that it minimises.
 
     Args:
         text: "worst", "rms", or the path of a CSV file. The file contains the weights of the position errors at several
@@ -132,8 +135,9 @@ def read_goal(text: str) -> Goal:
         if header.replace(" ", "") != WEIGHT_MAP_HEADER:
             raise ValueError(f"the columns are {header!r}")
         table = np.loadtxt(lines, delimiter=",", ndmin=2)
-        has_three_columns = len(table) > 0 and table.shape[1] == 3
-        if not has_three_columns or not np.isfinite(table).all() or table[:, 2].min() < 0.0:
+        has_rows_of_three = len(table) > 0 and table.shape[1] == 3
+        is_valid = has_rows_of_three and np.isfinite(table).all() and table[:, 2].min() >= 0.0
+        if not is_valid:
             raise ValueError("expected rows of three finite numbers, of which the weight is not negative")
     except (OSError, ValueError) as error:
         raise InputError(
@@ -189,6 +193,8 @@ class DesignCase:
     def __post_init__(self) -> None:
         """Check the requirements.
 
+        A kept electrode is an electrode of the initial sensor that keeps its position.
+
         Raises:
             InputError: If a value is not allowed, or the kept electrodes do not satisfy the rules.
             SceneError: If a press within the radius cannot exist.
@@ -200,9 +206,9 @@ class DesignCase:
                 "of a press are three unknowns"
             )
         check_family(self.sensor.coated_film, self.probe, Domain(self.radius, (self.force, self.force)))
-        _check_length("gap", self.gap, 0.0)
-        _check_length("rim", self.rim, 0.0)
-        _check_length("side", self.square_side, 1e-2)
+        _check_length("gap", self.gap, minimum=0.0)
+        _check_length("rim", self.rim, minimum=0.0)
+        _check_length("side", self.square_side, minimum=1e-2)
         if not self.noise.white > 0.0:
             raise InputError(
                 f"noise {self.noise.name!r}: expected white noise above 0, because errors have no lower limit "
@@ -213,7 +219,7 @@ class DesignCase:
         self._check_kept_electrodes()
 
     def _check_kept_electrodes(self) -> None:
-        """Raise an error if the kept electrodes do not satisfy the rules for kept electrodes.
+        """Raise an error if the electrodes to be kept cannot be a part of the new layout.
 
         The kept electrodes must exist and must be at their nominal positions. At least one electrode must be new. With
         the readout 'edge', all squares must have the same side.
@@ -234,9 +240,7 @@ class DesignCase:
         if self.sensor.readout != "edge":
             return
         for electrode in self.kept_electrodes:
-            lower_left, lower_right, *_ = electrode.corners
-            side = lower_right[0] - lower_left[0]
-            if electrode.square and abs(side - self.square_side) > 1e-6:  # allows for rounding errors
+            if electrode.square and abs(_side_of(electrode) - self.square_side) > 1e-6:  # allows for rounding errors
                 raise InputError(
                     f"side: with the readout 'edge' all squares have one side, got {self.square_side:g} mm"
                 )
@@ -253,12 +257,11 @@ class DesignCase:
         squares = [electrode for electrode in self.sensor.electrodes if electrode.square]
         if not squares:
             return DEFAULT_SIDE
-        lower_left, lower_right, *_ = squares[0].corners
-        return float(lower_right[0] - lower_left[0])
+        return _side_of(squares[0])
 
     @property
     def kept_electrodes(self) -> tuple[Electrode, ...]:
-        """Electrodes of the sensor that keep their positions."""
+        """Electrodes whose positions in the new layout are the same as in the initial sensor."""
         return tuple(self.sensor.electrodes[electrode_index(self.sensor, name)] for name in self.keep)
 
     @property
@@ -273,7 +276,10 @@ class DesignCase:
 
     @property
     def search_presses(self) -> Array:
-        """Positions (x, y) of the presses for which the exchange evaluates a layout, shape (n, 2), mm."""
+        """Positions (x, y) of the presses for which the first stage of the search evaluates layouts.
+
+        The shape is (n, 2), and the unit is mm.
+        """
         complex_positions = self.radius * lattice(MAX_SEARCH_PRESSES)  # x + iy
         return np.stack([complex_positions.real, complex_positions.imag], axis=1)
 
@@ -299,8 +305,8 @@ class DesignCase:
     def clearance(self, positions: Array) -> Array:
         """Compute the margin with which each square satisfies the distance rules.
 
-        The distance between a square and the rim of the film must be at least `rim`. The gap between a square and the
-        bounding box of a kept electrode must be at least `gap`.
+        The distance between a square and the rim of the film must be at least `self.rim`. The gap between a square and
+        each bounding box of a kept electrode must be at least `self.gap`.
 
         Args:
             positions: Centres (x, y) of the squares, shape (n, 2), mm.
@@ -355,7 +361,8 @@ class DesignCase:
     def layout(self, positions: Array) -> Sensor:
         """Create the sensor that has the kept electrodes and new squares at given positions.
 
-        The new squares are named in anticlockwise order, beginning at the x axis.
+        The new squares are named in anticlockwise order, beginning at the x axis. The electrodes of the sensor are
+        sorted by their names. The sensor is not calibrated, because a calibration belongs to the initial layout.
 
         Args:
             positions: Centres (x, y) of the new squares, shape (n, 2), mm.
@@ -391,6 +398,12 @@ class DesignCase:
             "rim_mm": self.rim,
             "seed": self.seed,
         }
+
+
+def _side_of(square: Electrode) -> float:
+    """Return the side of a square electrode, mm."""
+    lower_left, lower_right, *_ = square.corners
+    return float(lower_right[0] - lower_left[0])
 
 
 def _check_length(name: str, value: float, minimum: float) -> None:

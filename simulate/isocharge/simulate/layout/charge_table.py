@@ -3,7 +3,8 @@
 The table also contains the derivatives of the charges with respect to the position and the force of the press, the
 probe radius and the pretension. The equilibrium of a round film under a press depends on the distance of the press from
 the centre, but not on the electrodes. A conformal map (see `mesh.placement`) transforms the edge of the probe into a
-circle |z| = rho. In the coordinate z of the conformal map, the stress is smooth except for a kink on the circle.
+circle |z| = r0 around the origin. In the coordinate z of the conformal map, the stress is smooth except for a kink on
+the circle.
 
 The equilibrium is solved for presses at a few distances from the centre. In `distance_coordinate`, these distances are
 Chebyshev nodes. The stress and its derivatives are stored on a polar grid in z. The derivatives are computed by finite
@@ -57,7 +58,7 @@ ANGLES = 64
 """Number of columns of the polar grid, at equal angles."""
 
 MARGIN = 0.03
-"""Width of the gap of the polar grid on either side of the circle |z| = rho, in units of rho, dimensionless.
+"""Width of the gap of the polar grid on either side of the circle |z| = r0, in units of r0, dimensionless.
 
 The gap contains no nodes, because the finite differences would be wrong there: the stress has a kink on the circle.
 """
@@ -146,10 +147,11 @@ class ChargeTable:
         largest_coordinate = float(distance_coordinate(radius / film.radius))
         distance = film.radius * np.tanh(chebyshev_nodes(n_distance, 0.0, largest_coordinate))
         solve = partial(_stress_at, film, sensor.surface, probe, force, settings)
-        solved = list(track(in_order(executor, solve, distance.tolist()), "solving the film", n_distance))
+        stresses = list(track(in_order(executor, solve, distance.tolist()), "solving the film", n_distance))
 
-        # The axes (distance, column, node, stress component) become (distance, stress component, node, column).
-        component_before_node = np.stack(solved).transpose(0, 3, 2, 1)
+        # A column is one of the quantities in `COLUMNS`: the stress itself, or one of its derivatives. The axes
+        # (distance, column, node, stress component) become (distance, stress component, node, column).
+        component_before_node = np.stack(stresses).transpose(0, 3, 2, 1)
         stress = component_before_node.reshape(3 * n_distance, -1).astype(np.float32)
         return cls(film.radius, probe, (sensor.piezo.d31, sensor.piezo.d32), distance, stress)
 
@@ -171,7 +173,7 @@ class ChargeTable:
         """
         chunks = []
         for start in range(0, len(presses), PRESS_CHUNK):
-            pressed = _PressedFilm.of(self, presses[start : start + PRESS_CHUNK])
+            pressed = _PressedFilm.interpolate(self, presses[start : start + PRESS_CHUNK])
             square_rows = pressed.square_rows(centres, side)
             other_rows = [pressed.electrode_rows(electrode) for electrode in others]
             chunks.append(np.concatenate([square_rows, *other_rows], axis=1))
@@ -186,9 +188,9 @@ class _PressedFilm:
         table: Charge table from which the charges per area were interpolated.
         presses: Positions x + iy of the presses, shape (n,), mm.
         direction: Unit vector from the centre to each press as a complex number, shape (n,).
-        pole: Parameter of the conformal map of each press, shape (n,), dimensionless.
-        rho: Radius of the circle to which the conformal map of each press maps the edge of the probe, shape (n,),
-            dimensionless.
+        map_parameter: Parameter c of the conformal map of each press, shape (n,), dimensionless.
+        circle_radius: Radius r0 of the circle to which the conformal map of each press maps the edge of the probe,
+            shape (n,), dimensionless.
         density: Charge per area (pC/mm^2) and its derivatives with the columns `COLUMNS`, shape (n * n_node, 6). The
             derivatives with respect to the position are along and across the direction of the press.
     """
@@ -196,12 +198,12 @@ class _PressedFilm:
     table: ChargeTable
     presses: Complexes
     direction: Complexes
-    pole: Array
-    rho: Array
+    map_parameter: Array
+    circle_radius: Array
     density: np.ndarray
 
     @classmethod
-    def of(cls, table: ChargeTable, presses: Array) -> "_PressedFilm":
+    def interpolate(cls, table: ChargeTable, presses: Array) -> "_PressedFilm":
         """Compute the charges per area that several presses cause by interpolating a charge table.
 
         Args:
@@ -225,10 +227,10 @@ class _PressedFilm:
         flat_weights = weights.reshape(len(position), -1).astype(np.float32)
         density = (flat_weights @ table.stress).reshape(-1, len(COLUMNS))  # shape (n * n_node, 6)
 
-        # Compute the conformal map of each press, which transforms the edge of the probe into the circle |z| = rho.
+        # Compute the conformal map of each press, which transforms the edge of the probe into the circle |z| = r0.
         relative_radius = np.full(len(position), table.probe.radius / table.film_radius)
-        pole, rho = automorphism_onto(relative_distance, relative_radius)
-        return cls(table, position, direction, pole, rho, density)
+        map_parameter, circle_radius = automorphism_onto(relative_distance, relative_radius)
+        return cls(table, position, direction, map_parameter, circle_radius, density)
 
     def square_rows(self, centres: Array, side: float) -> Array:
         """Compute the charges of squares and their derivatives for all presses.
@@ -247,8 +249,9 @@ class _PressedFilm:
         half_diagonal = np.sqrt(0.5) * side
         relative_distance = distance / (half_diagonal + self.table.probe.radius)
 
-        # Choose the integration rule of each pair of a press and a square. Then compute all pairs with the same rule
-        # together, in chunks that limit the memory.
+        # Choose the integration rule of each pair of a press and a square: the first rule whose largest distance is not
+        # below the distance of the pair. Then compute all pairs with the same rule together, in chunks that limit the
+        # memory.
         chosen_rule = np.searchsorted([largest_distance for largest_distance, _ in GAUSS_RULES], relative_distance)
         rows = np.empty((*distance.shape, len(COLUMNS)))
         for rule_index, (_, points_per_side) in enumerate(GAUSS_RULES):
@@ -274,7 +277,7 @@ class _PressedFilm:
         _, points_per_side = GAUSS_RULES[0]  # the finest rule
         points, component_weights = electrode_rule(electrode, "area", points_per_side)
         weights = component_weights[:, 0]  # the weights of s11, s22 and s12 are equal
-        n_chunk = math.ceil(len(self.presses) * len(points) / POINT_CHUNK)
+        n_chunk = math.ceil(len(self.presses) * len(points) / POINT_CHUNK)  # the chunks limit the memory
         means = []
         for press_chunk in np.array_split(np.arange(len(self.presses)), n_chunk):
             chunk_points = np.broadcast_to(points, (len(press_chunk), *points.shape))
@@ -353,20 +356,21 @@ class _PressedFilm:
         Returns:
             Fractional rows and columns, each of shape (k, n_point).
         """
-        # Compute the coordinate z of the conformal map of the press, which maps the footprint onto the disk |z| <= rho.
-        pole = self.pole[press_index, None]
-        rho = self.rho[press_index, None]
+        # Compute the coordinate z of the conformal map of the press, which maps the footprint onto the disk |z| <= r0.
+        map_parameter = self.map_parameter[press_index, None]
+        circle_radius = self.circle_radius[press_index, None]
         relative_points = points / self.table.film_radius
         unit_points = relative_points / np.maximum(np.abs(relative_points), 1.0)  # moves points beyond the rim
-        z = (unit_points - pole) / (1.0 - pole * unit_points)
+        z = (unit_points - map_parameter) / (1.0 - map_parameter * unit_points)
         radius = np.abs(z)
 
-        # Invert the formulas of `_grid_points`: the rows are equally spaced in |z| within the circle |z| = rho, and in
+        # Invert the formulas of `_grid_points`: the rows are equally spaced in |z| within the circle |z| = r0, and in
         # ln|z| outside.
-        inner_row = radius / (rho * (1.0 - MARGIN)) * (INNER_ROWS - 1)
-        outer_fraction = 1.0 - np.log(np.maximum(radius, rho)) / np.log(rho * (1.0 + MARGIN))
+        inner_row = radius / (circle_radius * (1.0 - MARGIN)) * (INNER_ROWS - 1)
+        outer_radius = np.maximum(radius, circle_radius)  # avoids ln 0 for inner points, whose outer row is not used
+        outer_fraction = 1.0 - np.log(outer_radius) / np.log(circle_radius * (1.0 + MARGIN))
         outer_row = INNER_ROWS + outer_fraction * (OUTER_ROWS - 1)
-        row = np.where(radius <= rho, inner_row, outer_row)
+        row = np.where(radius <= circle_radius, inner_row, outer_row)
         column = np.angle(z) * ANGLES / (2.0 * np.pi)  # columns have equal angles
         return row, column
 
@@ -396,23 +400,24 @@ def _piezo_in_press_frame(piezo: tuple[float, float], direction: Complexes) -> A
     return np.stack([s11_coefficient, s22_coefficient, s12_coefficient], axis=1)
 
 
-def _row_weights(row: Array) -> tuple[Integers, Array]:
+def _row_weights(fractional_row: Array) -> tuple[Integers, Array]:
     """Find the rows of the polar grid between which values are interpolated, and the weights of these rows.
 
-    A fractional row is a position between rows: the fractional row 2.5 lies halfway between the rows 2 and 3. The inner
-    rows lie inside the edge of the probe, and the outer rows lie outside. The interpolation does not cross this edge,
-    because the stress has a kink there. Up to half a row beyond the last inner row, only inner rows are used. Farther
-    outside, only outer rows are used.
+    A row of the grid contains the nodes at one distance from the origin, and is numbered from the inside to the
+    outside. A fractional row is a position between rows: the fractional row 2.5 lies halfway between the rows 2 and 3.
+    The inner rows lie inside the edge of the probe, and the outer rows lie outside. The interpolation does not cross
+    this edge, because the stress has a kink there. Up to half a row beyond the last inner row, only inner rows are
+    used. Farther outside, only outer rows are used.
 
     Args:
-        row: Fractional rows, any shape. The outer rows are numbered after the inner rows.
+        fractional_row: Fractional rows, any shape. The outer rows are numbered after the inner rows.
 
     Returns:
         Indices of four rows for each fractional row, and the weights of these rows, each of shape (..., 4).
     """
-    is_inner = (row < INNER_ROWS - 0.5)[..., None]
-    inner_rows, inner_weights = cubic_weights(row, INNER_ROWS)
-    outer_rows, outer_weights = cubic_weights(row - INNER_ROWS, OUTER_ROWS)
+    is_inner = (fractional_row < INNER_ROWS - 0.5)[..., None]
+    inner_rows, inner_weights = cubic_weights(fractional_row, INNER_ROWS)
+    outer_rows, outer_weights = cubic_weights(fractional_row - INNER_ROWS, OUTER_ROWS)
     rows = np.where(is_inner, inner_rows, outer_rows + INNER_ROWS)
     weights = np.where(is_inner, inner_weights, outer_weights)
     return rows, weights
@@ -495,7 +500,7 @@ def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Ar
     """For a press on the positive x axis, compute the points of the polar grid.
 
     The grid is polar in the coordinate z of a conformal map. The conformal map transforms the edge of the probe into a
-    circle |z| = rho around the centre. The rows of the grid are equally spaced in |z| within the circle, and equally
+    circle |z| = r0 around the centre. The rows of the grid are equally spaced in |z| within the circle, and equally
     spaced in ln|z| outside the circle.
 
     Args:
@@ -506,16 +511,18 @@ def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Ar
     Returns:
         Points (x, y) on the film, row by row, shape (n_node, 2), mm.
     """
-    # Create the grid in the plane of z, with a small gap on both sides of the circle |z| = rho.
-    pole, rho = automorphism_onto(np.array(distance / film_radius), np.array(probe_radius / film_radius))
-    inner_radii = rho * (1.0 - MARGIN) * np.linspace(0.0, 1.0, INNER_ROWS)
-    outer_radii = (rho * (1.0 + MARGIN)) ** np.linspace(1.0, 0.0, OUTER_ROWS)
+    # Create the grid in the plane of z, with a small gap on both sides of the circle |z| = r0.
+    relative_distance = np.array(distance / film_radius)
+    relative_radius = np.array(probe_radius / film_radius)
+    map_parameter, circle_radius = automorphism_onto(relative_distance, relative_radius)
+    inner_radii = circle_radius * (1.0 - MARGIN) * np.linspace(0.0, 1.0, INNER_ROWS)
+    outer_radii = (circle_radius * (1.0 + MARGIN)) ** np.linspace(1.0, 0.0, OUTER_ROWS)  # ends at 1, which is the rim
     radii = np.concatenate([inner_radii, outer_radii])
     directions = np.exp(2j * np.pi * np.arange(ANGLES) / ANGLES)
     z = radii[:, None] * directions
 
-    # Map the grid onto the film by the inverse of the conformal map z = (p - pole) / (1 - pole p) of a point p. The
+    # Map the grid onto the film by the inverse of the conformal map z = (p - c) / (1 - c p) of a point p. The
     # last factor keeps the outermost points on the film despite rounding errors.
-    unit_points = ((z + pole) / (1.0 + pole * z)).ravel()
+    unit_points = ((z + map_parameter) / (1.0 + map_parameter * z)).ravel()
     points = film_radius * unit_points * (1.0 - 1e-12)
     return np.stack([points.real, points.imag], axis=1)

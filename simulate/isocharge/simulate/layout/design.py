@@ -158,13 +158,14 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     # checked if there is no accurate forward map.
     forward_map = _solve_forward_map(case, executor)
     checked_layouts: list[_CheckedLayout] = []
-    for error, *coordinates in track(refined_layouts, "looking for folds and ambiguous pairs"):
-        centres = np.round(np.array(coordinates).reshape(-1, 2), DECIMALS)  # the order is x1, y1, x2, y2, ...
+    for layout in track(refined_layouts, "looking for folds and ambiguous pairs"):
+        error = float(layout[0])
+        centres = np.round(layout[1:].reshape(-1, 2), DECIMALS)  # the order is x1, y1, x2, y2, ...
         sensor = case.layout(centres)
         summary = NOT_SEARCHED
         if forward_map is not None:
-            summary = ambiguities(case, ChargeSpline.of(replace(forward_map, sensor=sensor)))
-        checked_layouts.append(_CheckedLayout(sensor, float(error), summary))
+            summary = describe_ambiguities(case, ChargeSpline.of(replace(forward_map, sensor=sensor)))
+        checked_layouts.append(_CheckedLayout(sensor, error, summary))
         if summary == UNAMBIGUOUS:
             break
 
@@ -203,8 +204,8 @@ def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMa
         return None
 
 
-def ambiguities(case: DesignCase, charges: ChargeMap) -> str:
-    """Search for folds and ambiguous pairs of a layout, and describe them in a sentence.
+def describe_ambiguities(case: DesignCase, charges: ChargeMap) -> str:
+    """Search for folds and ambiguous pairs of a layout, and describe them in a short text.
 
     The search covers three forces: the smallest and the largest force of the charge map, and the force of the case.
 
@@ -213,7 +214,8 @@ def ambiguities(case: DesignCase, charges: ChargeMap) -> str:
         charges: Charge map of the layout.
 
     Returns:
-        `UNAMBIGUOUS` if there are no folds and no ambiguous pairs. Otherwise a sentence about the folds and pairs.
+        `UNAMBIGUOUS` if there are no folds and no ambiguous pairs. Otherwise a text with the smallest distance of a
+        fold from the centre and the number of pairs.
     """
     min_force, max_force = charges.domain.force_range
     forces = sorted({min_force, case.force, max_force})

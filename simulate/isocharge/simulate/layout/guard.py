@@ -6,7 +6,7 @@ distance from the centre.
 
 The search first finds pairs of contacts that have the same charges without the guard electrode. One contact of a pair
 is a press outside the working area, and the other contact is inside the working area. For each possible position of the
-guard electrode, the charge of this electrode is added to the charges of each pair, and a least-squares descent starts
+guard electrode, the charge of this electrode is added to the charges of each pair. A least-squares descent then starts
 from the inner contact. If the descent finds a contact with the same charges, the guard electrode does not reveal the
 press outside. For the best positions, the mirror region is computed by a search over the whole working area.
 """
@@ -60,7 +60,9 @@ LIMIT_ANGLES = 36
 
 @dataclass(frozen=True)
 class PositionLimits:
-    """Cramer-Rao limits of the position error for presses in the working area. The force is that of a design case.
+    """Cramer-Rao limits of the position error for presses in the working area.
+
+    All presses have the force of a design case.
 
     Attributes:
         rms: Root mean square of the limits over the working area, mm.
@@ -154,8 +156,8 @@ def guard_case(sensor: Sensor, radius: float, **settings: Any) -> DesignCase:
 def design_guard(case: DesignCase, *, executor: Executor | None = None) -> GuardDesign:
     """Find the position at which a guard electrode leaves the fewest presses outside the working area unnoticed.
 
-    If several positions have nearly the smallest share of unnoticed presses, the function prefers the position with the
-    smallest Cramer-Rao limits of the position error in the working area.
+    Several positions may have nearly the smallest share of unnoticed presses. The function then prefers the position
+    with the smallest Cramer-Rao limits of the position error in the working area.
 
     Args:
         case: Design case that `guard_case` created.

@@ -2,7 +2,7 @@
 
 The parameters of a press are x, y, ln F and the nuisance parameters. Let the matrix A contain the derivatives of the
 charges of all electrodes with respect to the parameters. Let W be the diagonal matrix of the Fisher information that
-one reading provides about each charge, and let P be the inverse of the prior covariance of the parameters. The Fisher
+one reading provides about each charge. Let P be the inverse of the prior covariance of the parameters. The Fisher
 information matrix of the parameters is B = A' W A + P. The Cramer-Rao limit of the position is the block of the inverse
 of B that belongs to x and y.
 
@@ -66,9 +66,9 @@ class ErrorModel:
     def sensitivity(self, rows: Array) -> Array:
         """Compute dimensionless derivatives of the charges with respect to the parameters of a press.
 
-        A derivative is multiplied by the prior standard deviation of the parameter and by the square root of the Fisher
-        information of a reading. In these units, the variances of the parameters and of the noise are 1. The parameters
-        are x, y, ln F, the probe radius and the pretension.
+        Each derivative is multiplied by the prior standard deviation of its parameter, and by the square root of the
+        Fisher information that a reading provides about the charge. In these units, the variances of the parameters and
+        of the noise are 1. The parameters are x, y, ln F, the probe radius and the pretension.
 
         Args:
             rows: Rows of a charge table, which contain a charge and its derivatives, shape (..., 6).

@@ -1,10 +1,10 @@
 """Search for electrode positions with small position errors, in two stages.
 
-The first stage starts from a random layout and is an exchange on a grid (Fedorov 1972; Meyer and Nachtsheim 1995). Each
-square in turn is moved to the position of the grid at which the error of the whole layout is smallest, until the error
-no longer decreases. The formula of Sherman and Morrison computes the errors for all positions of the grid at once (see
-`position_error`). If the goal is the largest error, the exchange minimises an approximation of the largest error: a
-power mean of all errors.
+The first stage starts from a random layout and is an exchange on a grid (Fedorov 1972; Meyer and Nachtsheim 1995). One
+square after the other is moved to the grid position at which the error of the whole layout is smallest. The exchange
+ends when the error no longer decreases. The formula of Sherman and Morrison computes the errors for all positions of
+the grid at once (see `position_error`). If the goal is the largest error, the exchange minimises an approximation of
+the largest error: a power mean of all errors.
 
 The second stage is a refinement. The largest error mostly occurs near the edge of an electrode, between the presses of
 a coarse grid. The refinement therefore considers the presses with the largest errors on a fine grid. The refinement
@@ -214,7 +214,7 @@ class Search:
             Layouts in ascending order of their errors. A layout contains the centre (x, y) of each new square, shape
             (n_new, 2), mm.
         """
-        exchange = _Exchange.of(self, grid)
+        exchange = _Exchange.prepare(self, grid)
         results = [exchange.improve(layout) for layout in track(layouts, "exchanging")]
         results.sort(key=lambda result: result[0])  # a result is a pair of the error and the layout
 
@@ -265,9 +265,10 @@ class Search:
     def _log_error_jacobian(self, positions: Array, selection: Integers | slice) -> Array:
         """Compute the derivatives of `_log_errors` with respect to the coordinates of the squares.
 
-        The derivatives are forward differences. The errors are computed from the rows of the electrodes. The row of an
-        electrode contains its charge and the derivatives of the charge, for each press. If one square moves, only the
-        row of this square changes.
+        There is one error for each selected press if the goal is the largest error, and a single error for all other
+        goals. The derivatives are forward differences. The errors are computed from the rows of the electrodes. The row
+        of an electrode contains its charge and the derivatives of the charge, for each press. If one square moves, only
+        the row of this square changes.
 
         Args:
             positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
@@ -445,7 +446,7 @@ class _Exchange:
     power: float
 
     @classmethod
-    def of(cls, search: Search, grid: Array) -> "_Exchange":
+    def prepare(cls, search: Search, grid: Array) -> "_Exchange":
         """Prepare exchanges by computing the sensitivities of a square at every position of a grid.
 
         Args:
@@ -469,7 +470,7 @@ class _Exchange:
     def mean_powers(self, other_squares: Integers) -> Array:
         """Add a square to a layout at each position of the grid in turn, and compute how large the errors then are.
 
-        The measure is the weighted mean over the presses of the position error, raised to the exponent `power`.
+        The measure is the weighted mean of the p-th powers of the position errors of all presses, where p is `power`.
 
         Args:
             other_squares: Indices of the grid positions of the new squares to which the square is added, shape

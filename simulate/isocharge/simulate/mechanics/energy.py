@@ -63,8 +63,8 @@ class ElasticFilm:
         self.back = BackPressure(geometry, groups) if groups.has_back_pressure else None
 
     @property
-    def components(self) -> int:
-        """Number of unknowns per node in the linear solves."""
+    def unknowns_per_node(self) -> int:
+        """Number of unknowns per node in the linear solves. Bending has an auxiliary unknown."""
         return 3 if self.bending is None else 4
 
     @property
@@ -152,7 +152,8 @@ class ElasticFilm:
             added_tension: Tension that is added to the pretension, in units of E_young A^2.
 
         Returns:
-            Element matrices, shape (n_element, n_local, components, n_local, components).
+            Element matrices, shape (n_element, n_local, n_unknown, n_local, n_unknown), where
+            n_unknown is `unknowns_per_node`.
         """
         tangent = Membrane(self.geometry, self.groups.stiffened(added_tension)).tangent(field)
         if self.bending is None:
@@ -407,9 +408,8 @@ class Bending:
     def __init__(self, geometry: Geometry, stiffness: float) -> None:
         """Compute the matrices L and M of a mesh, from which the bending energy is computed.
 
-        An element of L is the integral of the product of the gradients of two basis functions. An element of the mass
-        matrix M is the integral of the product of two basis functions. With the quadrature rule of the nodes, M is
-        diagonal.
+        The matrix L contains the integrals of dot(grad p, grad q) for all pairs of basis functions p and q. The mass
+        matrix M contains the integrals of p q. With the quadrature rule of the nodes, M is diagonal.
 
         Args:
             geometry: Integration rules of the elements.
@@ -432,9 +432,8 @@ class Bending:
     def laplacian(self, deflection: Array) -> Array:
         """Compute the Laplacian m = -M^-1 L W of the deflection W.
 
-        Each element of the matrix L is the integral of the product of the gradients of two basis functions. Each
-        element of the mass matrix M is the integral of the product of two basis functions, computed with the quadrature
-        rule of the nodes.
+        The matrix L contains the integrals of dot(grad p, grad q) for all pairs of basis functions p and q. The mass
+        matrix M contains the integrals of p q, computed with the quadrature rule of the nodes.
 
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).

@@ -1,17 +1,16 @@
 """Dimensionless groups of a press, and the amplitude by which the deflection of the film is scaled.
 
 A force F at the centre of the film deflects the centre by w = a A, where a is the radius of the film and A is the
-amplitude. With Young's modulus E and the thickness h of the film, the dimensionless force F / (E h a) is proportional
-to
+amplitude. With Young's modulus E and the thickness h of the film, the dimensionless force F / (E h a) is approximately
 
-    A^3                     for a membrane without pretension,
-    (pretension / E) A      for a membrane with a large pretension,
-    16 pi b A               for a plate, with b = (h / a)^2 / (12 (1 - poisson^2))
+    A^3                         for a membrane without pretension,
+    1.6 (pretension / E) A      for a membrane with a large pretension,
+    16 pi b A                   for a plate, with b = (h / a)^2 / (12 (1 - poisson^2))
 
 (Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). The amplitude A is the solution of a cubic equation, in
 which the sum of the three terms equals F / (E h a). Between the three limiting cases, the cubic equation is a good
 approximation. The in-plane displacement is proportional to A^2. If the deflection is divided by a A, the scaled
-deflection is of order one, and only the ratios of the three terms remain as parameters of the press.
+deflection is of order one. Only the ratios of the three terms then remain as parameters of the press.
 """
 
 from dataclasses import dataclass, replace

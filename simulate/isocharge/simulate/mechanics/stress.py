@@ -82,8 +82,8 @@ def stress(strain: Array, poisson: float, moduli: Array | None = None) -> Array:
 def stress_rotation(angle: float) -> Array:
     """Return the matrix that transforms stresses from a rotated frame to the unrotated frame.
 
-    If C is the elasticity matrix of a material in the rotated frame and T is the returned matrix, then T C T^T is the
-    elasticity matrix of the material in the unrotated frame.
+    Let C be the elasticity matrix of a material in the rotated frame, and let T be the returned matrix. The elasticity
+    matrix of the material in the unrotated frame is then T C T^T.
 
     Args:
         angle: Angle of the rotated frame, anticlockwise, rad.

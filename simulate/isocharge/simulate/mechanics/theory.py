@@ -105,11 +105,12 @@ def bending_length(film: Film, force: float) -> float:
 def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
     """Estimate by how much the bending of the film at the footprint changes a charge, relative to the charge.
 
-    The estimated change is proportional to the squared ratio of the bending length to the reach R of the footprint. The
-    tension at the footprint is the sum of the pretension and the induced stress S. The induced stress is estimated for
-    a membrane without pretension. If w' is the slope of the membrane at the footprint, the stress is S = E w'^2 / 2.
-    The vertical force at the footprint is 2 pi R h S w' = F. The equations for the stress and for the force result in
-    w'^3 = F / (pi R h E). If the induced stress is much larger than the pretension, bending hardly changes the charges.
+    The tension at the footprint is the sum of the pretension and the induced stress S. The estimated change is
+    proportional to two factors: the squared ratio of the bending length to the reach R of the footprint, and the share
+    of the pretension in the tension. The induced stress is estimated for a membrane without pretension. If w' is the
+    slope of the membrane at the footprint, the stress is S = E w'^2 / 2. The vertical force at the footprint is 2 pi R
+    h S w' = F. The equations for the stress and for the force result in w'^3 = F / (pi R h E). If the induced stress is
+    much larger than the pretension, bending hardly changes the charges.
 
     Args:
         film: The film, with Young's modulus E and thickness h.

@@ -105,7 +105,8 @@ class Blocks:
         self.n_sector = 2 * self.n_meshed * self.n_half_edge
         self.n_quad = self.n_meshed * self.n_half_edge**2
 
-        # Count the elements inside the innermost circle, and then all elements including the rings.
+        # Count the elements inside the innermost circle, and then all elements including the rings. There are two
+        # layers if the boundary of the footprint is a curve between the core polygon and the innermost circle.
         self.n_layer = 2 if topology.is_curved and not topology.fills_circle else 1
         self.n_inner = self.n_quad + self.n_layer * self.n_sector
         self.n_ring = resolution.rings + resolution.rim
@@ -151,9 +152,9 @@ class Blocks:
     def core_outline(self) -> Array:
         """Points along the edges of the core polygon, shape (n_sector + 1, n_corner + 1).
 
-        Each point is a weighted sum of the corners and the centroid of the core polygon, and is described by its
-        weights. The points are ordered anticlockwise. The first point is the middle of the edge before the first
-        corner.
+        The core polygon is the part of the footprint whose elements have straight sides. Each point is a weighted sum
+        of the corners and the centroid of the core polygon, and is described by its weights. The points are ordered
+        anticlockwise. The first point is the middle of the edge before the first corner.
         """
         # Weights of the corners, and of the middle of the edge after each corner. The weights of a corner are 1 for the
         # corner itself, and 0 for all other corners and for the centroid.
@@ -246,6 +247,7 @@ class Blocks:
         Returns:
             Index of the element that takes the place of each element, shape (n_element,).
         """
+        # The rotation maps corners onto corners, so it is a rotation by a whole number of corners.
         corner_shift = steps * self.n_corner // steps_per_turn
         sector_shift = 2 * self.n_half_edge * corner_shift
         core_elements = np.arange(self.n_quad).reshape(self.n_meshed, -1)  # one row for each corner

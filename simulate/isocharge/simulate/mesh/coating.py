@@ -152,7 +152,7 @@ class Coating:
         difference_x = self._shares(points + step).sum(-1) - self._shares(points - step).sum(-1)
         difference_y = self._shares(points + 1j * step).sum(-1) - self._shares(points - 1j * step).sum(-1)
 
-        # Normalise the gradient, except where it is zero.
+        # Normalise the gradient. Where the gradient is zero, return an arbitrary unit vector.
         length = np.hypot(difference_x, difference_y)
         has_gradient = length > 0.0
         normal_x = np.full_like(length, np.sqrt(0.5))

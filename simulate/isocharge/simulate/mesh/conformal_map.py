@@ -40,23 +40,23 @@ def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
     """Compute the disk automorphism that maps a circle around the origin onto a given circle.
 
     The map converts a point z into (z + c) / (1 + c z) with a parameter c. The circle around the origin has the radius
-    rho. For points on the x axis, the map adds arctanh(c) to arctanh(z). The map must convert -rho and rho into the two
-    points at which the given circle intersects the x axis. These two conditions determine c and rho.
+    r. For points on the x axis, the map adds arctanh(c) to arctanh(z). The map must convert -r and r into the two
+    points at which the given circle intersects the x axis. These two conditions determine c and r.
 
     Args:
         centre: Position of the centre of the given circle on the x axis, any shape, in film radii.
         radius: Radius of the given circle, same shape, in film radii.
 
     Returns:
-        Parameter c and radius rho, each of the shape of `centre`.
+        Parameter c and radius r, each of the shape of `centre`.
     """
-    # The conditions are right_end = arctanh(c) + arctanh(rho) and left_end = arctanh(c) - arctanh(rho). Their sum
-    # determines c, and their difference determines rho.
+    # The conditions are right_end = arctanh(c) + arctanh(r) and left_end = arctanh(c) - arctanh(r). Their sum
+    # determines c, and their difference determines r.
     right_end = np.arctanh(centre + radius)
     left_end = np.arctanh(centre - radius)
-    c = np.tanh(0.5 * (right_end + left_end))
-    rho = np.tanh(0.5 * (right_end - left_end))
-    return c, rho
+    map_parameter = np.tanh(0.5 * (right_end + left_end))
+    template_radius = np.tanh(0.5 * (right_end - left_end))
+    return map_parameter, template_radius
 
 
 def distance_coordinate(distance: Array | float) -> Any:
@@ -132,7 +132,7 @@ def sector_angles(
     centroid: Array,
     centre: Array,
     radius: Array,
-    c_rho: Array,
+    stretch: Array,
 ) -> Array:
     """Compute the angles at which the sides of the sectors meet the innermost circle.
 
@@ -151,7 +151,8 @@ def sector_angles(
         centroid: Position of the centroid of the footprint on the x axis, shape (...), in film radii.
         centre: Position of the centre of the circle on the x axis, shape (...), in film radii.
         radius: Radius of the circle, shape (...), in film radii.
-        c_rho: Product of the parameters c and rho of the conformal map, shape (...).
+        stretch: Factor with which `stretch_angles` converts angles on the circle into angles in the template plane,
+            shape (...); see `stretch_on_circle`.
 
     Returns:
         Angles in the template plane in increasing order, shape (..., n_sector + 1), rad.
@@ -169,7 +170,6 @@ def sector_angles(
     film_angle = np.concatenate([first_angle, first_angle + np.cumsum(increase, axis=-1)], axis=-1)
 
     # Convert the angles on the film into angles in the template plane.
-    stretch = (1.0 + c_rho) / (1.0 - c_rho)
     return stretch_angles(film_angle, stretch)
 
 
@@ -226,7 +226,7 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) ->
     return np.concatenate([angles, mixed_angle[..., -1:]], axis=-1)
 
 
-def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
+def rim_angles(angle: Array, map_parameter: Array, template_radius: Array) -> Array:
     """Compute the angles at which the sides of the sectors meet the rim.
 
     The conformal map compresses the far side of the film, which lies at the angle pi. Therefore the sides of the
@@ -234,23 +234,39 @@ def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
 
     Args:
         angle: Angles on the innermost circle in the template plane, shape (..., n_sector + 1), rad.
-        c: Parameter of the conformal map, shape (...).
-        rho: Radius of the innermost circle in the template plane, shape (...).
+        map_parameter: Parameter c of the conformal map, shape (...).
+        template_radius: Radius of the innermost circle in the template plane, shape (...).
 
     Returns:
         Angles in the template plane, shape (..., n_sector + 1), rad.
     """
-    rim_stretch = ((1.0 + c) / (1.0 - c)) ** GRADING
-    circle_stretch = (1.0 + c * rho) / (1.0 - c * rho)  # the part of the shift in the angles on the innermost circle
-    stretch = rim_stretch / circle_stretch
-    return stretch_angles(angle, np.maximum(stretch, 1.0))
+    # A factor above 1 shifts angles towards pi. A factor below 1 would shift them back, so the factor is at least 1.
+    rim_stretch = ((1.0 + map_parameter) / (1.0 - map_parameter)) ** GRADING
+    remaining_stretch = rim_stretch / stretch_on_circle(map_parameter, template_radius)
+    return stretch_angles(angle, np.maximum(remaining_stretch, 1.0))
+
+
+def stretch_on_circle(map_parameter: Array, template_radius: Array) -> Array:
+    """Compute the factor with which `stretch_angles` converts angles on the film into angles in the template plane.
+
+    The angles on the film are measured around the centre of the innermost circle.
+
+    Args:
+        map_parameter: Parameter c of the conformal map, shape (...).
+        template_radius: Radius of the innermost circle in the template plane, shape (...).
+
+    Returns:
+        Factors for points on the innermost circle, shape (...), dimensionless.
+    """
+    product = map_parameter * template_radius
+    return np.asarray((1.0 + product) / (1.0 - product))
 
 
 def stretch_angles(angle: Array, factor: Array) -> Array:
     """Change each angle such that the tangent of half of the angle is multiplied by a factor.
 
-    For points on a circle of radius rho around the origin, the conformal map with the parameter c multiplies the
-    tangent of half of the angle by (1 - c rho) / (1 + c rho). On the rim, the radius rho is 1.
+    The conformal map with the parameter c also changes angles in this way. For points at the distance r from the
+    origin, it multiplies the tangent of half of the angle by (1 - c r) / (1 + c r). On the rim, r is 1.
 
     Args:
         angle: Angles, shape (..., n), rad.
@@ -264,28 +280,28 @@ def stretch_angles(angle: Array, factor: Array) -> Array:
     return np.asarray(full_turns + 2.0 * np.arctan(factor[..., None] * np.tan(half_angle)))
 
 
-def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
+def ring_edges(resolution: Resolution, template_radius: Array, thin_ring_width: Array) -> Array:
     """Compute the depths of the edges of the rings, from 0 on the innermost circle to 1 on the rim.
 
-    The depth of a point is ln(r / rho) / ln(1 / rho), where r is the distance of the point from the origin of the
-    template plane, and rho is the radius of the innermost circle. All rings except the thin rings at the rim cover
-    equal ranges of depth. Each thin ring is a third as wide as the previous thin ring.
+    The depth of a point is ln(r / r0) / ln(1 / r0), where r is the distance of the point from the origin of the
+    template plane, and r0 is the radius of the innermost circle. All rings except the thin rings at the rim cover equal
+    ranges of depth. Each thin ring is a third as wide as the previous thin ring.
 
     Args:
         resolution: Fineness of the mesh.
-        rho: Radius of the innermost circle in the template plane, shape (...).
-        layer: Total width of all thin rings in the template plane, shape (...).
+        template_radius: Radius of the innermost circle in the template plane, shape (...).
+        thin_ring_width: Total width of all thin rings in the template plane, shape (...).
 
     Returns:
         Depths in increasing order, shape (..., n_ring + 1).
     """
     even_edges = np.linspace(0.0, 1.0, resolution.rings + 1)
     if resolution.rim == 0:
-        return np.broadcast_to(even_edges, (*rho.shape, even_edges.size))
+        return np.broadcast_to(even_edges, (*template_radius.shape, even_edges.size))
 
-    # The thin rings extend from r = 1 - layer to r = 1, over which ln(r) increases by about `layer`. According to the
-    # definition of the depth, the depth increases by layer / ln(1 / rho).
-    requested_thin_depth = -layer / np.log(rho)
+    # With the total width t, the thin rings extend from r = 1 - t to r = 1, over which ln(r) increases by about t.
+    # According to the definition of the depth, the depth increases by t / ln(1 / r0).
+    requested_thin_depth = -thin_ring_width / np.log(template_radius)
     thin_depth = np.minimum(requested_thin_depth, _max_thin_depth(resolution))[..., None]
 
     # The even rings share the remaining depth. The part of the thin rings outside edge i is 3^-i of their total depth.
@@ -295,19 +311,19 @@ def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
     return np.concatenate([edges_of_even_rings, edges_of_thin_rings], axis=-1)
 
 
-def widest_layer(resolution: Resolution, c: Array, rho: Array) -> Array:
+def max_thin_ring_width(resolution: Resolution, map_parameter: Array, template_radius: Array) -> Array:
     """Compute the largest total width of the thin rings for which `ring_edges` does not limit their total depth.
 
     Args:
         resolution: Fineness of the mesh.
-        c: Parameter of the conformal map, shape (...).
-        rho: Radius of the innermost circle in the template plane, shape (...).
+        map_parameter: Parameter c of the conformal map, shape (...).
+        template_radius: Radius of the innermost circle in the template plane, shape (...).
 
     Returns:
         Widths, shape (...), in film radii.
     """
-    width_in_template = -np.log(rho) * _max_thin_depth(resolution)
-    return np.asarray(width_in_template * (1.0 - c) / (1.0 + c))
+    width_in_template = -np.log(template_radius) * _max_thin_depth(resolution)
+    return np.asarray(width_in_template * (1.0 - map_parameter) / (1.0 + map_parameter))
 
 
 def _max_thin_depth(resolution: Resolution) -> float:

@@ -116,7 +116,7 @@ class Geometry:
         # of its nodes add up to 1 / copies.
         node_load = np.bincount(template.nodes[footprint].ravel(), element_load.ravel(), template.n_node)
         load = node_load / (template.copies * total_load)
-        if template.constraint is not None:
+        if template.constraint is not None:  # move the forces on hanging nodes to the nodes that determine their values
             load = template.constraint.T @ load
         return cls(template.nodes, gradient, weights, load, mass, template.constraint)
 
@@ -182,7 +182,7 @@ class PlacedMesh:
 
     @cached_property
     def geometry(self) -> Geometry:
-        """Integration rules of the elements."""
+        """Integration rules of the elements, with the stiffness of the coat if the film has one."""
         is_uniform = self.placement.probe.has_uniform_pressure
         geometry = Geometry.build(self.template, self.points, None if is_uniform else self._pressure)
         if self.coat is None:
@@ -317,7 +317,7 @@ def to_oval(points: Complexes, oval: complex) -> Complexes:
     """
     if oval == 0.0:
         return points
-    radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
+    radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)  # the displacement ratio is zero at `UNDEFORMED_RADIUS`
     rim_displacement = (np.conj(oval) * (points / radius) ** 2).real  # e cos(2 (angle - alpha))
     return np.asarray(points * (1.0 + _displacement_ratio(radius) * rim_displacement))
 

@@ -7,9 +7,10 @@ The positions of the rings follow from a conformal map of the unit disk onto its
 The map converts points z of the template plane into film points Z in film radii. The probe lies on the positive x axis
 of the film. The map converts circles into circles. With the parameters
 
-    al = (atanh(p + R) + atanh(p - R)) / 2,   be = (atanh(p + R) - atanh(p - R)) / 2,   c = tanh al,   rho = tanh be,
+    c  = tanh( (atanh(p + R) + atanh(p - R)) / 2 ),
+    r0 = tanh( (atanh(p + R) - atanh(p - R)) / 2 ),
 
-the map converts the circle |z| = rho into the circle with the radius R and the centre p, which is the innermost circle
+the map converts the circle |z| = r0 into the circle with the radius R and the centre p, which is the innermost circle
 of the mesh.
 
 Inside the innermost circle, the points of an element are interpolated linearly between the inner and the outer side of
@@ -30,10 +31,11 @@ from isocharge.simulate.mesh.blocks import Blocks
 from isocharge.simulate.mesh.conformal_map import (
     automorphism_onto,
     enclosing_circle,
+    max_thin_ring_width,
     rim_angles,
     ring_edges,
     sector_angles,
-    widest_layer,
+    stretch_on_circle,
 )
 from isocharge.simulate.sensor.probe import Probe
 
@@ -43,11 +45,11 @@ CHECKED_ORIENTATIONS = 12
 
 @dataclass(frozen=True)
 class Placement:
-    """Position of a template on the film. An object can contain several placements in leading axes of its arrays.
+    """Position of a template on the film. An object can contain several placements in the leading axes of its arrays.
 
     Attributes:
-        c: Parameter of the conformal map, shape (...).
-        rho: Radius of the innermost circle in the template plane, shape (...).
+        map_parameter: Parameter c of the conformal map, shape (...).
+        template_radius: Radius of the innermost circle in the template plane, shape (...).
         corners: Corners of the core polygon, followed by its centroid, as film points x + iy, in film radii, shape
             (..., n_corner + 1).
         circle_angles: Angles of the sides of the sectors on the innermost circle in the template plane, shape
@@ -60,8 +62,8 @@ class Placement:
         probe: The probe.
     """
 
-    c: Array
-    rho: Array
+    map_parameter: Array
+    template_radius: Array
     corners: Complexes
     circle_angles: Array
     rim_angles: Array
@@ -76,20 +78,20 @@ class Placement:
         probe: Probe,
         distance: Array,
         film_radius: float,
-        layer: float,
+        thin_ring_width: float,
         rotation: Array | float = 0.0,
     ) -> Self:
         """Place a template under a press on the positive x axis.
 
-        The method determines the innermost circle of the mesh, the conformal map for this circle, and the angles and
-        depths of the elements between the circle and the rim.
+        The method determines the innermost circle of the mesh and the conformal map for this circle. It also determines
+        the angles and depths of the elements between the circle and the rim.
 
         Args:
             blocks: The elements. Their topology must be the topology of the probe.
             probe: The probe in the frame in which the press lies on the positive x axis.
             distance: Distance of the centroid of the footprint from the centre of the film, any shape, mm.
             film_radius: Radius of the film, mm.
-            layer: Total width of the thin rings at the rim, in film radii.
+            thin_ring_width: Total width of the thin rings at the rim, in film radii.
             rotation: Additional rotation of the footprint, a number or of the shape of `distance`, rad.
         """
         # Corners of the core polygon on the film, followed by the centroid of the footprint. The centroid is a real
@@ -120,16 +122,17 @@ class Placement:
                 inner_points = np.asarray(centroid[..., None] + boundary / film_radius * rotation_factor[..., None])
 
         # Compute the conformal map of the innermost circle, and the angles and depths of the elements around it.
-        c, rho = automorphism_onto(centre, radius)
-        circle_angles = sector_angles(blocks, inner_points, inner_extent, centroid, centre, radius, c * rho)
-        template_layer = layer * (1.0 + c) / (1.0 - c)  # width of the thin rings in the template plane
+        map_parameter, template_radius = automorphism_onto(centre, radius)
+        circle_stretch = stretch_on_circle(map_parameter, template_radius)
+        circle_angles = sector_angles(blocks, inner_points, inner_extent, centroid, centre, radius, circle_stretch)
+        template_thin_ring_width = thin_ring_width * (1.0 + map_parameter) / (1.0 - map_parameter)
         return cls(
-            c=c,
-            rho=rho,
+            map_parameter=map_parameter,
+            template_radius=template_radius,
             corners=corners,
             circle_angles=circle_angles,
-            rim_angles=rim_angles(circle_angles, c, rho),
-            ring_depths=ring_edges(blocks.resolution, rho, template_layer),
+            rim_angles=rim_angles(circle_angles, map_parameter, template_radius),
+            ring_depths=ring_edges(blocks.resolution, template_radius, template_thin_ring_width),
             rotation_and_scale=np.asarray(rotation_factor / film_radius),
             probe=probe,
         )
@@ -162,8 +165,8 @@ class Placement:
         Returns:
             Film points, shape (..., n), in film radii.
         """
-        c = self.c[..., None]
-        return np.asarray((z + c) / (1.0 + c * z))
+        map_parameter = self.map_parameter[..., None]
+        return np.asarray((z + map_parameter) / (1.0 + map_parameter * z))
 
     def to_template(self, points: Complexes) -> Complexes:
         """Convert film points into points of the template plane by the inverse of the conformal map.
@@ -174,8 +177,8 @@ class Placement:
         Returns:
             Points of the template plane, shape (..., n).
         """
-        c = self.c[..., None]
-        return np.asarray((points - c) / (1.0 - c * points))
+        map_parameter = self.map_parameter[..., None]
+        return np.asarray((points - map_parameter) / (1.0 - map_parameter * points))
 
     def boundary(self, parameter: Array) -> Complexes:
         """Compute points of the boundary of a curved footprint on the film.
@@ -224,7 +227,8 @@ class Placement:
         points = (1.0 - radial) * inner_side + radial * outer_side
 
         # Contribution of the innermost circle, which is the outer side of the last layer
-        circle = self.to_film(self.rho * np.exp(1j * self._node_circle_angles(blocks)))  # shape (n_sector, n_local)
+        node_directions = np.exp(1j * self._node_circle_angles(blocks))  # shape (n_sector, n_local)
+        circle = self.to_film(self.template_radius * node_directions)
         points[blocks.last_layer] += radial * circle
 
         # Contribution of the boundary of the footprint, which separates the layers if there are two
@@ -257,7 +261,7 @@ class Placement:
         circle_angle = self._node_circle_angles(blocks)  # shape (n_sector, n_local)
         rim_angle = self.rim_angles[:-1, None] + angular * np.diff(self.rim_angles)[:, None]
         angle = (1.0 - depth) * circle_angle + depth * rim_angle  # shape (n_ring, n_sector, n_local)
-        log_radius = (1.0 - depth) * np.log(self.rho)
+        log_radius = (1.0 - depth) * np.log(self.template_radius)
         template_points = np.exp(log_radius + 1j * angle)
         return self.to_film(template_points).reshape(-1, radial.size)
 
@@ -289,7 +293,7 @@ def _unit_coordinates(blocks: Blocks) -> tuple[Array, Array]:
 
 
 def widest_smooth_layer(mesh: Blocks, probe: Probe, distance: float, film_radius: float) -> float:
-    """Compute the largest width of the thin rings with which the mesh changes smoothly with the position of the press.
+    """Compute the largest width of the thin rings for which the nodes move smoothly if the press moves.
 
     The nodes of the mesh move when the distance of the press from the centre increases. Fields at the nodes can be
     interpolated by polynomials in this distance only if the nodes move smoothly. For presses near the rim, the function
@@ -306,10 +310,10 @@ def widest_smooth_layer(mesh: Blocks, probe: Probe, distance: float, film_radius
     Returns:
         Total width of the thin rings, in film radii.
     """
-    # Place the mesh under the outermost press, in several orientations of the probe. Only the parameters c and rho of
+    # Place the mesh under the outermost press, in several orientations of the probe. Only the parameters of
     # the conformal map are needed. They do not depend on the width of the thin rings, so the width is set to 0.
-    no_layer = 0.0
+    no_thin_rings = 0.0
     rotation = 2.0 * np.pi * np.arange(CHECKED_ORIENTATIONS) / CHECKED_ORIENTATIONS
     distances = np.full(CHECKED_ORIENTATIONS, distance)
-    placement = Placement.of(mesh, probe, distances, film_radius, no_layer, rotation)
-    return float(widest_layer(mesh.resolution, placement.c, placement.rho).min())
+    placement = Placement.of(mesh, probe, distances, film_radius, no_thin_rings, rotation)
+    return float(max_thin_ring_width(mesh.resolution, placement.map_parameter, placement.template_radius).min())

@@ -102,7 +102,7 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
     # First locate all points as if they were in the rings. Then locate the points inside the innermost circle again.
     template_points = placement.to_template(points)
     element, radial, angular = _locate_in_rings(placement, blocks, template_points)
-    is_inside = np.abs(template_points) <= placement.rho[:, None]
+    is_inside = np.abs(template_points) <= placement.template_radius[:, None]
     if np.any(is_inside):
         placement_index, _ = np.nonzero(is_inside)
         placement_of_point = placement[placement_index]  # one placement for each point inside the circle
@@ -130,7 +130,7 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
     # Depth of each point, from 0 on the innermost circle to 1 on the rim. At the origin, the logarithm is infinite, and
     # the depth is clipped to 0.
     with np.errstate(divide="ignore"):
-        log_ratio = np.log(np.abs(template_points)) / np.log(placement.rho)[:, None]
+        log_ratio = np.log(np.abs(template_points)) / np.log(placement.template_radius)[:, None]
     depth = np.clip(1.0 - log_ratio, 0.0, 1.0)
 
     # The index of the ring is the number of edges between rings that lie inside of the point.
@@ -194,10 +194,10 @@ def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
 def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
     """Find the elements that contain points inside the innermost circle.
 
-    The signed distance of a point from a side of an element is positive if the point and the element lie on the same
-    side of the straight line through this side. Therefore the smallest of the four distances is positive for points
-    inside an element with straight sides. Each point is assigned to the element for which the smallest of its four
-    distances is largest.
+    A straight line is drawn through each side of an element. The signed distance of a point from the line is positive
+    if the point and the element lie on the same side of the line. Therefore the smallest of the four distances is
+    positive for points inside an element with straight sides. Each point is assigned to the element for which the
+    smallest of its four distances is largest.
 
     The elements with straight sides fill the core polygon. One or two layers of elements with curved sides surround the
     core polygon. If there are two layers, the edge of the footprint separates them.
@@ -320,7 +320,7 @@ def _inner_corners(placement: Placement, blocks: Blocks) -> QuadCorners:
     inner_first, inner_last, outer_first, outer_last = np.moveaxis(weighted_sums, -1, 0)
 
     # Replace the corners of the last layer on the innermost circle.
-    circle = placement.to_film(placement.rho[:, None] * np.exp(1j * placement.circle_angles))
+    circle = placement.to_film(placement.template_radius[:, None] * np.exp(1j * placement.circle_angles))
     outer_first[:, blocks.last_layer] = circle[:, :-1]
     outer_last[:, blocks.last_layer] = circle[:, 1:]
 
@@ -340,7 +340,7 @@ def _local_coordinates(
     """Compute the local coordinates of points in given elements inside the innermost circle by Newton's method.
 
     The film point with the coordinates (radial, angular) is (1 - radial) * inner(angular) + radial * outer(angular).
-    The functions inner and outer describe the two sides of the element by the angular coordinate.
+    The functions inner and outer return the points of the inner and the outer side at a given angular coordinate.
 
     Args:
         placement: n placements, one for each point.
@@ -373,6 +373,8 @@ def _local_coordinates(
 
 def _sides(placement: Placement, blocks: Blocks, element: Integers, corners: QuadCorners, angular: Array) -> _Sides:
     """Compute the points of the inner and the outer side of elements at given angular coordinates.
+
+    The derivatives of the points with respect to the angular coordinate are also returned.
 
     Args:
         placement: n placements, one for each point.
@@ -427,10 +429,10 @@ def _circle_in_sector(placement: Placement, sector: Integers, angular: Array) ->
     angle_range = last_angle - first_angle
 
     # The conformal map converts a point z of the template plane into the film point (z + c) / (1 + c z).
-    template_points = placement.rho * np.exp(1j * (first_angle + angular * angle_range))
-    denominator = 1.0 + placement.c * template_points
-    points = (template_points + placement.c) / denominator
-    derivative = 1j * angle_range * template_points * (1.0 - placement.c**2) / denominator**2
+    template_points = placement.template_radius * np.exp(1j * (first_angle + angular * angle_range))
+    denominator = 1.0 + placement.map_parameter * template_points
+    points = (template_points + placement.map_parameter) / denominator
+    derivative = 1j * angle_range * template_points * (1.0 - placement.map_parameter**2) / denominator**2
     return np.asarray(points), np.asarray(derivative)
 
 

@@ -75,6 +75,7 @@ class RefinedTemplate(Template):
             (n_element, 2).
         size: Lengths of the sides of each element in the local coordinates of its original element, shape
             (n_element, 2). The possible lengths are 2, 1, 1/2, and so on.
+        splits: The arrays `parent`, `low` and `size` as columns, shape (n_element, 5), by which templates are compared.
     """
 
     def __init__(self, base: Template, parent: Integers, low: Array, size: Array) -> None:

@@ -78,7 +78,7 @@ def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMa
     x, y = limit_map.rings.position.reshape(-1, 2).T  # mm
     levels = np.geomspace(MIN_ERROR_mm, MAX_ERROR_mm, 25)
     errors = np.clip(limit_map.position.ravel(), MIN_ERROR_mm, MAX_ERROR_mm)
-    shades = axes.tricontourf(x, y, errors, levels, norm=LogNorm(), cmap="viridis")
+    coloured_areas = axes.tricontourf(x, y, errors, levels, norm=LogNorm(), cmap="viridis")
 
     # Draw the folds, which are positions (x, y), the working area, and the electrodes.
     folds = identification.area.folds
@@ -91,7 +91,7 @@ def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMa
     if len(folds):
         title += "; red: folds"
     axes.set(title=title, xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=axis_limits, ylim=axis_limits)
-    return shades
+    return coloured_areas
 
 
 def _draw_distance(axes: Any, identification: Identification) -> None:
@@ -158,11 +158,13 @@ def error_maps_picture(design: Design) -> Figure:
     figure = new_figure(6.4 * len(layouts) + 1.0, 6.0)
     all_axes = figure.subplots(1, len(layouts), squeeze=False)[0]
     for axes, (sensor, errors) in zip(all_axes, layouts, strict=True):
-        shades = _draw_errors(axes, sensor, errors, norm)
+        coloured_area = _draw_errors(axes, sensor, errors, norm)
         draw_working_area(axes, case.radius)
         axes.set(xlim=limits, ylim=limits, xlabel="x, mm", ylabel="y, mm", aspect="equal")
+
+    # One colour bar is enough for both maps.
     label = "lower limit of the position error (rms), mm"
-    colour_bar = figure.colorbar(shades, ax=list(all_axes), label=label, shrink=0.85, extend="max")
+    colour_bar = figure.colorbar(coloured_area, ax=list(all_axes), label=label, shrink=0.85, extend="max")
     colour_bar.ax.yaxis.set_major_formatter(ScalarFormatter())
     colour_bar.ax.yaxis.set_minor_formatter(ScalarFormatter())
     nuisances = "without nuisances" if case.nuisances == NO_NUISANCES else "with nuisances"
@@ -171,7 +173,7 @@ def error_maps_picture(design: Design) -> Figure:
 
 
 def _draw_errors(axes: Any, sensor: Sensor, errors: ErrorMap, norm: LogNorm) -> Any:
-    """Draw the errors of one layout as colours, the position of the largest error, and the electrodes.
+    """Draw the position errors of one layout as colours, and mark the largest error and the electrodes.
 
     Args:
         axes: Axes of matplotlib.

@@ -111,14 +111,14 @@ def check_picture(path: Path) -> None:
     refuse_existing(path)
 
 
-def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
+def picture_bytes(figure: Figure, file_format: str = "png") -> bytes:
     """Convert a figure into the content of an image file.
 
     The content includes neither a date nor random identifiers. Equal figures therefore result in equal bytes.
 
     Args:
         figure: Figure to be converted.
-        kind: Format of the file: "png", "svg" or "pdf".
+        file_format: Format of the file: "png", "svg" or "pdf".
     """
     # The value None removes the present date, which matplotlib would write into SVG and PDF files.
     date_metadata: dict[str, dict[str, None]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
@@ -126,7 +126,7 @@ def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
 
     # With a fixed salt, the identifiers of SVG elements are not random. Text is stored as text, not as outlines.
     with rc_context({"svg.hashsalt": "isocharge", "svg.fonttype": "none"}):
-        figure.savefig(buffer, format=kind, dpi=DPI, metadata=date_metadata[kind])
+        figure.savefig(buffer, format=file_format, dpi=DPI, metadata=date_metadata[file_format])
     return buffer.getvalue()
 
 

@@ -35,7 +35,7 @@ def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool 
         names: Whether to write the names of the electrodes.
         ink: Colour of the outlines.
     """
-    halo = [withStroke(linewidth=3.0, foreground="white", alpha=0.8)]
+    halo = [withStroke(linewidth=3.0, foreground="white", alpha=0.8)]  # separates dark lines from dark colours
     for electrode in sensor.electrodes:
         colour = FELT if electrode.name == highlight else ink
         for polygons, style in ((electrode.front, "-"), (electrode.back, "--")):
@@ -117,7 +117,7 @@ def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "", highl
     frame_film(axes, sensor, radius, title)
 
 
-def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float = 1.0, count: int = 81) -> None:
+def draw_charge_map(axes: Any, charge_map: ChargeMap, electrode: int, force: float = 1.0, count: int = 81) -> None:
     """Draw the charge of one electrode as a function of the position of a press.
 
     The charge is shown by shades and by labelled contours.
@@ -125,16 +125,16 @@ def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float 
     Args:
         axes: Axes of matplotlib.
         charge_map: Map that computes the charges of contacts.
-        number: Index of the electrode in the order of the charges.
+        electrode: Index of the electrode in the order of the charges.
         force: Force of the presses, N.
         count: Number of points on each ring of the polar grid on which the charge is computed.
     """
     # The grid has half as many rings as angles.
     x, y = _polar_grid(charge_map.domain.radius, rings=count // 2, angles=count)
     contact = np.stack([x.ravel(), y.ravel(), np.full(x.size, force)], axis=1)
-    values = charge_map.charges(contact)[:, number].reshape(x.shape)
-    axes.contourf(x, y, values, levels=30, cmap="YlGnBu")
-    contour_lines = axes.contour(x, y, values, levels=12, colors=INK, linewidths=0.8)
+    charge = charge_map.charges(contact)[:, electrode].reshape(x.shape)
+    axes.contourf(x, y, charge, levels=30, cmap="YlGnBu")
+    contour_lines = axes.contour(x, y, charge, levels=12, colors=INK, linewidths=0.8)
     axes.clabel(contour_lines, fmt="%.0f", fontsize=7)
 
 
@@ -174,10 +174,11 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     axes.plot(distance_along_section, -depth, color=INK, lw=1.5)
 
     # Mark the probe as a bar above the film, with an arrow to the deepest point.
+    bar_height_mm = 0.25
     bar_ends = [distance - equilibrium.probe.reach, distance + equilibrium.probe.reach]
-    axes.plot(bar_ends, [0.25, 0.25], color=FELT, lw=5, solid_capstyle="butt")
+    axes.plot(bar_ends, [bar_height_mm, bar_height_mm], color=FELT, lw=5, solid_capstyle="butt")
     arrow_tip = (distance, -depth.max())
-    arrow_start = (distance, 0.2)  # just below the bar
+    arrow_start = (distance, bar_height_mm - 0.05)  # just below the bar
     axes.annotate("", arrow_tip, arrow_start, arrowprops={"arrowstyle": "->", "color": FELT})
     axes.set(
         title=f"cut through probe and centre: {depth.max():.2f} mm deep",

@@ -14,8 +14,9 @@ from isocharge.simulate.sensor.sensor import Sensor
 def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
     """Draw the mirror region of a sensor.
 
-    A map shows which share of the presses at each position cannot be noticed. A diagram shows this share as a function
-    of the distance from the centre.
+    A press outside the working area cannot be noticed if it has the same charges as a press inside the working area. A
+    map shows the share of such presses at each position. A diagram shows this share as a function of the distance from
+    the centre.
 
     Args:
         sensor: Sensor whose mirror region is drawn.
@@ -41,6 +42,8 @@ def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
 
 def _draw_region(axes: Any, sensor: Sensor, mirror: MirrorRegion) -> Any:
     """Draw a map of the share of unnoticeable presses, with the clamp, the working area and the electrodes.
+
+    An unnoticeable press lies outside the working area and has the same charges as a press inside the working area.
 
     Args:
         axes: Axes of matplotlib.
@@ -71,6 +74,8 @@ def _draw_region(axes: Any, sensor: Sensor, mirror: MirrorRegion) -> Any:
 
 def _draw_distance(axes: Any, mirror: MirrorRegion) -> None:
     """Draw the share of unnoticeable presses as a function of their distance from the centre.
+
+    An unnoticeable press lies outside the working area and has the same charges as a press inside the working area.
 
     Args:
         axes: Axes of matplotlib.

@@ -171,6 +171,7 @@ class Film:
         Raises:
             SensorError: If a property is outside its accepted range.
         """
+        # Most conditions negate an accepted range, so that NaN is rejected as well.
         check_length("film radius", self.radius, MIN_RADIUS, SensorError)
         check_length("film thickness", self.thickness, MIN_THICKNESS, SensorError)
         check_stress("film young", self.young, MIN_YOUNG, MAX_YOUNG, SensorError)
@@ -255,7 +256,7 @@ class Piezo:
             SensorError: If a coefficient is outside its accepted range, or if d31, d32 and d12 are all zero.
         """
         for name, coefficient in vars(self).items():
-            if not abs(coefficient) <= MAX_PIEZO:
+            if not abs(coefficient) <= MAX_PIEZO:  # NaN is rejected as well
                 raise SensorError(f"piezo {name}: expected a number up to {MAX_PIEZO:g} in size, got {coefficient}")
             if name != "pyro" and 0.0 < abs(coefficient) < MIN_PIEZO:
                 raise SensorError(

@@ -41,7 +41,7 @@ MAX_SHOWN_CENTRES = 8
 
 @dataclass(frozen=True)
 class FilmSpread:
-    """Widths of the prior distribution of the parameters of a film.
+    """Widths of the prior distribution from which the parameters of a film are drawn.
 
     The width of the pretension is its largest value. The widths of all other parameters are standard deviations.
 
@@ -110,7 +110,7 @@ class FilmParameter:
     file_factor: float = 1.0
 
     def mean(self, prior: "FilmPrior") -> float:
-        """Return the mean of the prior distribution. It is zero, which is the value of the described film.
+        """Return the mean of the prior distribution. The mean is zero, which is the parameter of the described film.
 
         Args:
             prior: Prior distribution. Only subclasses use it.
@@ -138,7 +138,7 @@ class FilmParameter:
             return float(value.get(self.item, 1.0))
         return float(value if self.item is None else value[self.item])
 
-    def to_physical_value(self, described: float, parameter: float, factor: float) -> float:
+    def to_physical_value(self, described_value: float, parameter: float, exp_parameter: float) -> float:
         """Convert the value of the parameter into a physical value, according to `form`.
 
         The parameter describes how a film differs from the film in the sensor file (the described film). If the form is
@@ -146,28 +146,28 @@ class FilmParameter:
         the parameter is their difference. If the form is "value", the parameter is the physical value itself.
 
         Args:
-            described: Physical value of the described film.
+            described_value: Physical value of the described film.
             parameter: Value of the parameter.
-            factor: Exponential of `parameter`, which the caller computes for all parameters at once. It is used only if
-                the form is "logarithm".
+            exp_parameter: Exponential of `parameter`, which the caller computes for all parameters at once. It is used
+                only if the form is "logarithm".
 
         Returns:
-            The physical value, in the unit of `described`.
+            The physical value, in the unit of `described_value`.
         """
         if self.form == "logarithm":
-            return described * factor
+            return described_value * exp_parameter
         if self.form == "difference":
-            return described + parameter
+            return described_value + parameter
         return parameter
 
-    def from_physical_value(self, value: float, described: float) -> float:
+    def from_physical_value(self, value: float, described_value: float) -> float:
         """Convert a physical value into the value of the parameter, according to `form`.
 
         This method is the inverse of `to_physical_value`.
 
         Args:
             value: Physical value of a film.
-            described: Physical value of the described film, in the same unit.
+            described_value: Physical value of the described film, in the same unit.
 
         Returns:
             The logarithm of the ratio of both values, their difference, or `value` itself.
@@ -177,12 +177,12 @@ class FilmParameter:
                 zero.
         """
         if self.form == "logarithm":
-            ratio = _ratio(value, described)
+            ratio = _ratio(value, described_value)
             if ratio <= 0.0:
-                raise ValueError(f"expected the sign of {described:g}, got {value:g}")
+                raise ValueError(f"expected the sign of {described_value:g}, got {value:g}")
             return float(np.log(ratio))
         if self.form == "difference":
-            return value - described
+            return value - described_value
         return value
 
 
@@ -339,7 +339,7 @@ class FilmPrior:
 
     @cached_property
     def _components(self) -> Components:
-        """Objects that have attributes which the parameters change: parts of the described sensor, and the probe."""
+        """Objects whose attributes the parameters change: parts of the described sensor, and the probe."""
         return _components_of(self.sensor, self.probe)
 
     @property
@@ -353,7 +353,8 @@ class FilmPrior:
     def draw(self, rng: np.random.Generator, count: int) -> Array:
         """Draw the parameters of films from the prior distribution.
 
-        Values outside the bounds are drawn again.
+        The pretension is distributed uniformly. All other parameters are distributed normally, and values outside their
+        bounds are drawn again.
 
         Args:
             rng: Random number generator.
@@ -393,11 +394,11 @@ class FilmPrior:
         # Collect the changed attributes of each component (film, piezo, calibration and probe). An attribute that is a
         # tuple or a mapping, such as the gains, has several parameters. Collect its changed items by index or key.
         changes: dict[str, dict[str, Any]] = {component: {} for component in self._components}
-        factors = np.exp(parameters)
-        for declaration, described, parameter, factor in zip(
-            self.parameters, self._described_values, parameters.tolist(), factors.tolist(), strict=True
+        exp_parameters = np.exp(parameters)
+        for declaration, described_value, parameter, exp_parameter in zip(
+            self.parameters, self._described_values, parameters.tolist(), exp_parameters.tolist(), strict=True
         ):
-            value = declaration.to_physical_value(described, parameter, factor)
+            value = declaration.to_physical_value(described_value, parameter, exp_parameter)
             attributes = changes[declaration.component]
             if declaration.item is None:
                 attributes[declaration.attribute] = value
@@ -476,7 +477,7 @@ class FilmPrior:
 
 
 def _components_of(sensor: Sensor, probe: Circle) -> Components:
-    """Return the objects that have attributes which the parameters change: parts of a sensor, and the probe."""
+    """Return the objects whose attributes the parameters change: parts of a sensor, and the probe."""
     return {"film": sensor.film, "piezo": sensor.piezo, "calibration": sensor.calibration, "probe": probe}
 
 

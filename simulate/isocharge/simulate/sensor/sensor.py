@@ -523,14 +523,15 @@ def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -
 
 
 def check_polygon(where: str, polygon: Corners) -> None:
-    """Raise an error if a polygon crosses itself or is clockwise, or if its corners are not valid.
+    """Raise an error unless a polygon has finite corners in anticlockwise order and does not cross itself.
 
     Args:
         where: First words of the error message, which name the polygon.
         polygon: Corners (x, y) of the polygon, mm.
 
     Raises:
-        SensorError: If the polygon crosses itself, is clockwise, or has too few or too many corners.
+        SensorError: If the polygon crosses itself, is clockwise, has too few or too many corners, or has a coordinate
+            that is not finite.
     """
     corners = np.array(polygon)
     if corners.ndim != 2 or not 3 <= len(corners) <= MAX_CORNERS or corners.shape[1] != 2:

@@ -81,7 +81,7 @@ class PiezoTable(Settings, frozen=True):
 
 
 class PolygonTable(Settings, frozen=True):
-    """Description in a sensor file of an electrode that is not a square.
+    """Description of an electrode that is not a square, in the form of a sensor file.
 
     The electrode has a pad on the front of the film. The electrode may have further polygons and a trace on the front,
     and polygons on the back.
@@ -160,9 +160,9 @@ def built_in_sensors() -> tuple[str, ...]:
 
 
 def load_sensor(sensor: str | Path) -> Sensor:
-    """Read a sensor file.
+    """Read a sensor file, which belongs to the package (built-in sensor) or to the user.
 
-    If the sensor has only one electrode, a warning is logged.
+    If a file of the user describes a sensor with only one electrode, a warning is logged.
 
     Args:
         sensor: Name of a built-in sensor such as "three-25um-biaxial", or path of a TOML file.
@@ -203,7 +203,7 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
     file = convert(table, SensorTable, where, SensorError)
     piezo = file.piezo
     calibration = file.calibration
-    coating = file.electrodes.get(COATING)
+    coating = file.electrodes.get(COATING)  # absent if the metal does not stiffen the film
     with error_prefix(f"{where}: ", SensorError):
         return Sensor(
             name=file.name,

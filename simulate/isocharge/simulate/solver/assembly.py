@@ -25,17 +25,17 @@ class Assembly:
     """Linear solver for a given template and a given number of unknowns per node.
 
     Attributes:
-        components: Number of unknowns per node.
+        unknowns_per_node: Number of unknowns per node.
         odd: Whether the fields are odd about the line of symmetry.
-        free: Whether each unknown is free, shape (n_node, components).
-        inner_global: Indices of the interior unknowns of each element, shape (n_element, n_inner).
-        outer_global: Indices of the unknowns on the sides of each element, shape (n_element, n_outer).
+        free: Whether each unknown is free, shape (n_node, unknowns_per_node).
+        interior_unknowns: Indices of the interior unknowns of each element, shape (n_element, n_interior).
+        side_unknowns: Indices of the unknowns on the sides of each element, shape (n_element, n_side).
         skeleton: Indices of the free unknowns on sides, in the order of elimination, shape (n_skeleton,).
         constraint: Matrix that computes all skeleton unknowns from the unknowns of nodes that are not hanging nodes;
             None if there are no hanging nodes.
     """
 
-    def __init__(self, mesh: Template, components: int, odd: bool = False) -> None:
+    def __init__(self, mesh: Template, unknowns_per_node: int, odd: bool = False) -> None:
         """Number the unknowns, and compute the sparsity pattern of the skeleton matrix.
 
         The skeleton consists of the unknowns on the sides of the elements. The unknowns in the interior of an element
@@ -43,35 +43,35 @@ class Assembly:
 
         Args:
             mesh: Template of the mesh.
-            components: Number of unknowns per node.
+            unknowns_per_node: Number of unknowns per node.
             odd: Whether the fields are odd about the line of symmetry.
         """
-        self.components = components
+        self.unknowns_per_node = unknowns_per_node
         self.odd = odd
-        self.free = _free(mesh, components, odd)
+        self.free = _free_unknowns(mesh, unknowns_per_node, odd)
 
         # Compute the local indices of the unknowns on the sides of an element and in its interior. Within an element,
         # the unknowns are numbered component by component. The nodes of an element form a square grid.
         grid_index = np.arange(mesh.resolution.order + 1)
         is_end = (grid_index == grid_index[0]) | (grid_index == grid_index[-1])
         is_on_side = (is_end[:, None] | is_end[None, :]).ravel()
-        component = np.arange(components)[:, None]
+        component = np.arange(unknowns_per_node)[:, None]
         n_local = is_on_side.size
-        self._outer = (component * n_local + np.flatnonzero(is_on_side)).ravel()
-        self._inner = (component * n_local + np.flatnonzero(~is_on_side)).ravel()
+        self._side_indices = (component * n_local + np.flatnonzero(is_on_side)).ravel()
+        self._interior_indices = (component * n_local + np.flatnonzero(~is_on_side)).ravel()
 
         # Compute the global indices of the unknowns of each element. Globally, the unknowns are numbered node by node.
-        unknown = (components * mesh.nodes[:, None] + component).reshape(len(mesh.nodes), -1)
-        self.inner_global = unknown[:, self._inner]
-        self.outer_global = unknown[:, self._outer]
+        unknown = (unknowns_per_node * mesh.nodes[:, None] + component).reshape(len(mesh.nodes), -1)
+        self.interior_unknowns = unknown[:, self._interior_indices]
+        self.side_unknowns = unknown[:, self._side_indices]
 
         # Number the skeleton unknowns, which are the free unknowns on sides. All other unknowns have the number -1.
         is_in_skeleton = np.zeros(self.free.size, dtype=bool)
-        is_in_skeleton[self.outer_global.ravel()] = True
+        is_in_skeleton[self.side_unknowns.ravel()] = True
         self.skeleton = np.flatnonzero(is_in_skeleton & self.free.ravel())
         skeleton_number = np.full(self.free.size, -1, dtype=np.intp)
         skeleton_number[self.skeleton] = np.arange(self.skeleton.size)
-        self._set_pattern(skeleton_number[self.outer_global])
+        self._set_pattern(skeleton_number[self.side_unknowns])
         self.constraint = None if mesh.constraint is None else self._skeleton_constraint(mesh.constraint)
         self._reorder()
 
@@ -84,7 +84,7 @@ class Assembly:
             node_constraint: Matrix that computes the values at all nodes from the values at nodes that are not hanging
                 nodes, shape (n_node, n_node). The columns of hanging nodes are zero.
         """
-        unknown_constraint = kron(node_constraint, eye_array(self.components)).tocsr()
+        unknown_constraint = kron(node_constraint, eye_array(self.unknowns_per_node)).tocsr()
         skeleton_constraint = unknown_constraint[self.skeleton][:, self.skeleton]
         is_regular = skeleton_constraint.diagonal() > 0.0  # false for hanging nodes, whose columns are zero
         return skeleton_constraint[:, is_regular].tocsc()
@@ -92,18 +92,18 @@ class Assembly:
     def _set_pattern(self, skeleton_numbers: Integers) -> None:
         """Determine which entries of the skeleton matrix may be nonzero, and where the element matrices are added.
 
-        The skeleton matrix is the matrix of the unknowns on the sides of the elements. It is the sum of the matrices of
-        all elements. Only its nonzero entries are stored, in an array that is ordered column by column (compressed
+        The skeleton matrix is the matrix of the unknowns on the sides of the elements, and is the sum of the matrices
+        of all elements. Only its nonzero entries are stored, in an array that is ordered column by column (compressed
         sparse column format). The method stores the position of each entry of each element matrix in this array.
         Entries that belong to a fixed unknown get the position after the last nonzero entry.
 
         Args:
             skeleton_numbers: Row of the skeleton matrix for each unknown on the sides of each element, shape
-                (n_element, n_outer). Fixed unknowns have the number -1.
+                (n_element, n_side). Fixed unknowns have the number -1.
         """
         # Row and column of each entry of the element matrices in the skeleton matrix
-        n_element, n_outer = skeleton_numbers.shape
-        shape = (n_element, n_outer, n_outer)
+        n_element, n_side = skeleton_numbers.shape
+        shape = (n_element, n_side, n_side)
         size = self.skeleton.size
         row = np.broadcast_to(skeleton_numbers[:, :, None], shape)
         column = np.broadcast_to(skeleton_numbers[:, None, :], shape)
@@ -159,32 +159,34 @@ class Assembly:
         """Factorise the matrix of the mesh.
 
         Args:
-            matrix: Symmetric element matrices, shape (n_element, n_local, components, n_local, components).
+            matrix: Symmetric element matrices, shape (n_element, n_local, unknowns_per_node, n_local,
+                unknowns_per_node).
 
         Returns:
             Factorisation that solves the linear system for arbitrary right-hand sides.
         """
-        inner = self._inner
-        outer = self._outer
+        interior = self._interior_indices
+        sides = self._side_indices
         n_local = matrix.shape[1]
-        n_unknown = n_local * self.components
+        n_unknown = n_local * self.unknowns_per_node
         # Number the unknowns of an element component by component.
         element_matrix = matrix.transpose(0, 2, 1, 4, 3).reshape(-1, n_unknown, n_unknown)
 
         # Eliminate the interior unknowns of each element by static condensation. With the blocks A (interior), B
-        # (coupling) and C (outer), the Schur complement is C - B' A^-1 B.
-        coupling = element_matrix[:, inner[:, None], outer]  # B
-        inner_inverse = np.linalg.inv(element_matrix[:, inner[:, None], inner]).astype(float, copy=False)  # A^-1
-        reduced_coupling = inner_inverse @ coupling  # A^-1 B
-        outer_block = element_matrix[:, outer[:, None], outer]  # C
-        schur_complement = outer_block - coupling.transpose(0, 2, 1) @ reduced_coupling
+        # (coupling) and C (sides), the Schur complement is C - B' A^-1 B.
+        coupling = element_matrix[:, interior[:, None], sides]  # B
+        interior_block = element_matrix[:, interior[:, None], interior]  # A
+        interior_inverse = np.linalg.inv(interior_block).astype(float, copy=False)  # A^-1
+        reduced_coupling = interior_inverse @ coupling  # A^-1 B
+        side_block = element_matrix[:, sides[:, None], sides]  # C
+        schur_complement = side_block - coupling.transpose(0, 2, 1) @ reduced_coupling
 
         # Add the Schur complements of all elements. The last sum is not used, because it contains the entries of fixed
         # unknowns.
         entry_count = self._indices.size + 1
         skeleton_entries = np.bincount(self._entry_positions, schur_complement.ravel(), entry_count)[:-1]
         skeleton_factor = _factorise(self._skeleton_matrix(skeleton_entries), "NATURAL")
-        return Factor(self, inner_inverse, coupling, reduced_coupling, skeleton_factor)
+        return Factor(self, interior_inverse, coupling, reduced_coupling, skeleton_factor)
 
     def _skeleton_matrix(self, entries: np.ndarray) -> csc_matrix:
         """Create the matrix of the skeleton unknowns, without the unknowns of hanging nodes.
@@ -204,7 +206,7 @@ class Factor:
     def __init__(
         self,
         assembly: Assembly,
-        inner_inverse: Array,
+        interior_inverse: Array,
         coupling: Array,
         reduced_coupling: Array,
         skeleton_factor: SuperLU,
@@ -213,14 +215,14 @@ class Factor:
 
         Args:
             assembly: Linear solver with the indices of the unknowns.
-            inner_inverse: Inverse of the block of the interior unknowns of each element, shape
-                (n_element, n_inner, n_inner).
-            coupling: Block between interior and outer unknowns, shape (n_element, n_inner, n_outer).
-            reduced_coupling: Product of `inner_inverse` and `coupling`, same shape as `coupling`.
+            interior_inverse: Inverse of the block of the interior unknowns of each element, shape
+                (n_element, n_interior, n_interior).
+            coupling: Block between interior unknowns and unknowns on sides, shape (n_element, n_interior, n_side).
+            reduced_coupling: Product of `interior_inverse` and `coupling`, same shape as `coupling`.
             skeleton_factor: Factorisation of the matrix of the skeleton unknowns.
         """
         self._assembly = assembly
-        self._inner_inverse = inner_inverse
+        self._interior_inverse = interior_inverse
         self._coupling = coupling
         self._reduced_coupling = reduced_coupling
         self._skeleton_factor = skeleton_factor
@@ -241,25 +243,25 @@ class Factor:
         flat_right = padded_right.ravel()
 
         # Eliminate the interior unknowns of each element from the right-hand side.
-        inner_right = flat_right[assembly.inner_global][..., None]  # shape (n_element, n_inner, 1)
-        inner_solution = self._inner_inverse @ inner_right
-        coupled_right = self._coupling.transpose(0, 2, 1) @ inner_solution  # shape (n_element, n_outer, 1)
-        reduced_right = flat_right - np.bincount(assembly.outer_global.ravel(), coupled_right.ravel(), flat_right.size)
+        interior_right = flat_right[assembly.interior_unknowns][..., None]  # shape (n_element, n_interior, 1)
+        interior_solution = self._interior_inverse @ interior_right
+        coupled_right = self._coupling.transpose(0, 2, 1) @ interior_solution  # shape (n_element, n_side, 1)
+        reduced_right = flat_right - np.bincount(assembly.side_unknowns.ravel(), coupled_right.ravel(), flat_right.size)
 
         # Solve for the unknowns of the skeleton.
         skeleton_right = reduced_right[assembly.skeleton]
         if assembly.constraint is None:
             skeleton_solution = self._skeleton_factor.solve(skeleton_right)
-        else:
+        else:  # solve for the unknowns of regular nodes, which determine the unknowns of hanging nodes
             regular_solution = self._skeleton_factor.solve(assembly.constraint.T @ skeleton_right)
             skeleton_solution = assembly.constraint @ regular_solution
         solution = np.zeros(flat_right.size)
         solution[assembly.skeleton] = skeleton_solution
 
         # Compute the interior unknowns of each element from the unknowns on its sides.
-        outer_solution = solution[assembly.outer_global][..., None]  # shape (n_element, n_outer, 1)
-        correction = self._reduced_coupling @ outer_solution
-        solution[assembly.inner_global] = (inner_solution - correction)[..., 0]
+        side_solution = solution[assembly.side_unknowns][..., None]  # shape (n_element, n_side, 1)
+        correction = self._reduced_coupling @ side_solution
+        solution[assembly.interior_unknowns] = (interior_solution - correction)[..., 0]
         return solution.reshape(assembly.free.shape)[:, :3]
 
 
@@ -273,7 +275,7 @@ def _factorise(matrix: csc_matrix, column_order: str) -> SuperLU:
     return splu(matrix, permc_spec=column_order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
+def _free_unknowns(mesh: Template, unknowns_per_node: int, odd: bool) -> np.ndarray:
     """Return which unknowns are free. All other unknowns are fixed at zero.
 
     The clamp fixes U1, U2 and W on the rim. On the line of symmetry, U2 is fixed if the field is even, and all unknowns
@@ -281,30 +283,30 @@ def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
 
     Args:
         mesh: Template of the mesh.
-        components: Number of unknowns per node.
+        unknowns_per_node: Number of unknowns per node.
         odd: Whether the fields are odd about the line of symmetry.
 
     Returns:
-        Whether each unknown is free, shape (n_node, components).
+        Whether each unknown is free, shape (n_node, unknowns_per_node).
     """
-    component = np.arange(components)  # 0: U1, 1: U2, 2: W, 3: auxiliary unknown of bending
+    component = np.arange(unknowns_per_node)  # 0: U1, 1: U2, 2: W, 3: auxiliary unknown of bending
     is_displacement = component < 3
     is_u2 = component == 1
     is_fixed_on_axis = ~is_u2 if odd else is_u2
 
-    free = np.ones((mesh.n_node, components), dtype=bool)
+    free = np.ones((mesh.n_node, unknowns_per_node), dtype=bool)
     free[np.ix_(mesh.on_rim, is_displacement)] = False
     free[np.ix_(mesh.on_axis, is_fixed_on_axis)] = False
     return free
 
 
 @lru_cache(maxsize=16)
-def assembly(mesh: Template, components: int, odd: bool = False) -> Assembly:
+def assembly(mesh: Template, unknowns_per_node: int, odd: bool = False) -> Assembly:
     """Return the linear solver for the mesh of a template. Linear solvers are cached.
 
     Args:
         mesh: Template of the mesh.
-        components: Number of unknowns per node: 3 without bending, 4 with bending.
+        unknowns_per_node: Number of unknowns per node: 3 without bending, 4 with bending.
         odd: Whether the fields are odd about the line of symmetry.
     """
-    return Assembly(mesh, components, odd)
+    return Assembly(mesh, unknowns_per_node, odd)

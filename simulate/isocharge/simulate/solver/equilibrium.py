@@ -199,8 +199,8 @@ def _induced_stress(equilibrium: Equilibrium, surface: Surface) -> Array:
 def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     """Compute the smallest and the largest principal stress in the film, including the pretension.
 
-    The smallest stress is the minimum over the mid-surface. If the theory includes bending, the largest stress is the
-    maximum over the mid-surface and both outer surfaces.
+    The smallest stress is the minimum over the mid-surface. The largest stress is the maximum over the mid-surface and,
+    if the theory includes bending, over both outer surfaces.
 
     Args:
         equilibrium: The solved press.

@@ -1,13 +1,13 @@
 """Estimates of the errors that the mesh and the theory cause in a charge, and warnings about omitted effects.
 
-In the inner part of the film, the error that the mesh causes is estimated from the shapes of the elements, and from the
-contribution of the highest polynomial modes to the slopes of the deflection. The estimate is not reliable for presses
-near the rim or for large footprints that are not circular. Under such presses, elements that are too coarse may lie far
-from the elements with the largest stress. These presses are therefore solved on meshes of increasing polynomial order,
-until two successive meshes result in nearly the same charges. Presses are also solved on several meshes if the required
-accuracy is better than the default accuracy. If the polynomial order of the elements increases by one, the error
-decreases by a factor of three to ten. The difference between the charges of two successive meshes is therefore an upper
-bound of the error on the finer mesh.
+In the inner part of the film, two quantities indicate the error that the mesh causes: the shapes of the elements, and
+the contribution of the highest polynomial modes to the slopes of the deflection. The estimate is not reliable for
+presses near the rim or for large footprints that are not circular. Under such presses, elements that are too coarse may
+lie far from the elements with the largest stress. These presses are therefore solved on meshes of increasing polynomial
+order, until two successive meshes result in nearly the same charges. Presses are also solved on several meshes if the
+required accuracy is better than the default accuracy. If the polynomial order of the elements increases by one, the
+error decreases by a factor of three to ten. The difference between the charges of two successive meshes is therefore an
+upper bound of the error on the finer mesh.
 """
 
 from typing import Any
@@ -125,8 +125,8 @@ def mesh_error(equilibrium: Equilibrium) -> float:
     """Estimate the relative error that the mesh causes in a charge.
 
     If the press was solved on two meshes, the estimate is the relative difference between the results on both meshes.
-    If the press was solved on one mesh, the error is predicted from the shapes of the elements and from the share of
-    the highest polynomial modes in the slopes.
+    If the press was solved on one mesh, the estimate is the larger of two predictions. One is made from the shapes of
+    the elements, and the other from the share of the highest polynomial modes in the slopes.
 
     Args:
         equilibrium: The solved press.
@@ -200,8 +200,8 @@ def _patch_charges(equilibrium: Equilibrium, centres: Array) -> Array:
         centres: Centres x + iy of the patches, shape (n_ring, n_patch), mm.
 
     Returns:
-        Charges in arbitrary units, shape (n_ring, n_patch, 2). The last axis is the kind of film. The part of a patch
-        outside the film does not contribute.
+        Charges per area in arbitrary units, shape (n_ring, n_patch, 2). The last axis is the kind of film. The part of
+        a patch outside the film does not contribute.
     """
     # Integration points of all patches. The coordinates xi and eta range from -1 to 1.
     film_radius = equilibrium.film.radius

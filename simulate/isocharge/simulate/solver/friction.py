@@ -47,7 +47,6 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
     mesh = solved.mesh
     geometry = mesh.geometry
     groups = solved.groups
-    components = 3 if groups.bending == 0.0 else 4  # bending has an auxiliary unknown
     n_direction = 1 if mesh.template.half else 2  # a half template has no displacement across its line of symmetry
 
     # Mean in-plane displacement of the footprint since the contact, shape (n_direction,). `geometry.load` contains the
@@ -58,7 +57,8 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
     # Mean displacement of the footprint under a unit side load in each direction, with one column for each load
     compliance = np.empty((n_direction, n_direction))
     with single_threaded_blas():
-        factor = factor_tangent(ElasticFilm(geometry, groups), assembly(mesh.template, components), solved.field)
+        elastic = ElasticFilm(geometry, groups)
+        factor = factor_tangent(elastic, assembly(mesh.template, elastic.unknowns_per_node), solved.field)
         for direction in range(n_direction):
             unit_load = np.zeros_like(solved.field)
             unit_load[:, direction] = geometry.load

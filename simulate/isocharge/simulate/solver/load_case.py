@@ -263,7 +263,7 @@ class LoadCase:
 
         layer = settings.layer
         if layer == "auto":
-            layer = _choose_layer(film, force, probe, settings, start)
+            layer = _choose_thin_ring_width(film, force, probe, settings, start)
         return cls(
             film=film,
             probe=probe,
@@ -321,12 +321,15 @@ def place_coated(
     return coated(mesh, tuple(coat_layers), film_moduli, coat_moduli)
 
 
-def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None) -> float:
+def _choose_thin_ring_width(
+    film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None
+) -> float:
     """Choose the total width of the thin rings of elements at the rim.
 
-    The default width is `LAYER_WIDTH` bending lengths. If the solve starts from an equilibrium on another mesh, the
-    width of the thin rings of that mesh may be used instead. The reason is that the solve can then start from the field
-    of the equilibrium. Both widths must be similar, and both meshes may have the same elements.
+    The default width is `LAYER_WIDTH` bending lengths. A solve that starts from an equilibrium on another mesh may use
+    the width of the thin rings of that mesh instead. The solve can then start from the field of the equilibrium. The
+    other width is used only if it is similar to the default width, and if the new mesh can have the same elements as
+    the other mesh.
 
     Args:
         film: The film.
@@ -427,9 +430,10 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     extra_order = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.accuracy)))
     first_order = 5 if case.theory.bending and film.coat is None else 4
 
-    # A small radius `rho` of the circle and the stretch of the conformal map require more rings (empirical factors).
+    # A small radius of the innermost circle and the stretch of the conformal map require more rings (empirical
+    # factors).
     rings_for_stretch = min(2.0 * math.log(_stretch(placement)), 4.0)
-    rings = math.ceil(-1.3 * math.log(float(placement.rho)) + rings_for_stretch)
+    rings = math.ceil(-1.3 * math.log(float(placement.template_radius)) + rings_for_stretch)
     first_resolution = Resolution(
         order=first_order + extra_order,
         around=16 if is_crowded else 8,
@@ -442,7 +446,7 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
         yield replace(first_resolution, order=order, around=around)
 
 
-def _thin_ring_count(placement: Placement, layer: float) -> int:
+def _thin_ring_count(placement: Placement, total_width: float) -> int:
     """Compute the number of thin rings at the rim.
 
     At the clamped rim, the film bends within a narrow strip, the boundary layer. The mesh is created in a unit disk,
@@ -453,14 +457,14 @@ def _thin_ring_count(placement: Placement, layer: float) -> int:
 
     Args:
         placement: Placement of the mesh under the press.
-        layer: Total width of the thin rings on the film, in film radii.
+        total_width: Total width of the thin rings on the film, in film radii.
     """
     # Largest and smallest width of the boundary layer in the template plane, as a fraction of the range of ln(r) that
     # all rings cover. The upper limit of 1 / 8 keeps the thin rings near the rim.
     stretch = _stretch(placement)
-    total_depth = -float(np.log(placement.rho))
-    largest_width = min(layer * stretch / total_depth, 1.0 / 8.0)
-    smallest_width = min(min(layer, 0.2) / stretch / total_depth, 1.0 / 8.0)
+    total_depth = -float(np.log(placement.template_radius))
+    largest_width = min(total_width * stretch / total_depth, 1.0 / 8.0)
+    smallest_width = min(min(total_width, 0.2) / stretch / total_depth, 1.0 / 8.0)
 
     # The logarithm to the base 3 is the number of rings between both widths if each ring is a third as wide.
     return 1 + math.floor(THIN_RINGS_PER_FACTOR * math.log(largest_width / smallest_width, 3.0))
@@ -468,4 +472,4 @@ def _thin_ring_count(placement: Placement, layer: float) -> int:
 
 def _stretch(placement: Placement) -> float:
     """Return the factor by which the conformal map stretches the template at the rim next to the probe."""
-    return float((1.0 + placement.c) / (1.0 - placement.c))
+    return float((1.0 + placement.map_parameter) / (1.0 - placement.map_parameter))

@@ -16,7 +16,7 @@ from typing import Self
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans, Complexes
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.solver.assembly import Assembly
@@ -103,7 +103,7 @@ class NewtonResult:
     message: str
 
 
-def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Array:
+def schwerin_start(template_points: Complexes, template_radius: float, groups: DimensionlessGroups) -> Array:
     """Compute the first iterate of Newton's method from Schwerin's deflection of a membrane.
 
     Schwerin's deflection is W = (3 / pi)^(1/3) (1 - r^(2/3)), where r is the distance from the origin of the template
@@ -112,19 +112,20 @@ def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Ar
     (3 / pi)^(1/3). The in-plane displacements are zero.
 
     Args:
-        z: Nodes x + iy in the template plane, shape (n_node,).
-        rho: Radius of the innermost circle in the template plane.
+        template_points: Nodes x + iy in the template plane, shape (n_node,).
+        template_radius: Radius of the innermost circle in the template plane.
         groups: Dimensionless groups of the press.
 
     Returns:
         Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
     """
-    # The term rho^2 rounds the tip of the deflection under the probe.
-    deflection_shape = np.cbrt(1.0 + rho**2) - np.cbrt(np.abs(z) ** 2 + rho**2)
-    field = np.zeros((z.size, 3))
+    # The term r0^2, with the radius r0 of the innermost circle, rounds the tip of the deflection under the probe.
+    distance = np.abs(template_points)
+    deflection_shape = np.cbrt(1.0 + template_radius**2) - np.cbrt(distance**2 + template_radius**2)
+    field = np.zeros((template_points.size, 3))
     field[:, 2] = groups.height * deflection_shape
-    is_on_rim = np.abs(z) > 1.0 - 1e-9
-    field[is_on_rim] = 0.0
+    is_on_rim = distance > 1.0 - 1e-9
+    field[is_on_rim] = 0.0  # removes rounding errors
     return field
 
 
@@ -143,7 +144,7 @@ def parabolic_start(radius: np.ndarray, groups: DimensionlessGroups) -> Array:
     field = np.zeros((radius.size, 3))
     field[:, 2] = groups.static_height * np.maximum(1.0 - radius**2, 0.0)
     is_on_rim = radius > 1.0 - 1e-9
-    field[is_on_rim] = 0.0
+    field[is_on_rim] = 0.0  # removes rounding errors
     return field
 
 
@@ -178,8 +179,9 @@ def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
         field = field + correction
         if correction_size <= REFINEMENT_TOLERANCE:
             message = f"linear theory, solved to round-off: corrected by {correction_size:.0e}"
-            return NewtonResult(field, True, n_solve, correction_size, message)
-    return NewtonResult(field, False, n_solve, correction_size, "the linear system is too near to singular")
+            return NewtonResult(field, converged=True, iterations=n_solve, residual=correction_size, message=message)
+    message = "the linear system is too near to singular"
+    return NewtonResult(field, converged=False, iterations=n_solve, residual=correction_size, message=message)
 
 
 def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
@@ -198,11 +200,11 @@ def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
     Returns:
         Residual, shape (n_node, 3). Only the last column is meaningful.
     """
-    factor = 0.01  # every small factor a results in the same coefficient k
+    small_factor = 0.01  # a; every small factor results in the same coefficient k
     flat_residual = elastic.residual(np.zeros_like(field))
-    single_change = elastic.residual(factor * field) - flat_residual  # r(a)
-    double_change = elastic.residual(2.0 * factor * field) - flat_residual  # r(2 a)
-    return flat_residual + (8.0 * single_change - double_change) / (6.0 * factor)
+    single_change = elastic.residual(small_factor * field) - flat_residual  # r(a)
+    double_change = elastic.residual(2.0 * small_factor * field) - flat_residual  # r(2 a)
+    return flat_residual + (8.0 * single_change - double_change) / (6.0 * small_factor)
 
 
 def solve_newton(
@@ -228,16 +230,16 @@ def solve_newton(
     Returns:
         The result, which may not have converged.
     """
-    iterate = _Iterate.of(elastic, assembly.free[:, :3], first_field)
+    iterate = _Iterate.create(elastic, assembly.free[:, :3], first_field)
     step_sizes: list[float] = []
     for iteration in range(MAX_ITERATIONS + 1):
         relative_residual = iterate.relative_residual
         if not np.isfinite(relative_residual):
-            return iterate.result(False, iteration, "the residual is not a finite number")
+            return iterate.result(iteration, converged=False, message="the residual is not a finite number")
         if relative_residual <= tolerance:
-            return iterate.result(True, iteration, f"converged in {iteration} steps")
-        if iteration == MAX_ITERATIONS or _stalled(step_sizes):
-            return iterate.result(False, iteration, f"no progress any more after {iteration} steps")
+            return iterate.result(iteration, converged=True, message=f"converged in {iteration} steps")
+        if iteration == MAX_ITERATIONS or _has_stalled(step_sizes):
+            return iterate.result(iteration, converged=False, message=f"no progress any more after {iteration} steps")
 
         # Compute the Newton step.
         stabilising_tension = _stabilising_tension(elastic, relative_residual)
@@ -246,14 +248,14 @@ def solve_newton(
         step_size = _step_size(elastic, iterate.field, step, iterate.residual)
         step_sizes.append(step_size)
         if step_size <= ROUND_OFF:
-            return iterate.result(True, iteration, f"converged to round-off in {iteration} steps")
+            return iterate.result(iteration, converged=True, message=f"converged to round-off in {iteration} steps")
 
         # Close to the equilibrium, take the full step if it halves the residual. Otherwise search for the step length.
         next_iterate = _take_full_step(iterate, step) if relative_residual <= full_steps_below else None
         if next_iterate is None:
             next_iterate = _line_search(iterate, _descent_step(iterate, assembly, step))
         if next_iterate is None:
-            return iterate.result(False, iteration, "no step lowers the energy any more")
+            return iterate.result(iteration, converged=False, message="no step lowers the energy any more")
         iterate = _chord_steps(next_iterate, factor, relative_residual, tolerance)
     raise AssertionError("the loop returns")  # the last iteration returns in every case
 
@@ -275,13 +277,13 @@ class _Iterate:
     residual: Array
 
     @classmethod
-    def of(cls, elastic: ElasticFilm, free: Booleans, field: Array) -> Self:
+    def create(cls, elastic: ElasticFilm, free: Booleans, field: Array) -> Self:
         """Create the iterate with a given field, and compute its residual."""
         return cls(elastic, free, field, elastic.residual(field))
 
     def after(self, step: Array) -> Self:
         """Return the iterate whose field is the present field plus a step of shape (n_node, 3)."""
-        return type(self).of(self.elastic, self.free, self.field + step)
+        return type(self).create(self.elastic, self.free, self.field + step)
 
     @cached_property
     def relative_residual(self) -> float:
@@ -297,12 +299,12 @@ class _Iterate:
         in_plane_ratio = np.linalg.norm(free_residual[:, :2]) / in_plane_force
         return float(max(transverse_ratio, in_plane_ratio))
 
-    def result(self, converged: bool, iterations: int, message: str) -> NewtonResult:
+    def result(self, iterations: int, *, converged: bool, message: str) -> NewtonResult:
         """Return the result of a solve whose last iterate is this object."""
         return NewtonResult(self.field, converged, iterations, self.relative_residual, message)
 
 
-def _stalled(step_sizes: list[float]) -> bool:
+def _has_stalled(step_sizes: list[float]) -> bool:
     """Return whether the sizes of the steps no longer decrease.
 
     The sizes stagnate, for example, if the film has no stiffness in some direction.
@@ -324,8 +326,8 @@ def _step_size(elastic: ElasticFilm, field: Array, step: Array, residual: Array)
 
     Args:
         elastic: Discrete model of the film.
-        field: Scaled displacements before the step, shape (n_node, 3) or (n_node,).
-        step: Change of the displacements, shape (n_node, 3) or (n_node,).
+        field: Scaled displacements (U1, U2, W) before the step, shape (n_node, 3).
+        step: Change of all displacements, shape (n_node, 3), or of W alone, shape (n_node,).
         residual: Out-of-balance forces before the step, same shape as `step`.
     """
     step_energy = abs(float(np.sum(step * residual)))
@@ -445,7 +447,7 @@ def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
     """
     elastic = iterate.elastic
     energy = elastic.energy(iterate.field)
-    energy_slope = float(np.sum(step * iterate.residual))  # derivative of the energy by the step length
+    energy_slope = float(np.sum(step * iterate.residual))  # derivative of the energy with respect to the step length
     residual_norm = np.linalg.norm(iterate.residual[iterate.free])
     step_length = 1.0
     for _ in range(MAX_HALVINGS):
@@ -454,7 +456,7 @@ def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
         lowers_energy = energy_change <= ARMIJO_SHARE * step_length * energy_slope
         is_round_off = abs(energy_change) <= ENERGY_ROUND_OFF * abs(energy)
         if lowers_energy or is_round_off:
-            next_iterate = _Iterate.of(elastic, iterate.free, field)
+            next_iterate = _Iterate.create(elastic, iterate.free, field)
             lowers_residual = np.linalg.norm(next_iterate.residual[iterate.free]) < residual_norm
             if lowers_energy or lowers_residual:
                 return next_iterate

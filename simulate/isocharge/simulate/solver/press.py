@@ -134,9 +134,9 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
     The charges agree if their relative difference is at most half of the required accuracy. The order is increased at
     most `MAX_EXTRA_ORDERS` times.
 
-    The status of the result is "failed" in two cases: if no equilibrium is found on the first or the second mesh, or if
-    the charges on the last two meshes differ by more than `DIFFERENT_EQUILIBRIUM`. If no equilibrium is found on a
-    later mesh, the result is the equilibrium on the previous mesh.
+    The status of the result is "failed" if no equilibrium is found on the first or the second mesh. The status is also
+    "failed" if the charges on the last two meshes differ by more than `DIFFERENT_EQUILIBRIUM`. If no equilibrium is
+    found on a later mesh, the result is the equilibrium on the previous mesh.
 
     Args:
         case: The press and the required accuracy.
@@ -157,7 +157,7 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
             only_one_mesh_is_solved = solved.proven_error is None
             if only_one_mesh_is_solved:  # the error of this mesh is unknown
                 return replace(finer_equilibrium, iterations=iterations)
-            break
+            break  # the equilibrium on the previous mesh is the result
         error = relative_difference(solved, finer_equilibrium)
         solved = replace(finer_equilibrium, iterations=iterations, proven_error=error)
         if error <= 0.5 * case.accuracy:
@@ -192,9 +192,8 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
     has_folded_element = np.isinf(shape_error(mesh))
     if has_folded_element:
         raise too_near_the_rim(case, mesh.resolution)
-    components = 4 if case.theory.bending else 3  # bending has an auxiliary unknown
-    solver = assembly(mesh.template, components)
     elastic = _elastic_film(case, mesh.geometry, case.force)
+    solver = assembly(mesh.template, elastic.unknowns_per_node)
     if case.theory.stretching:
         result = _solve_nonlinear(case, elastic, solver, mesh, start)
     else:
@@ -235,7 +234,7 @@ def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
     """
     mesh = equilibrium.mesh
     elastic = ElasticFilm(mesh.geometry, equilibrium.groups.without_probe)
-    solver = assembly(mesh.template, elastic.components)
+    solver = assembly(mesh.template, elastic.unknowns_per_node)
     first_field = _static_start(mesh, elastic.groups)
     result = solve_newton(elastic, solver, first_field, tolerance)
 
@@ -305,7 +304,7 @@ def _solve_nonlinear(
     """
     # Compute the first iterate without a starting equilibrium.
     template_points = mesh.placement.to_template(from_oval(mesh.node_points, mesh.oval))
-    default_field = schwerin_start(template_points, float(mesh.placement.rho), elastic.groups)
+    default_field = schwerin_start(template_points, float(mesh.placement.template_radius), elastic.groups)
     if elastic.groups.static_pressure != 0.0:
         default_field += _static_start(mesh, elastic.groups)
 

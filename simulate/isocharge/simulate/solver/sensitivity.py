@@ -66,6 +66,7 @@ def _tension_imperfection(direction: tuple[float, float, float]) -> AddImperfect
 
     def add_tension(solved: Equilibrium, value: float) -> Equilibrium:
         """Return the equilibrium with `value` units of additional tension."""
+        # The film of `solved` is isotropic, so this is its only anisotropy.
         unit = 1.0 + solved.groups.tension  # divided by E A^2, like all tensions in `groups`
         anisotropy = Anisotropy(moduli=np.zeros((3, 3)), tension=value * unit * np.array(direction))
         return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
@@ -203,7 +204,7 @@ def stress_changes(solved: Equilibrium, surface: Surface = "middle") -> Array:
         Changes of the stress of `nodal_stress` per unit of the imperfection, shape (n_field, n_element, n_local, 3).
     """
     all_fields = [field for fields in FIELDS.values() for field in fields]
-    return _stress_changes(solved, all_fields, surface)
+    return _changes_by_fields(solved, all_fields, surface)
 
 
 def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
@@ -220,7 +221,7 @@ def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array
         Changes, shape (n_element, n_local, 2, 3), in the order of the table of a `ForwardMap` with several fields. The
         last two axes are the field and the stress component (S11, S22, S12).
     """
-    return np.moveaxis(_stress_changes(solved, SIDE_FORCE_FIELDS, surface), 0, 2)
+    return np.moveaxis(_changes_by_fields(solved, SIDE_FORCE_FIELDS, surface), 0, 2)
 
 
 def tension_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
@@ -237,10 +238,10 @@ def tension_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
         Changes, shape (n_element, n_local, 3, 3), in the order of the table of a `ForwardMap` with several fields. The
         last two axes are the field and the stress component (S11, S22, S12).
     """
-    return np.moveaxis(_stress_changes(solved, TENSION_FIELDS, surface), 0, 2)
+    return np.moveaxis(_changes_by_fields(solved, TENSION_FIELDS, surface), 0, 2)
 
 
-def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: Surface) -> Array:
+def _changes_by_fields(solved: Equilibrium, fields: Sequence[StressField], surface: Surface) -> Array:
     """Compute how several imperfections change the scaled stress at the nodes.
 
     Even and odd fields have different fixed displacements on the line of symmetry. Therefore the tangent is factorised
@@ -255,20 +256,19 @@ def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface:
         Changes per unit of the imperfection, shape (n_field, n_element, n_local, 3).
     """
     with single_threaded_blas():
-        components = 3 if solved.groups.bending == 0.0 else 4  # bending has an auxiliary unknown
         elastic = ElasticFilm(solved.mesh.geometry, solved.groups)
-        even_assembly = assembly(solved.mesh.template, components, odd=False)
-        odd_assembly = assembly(solved.mesh.template, components, odd=True)
+        even_assembly = assembly(solved.mesh.template, elastic.unknowns_per_node, odd=False)
+        odd_assembly = assembly(solved.mesh.template, elastic.unknowns_per_node, odd=True)
         even_factor = factor_tangent(elastic, even_assembly, solved.field)
         odd_factor = factor_tangent(elastic, odd_assembly, solved.field)
         changes = []
         for field in fields:
             factor = odd_factor if field.odd else even_factor
-            changes.append(_stress_change(solved, field.add, factor, surface))
+            changes.append(_change_by_imperfection(solved, field.add, factor, surface))
         return np.stack(changes)
 
 
-def _stress_change(
+def _change_by_imperfection(
     solved: Equilibrium, add_imperfection: AddImperfection, factor: TangentFactor, surface: Surface
 ) -> Array:
     """Compute how one imperfection changes the scaled stress at the nodes.

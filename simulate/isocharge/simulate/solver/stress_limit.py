@@ -2,10 +2,10 @@
 
 The largest principal stress occurs under the probe, at the surface of the film. For presses within 0.7 film radii of
 the centre, the largest stress hardly depends on the position of the press. The largest stress is therefore computed for
-a press at the centre. For presses closer to the rim, the largest stress increases. Compared with a press at the centre,
-it is 1.4 times as large for a press at 0.8 film radii, and 3.7 times as large for a press at 0.93 film radii. In a
-membrane, the stress is proportional to F^(2/3), where F is the force. Under a small probe, the stress increases
-slightly more slowly with the force.
+a press at the centre. For presses closer to the rim, the largest stress increases. At 0.8 film radii, the largest
+stress is 1.4 times the stress at the centre. At 0.93 film radii, the largest stress is 3.7 times the stress at the
+centre. In a membrane, the stress is proportional to F^(2/3), where F is the force. Under a small probe, the stress
+increases slightly more slowly with the force.
 """
 
 from functools import lru_cache

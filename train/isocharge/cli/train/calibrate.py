@@ -134,7 +134,7 @@ def calibrate_command(
             knows_temperature = presses is not None and presses.knows_temperature
             problem = replace(problem, earlier=read_earlier(earlier, problem, knows_temperature=knows_temperature))
         if presses is not None:
-            result = _fit(presses, problem)
+            result = _calibrate(presses, problem)
         if result is not None and output is not None:
             _write(result, output)
 
@@ -156,12 +156,12 @@ def calibrate_into(presses: MeasuredPresses, problem: CalibrationProblem, output
         json: Whether to print one JSON object instead of text.
     """
     with calibration_folder(output, problem):
-        result = _fit(presses, problem)
+        result = _calibrate(presses, problem)
         _write(result, output)
     _print_result(result, [], json=json)
 
 
-def _fit(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
+def _calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
     """Calibrate a film with measured presses, and print the cautions of the calibration.
 
     Args:

@@ -364,11 +364,13 @@ def refuse_training_options(config: Path | None, version: int, radius: str) -> N
 def _film_prior(
     dataset: Path | None, sensor: str | None, notations: list[str], radius: str, config: Path | None
 ) -> FilmPrior:
-    """For `--films`, check the other options, and return the distribution of the films of a sensor.
+    """Check the options of a training with `--films`, and return the distribution of the films of the sensor.
+
+    With the option `--films`, the command trains a network for all films of a sensor.
 
     Args:
         dataset: Dataset or file of presses, which must be None.
-        sensor: Name or file of the sensor.
+        sensor: Name or file of the sensor, which must be given.
         notations: Notations of the probes; exactly one, which must be round.
         radius: Radius of the working area, which must be a number of mm.
         config: File with settings of the training, which must be None.

@@ -179,6 +179,10 @@ class Dialogue:
         """Wait for the next reading in one of the given phases.
 
         Readings in other phases are only displayed, and typed lines are ignored.
+
+        Raises:
+            SessionEnd: If the port or the input has ended.
+            IsochargeError: If the port fails.
         """
         while True:
             event = self._events.next()
@@ -238,16 +242,16 @@ class Dialogue:
             Whether the proposal is settled. If so, the next press must be proposed.
         """
         try:
-            return self._act_on(read_answer(line), press, proposed)
+            return self._carry_out(read_answer(line), press, proposed)
         except PressError as error:
             self._screen.say(f"   {error}")
             return False
 
-    def _act_on(self, answer: Answer, press: SteadyPress | None, proposed: Array) -> bool:
+    def _carry_out(self, answer: Answer, press: SteadyPress | None, proposed: Array) -> bool:
         """Carry out the command of an answer: quit, skip the proposal, record the steady press, or remove a press.
 
-        A press can only be recorded while a question about it is open. The command to remove the last press discards
-        this press or, if no question is open, removes the last recorded press.
+        A press can only be recorded while a question about it is open. While a question is open, the command to remove
+        the last press discards the steady press. Otherwise, this command removes the last recorded press.
 
         Args:
             answer: The command, which was read from the typed line.

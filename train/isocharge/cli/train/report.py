@@ -69,8 +69,8 @@ def report_command(
     simulation are left out. The option --probe states the probe with which the presses of PRESSES.csv were made.
 
     The report takes some minutes for a dataset of 24,000 presses. Durations are measured, so do not run other programs
-    at the same time. If the report is interrupted, its finished solves and limits remain in DIR.part, and the same
-    command continues it. The option --json prints report.json.
+    at the same time. If the report is interrupted, the results so far remain in DIR.part, and the same command
+    continues it. The option --json prints report.json.
 
     Example: isocharge train report presses -o report
     """

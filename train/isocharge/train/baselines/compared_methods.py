@@ -20,7 +20,13 @@ from isocharge.common.contact_errors import position_error
 from isocharge.common.statistics import rms
 from isocharge.simulate import ChargeMap, Domain, NoiseModel
 from isocharge.train.baselines.gauss_newton import GaussNewton
-from isocharge.train.baselines.learned import AXIS_SCALES, ResidualRegressor, SubsetProcess, on_logarithms, scale_axes
+from isocharge.train.baselines.learned import (
+    AXIS_SCALES,
+    ResidualRegressor,
+    SubsetProcess,
+    log_charge_regressor,
+    scale_axes,
+)
 from isocharge.train.baselines.paper import AffineTable, LinearBand, Triangulate
 from isocharge.train.data.presses import LabelledPresses
 
@@ -86,7 +92,7 @@ class FittingTask:
     quick: bool = False
 
     def presses(self, copies: int) -> LabelledPresses:
-        """Return one or more copies of the training presses, each with different noise in its charges.
+        """Return the training presses, or several copies of these presses with different noise in each copy.
 
         Args:
             copies: Number of copies; 0 for the presses without noise. A quick task has at most one copy.
@@ -97,7 +103,7 @@ class FittingTask:
         """
         if self.train.measured or copies == 0:
             return self.train
-        n_copies = 1 if self.quick else copies
+        n_copies = 1 if self.quick else copies  # one copy is enough for a trial run
         charges_of_copies = []
         for copy_index in range(n_copies):
             noise_seed = self.seed + FIRST_COPY_SEED + copy_index
@@ -188,7 +194,7 @@ class ComparedMethod:
         best_index = int(np.argmin(errors_mm))
 
         choice = self.choice
-        if not choice:
+        if not choice:  # a method without parameters can have a fixed text, which is kept
             choice = self._describe_choice(
                 parameter_sets[best_index],
                 n_compared=len(parameter_sets),
@@ -221,7 +227,7 @@ def describe_parameter(name: str, value: object) -> str:
 
     A pipeline of scikit-learn has several steps, and its parameters have names of the form "step__parameter". The text
     for a number is the last part of the name and the number. The text for a mapping contains only the entries of the
-    mapping.
+    mapping. The text for any other value is the whole name and the value.
 
     Args:
         name: Name of the parameter.
@@ -293,7 +299,7 @@ def compared_methods(task: FittingTask, charge_map: ChargeMap | None = None) -> 
         name="lookup table, nearest entry",
         kind="paper",
         computed_by=SKLEARN,
-        regressor=on_logarithms(domain, entry=KNeighborsRegressor(1)),
+        regressor=log_charge_regressor(domain, nearest_press=KNeighborsRegressor(1)),
     )
     gauss_newton = ComparedMethod(
         name=GAUSS_NEWTON,
@@ -337,7 +343,9 @@ def polynomial_ridge(task: FittingTask) -> ComparedMethod:
     # The logarithms are scaled to [-1, 1] and clipped to the range of the training presses, because a polynomial of
     # high degree grows fast beyond it.
     scaler = MinMaxScaler((-1.0, 1.0), clip=True)
-    regressor = on_logarithms(task.domain, box=scaler, monomials=PolynomialFeatures(), ridge=Ridge(solver="cholesky"))
+    regressor = log_charge_regressor(
+        task.domain, box=scaler, monomials=PolynomialFeatures(), ridge=Ridge(solver="cholesky")
+    )
 
     # The fit uses several copies of the presses with different noise. The penalty is proportional to the number of
     # presses in all copies, as the sum of the squared errors is.
@@ -393,7 +401,10 @@ def _scaled_axes() -> FunctionTransformer:
 
 
 def _axis_scale_candidates(task: FittingTask) -> dict[str, Sequence[Any]]:
-    """Return the candidates for the factors of the principal axes, by the name of the parameter."""
+    """Return the candidates for the factors of the principal axes, by the name of the parameter.
+
+    A quick task has only one candidate.
+    """
     candidates = AXIS_SCALES[1:2] if task.quick else AXIS_SCALES
     return {"regressor__scales__kw_args": candidates}
 
@@ -404,7 +415,7 @@ def _interpolated_table(task: FittingTask) -> ComparedMethod:
     Args:
         task: Presses and conditions for the fit.
     """
-    regressor = on_logarithms(task.domain, scales=_scaled_axes(), table=AffineTable())
+    regressor = log_charge_regressor(task.domain, scales=_scaled_axes(), table=AffineTable())
     candidates = _axis_scale_candidates(task) | {"regressor__table__neighbours": (64, 128)}
     return ComparedMethod(
         name=TABLE, kind="paper", computed_by=KD_TREE, regressor=regressor, copies=5, candidates=candidates
@@ -414,13 +425,13 @@ def _interpolated_table(task: FittingTask) -> ComparedMethod:
 def _nearest_neighbours(task: FittingTask) -> ComparedMethod:
     """Return a regressor that adds the mean residual of the nearest neighbours to a linear regression.
 
-    The neighbours are the presses whose charges are most similar. There are candidates for the number of neighbours,
-    and for the scales of the axes along which distances are measured.
+    The neighbours are the presses whose charges are most similar. The number of neighbours and the factors by which the
+    principal axes are scaled are chosen among several candidates.
 
     Args:
         task: Presses and conditions for the fit.
     """
-    regressor = on_logarithms(task.domain, scales=_scaled_axes(), near=ResidualRegressor(KNeighborsRegressor()))
+    regressor = log_charge_regressor(task.domain, scales=_scaled_axes(), near=ResidualRegressor(KNeighborsRegressor()))
     neighbour_counts = [count for count in (16, 32, 64) if count <= len(task.train)]  # not more than there are presses
     candidates = _axis_scale_candidates(task) | {"regressor__near__regressor__n_neighbors": neighbour_counts}
     return ComparedMethod(
@@ -442,7 +453,8 @@ def _gradient_boosting(task: FittingTask) -> ComparedMethod:
     n_trees = 30 if task.quick else 250
     trees = HistGradientBoostingRegressor(max_iter=n_trees, early_stopping=False, random_state=task.seed)
     trees_for_each_target = MultiOutputRegressor(trees)  # the targets are x, y and the logarithm of the force
-    regressor = on_logarithms(task.domain, trees=ResidualRegressor(trees_for_each_target))
+    regressor = log_charge_regressor(task.domain, trees=ResidualRegressor(trees_for_each_target))
+    # The name of the parameter is its path: the pipeline, its step `trees`, and the regressors within this step.
     candidates = {"regressor__trees__regressor__estimator__max_leaf_nodes": (31, 63)}
     return ComparedMethod(
         name=BOOSTING,
@@ -460,7 +472,7 @@ def _gaussian_process(task: FittingTask) -> ComparedMethod:
     Args:
         task: Conditions of the fit: the domain and the seed. A quick task has a smaller subset.
     """
-    points, kernel_points = (300, 150) if task.quick else (2000, 500)
-    process = SubsetProcess(points, kernel_points, task.seed)
-    regressor = on_logarithms(task.domain, process=process)
+    n_presses, n_kernel_presses = (300, 150) if task.quick else (2000, 500)
+    process = SubsetProcess(n_presses, n_kernel_presses, task.seed)
+    regressor = log_charge_regressor(task.domain, process=process)
     return ComparedMethod(name="Gaussian process", kind="learnt", computed_by=SKLEARN, regressor=regressor, copies=1)

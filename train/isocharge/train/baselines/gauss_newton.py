@@ -92,7 +92,7 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
         The residuals of a press with the charges Q are (Q - Q(c)) / sigma. Q(c) are the charges of the estimated
         contact c, and sigma are the standard deviations of the noise. If the sum of the squared residuals of a press is
-        above `RESTART_THRESHOLD`, the search is repeated from another start.
+        above `RESTART_THRESHOLD`, the search is repeated from another start, up to `MAX_ATTEMPTS` searches in all.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.

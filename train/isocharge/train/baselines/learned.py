@@ -34,8 +34,10 @@ N_POSITION_AND_FORCE_AXES = 3
 """Number of principal axes that depend mostly on the force and the position."""
 
 
-def on_logarithms(domain: Domain, **steps: Any) -> TransformedTargetRegressor:
+def log_charge_regressor(domain: Domain, **steps: Any) -> TransformedTargetRegressor:
     """Return a regressor that estimates contacts, shape (n, 3), mm and N, from charges, shape (n, n_electrode), pC.
+
+    The charges are first converted into whitened logarithms, and the targets are the contacts in unit coordinates.
 
     Args:
         domain: Contacts that can occur.
@@ -59,9 +61,10 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         """Determine whether the charges have both signs and, if they do, compute the scale of the transformation.
 
         The charges of an electrode have both signs if more than the fraction `BOTH_SIGNS` of them is not positive. A
-        smaller fraction can be due to noise alone. Charges of both signs are transformed to asinh(Q / scale), which is
-        linear for charges far below the scale and logarithmic for charges far above it. If no electrode has charges of
-        both signs, the scale is None, and the charges are transformed to logarithms.
+        smaller fraction can be due to noise alone. If at least one electrode has charges of both signs, the charges of
+        all electrodes are transformed to asinh(Q / scale). This function is linear for charges far below the scale and
+        logarithmic for charges far above it. Otherwise, the scale is None, and the charges are transformed to
+        logarithms.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -73,9 +76,9 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         del target
         is_not_positive = charge <= 0.0
         not_positive_fraction = is_not_positive.mean(axis=0)  # one value for each electrode
-        has_both_signs = (not_positive_fraction > BOTH_SIGNS).any()
+        any_has_both_signs = (not_positive_fraction > BOTH_SIGNS).any()
         self.scale_ = None
-        if has_both_signs:
+        if any_has_both_signs:
             self.scale_ = MIN_TRANSITION_RATIO * usual_size(charge)  # shape (n_electrode,), pC
         return self
 
@@ -104,7 +107,7 @@ def scale_axes(values: Array, force: float, rest: float) -> Array:
 
 
 class ResidualRegressor(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """Sum of a linear regression and a regressor that is fitted to its residuals.
+    """Sum of a linear regression and a second regressor, which is fitted to the residuals of the linear regression.
 
     Args:
         regressor: Regressor for the residuals of the linear regression.
@@ -114,7 +117,7 @@ class ResidualRegressor(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         self.regressor = regressor
 
     def fit(self, inputs: Array, target: Array) -> "ResidualRegressor":
-        """Fit the linear regression, and then fit the regressor to its residuals.
+        """Fit the linear regression, and then fit a clone of the second regressor to the residuals.
 
         Args:
             inputs: Inputs, shape (n, n_input).
@@ -140,14 +143,14 @@ class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
     A subset is used because the time of a fit grows with the third power of the number of presses.
 
     Args:
-        points: Number of presses to which the process is fitted.
-        kernel_points: Number of presses to which the parameters of the kernel are fitted, by marginal likelihood.
+        n_presses: Number of presses to which the process is fitted.
+        n_kernel_presses: Number of presses to which the parameters of the kernel are fitted, by marginal likelihood.
         seed: Seed of the subset.
     """
 
-    def __init__(self, points: int = 2000, kernel_points: int = 500, seed: int = 0) -> None:
-        self.points = points
-        self.kernel_points = kernel_points
+    def __init__(self, n_presses: int = 2000, n_kernel_presses: int = 500, seed: int = 0) -> None:
+        self.n_presses = n_presses
+        self.n_kernel_presses = n_kernel_presses
         self.seed = seed
 
     def fit(self, inputs: Array, target: Array) -> "SubsetProcess":
@@ -164,8 +167,8 @@ class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
             This estimator.
         """
         shuffled_rows = np.random.default_rng(self.seed).permutation(len(inputs))
-        rows = shuffled_rows[: self.points]
-        kernel_rows = rows[: self.kernel_points]
+        process_rows = shuffled_rows[: self.n_presses]
+        kernel_rows = process_rows[: self.n_kernel_presses]
 
         # The covariance of two inputs is the variance times their correlation, which decreases with their distance. The
         # noise is independent for each press. Each part has an initial value, and bounds within which it is fitted.
@@ -181,7 +184,7 @@ class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
         # Without an optimiser, the second process uses the fitted kernel as it is.
         self.process_ = GaussianProcessRegressor(kernel_process.kernel_, optimizer=None, normalize_y=True)
-        self.process_.fit(inputs[rows], target[rows])
+        self.process_.fit(inputs[process_rows], target[process_rows])
         return self
 
     def predict(self, inputs: Array) -> Array:

@@ -49,24 +49,25 @@ class OnnxContact(GivenMethod):
         (contact,) = self._session.run(["contact"], {INPUT: charge.astype(np.float32)})
         return np.asarray(contact, dtype=float)
 
-    def single(self, charge: Array) -> Callable[[], object]:
+    def single_press_function(self, charge: Array) -> Callable[[], object]:
         """Return a function without arguments that computes the contact of one press, for measuring its duration.
 
-        Memory for the charges and the contact is bound to the session before the first call, as in `Predictor`.
+        Memory for the charges and the contact is bound to the session before the first call, as in `Predictor`. The
+        function returns the same array in every call.
 
         Args:
             charge: Charges of the press, shape (n_electrode,), pC.
         """
         bound_press = BoundPress(self._session, charge.size)
-        single_charge = charge.astype(np.float32)
+        float32_charge = charge.astype(np.float32)  # the type of the input of the graph
         contact = np.zeros(3, np.float32)  # overwritten by every call
 
-        def compute() -> object:
+        def compute_contact() -> object:
             """Return the contact (x, y, F) of the press, shape (3,), float32, mm and N."""
-            bound_press.run_into(single_charge, contact)
+            bound_press.run_into(float32_charge, contact)
             return contact
 
-        return compute
+        return compute_contact
 
     def __getstate__(self) -> dict[str, Any]:
         return {"graph": self.graph}
@@ -105,7 +106,7 @@ class TrainedNetwork(OnnxContact):
         self.seed = seed
 
     def fit(self, charge: Array, contact: Array) -> Self:
-        """Train the network on presses, and write the ONNX graph that computes its contacts.
+        """Train the network on presses, and store the ONNX graph that computes its contacts.
 
         A training always includes the misfit perceptron, whose output is not used here. This perceptron is therefore
         small and trained for one step only.
@@ -165,15 +166,15 @@ class ReleasedModel(GivenMethod):
         misfit = np.reshape(answers.misfit, (-1, 1))  # one column
         return contact.astype(float), std.astype(float), misfit.astype(float)
 
-    def single(self, charge: Array) -> Callable[[], object]:
+    def single_press_function(self, charge: Array) -> Callable[[], object]:
         """Return a function without arguments that computes the answer to one press with `Predictor.predict_into`.
 
         Args:
             charge: Charges of the press, shape (n_electrode,), pC.
         """
-        single_charge = charge.astype(np.float32)
-        answer = np.zeros(N_WITHOUT_CORRELATION, np.float32)
-        return partial(self.predictor.predict_into, single_charge, answer)
+        float32_charge = charge.astype(np.float32)
+        answer = np.zeros(N_WITHOUT_CORRELATION, np.float32)  # overwritten by every call
+        return partial(self.predictor.predict_into, float32_charge, answer)
 
     @cached_property
     def predictor(self) -> Predictor:

@@ -8,8 +8,9 @@ in F, F dx and F dy. The equations of all electrodes are solved for these three 
 slack films, because their charges are proportional to F^(2/3).
 
 Lookup table: an entry consists of a contact, the mean features of the presses at this contact, and an affine map. The
-affine map is fitted to the presses with the most similar features. A large number of such presses averages the noise,
-and a small number follows the curvature of the map. The number is chosen by validation.
+affine map is fitted to the presses with the most similar features. With a larger number of such presses, the noise is
+averaged better; with a smaller number, the affine map is a better approximation of the curved map. The number is
+chosen by validation.
 """
 
 import numpy as np
@@ -156,7 +157,7 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         grid = square_grid[is_in_disk]  # positions divided by the radius, shape (n_grid, 2)
 
         # The columns of the linear map are s, ds/dx and ds/dy. The derivative ds/dx is s d(ln s)/dx, and d(ln s)/dx is
-        # computed by central differences.
+        # computed by central differences. The steps are relative to the radius, so the differences are divided by it.
         slope = np.exp(self._polynomials(grid) @ coefficients)  # s, shape (n_grid, n_electrode)
         columns = [slope]
         for step in DIFFERENCE_STEP * np.eye(2):  # a step along x, and a step along y
@@ -187,7 +188,8 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         force, force_times_shift = np.split(estimates, [1], axis=1)  # shapes (n, 1) and (n, 2)
 
         # The linear map is only valid near the grid point, so the shift is limited to twice the spacing of the grid.
-        max_shift = 4.0 * self.radius / (GRID_POINTS - 1)
+        grid_spacing = 2.0 * self.radius / (GRID_POINTS - 1)
+        max_shift = 2.0 * grid_spacing
         positive_force = np.maximum(force, MIN_DIVISOR)  # noise can make the estimated force zero or negative
         shift = np.clip(force_times_shift / positive_force, -max_shift, max_shift)
         position = self.grid_position_[grid_index] + shift
@@ -261,7 +263,7 @@ class AffineTable(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         n_neighbour = min(self.neighbours, len(features))
         ranks = range(1, n_neighbour + 1)
 
-        # The maps are fitted in chunks of entries, which limits the memory.
+        # The maps are fitted in chunks of entries, which limits the memory. "+ 1" rounds the number of chunks up.
         entries_per_chunk = max(1, CHUNK // self.neighbours)
         n_chunk = len(entry_features) // entries_per_chunk + 1
         maps_of_chunks = []

@@ -70,8 +70,8 @@ def bayes_estimate(
     Args:
         problem: Sensor, probe, prior and noise.
         charge: Touch charges with noise, shape (n, n_electrode), pC.
-        charge_map: Map from contacts to charges; None to simulate this map. The range of forces of the map must be that
-            of the problem, and its radius must be at least that of the problem.
+        charge_map: Map from contacts to charges; None to simulate this map. The range of forces of the map must be
+            equal to that of the problem, and the radius of the map must be at least that of the problem.
         executor: Executor for the solves and integrals; None for this process. The executor of a `ResumableRun` saves
             completed results.
 
@@ -90,7 +90,7 @@ def bayes_estimate(
 
     # The integration evaluates the charges at many contacts, which is much faster with a spline of the map.
     spline = used_map if isinstance(used_map, ChargeSpline) else ChargeSpline.of(used_map)
-    posterior = Posterior(spline, problem.noise, problem.radius)
+    posterior = Posterior(spline, problem.noise, problem.radius)  # raises an error for zero noise or a small map
     return posterior.mean_and_std(charge, executor)
 
 

@@ -133,7 +133,7 @@ class Cells:
         half_diagonal = np.sqrt(0.5) * self.side
         return np.asarray(np.hypot(self.centre[:, 0], self.centre[:, 1]) + half_diagonal > radius)
 
-    def inside(self, radius: float) -> tuple[Array, Array]:
+    def fraction_and_centroid_inside(self, radius: float) -> tuple[Array, Array]:
         """Compute how much of each cell lies in the disk, and the centroid of this part.
 
         Cells that may extend beyond the disk are sampled by a grid of points. All other cells lie inside completely.
@@ -252,7 +252,7 @@ class Posterior:
         return ForceProfile.of(self.charges.force_weights, self.charges.domain.force_range)
 
     @cached_property
-    def _roots(self) -> _RootCells:
+    def _root_cells(self) -> _RootCells:
         """Undivided cells of a press, with the charges at their centres and the largest slopes of the charges in them.
 
         Each charge is a sum of terms, which depend on the position and are weighted by functions of the force.
@@ -294,7 +294,7 @@ class Posterior:
         area_groups = []
         centroid_groups = []
         for cells in self._integration_cells(charge):
-            fraction, centroid = cells.inside(self.radius)
+            fraction, centroid = cells.fraction_and_centroid_inside(self.radius)
             press_groups.append(cells.press)
             area_groups.append(fraction * np.square(cells.side))
             centroid_groups.append(centroid)
@@ -311,19 +311,20 @@ class Posterior:
         return _posterior_moments(press, position, log_force, log_weight)
 
     def _integration_cells(self, charge: Array) -> Iterator[Cells]:
-        """Yield cells that cover the posterior of each press and are small compared with its width.
+        """Yield groups of cells that cover the posterior of each press and are small compared with its width.
 
-        In each round, all cells have the same side. The deviation chi-squared of the charges of a press is computed at
-        the centres of its cells. A cell is possible if chi-squared may be small at some contact in it. If the possible
-        cells of a press are small enough, the cells of this press are finished and yielded. Otherwise, each possible
-        cell is divided into four cells for the next round.
+        In each round, all cells have the same side. Chi-squared, which is the sum of the squared deviations of the
+        charges in units of the noise, is computed at the centre of each cell. A cell is possible if chi-squared may be
+        small at some contact in the cell. If the possible cells of a press are small enough, the cells of this press
+        are finished: those with a small chi-squared are yielded. Otherwise, each possible cell is divided into four
+        cells for the next round. In the last round, all cells are accepted.
 
         Args:
             charge: Charges with noise, shape (n_press, n_electrode), pC.
         """
         # In the first round, each press has all root cells.
         n_press = len(charge)
-        roots = self._roots
+        roots = self._root_cells
         press, root = np.indices((n_press, len(roots.cells))).reshape(2, -1)
         cells = Cells(press, root, roots.cells.centre[root], roots.cells.side)
         terms = roots.terms[root]
@@ -332,7 +333,7 @@ class Posterior:
             # the smallest value among the cells of the same press
             cell_charge = charge[cells.press]
             log_force = self._profile.best_log_force(terms, cell_charge, self.noise)
-            chi2, slope = self._chi2_and_slope(terms, log_force, cell_charge, roots.largest_slope[cells.root])
+            chi2, root_slope = self._chi2_and_slope(terms, log_force, cell_charge, roots.largest_slope[cells.root])
             smallest_chi2 = np.full(n_press, np.inf)
             np.minimum.at(smallest_chi2, cells.press, chi2)  # minimum by press, shape (n_press,)
             excess_chi2 = chi2 - smallest_chi2[cells.press]
@@ -340,18 +341,20 @@ class Posterior:
             # Lower bound of chi-squared in the whole cell: between the centre and any position in the cell, the root of
             # chi-squared decreases by at most the half diagonal times the largest slope of the root.
             half_diagonal = np.sqrt(0.5) * cells.side
-            lower_bound = np.maximum(np.sqrt(chi2) - half_diagonal * slope, 0.0) ** 2
-            possible = np.flatnonzero(lower_bound - smallest_chi2[cells.press] <= NEGLIGIBLE_CHI2)
+            lower_bound = np.maximum(np.sqrt(chi2) - half_diagonal * root_slope, 0.0) ** 2
+            is_possible = lower_bound - smallest_chi2[cells.press] <= NEGLIGIBLE_CHI2
 
             # Yield the cells of the presses whose possible cells are small enough.
-            press_is_fine = self._has_fine_cells(cells[possible], terms[possible], log_force[possible], n_press)
+            press_has_fine_cells = self._has_fine_cells(
+                cells[is_possible], terms[is_possible], log_force[is_possible], n_press
+            )
             if division == MAX_DIVISIONS:
-                press_is_fine[:] = True  # the cells are not divided again, so they are accepted as they are
-            is_fine = press_is_fine[cells.press]
-            yield from self._finished_cells(cells[is_fine], excess_chi2[is_fine], n_press)
+                press_has_fine_cells[:] = True  # the cells are not divided again, so they are accepted as they are
+            is_finished = press_has_fine_cells[cells.press]
+            yield from self._finished_cells(cells[is_finished], excess_chi2[is_finished], n_press)
 
-            # Divide the cells of the other presses.
-            cells = cells[possible][~is_fine[possible]].divided(self.radius)
+            # Divide the possible cells of the other presses.
+            cells = cells[is_possible & ~is_finished].divided(self.radius)
             if not len(cells):
                 return
             terms = self._terms(cells)
@@ -420,9 +423,9 @@ class Posterior:
         deviation = (charge - expected) / sigma
         chi2 = (deviation**2).sum(axis=1)
 
-        # No term is steeper than the largest slope. The slope of an expected charge is therefore at most the largest
-        # slope times the sum of the weights. The square root of chi-squared is the norm of the deviations of all
-        # electrodes, so its slope is at most the norm of their slopes.
+        # No term is steeper than the largest slope. The slope of an expected charge is therefore at most about the
+        # largest slope times the sum of the weights, most of which are positive. The square root of chi-squared is the
+        # norm of the deviations of all electrodes, so its slope is at most the norm of their slopes.
         deviation_slope = largest_slope * force_weights.sum(axis=1)[:, None] / sigma
         return chi2, np.linalg.norm(deviation_slope, axis=1)
 
@@ -430,8 +433,8 @@ class Posterior:
         """Compute the inverse of the standard deviation of the position along its most certain direction.
 
         The force is assumed to be unknown. The computation begins with the derivatives of the charges with respect to
-        the position, in units of the noise. The part of them that a change of the force can also cause is removed. The
-        largest singular value of the remaining matrix is the result.
+        the position, in units of the noise. The part of these derivatives that a change of the force can also cause is
+        removed. The largest singular value of the remaining matrix is the result.
 
         Args:
             cells: Cells at whose centres the contact is assumed.
@@ -500,15 +503,14 @@ class Posterior:
 def _posterior_moments(press: Integers, position: Array, log_force: Array, log_weight: Array) -> Array:
     """Compute the mean and the standard deviation of (x, y, F) for every press.
 
-    The mean and the standard deviation are weighted sums over all positions of the press and over all forces at each
-    position. Instead of the mean of the force, E[1/F] / E[1/F^2] is returned. This estimate has the smallest mean
-    squared relative error.
+    Each expectation is a weighted mean over all positions of the press and over all forces at each position. Instead of
+    the mean of the force, E[1/F] / E[1/F^2] is returned. This estimate has the smallest mean squared relative error.
 
     Args:
         press: Number of the press of each position, ascending, shape (n_position,).
         position: Positions, shape (n_position, 2), mm.
         log_force: Logarithms of the forces at each position, shape (n_position, n_node).
-        log_weight: Logarithms of the weights of these contacts, shape (n_position, n_node).
+        log_weight: Logarithms of the weights of these contacts, up to a constant, shape (n_position, n_node).
 
     Returns:
         Means and then standard deviations, shape (2, n_press, 3), mm and N.

@@ -70,7 +70,7 @@ class ChannelNoise:
     name: str = "measured"
 
     @classmethod
-    def of(cls, charge: Array, unit: Array) -> "ChannelNoise":
+    def estimate(cls, charge: Array, unit_contact: Array) -> "ChannelNoise":
         """Estimate the noise of each channel from measured presses.
 
         A plane through the neighbours of a press estimates the charges of the press without noise. The residuals are
@@ -79,18 +79,20 @@ class ChannelNoise:
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
-            unit: Contacts in unit coordinates, shape (n, 3).
+            unit_contact: Contacts in unit coordinates, shape (n, 3).
 
         Returns:
             Noise model with the white noise and the noise of the gain of each channel.
         """
-        planes = LocalPlanes.through(unit, charge)
+        planes = LocalPlanes.fit(unit_contact, charge)
         channel_variances = [
-            _fit_variances(value, residual) for value, residual in zip(planes.value.T, planes.residual.T, strict=True)
+            _fit_variances(channel_charge, channel_residual)
+            for channel_charge, channel_residual in zip(planes.value.T, planes.residual.T, strict=True)
         ]
         white_std, gain_std = np.sqrt(np.array(channel_variances)).T  # each of shape (n_electrode,)
         gain = np.maximum(gain_std, LEAST_GAIN)
-        # The presses do not determine the white noise if all charges are large, so it has a lower limit.
+        # The presses do not determine the white noise if all charges are large. Its lower limit is a small fraction of
+        # the noise of the gain at the usual charge.
         smallest_white = LEAST_SHARE * gain * usual_size(charge)
         white = np.maximum(white_std, smallest_white)
         return cls(white, gain)
@@ -131,7 +133,7 @@ class ChannelNoise:
 
         The inputs of the network are asinh(Q / transition charge). They are nearly linear in charges Q below the
         transition charge, and nearly logarithmic above it. The transition charge is the charge above which the noise is
-        mostly proportional to the charge. A channel with charges of both signs also has a smallest transition charge.
+        mostly proportional to the charge. For a channel with charges of both signs, it also has a lower limit.
 
         Args:
             charge: Charges of presses, shape (n, n_electrode), pC.
@@ -176,22 +178,24 @@ class LocalPlanes:
     reach: Array
 
     @classmethod
-    def through(cls, unit: Array, values: Array) -> "LocalPlanes":
+    def fit(cls, unit_contact: Array, values: Array) -> "LocalPlanes":
         """For each press, fit a plane to the values of its neighbours by least squares.
 
         The plane is a linear function from the unit coordinates of a contact to the k values. The press itself is not
-        used in the fit, so that its residual is independent of the plane.
+        used in the fit, so that its residual is independent of the plane. The residuals are scaled so that their
+        variance is equal to that of the noise of the values.
 
         Args:
-            unit: Contacts in unit coordinates, shape (n, 3).
+            unit_contact: Contacts in unit coordinates, shape (n, 3).
             values: Values at the contacts, such as charges, shape (n, k).
 
         Returns:
             The planes, one for each press.
         """
-        distance, nearest = cKDTree(unit).query(unit, NEIGHBOURS + 1)  # both of shape (n, NEIGHBOURS + 1)
+        tree = cKDTree(unit_contact)
+        distance, nearest = tree.query(unit_contact, NEIGHBOURS + 1)  # both of shape (n, NEIGHBOURS + 1)
         neighbours = nearest[:, 1:]  # the nearest point is the press itself
-        offsets = unit[neighbours] - unit[:, None]  # shape (n, NEIGHBOURS, 3)
+        offsets = unit_contact[neighbours] - unit_contact[:, None]  # shape (n, NEIGHBOURS, 3)
         # The constant and the offsets of the neighbours, shape (n, NEIGHBOURS, 1 + number of coordinates)
         columns = np.concatenate([np.ones((*neighbours.shape, 1)), offsets], axis=2)
         # The pseudoinverse contains the weights of the neighbours in the least-squares solution.
@@ -201,10 +205,11 @@ class LocalPlanes:
         value = coefficients[:, 0]
         slope = coefficients[:, 1:].swapaxes(1, 2)  # shape (n, k, 3)
 
-        # The plane is itself uncertain, by the sum of the squared weights of its neighbours.
+        # A residual contains the noise of the press and the noise of the plane. If the noise of each value has the
+        # variance 1, the variance of the plane is the sum of the squared weights of its neighbours.
         value_weights = neighbour_weights[:, :1]  # weights in the value of the plane, shape (n, 1, NEIGHBOURS)
-        residual_std = np.sqrt(1.0 + (value_weights**2).sum(axis=2))
-        residual = (values - value) / residual_std
+        relative_residual_std = np.sqrt(1.0 + (value_weights**2).sum(axis=2))
+        residual = (values - value) / relative_residual_std
         reach = distance[:, -1]  # the distances are sorted
         return cls(value, slope, residual, reach)
 
@@ -224,20 +229,20 @@ class LocalPlanes:
         _, candidate_planes = cKDTree(self.value).query(values, CANDIDATES)  # indices, shape (m, CANDIDATES)
         inverse_slope = np.linalg.pinv(self.slope)  # shape (n, 3, k)
         smallest_residual = np.full(values.shape, np.inf)
-        for planes in candidate_planes.T:  # indices of one plane for each set of values, shape (m,)
+        for plane_index in candidate_planes.T:  # index of one plane for each set of values, shape (m,)
             # Find the point of the plane that is nearest to each set of values. The vector `step`, shape (m, 3), leads
             # from the press of the plane to the contact of this point, in unit coordinates. The matrices are
             # multiplied by column vectors, which have an additional last axis.
-            difference = values - self.value[planes]  # from the value at the press, shape (m, k)
-            step = (inverse_slope[planes] @ difference[..., None])[..., 0]
+            difference = values - self.value[plane_index]  # from the values at the press, shape (m, k)
+            step = (inverse_slope[plane_index] @ difference[..., None])[..., 0]
 
             # Shorten steps that end beyond the farthest neighbour.
             length = np.linalg.norm(step, axis=1)
-            factor = np.minimum(1.0, self.reach[planes] / np.maximum(length, TINY))
-            limited_step = step * factor[:, None]
+            length_ratio = np.minimum(1.0, self.reach[plane_index] / np.maximum(length, TINY))
+            limited_step = step * length_ratio[:, None]
 
             # Difference from the point at the end of the step, shape (m, k)
-            residual = difference - (self.slope[planes] @ limited_step[..., None])[..., 0]
+            residual = difference - (self.slope[plane_index] @ limited_step[..., None])[..., 0]
 
             # Keep the residual if this plane is nearer than all earlier planes.
             is_nearer = (residual**2).sum(axis=1) < (smallest_residual**2).sum(axis=1)
@@ -260,7 +265,7 @@ def _fit_variances(charge: Array, residual: Array) -> tuple[float, float]:
     The function white^2 + gain^2 Q^2 is fitted to the squared residuals by weighted least squares. Neither white^2 nor
     gain^2 can become negative. The squared residuals of large charges scatter more, so each squared residual is divided
     by its expected value. The expected values are not known at first. The fit is therefore repeated, and each round
-    uses the expected values that follow from the variances of the previous round.
+    uses the expected values that follow from the variances of the previous round. Outliers are clipped.
 
     Args:
         charge: Charges Q without noise, shape (n,), pC.

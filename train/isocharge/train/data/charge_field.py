@@ -127,7 +127,7 @@ class ChargeField:
         Raises:
             TrainingError: If there are too few presses for the smallest degrees.
         """
-        fitter = _SeriesFitter.of(domain, electrodes, presses, validation)
+        fitter = _SeriesFitter.prepare(domain, electrodes, presses, validation)
         candidate_degrees = SIGNED_CANDIDATE_DEGREES if presses.signed else CANDIDATE_DEGREES
         first_degrees, *further_degrees = candidate_degrees
         best_field = fitter.fit(*first_degrees)
@@ -178,23 +178,23 @@ class ChargeField:
             Charges, shape (n, n_electrode), pC, and their derivatives with respect to (x, y, ln F), shape (n,
             n_electrode, 3).
         """
-        unit = self.domain.to_unit(contact)
+        unit_contact = self.domain.to_unit(contact)
         # The second axis has the value of the series, and then its derivatives with respect to the unit coordinates x,
         # y and l.
-        values_and_slopes = self._series.values_and_derivatives(unit)  # shape (n, 4, n_electrode)
+        values_and_slopes = self._series.values_and_derivatives(unit_contact)  # shape (n, 4, n_electrode)
         value = values_and_slopes[:, 0]
         slopes = values_and_slopes[:, 1:]  # shape (n, 3, n_electrode)
 
-        # In both cases, the derivative of the charge is a factor times `slopes`.
+        # In both cases, the derivative of the charge is `charge_per_value` times `slopes`.
         if self.log_size is None:  # Q = exp(value), so the derivative is Q' = Q value'
             charge = np.exp(value)
-            factor = charge
+            charge_per_value = charge  # dQ / d(value)
         else:  # Q = S(l) value, so the derivative is Q' = S (value' + (ln S)' value)
-            size, log_size_slope = _size_and_slope(self.log_size, unit[:, 2])
+            size, log_size_slope = _size_and_slope(self.log_size, unit_contact[:, 2])
             charge = size * value
             slopes[:, 2] += log_size_slope * value  # S depends only on l, the third coordinate
-            factor = size
-        charge_slopes = factor[:, :, None] * slopes.swapaxes(1, 2)
+            charge_per_value = size
+        charge_slopes = charge_per_value[:, :, None] * slopes.swapaxes(1, 2)
         # The division by the scale converts derivatives in unit coordinates into derivatives in x, y and ln F.
         return charge, charge_slopes / self.domain.scale
 
@@ -204,7 +204,7 @@ class ChargeField:
         return Series(self.series)
 
     @property
-    def of_positive(self) -> ChargeSeries | None:
+    def positive_series(self) -> ChargeSeries | None:
         """Series with which contacts are tracked across folds. None if the charges have both signs."""
         if self.log_size is not None:
             return None
@@ -218,7 +218,7 @@ class _SeriesFitter:
     Attributes:
         domain: Working area and range of forces of the contacts.
         electrodes: Names of the electrodes, in the order of the charges.
-        unit: Contacts of the fit in unit coordinates, shape (n, 3).
+        unit_contact: Contacts of the fit in unit coordinates, shape (n, 3).
         target: Values of the series at these contacts, ln Q or Q / S, shape (n, n_electrode).
         log_size: Coefficients of ln S for charges of both signs; None for positive charges.
         validation: Presses on which the errors are measured.
@@ -227,17 +227,17 @@ class _SeriesFitter:
 
     domain: Domain
     electrodes: tuple[str, ...]
-    unit: Array
+    unit_contact: Array
     target: Array
     log_size: Array | None
     validation: LabelledPresses
     error_unit: Array
 
     @classmethod
-    def of(
+    def prepare(
         cls, domain: Domain, electrodes: tuple[str, ...], presses: LabelledPresses, validation: LabelledPresses
     ) -> "_SeriesFitter":
-        """Compute the target values of the series, and the units in which its errors are measured.
+        """Return a fitter with the target values of the series, and with the units in which its errors are measured.
 
         For positive charges Q, the targets are ln Q, and the errors are relative. For charges of both signs, the
         targets are Q / S. The typical size S of the charges is a fitted function of the force, and `log_size` contains
@@ -249,18 +249,19 @@ class _SeriesFitter:
             presses: Presses to which series will be fitted.
             validation: Other presses, on which the errors will be measured.
         """
-        unit = domain.to_unit(presses.contact)
+        unit_contact = domain.to_unit(presses.contact)
         if presses.signed:  # the presses have charges of both signs
-            log_size = _fit_log_size(unit[:, 2], presses.charge)
-            size, _ = _size_and_slope(log_size, unit[:, 2])
+            scaled_log_force = unit_contact[:, 2]
+            log_size = _fit_log_size(scaled_log_force, presses.charge)
+            size, _ = _size_and_slope(log_size, scaled_log_force)
             target = presses.charge / size
             smallest_error_unit = NOISE_CORNER_pC  # otherwise, charges near zero would have large relative errors
         else:
             log_size = None
             target = np.log(presses.charge)
             smallest_error_unit = 0.0
-        error_unit = np.hypot(validation.charge, smallest_error_unit)
-        return cls(domain, electrodes, unit, target, log_size, validation, error_unit)
+        error_unit = np.hypot(validation.charge, smallest_error_unit)  # |Q| if the smallest unit is zero
+        return cls(domain, electrodes, unit_contact, target, log_size, validation, error_unit)
 
     def fit(self, degree: int, force_degree: int) -> ChargeField | None:
         """Fit a series with the given degrees, and measure its error on the validation presses.
@@ -275,10 +276,10 @@ class _SeriesFitter:
             The fitted field with its error; None if there are fewer than `FEWEST_PER_TERM` presses for each term.
         """
         n_term = series_term_count(degree, force_degree)
-        if FEWEST_PER_TERM * n_term > len(self.unit):
+        if FEWEST_PER_TERM * n_term > len(self.unit_contact):
             return None
         used_rows = slice(0, ROWS_PER_TERM * n_term)
-        series = fit_series(self.unit[used_rows], self.target[used_rows], degree, force_degree)
+        series = fit_series(self.unit_contact[used_rows], self.target[used_rows], degree, force_degree)
         field = ChargeField(self.domain, self.electrodes, series, np.inf, self.log_size)  # the error is not known yet
         charge_error = field.charges(self.validation.contact) - self.validation.charge
         return replace(field, error=rms(charge_error / self.error_unit))
@@ -320,14 +321,15 @@ def series_term_count(degree: int, force_degree: int) -> int:
     return (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
 
 
-def fit_series(unit: Array, target: Array, degree: int, force_degree: int) -> Array:
+def fit_series(unit_contact: Array, target: Array, degree: int, force_degree: int) -> Array:
     """Fit a Chebyshev series in position and force by least squares.
 
     Let the matrix A have one row for each of n contacts and one column for each term of the series. The coefficients c
-    solve the normal equations (A' A + RIDGE n I) c = A' target.
+    solve the normal equations (A' A + RIDGE n I) c = A' target. The ridge, RIDGE n I, makes the solution unique if the
+    contacts do not determine all coefficients.
 
     Args:
-        unit: Contacts in unit coordinates, shape (n, 3).
+        unit_contact: Contacts in unit coordinates, shape (n, 3).
         target: Values of the series at these contacts, shape (n, k).
         degree: Largest total degree in x and y.
         force_degree: Largest degree in the logarithm of the force.
@@ -336,11 +338,12 @@ def fit_series(unit: Array, target: Array, degree: int, force_degree: int) -> Ar
         Coefficients, shape (degree + 1, degree + 1, force_degree + 1, k).
     """
     n_term = series_term_count(degree, force_degree)
-    normal_matrix = RIDGE * len(unit) * np.eye(n_term)
+    n_contact = len(unit_contact)
+    normal_matrix = RIDGE * n_contact * np.eye(n_term)
     right_side = np.zeros((n_term, target.shape[1]))
-    n_chunk = len(unit) // CHUNK_SIZE + 1  # chunks limit the memory
-    for rows in np.array_split(np.arange(len(unit)), n_chunk):
-        position_terms, force_terms = chebyshev_terms(unit[rows], degree, force_degree)
+    n_chunk = n_contact // CHUNK_SIZE + 1  # chunks limit the memory; "+ 1" rounds up
+    for rows in np.array_split(np.arange(n_contact), n_chunk):
+        position_terms, force_terms = chebyshev_terms(unit_contact[rows], degree, force_degree)
         # Each column of A is the product of a polynomial in the position and a polynomial in the force.
         chunk_of_a = (position_terms[:, :, None] * force_terms[:, None, :]).reshape(len(rows), -1)
         normal_matrix += chunk_of_a.T @ chunk_of_a
@@ -408,27 +411,28 @@ def invertible_domain(
     """
     requested_domain = field.domain
     fold_radius = _fold_radius(field, noise)  # infinity without a fold
-    has_little_noise = field.error < MAX_ERROR_WITHOUT_NOISE
+    has_little_noise = field.error < MAX_ERROR_WITHOUT_NOISE  # the error of the fit includes the noise of the charges
 
     # An inaccurate fit does not prove a fold, so the fold is only reported, and only if it lies well inside the domain.
+    certain_fold_radius = fold_radius
     if field.error > MAX_ERROR_OF_CERTAIN_FOLD:
         credible_ratio = CREDIBLE_FOLD_RATIO if has_little_noise else CREDIBLE_FOLD_RATIO_WITH_NOISE
         if fold_radius < credible_ratio * requested_domain.radius:
             return requested_domain, (_uncertain_fold_caution(fold_radius, requested_domain.radius),)
-        fold_radius = np.inf  # a fold near the edge is probably not real
+        certain_fold_radius = np.inf  # a fold near the edge is probably not real
 
-    if fold_radius < SMALLEST_SHARE * requested_domain.radius:
+    if certain_fold_radius < SMALLEST_SHARE * requested_domain.radius:
         raise DatasetError(
-            f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of "
+            f"the map from contacts to charges folds {certain_fold_radius:g} mm from the centre, of "
             f"{requested_domain.radius:g} mm asked for: beyond, two contacts give the same charges; add an "
             "electrode, or take a biaxial film"
         )
     # Reduce the domain to a certain fold, and search for pairs of distant contacts with the same charges.
     domain = requested_domain
     cautions = []
-    if fold_radius < requested_domain.radius:
-        domain = requested_domain.within(fold_radius)
-        cautions.append(_fold_caution(field, presses, fold_radius))
+    if certain_fold_radius < requested_domain.radius:
+        domain = requested_domain.within(certain_fold_radius)
+        cautions.append(_fold_caution(field, presses, certain_fold_radius))
     if has_little_noise:
         searched_field = within(field, SEARCHED_RADIUS_RATIO * domain.radius)  # the field is inaccurate at the edge
         cautions += _pair_cautions(searched_field, noise)
@@ -488,7 +492,7 @@ def _fold_caution(field: ChargeField, presses: LabelledPresses, fold_radius: flo
         f"the model is trained for {fold_radius:g} mm, not {requested_radius:g} mm, on {remaining_count} of "
         f"{len(presses)} presses"
     )
-    if field.of_positive is None:  # some charges are negative
+    if field.positive_series is None:  # some charges are negative
         return caution
     return f"{caution}; 'serve stream --track' follows contacts to {requested_radius:g} mm"
 

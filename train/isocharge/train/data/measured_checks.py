@@ -63,7 +63,7 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
     force = contact_columns["force_N"]
     _check_far_value(presses, "force_N", force, compared_values=1.0 / force)
     _check_independence(channels)
-    PressedArea.of(presses.contact)  # raises if the positions enclose no area
+    PressedArea.of_contacts(presses.contact)  # raises if the positions enclose no area
 
 
 def check_measured_dataset(dataset: Dataset) -> None:

@@ -62,7 +62,7 @@ class PressedArea(Domain):
     corners: tuple[tuple[float, float], ...]
 
     @classmethod
-    def of(cls, contact: Array) -> "PressedArea":
+    def of_contacts(cls, contact: Array) -> "PressedArea":
         """Return the domain of given contacts: the outline of their places, and the range of their forces.
 
         If all forces are nearly equal, the range of forces is enlarged.
@@ -101,8 +101,8 @@ class PressedArea(Domain):
         return np.append(0.5 * np.ptp(np.array(self.corners), axis=0), super().scale[2])
 
     @property
-    def places(self) -> str:
-        """Text for error messages that states where contacts may lie."""
+    def _allowed_positions(self) -> str:
+        """Description of the allowed positions for error messages."""
         left, bottom = np.min(self.corners, axis=0)
         right, top = np.max(self.corners, axis=0)
         return f"a place in the pressed area, x from {left:g} to {right:g} mm and y from {bottom:g} to {top:g} mm,"

@@ -186,8 +186,8 @@ def draw_outside_examples(
     """
     rng = np.random.default_rng(seed)
     chosen_charge = outside[rng.integers(len(outside), size=count)]
-    factor = np.exp(OUTSIDE_SCATTER * rng.standard_normal((count, 1)))
-    noisy_charge = noise.add(chosen_charge * factor, rng)
+    common_factor = np.exp(OUTSIDE_SCATTER * rng.standard_normal((count, 1)))  # one factor for all charges of a press
+    noisy_charge = noise.add(chosen_charge * common_factor, rng)
     charge = np.clip(noisy_charge, *options.limits)
     _, residual = options.find_nearest(charge_map, charge, noise.sigma(charge))
     return np.stack([charge, residual])
@@ -205,8 +205,8 @@ def _compute_residuals(
 
     Charges that are similar to those of the press from which they were made are called near. For near charges, a fast
     search begins at the contact of the press. In this search, the charge map is scaled so that it gives the charges
-    of the press at this contact. A thorough search begins at several contacts. It is made for all charges that
-    are not near, and for near charges whose residuals are large after the fast search.
+    of the press at this contact. A thorough search begins at several contacts. The thorough search is made for all
+    charges that are not near, and for near charges whose residuals are large after the fast search.
 
     Args:
         charge_map: Map from contacts to charges.
@@ -322,8 +322,8 @@ def _move_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Arra
     """
     one_per_press = (len(charge), 1)  # the shape of an array with one number for each press
     if isinstance(noise, ChannelNoise):
-        # A level is a function of the charge whose noise has the standard deviation 1 for every charge. A distance
-        # between levels is therefore a multiple of the noise.
+        # A level is a function of the charge; the noise of every level has the standard deviation 1. A distance between
+        # levels is therefore a multiple of the noise.
         distance = 10.0 ** rng.uniform(*MOVED_LOG_DISTANCES, one_per_press)
         moved_level = noise.level(charge) + distance * rng.standard_normal(charge.shape)
         return noise.charge(moved_level)
@@ -362,11 +362,11 @@ def _draw_common_factors(rng: np.random.Generator, shape: tuple[int, ...]) -> Ar
 
 
 def _draw_any_charges(rng: np.random.Generator, shape: tuple[int, ...], other_charge: Array, noise: Noise) -> Array:
-    """Draw random charges of each electrode from a range that contains the charges of the presses.
+    """Draw random charges of each electrode from a wide range.
 
-    For charges of any sign, the levels are uniformly distributed. A level is a function of the charge whose noise has
-    the standard deviation 1. For positive charges, the logarithms are uniformly distributed from 1 pC to an upper
-    limit, which is larger for some presses.
+    For charges of any sign, the levels are uniformly distributed over a range twice as wide as that of the presses. A
+    level is a function of the charge; the noise of every level has the standard deviation 1. For positive charges, the
+    logarithms are uniformly distributed from 1 pC to an upper limit, which is larger for some presses.
 
     Args:
         rng: Random number generator.

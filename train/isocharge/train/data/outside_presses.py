@@ -52,11 +52,13 @@ class OutsidePresses:
     inner: float
 
     @classmethod
-    def of(cls, sensor: Sensor, probes: tuple[str, ...], force_range: tuple[float, float]) -> "OutsidePresses | None":
-        """Simulate a coarse forward map of the whole film, and return presses on it. The map is for a single probe.
+    def simulate(
+        cls, sensor: Sensor, probes: tuple[str, ...], force_range: tuple[float, float]
+    ) -> "OutsidePresses | None":
+        """Simulate a coarse forward map of the whole film, and return presses whose charges this map gives.
 
-        This probe is a disk whose radius is the largest reach of the given probes. The reach of a probe is the distance
-        from the centroid of its footprint to the farthest point of the footprint.
+        The map is simulated for a single probe, which is a disk whose radius is the largest reach of the given probes.
+        The reach of a probe is the distance from the centroid of its footprint to the farthest point of the footprint.
 
         Args:
             sensor: The sensor.
@@ -125,11 +127,12 @@ class OutsidePresses:
         distances, angles, forces = np.meshgrid(distance, angle, self._measured_forces(), indexing="ij")
         return self._simulate(distances.ravel(), angles.ravel(), forces.ravel())
 
-    def unnoticed(self, is_unnoticed: Booleans) -> UnnoticedPresses:
+    def unnoticed_shares(self, is_unnoticed: Booleans) -> UnnoticedPresses:
         """For each sector of each ring, compute the share of presses with a wrong answer that carries no flag.
 
         Args:
-            is_unnoticed: Whether the answer to each press of `grid` is wrong and carries no flag, shape (n,).
+            is_unnoticed: Whether the answer to each press is wrong and carries no flag, shape (n,), in the order of
+                `grid`.
         """
         is_unnoticed_at_place = is_unnoticed.reshape(N_RINGS, N_SECTORS, N_FORCES)
         share_of_forces = is_unnoticed_at_place.mean(axis=2)  # shape (N_RINGS, N_SECTORS)

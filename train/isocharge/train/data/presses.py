@@ -29,7 +29,7 @@ SOLVER = "solver"
 FEWEST = 500
 """Smallest number of presses for a fit."""
 
-ROUNDING = 1.0 + 1e-9
+ROUNDING_RATIO = 1.0 + 1e-9
 """Largest ratio by which a sample may exceed the ranges of its manifest because of rounding."""
 
 FEWEST_POSITIONS = 50
@@ -134,13 +134,15 @@ def domain_of(dataset: Dataset) -> Domain:
     except (AttributeError, TypeError, ValueError) as error:
         raise DatasetError(f"manifest ranges: expected radius_mm and force_N [MIN, MAX], got {ranges!r}") from error
 
-    smallest, largest = sample_forces
-    contains_places = sample_radius <= radius * ROUNDING
-    contains_forces = 0.0 < min_force <= smallest * ROUNDING and largest <= max_force * ROUNDING
-    if not (contains_places and contains_forces):
+    # The comparisons allow for rounding errors.
+    smallest_force, largest_force = sample_forces
+    contains_positions = sample_radius <= radius * ROUNDING_RATIO
+    contains_smallest_force = 0.0 < min_force <= smallest_force * ROUNDING_RATIO
+    contains_largest_force = largest_force <= max_force * ROUNDING_RATIO
+    if not (contains_positions and contains_smallest_force and contains_largest_force):
         raise DatasetError(
             f"manifest ranges: radius_mm {radius:g} and force_N [{min_force:g}, {max_force:g}] do not hold the "
-            f"samples, which reach {sample_radius:g} mm and {smallest:g} to {largest:g} N"
+            f"samples, which reach {sample_radius:g} mm and {smallest_force:g} to {largest_force:g} N"
         )
     return Domain(radius, (min_force, max_force))
 
@@ -186,7 +188,7 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
 
     rounded_positions_mm = np.round(presses.contact[:, :2], 3)  # positions within a micrometre count as the same
     n_position = len(np.unique(rounded_positions_mm, axis=0))
-    fewest_positions = min(fewest, FEWEST_POSITIONS)
+    fewest_positions = min(fewest, FEWEST_POSITIONS)  # a few presses cannot have more positions than presses
     if len(presses) < fewest or n_position < fewest_positions:
         raise DatasetError(
             f"expected at least {fewest} presses at {fewest_positions} positions, got {len(presses)} at "
@@ -201,9 +203,9 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
             raise DatasetError(f"electrode {name!r}: expected charges that vary, got {charge[0]:g} pC everywhere")
 
     force = presses.contact[:, 2]
-    rows_without_force = np.flatnonzero(force <= 0.0)
-    if rows_without_force.size:
-        row = int(rows_without_force[0])
+    rows_without_positive_force = np.flatnonzero(force <= 0.0)
+    if rows_without_positive_force.size:
+        row = int(rows_without_positive_force[0])
         raise DatasetError(f"sample {row}: expected a positive force, got {force[row]:g} N")
     return presses
 

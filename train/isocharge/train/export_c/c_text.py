@@ -53,7 +53,7 @@ def c_array(name: str, values: NDArray[Any]) -> str:
     as_text = str if is_int8 else c_float
     literals = ", ".join(as_text(value) for value in values.ravel())
     # While the lines are broken, a comma follows the last number, too. The last number then counts with the same length
-    # as the other numbers. The last comma is removed afterwards.
+    # as the other numbers. The last comma is removed afterwards. Lines are not broken after a minus sign.
     lines = wrap(f"{literals},", LINE_WIDTH, break_on_hyphens=False)
     numbers = "\n    ".join(lines).rstrip(",")
     return f"static const {number_type} {name}[{values.size}] = {{\n    {numbers}\n}};\n"

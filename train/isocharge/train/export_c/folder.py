@@ -44,6 +44,7 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     """
     chain = device.chain(electrodes)
     _check_exists_in_c(device.where, chain)
+    # A chain without zeros subtracts nothing, and a chain without gains reads charges in pC.
     zero = np.zeros(len(electrodes)) if chain.zero is None else chain.zero
     gain_pC = np.ones(len(electrodes)) if chain.gain_pC is None else chain.gain_pC
     has_saturation = chain.limit_pC is not None
@@ -52,7 +53,7 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
         "GAIN_PC": c_doubles(gain_pC),
         "LARGEST": c_double(chain.largest),
         "SATURATION": str(int(has_saturation)),
-        "HUM_LEAST_TURN": c_double(MIN_SQUARED_STEP),
+        "HUM_LEAST_TURN": c_double(MIN_SQUARED_STEP),  # smallest squared step of the phasor of the hum
     }
     if chain.limit_pC is not None:
         numbers["LIMIT_PC"] = c_double(chain.limit_pC)
@@ -130,7 +131,7 @@ def _check_exists_in_c(where: str, chain: Chain) -> None:
             f"{where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES} for a signal chain in C, which "
             f"stores all frames of the tare, got {chain.tare.frames}"
         )
-    has_pyroelectric_charges = isinstance(chain.warming_ratios, np.ndarray)
+    has_pyroelectric_charges = isinstance(chain.warming_ratios, np.ndarray)  # otherwise, it is the default 1.0
     if chain.memory is not None or has_pyroelectric_charges:
         key = "common_mode.pC_per_K" if has_pyroelectric_charges else "memory"
         raise DeviceError(
@@ -163,7 +164,7 @@ SINGLE_PRECISION = "/* This board computes the chain in single precision. */\n#d
 
 
 def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: str = "") -> Path:
-    """Write a model and the signal chain of a board as C99.
+    """Write a model and the signal chain of a board as a folder of C99 files.
 
     Args:
         model: Version folder of the model, as `find_model` returns it.

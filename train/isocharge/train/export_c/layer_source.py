@@ -104,8 +104,9 @@ def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Bloc
     on its diagonal: the upper left block of the first perceptron, and the lower right block of the second one. All
     other layers have a single block, which is the whole matrix.
 
-    The layers are examined from the last to the first. It is always known which outputs of a layer belong to the first
-    perceptron. The weights then show which inputs belong to it, and these inputs are the outputs of the layer before.
+    The layers are examined from the last to the first. When a layer is examined, the number of its outputs that belong
+    to the first perceptron is known. The weights then show which of its inputs belong to the first perceptron. These
+    inputs are the outputs of the layer before.
 
     Args:
         weights: Weights of each layer except the first layer, whose inputs both perceptrons share.

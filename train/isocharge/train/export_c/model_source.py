@@ -3,8 +3,8 @@
 In C, the inputs of the first layer are the logarithm of one charge, ln q_0, and the logarithms ln(q_k / q_0) for the
 other charges q_k. The network remains the same function of the charges, but its rounding errors are smaller. The force
 changes all charges of a film together, and the position changes the ratios of the charges. The first layer of a trained
-network therefore has large weights of both signs. The logarithms are nearly equal, so that the terms of its sums nearly
-cancel:
+network therefore has large weights of both signs. The logarithms are nearly equal, so that the terms of the sums in
+this layer nearly cancel:
 
     sum_k w_k ln q_k = (sum_k w_k) ln q_0 + sum_k w_k ln(q_k / q_0).
 
@@ -173,7 +173,7 @@ def self_test(golden: Golden) -> str:
         vectors=len(answers),
         numbers=answers.shape[1],
         function="isocharge_predict_all" if CORRELATION in names else "isocharge_predict",
-        relative=c_float(golden.relative),
+        relative=c_float(golden.relative_tolerance),
         floors=c_array("FLOOR", floors),
         charges=c_array("CHARGE_PC", golden.charge_pC),
         contacts=c_array("CONTACT", answers),

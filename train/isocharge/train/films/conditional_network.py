@@ -135,8 +135,8 @@ class ConditionalPerceptron(nn.Module):
         The weight matrix of each layer is a constant matrix plus a weighted sum of `N_BASES` basis matrices. The
         weights of this sum, called the factors phi, and the biases depend on the film. A small context network computes
         features of the film from its context, and the factors and biases are linear functions of these features. The
-        skip layer connects the inputs directly with the outputs. Before the training, its weights are zero, and the
-        biases are the same for all films.
+        skip layer connects the inputs directly with the outputs. Before the training, the weights of the skip layer are
+        zero, and the biases are the same for all films.
 
         Args:
             n_input: Number of inputs.
@@ -170,6 +170,7 @@ class ConditionalPerceptron(nn.Module):
 
         for bias_layer in self.bias:  # with weights of zero, the biases are the same for all films
             nn.init.zeros_(bias_layer.weight)  # type: ignore[arg-type]
+        # A factor is a sum over `CONTEXT_WIDTH` features, so the division makes its size independent of their number.
         nn.init.normal_(self.phi.weight, std=INITIAL_PHI_STD / np.sqrt(CONTEXT_WIDTH))
         nn.init.zeros_(self.phi.bias)
 
@@ -183,9 +184,9 @@ class ConditionalPerceptron(nn.Module):
         Returns:
             Outputs, shape (n_film, n, n_output).
         """
-        return evaluate(self.definition(context), inputs)
+        return evaluate(self.film_perceptrons(context), inputs)
 
-    def definition(self, context: Tensor) -> Perceptron[Tensor]:
+    def film_perceptrons(self, context: Tensor) -> Perceptron[Tensor]:
         """Return the perceptrons of several films as a single `Perceptron`.
 
         The first axis of its weight arrays is the index of the film. The context network computes the features psi of
@@ -207,8 +208,8 @@ class ConditionalPerceptron(nn.Module):
             film_bias = bias(film_features)[:, None]  # shape (n_film, 1, n_output), the same for all presses on a film
             layers.append(Layer(weight, film_bias))
         skip = _mix_weights(self.skip, self.skip_bases, basis_factors[:, n_layer])
-        *hidden, last = layers
-        return Perceptron(tuple(hidden), last, skip, self.activation)
+        *hidden, output_layer = layers
+        return Perceptron(tuple(hidden), output_layer, skip, self.activation)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the weights as a dictionary of arrays by name, as `ConditionalWeights` expects them."""

@@ -9,10 +9,9 @@ charge Q of the electrode under a force F then has the following form:
 
 The context contains the logarithms of three quantities: the ratio of the pretension to E, the ratio of d31 to d32, and
 h. The context also contains the position of the film's centre in the frame of the electrodes, the rotation of the
-electrodes, and the radius of the probe. The noise and the limits of the domain are the same for all films. Their
-influence on a film therefore depends on the scales of its charges and forces. For this reason, the context also
-contains the mean scale of the charges, the scale of the forces, and the gain of each electrode relative to the mean
-gain.
+electrodes, and the radius of the probe. The noise and the limits of the domain are the same for all films. After the
+scaling, they depend on the scales of the charges and forces of a film. For this reason, the context also contains the
+mean scale of the charges, the scale of the forces, and the gain of each electrode relative to the mean gain.
 """
 
 from dataclasses import dataclass
@@ -54,8 +53,8 @@ class FilmScaling:
     def log_charge_scale(self, parameters: Array) -> Array:
         """Compute the logarithms of the charge scales of the electrodes.
 
-        The charge scale of an electrode is the product of three ratios: those of Young's modulus, of the geometric mean
-        of d31 and d32, and of the gain of the electrode to their values for the described film.
+        The charge scale of an electrode is the product of three quantities: Young's modulus, the geometric mean of d31
+        and d32, and the gain of the electrode. Each quantity is divided by its value for the described film.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -78,7 +77,7 @@ class FilmScaling:
             Matrices T, shape (..., 3, 3).
         """
         rotation = np.zeros((*parameters.shape[:-1], 3, 3))
-        rotation[..., :2, :2] = _rotation(_shared(parameters, "rotation"))
+        rotation[..., :2, :2] = _rotation_matrices(_shared(parameters, "rotation"))
         rotation[..., 2, 2] = 1.0
         return rotation
 
@@ -100,7 +99,7 @@ class FilmScaling:
         # shift in the sensor file, and ds is the additional shift of the film. The part that does not depend on p is
         # s + ds - R s.
         described_shift = np.array(self.prior.sensor.calibration.shift)
-        rotated_shift = _rotation(_shared(parameters, "rotation")) @ described_shift
+        rotated_shift = _rotation_matrices(_shared(parameters, "rotation")) @ described_shift
         position_offset = described_shift + _shift(parameters) - rotated_shift
 
         # Force: the stiffness is Young's modulus times the thickness. Both parameters are logarithms of ratios.
@@ -164,7 +163,7 @@ class FilmScaling:
 
         # Centre of the film in the axes of the electrodes, relative to its described position. The additional last axis
         # makes each shift a column vector, shape (..., 2, 1).
-        rotation_to_electrodes = _rotation(-_shared(parameters, "rotation"))
+        rotation_to_electrodes = _rotation_matrices(-_shared(parameters, "rotation"))
         rotated_shift = (rotation_to_electrodes @ shift[..., None])[..., 0]
         centre = described_shift - rotated_shift
 
@@ -199,7 +198,7 @@ def _shift(parameters: Array) -> Array:
     return np.stack([_shared(parameters, "shift_x"), _shared(parameters, "shift_y")], axis=-1)
 
 
-def _rotation(angle: Array) -> Array:
+def _rotation_matrices(angle: Array) -> Array:
     """Return the matrices, shape (..., 2, 2), that rotate anticlockwise by angles of shape (...), rad."""
     cosine = np.cos(angle)
     sine = np.sin(angle)

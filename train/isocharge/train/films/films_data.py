@@ -60,13 +60,13 @@ class FilmPresses:
     Attributes:
         parameters: Parameters of the films, shape (n_film, n_parameter).
         contact: Contacts (x, y, F), shape (n_film, n_press, 3), mm and N, float32.
-        response: Parts of the charges that are due to d31, to d32 and to d33, for the gains and coefficients of the
+        charge_parts: Parts of the charges that are due to d31, to d32 and to d33, for the gains and coefficients of the
             sensor file, shape (n_film, n_press, n_electrode, 3), pC, float32.
     """
 
     parameters: Array
     contact: Singles
-    response: Singles
+    charge_parts: Singles
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -88,7 +88,8 @@ class FilmPresses:
         part_factors = np.stack([d31_factor, d32_factor, d33_factor], axis=1)
         gain_factors = np.exp(self.parameters[:, GAINS])
         # Sum over the parts c for each film f, press p and electrode e
-        return np.asarray(np.einsum("fpec,fc,fe->fpe", self.response.astype(float), part_factors, gain_factors))
+        charge_parts = self.charge_parts.astype(float)
+        return np.asarray(np.einsum("fpec,fc,fe->fpe", charge_parts, part_factors, gain_factors))
 
 
 def draw_film_presses(
@@ -125,10 +126,10 @@ def draw_film_presses(
     press_films = partial(_press_films, prior, family, domain, presses, seed)
     chunks = list(track(in_order(executor, press_films, jobs), "pressing films", len(jobs)))
 
-    contact_and_response = np.concatenate(chunks)  # shape (films, presses, 1 + n_electrode, 3)
-    contact = contact_and_response[:, :, 0]
-    response = contact_and_response[:, :, 1:]
-    film_presses = FilmPresses(parameters, contact, response)
+    contact_and_parts = np.concatenate(chunks)  # shape (films, presses, 1 + n_electrode, 3)
+    contact = contact_and_parts[:, :, 0]
+    charge_parts = contact_and_parts[:, :, 1:]
+    film_presses = FilmPresses(parameters, contact, charge_parts)
     _check_most_charges_are_positive(film_presses)
     return film_presses
 
@@ -151,27 +152,27 @@ def _press_films(
             n_parameter).
 
     Returns:
-        Array of shape (n_film, presses, 1 + n_electrode, 3). Along the third axis, it contains the contact and then the
-        response of each electrode (see `FilmPresses`).
+        Array of shape (n_film, presses, 1 + n_electrode, 3). Along the third axis, it contains the contact (x, y, F)
+        and then the three parts of the charge of each electrode.
     """
     first_film, parameters = job
     # The numbers after the seed make these random numbers independent of those of the films and of other jobs.
     rng = np.random.default_rng([seed, 1, first_film])
     contacts = np.stack([draw_contacts(rng, domain, presses) for _ in parameters])
-    responses = np.stack(
+    charge_parts = np.stack(
         [
-            _compute_response(prior, family, film_parameters, film_contacts)
+            _compute_charge_parts(prior, family, film_parameters, film_contacts)
             for film_parameters, film_contacts in zip(parameters, contacts, strict=True)
         ]
     )
-    return np.concatenate([contacts[:, :, None], responses], axis=2).astype(np.float32)
+    return np.concatenate([contacts[:, :, None], charge_parts], axis=2).astype(np.float32)
 
 
-def _compute_response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: Array) -> Array:
+def _compute_charge_parts(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: Array) -> Array:
     """For presses on one film, compute the three parts of the charges that are due to d31, d32 and d33.
 
     The charge of an electrode is the sum of the three parts. The parts are computed with the piezoelectric coefficients
-    and the gains of the sensor file. `FilmPresses.charge` later multiplies them by factors of the film.
+    and the gains of the sensor file. `FilmPresses.charge` later multiplies the parts by factors of the film.
 
     Args:
         prior: Distribution of the films.
@@ -242,7 +243,10 @@ def _check_most_charges_are_positive(film_presses: FilmPresses) -> None:
 
 
 class SearchMap(FunctionMap):
-    """Charge map for searches. Its one-sided differences need fewer charges than the differences of `FunctionMap`."""
+    """Charge map for searches of contacts.
+
+    Its derivatives are one-sided differences, which need fewer charges than the two-sided differences of `FunctionMap`.
+    """
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """See `LinearisedMap`."""
@@ -282,7 +286,7 @@ class FilmsSource:
         return FunctionMap(charges, forward_map.electrodes, self.domain)
 
     def search_map(self, parameters: Array) -> SearchMap:
-        """Return the charge map of one film for searches.
+        """Return the charge map of one film for searches of contacts.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -325,6 +329,7 @@ def draw_misfit_films(
         Films, charges Q and targets. The targets are the residuals (Q - Q(c)) / sigma at the nearest contact c, with
         the standard deviation sigma of the noise, shape (films, charges, n_electrode).
     """
+    # The number after the seed makes these random numbers independent of those of other data sets.
     parameters = source.prior.draw(np.random.default_rng([seed, 2]), films)
     results = in_order(executor, partial(_draw_charges_of_every_kind, source, charges, seed), enumerate(parameters))
     arrays_of_films = list(track(results, "searching nearest contacts", films))  # each contains charges and residuals
@@ -339,19 +344,19 @@ def _draw_charges_of_every_kind(source: FilmsSource, charges: int, seed: int, jo
         source: Distribution and forward maps of the films, contacts and noise.
         charges: Number of sets of charges.
         seed: Seed of the random numbers.
-        job: Number of the film, and its parameters, shape (n_parameter,).
+        job: Index of the film, and its parameters, shape (n_parameter,).
 
     Returns:
         Array of shape (2, charges, n_electrode) with the charges, pC, and then their residuals at the nearest contact.
     """
-    film_number, parameters = job
+    film_index, parameters = job
     charge_map = source.search_map(parameters)
     # The numbers after the seed make these random numbers independent of those of other films and other data sets.
-    rng = np.random.default_rng([seed, 3, film_number])
+    rng = np.random.default_rng([seed, 3, film_index])
     contact = draw_contacts(rng, source.domain, charges)
     presses = LabelledPresses(contact, charge_map.charges(contact))
     options = ExampleOptions(candidates=N_CANDIDATES)
-    return draw_misfit_examples(presses, charge_map, source.noise, charges, seed + film_number, options=options)
+    return draw_misfit_examples(presses, charge_map, source.noise, charges, seed + film_index, options=options)
 
 
 def draw_near_films(
@@ -373,6 +378,7 @@ def draw_near_films(
         Films, charges without noise, and projection matrices as targets, shape (films, presses, n_electrode,
         n_electrode). The noise and the residuals of a press are in units of the standard deviation of the noise.
     """
+    # The number after the seed makes these random numbers independent of those of other data sets.
     parameters = source.prior.draw(np.random.default_rng([seed, 4]), films)
     results = in_order(executor, partial(_draw_good_presses, source, presses, seed), enumerate(parameters))
     charge_and_projection = np.stack(list(track(results, "drawing good presses", films)))
@@ -391,15 +397,15 @@ def _draw_good_presses(source: FilmsSource, presses: int, seed: int, job: tuple[
         source: Distribution and forward maps of the films, contacts and noise.
         presses: Number of presses.
         seed: Seed of the random numbers.
-        job: Number of the film, and its parameters, shape (n_parameter,).
+        job: Index of the film, and its parameters, shape (n_parameter,).
 
     Returns:
         Array of shape (presses, n_electrode, 1 + n_electrode). Along the last axis, it contains the charge of an
         electrode, pC, and then the row of the projection matrix for this electrode.
     """
-    film_number, parameters = job
+    film_index, parameters = job
     # The numbers after the seed make these random numbers independent of those of other films and other data sets.
-    rng = np.random.default_rng([seed, 5, film_number])
+    rng = np.random.default_rng([seed, 5, film_index])
     contact = draw_contacts(rng, source.domain, presses)
     charge, slopes = linearised(source.charge_map(parameters), contact)
     noise_std = source.noise.sigma(charge)

@@ -179,6 +179,7 @@ def _about_table(films: FilmsModel) -> dict[str, Any]:
     """
     prior = films.prior
     activation = films.contact.activation
+    # Standard deviations of the parameters of the films, by name
     spread = {name: _converted(value, FILE_UNITS.get(name, 1.0)) for name, value in asdict(prior.spread).items()}
     about = {
         "format": FORMAT,
@@ -264,7 +265,7 @@ def _pack_weights(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarr
     Returns:
         Integers and scales by their names in the file.
     """
-    largest_integer = 2 ** (BITS - 1) - 1
+    largest_integer = 2 ** (BITS - 1) - 1  # one bit is the sign
     packed: dict[str, np.ndarray] = {}
     for name, values in weights.items():
         # The lower limit avoids a division by zero for a row of zeros.

@@ -279,7 +279,7 @@ class FilmsModel:
         return adapt_to_charges(network, noisy_charge, simulated_charge, presses.contact[copied_rows])
 
     def fold(self, parameters: Array) -> FoldedNetwork:
-        """Compute the network of one film without corrections.
+        """Compute the network of one film from its parameters, without the corrections of the method `film`.
 
         One perceptron estimates the contact, and another the misfit. Both are merged into one perceptron, which reads
         the logarithms of the charges. Its first layer also divides the charges by the charge scales of the film, which

@@ -76,7 +76,7 @@ N_VALIDATION_PRESSES = 8
 
 @dataclass(frozen=True)
 class FilmsConfig:
-    """Settings of the training of a network for all films.
+    """Settings for training a network for all films.
 
     Attributes:
         radius: Largest distance of a press from the film's centre, mm.
@@ -241,7 +241,7 @@ def _new_perceptron(
 
 
 def _train_stage(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | None) -> None:
-    """Train a network for all steps of its stage.
+    """Train one of the two networks, the contact network or the misfit network, for all steps of its stage.
 
     The training does not stop early, because the loss is smallest after the last steps of the schedule.
     """
@@ -317,16 +317,19 @@ class _ContactTraining:
         film_rows = torch.randint(self.n_train, (config.batch_films,), generator=random).numpy()
         press_rows = torch.randint(n_press, (config.batch_films, config.batch_presses), generator=random).numpy()
         prior = self.inputs.scaling.prior
-        parameters = _with_fresh_factors(prior, self.presses.parameters[film_rows], random)
+        parameters = _redraw_piezo_and_gains(prior, self.presses.parameters[film_rows], random)
         batch = self.evaluate_batch(film_rows, press_rows, parameters, random)
         loss_function = warm_up_loss if step < self.warm_up_steps else likelihood_loss
         return loss_function(*batch)
 
     def score(self) -> tuple[float, str]:
-        """Return the loss on the validation films, and a text that states the errors."""
+        """Return the loss on the validation films, and a text that states the errors.
+
+        The noise of the charges is the same in every call.
+        """
         film_rows = np.arange(self.n_train, len(self.presses))
         n_press = self.presses.contact.shape[1]
-        all_press_rows = np.tile(np.arange(n_press), (self.config.watched, 1))
+        all_press_rows = np.tile(np.arange(n_press), (len(film_rows), 1))  # all presses on each of these films
         random = torch.Generator().manual_seed(self.config.seed)
         batch = self.evaluate_batch(film_rows, all_press_rows, self.presses.parameters[film_rows], random)
         return validation_score(*batch, self.inputs.scaling.domain, "films")
@@ -349,8 +352,8 @@ class _ContactTraining:
         # The index arrays have the shapes (n_film, 1) and (n_film, n_row), and select n_row presses of each film.
         film_column = film_rows[:, None]
         contact = self.presses.contact[film_column, press_rows]
-        response = self.presses.response[film_column, press_rows]
-        charge = as_tensor(FilmPresses(parameters, contact, response).charge())
+        charge_parts = self.presses.charge_parts[film_column, press_rows]
+        charge = as_tensor(FilmPresses(parameters, contact, charge_parts).charge())
         noisy_charge = with_fresh_noise(charge, self.noise, random)
         outputs = self.network(self.inputs.values(noisy_charge, parameters), self.inputs.context(parameters))
 
@@ -364,7 +367,7 @@ class _ContactTraining:
         return _Batch(mean.reshape(-1, 3), outputs[..., LOG_STD].reshape(-1, 3), target)
 
 
-def _with_fresh_factors(prior: FilmPrior, parameters: Array, random: torch.Generator) -> Array:
+def _redraw_piezo_and_gains(prior: FilmPrior, parameters: Array, random: torch.Generator) -> Array:
     """Draw new values of d31, d32 and the gains from the prior, and return the changed parameters of the films.
 
     The charges for the new values follow from the stored parts of the charges, so that no simulation is needed.
@@ -377,8 +380,9 @@ def _with_fresh_factors(prior: FilmPrior, parameters: Array, random: torch.Gener
     Returns:
         Parameters with the new values, same shape.
     """
-    gain_columns = range(len(SHARED), parameters.shape[1])
+    gain_columns = range(len(SHARED), parameters.shape[1])  # the gains follow the shared parameters of a film
     columns = [D31, D32, *gain_columns]
+    # Deviations from the mean in standard deviations, which are limited to the bounds of the parameters
     deviation = torch.randn((len(parameters), len(columns)), generator=random).clamp(-MAX_DEVIATION, MAX_DEVIATION)
     new_parameters = parameters.copy()
     new_parameters[:, columns] = prior.mean[columns] + prior.std[columns] * deviation.double().numpy()
@@ -434,7 +438,7 @@ class _MisfitTraining:
         Args:
             network: The misfit network.
             inputs: Computation of the inputs from charges.
-            examples: Charges of every kind and their residuals.
+            examples: Charges of every kind and their residuals. The last films are used for validation.
             good_presses: Good presses and the projections that compute their residuals.
             noise: Noise of good presses.
             config: Settings of the training.
@@ -446,11 +450,12 @@ class _MisfitTraining:
         self.config = config
         self.example_inputs = inputs.values(as_tensor(examples.charge), examples.parameters)
         self.example_context = inputs.context(examples.parameters)
+        # The network learns residual vectors with compressed lengths: large lengths count on a logarithmic scale.
         self.example_targets = compress_length(torch.tensor(examples.target)).float()
         self.good_charge = as_tensor(good_presses.charge)
         self.good_projection = as_tensor(good_presses.target)
         n_example_film = len(self.example_inputs)
-        n_validation = max(1, round(MISFIT_VALIDATION_FRACTION * n_example_film))
+        n_validation = max(1, round(MISFIT_VALIDATION_FRACTION * n_example_film))  # at least one film
         self.n_train = n_example_film - n_validation
 
     def loss(self, step: int, random: torch.Generator) -> Tensor:
@@ -472,7 +477,11 @@ class _MisfitTraining:
         return GOOD_PRESS_WEIGHT * self.good_press_loss(n_film, n_press, random) + example_loss
 
     def score(self) -> tuple[float, str]:
-        """Return the loss on validation examples and good presses, and a text that states both parts of the loss."""
+        """Return the loss on validation examples and good presses, and a text that states both parts of the loss.
+
+        The good presses are those of the training, but their noise is not that of the training. The noise is the same
+        in every call.
+        """
         validation = slice(self.n_train, None)
         misfit_vector = self.network(self.example_inputs[validation], self.example_context[validation])
         example_loss = mean_squared_distance(misfit_vector, self.example_targets[validation]).item()
@@ -484,8 +493,9 @@ class _MisfitTraining:
     def good_press_loss(self, n_film: int, n_press: int, random: torch.Generator) -> Tensor:
         """Draw good presses at random, add new noise to their charges, and compute their loss.
 
-        The loss compares the outputs of the network with the residuals. A residual is the difference between the noisy
-        charges and those of the nearest contact, in standard deviations of the noise.
+        The loss compares the outputs of the network with the residuals of the charges, after large residuals are
+        compressed to a logarithmic scale. A residual is the difference between a noisy charge and the charge of the
+        nearest contact, in standard deviations of the noise.
 
         The noise of each press is multiplied by a random factor from 1 to `MAX_NOISE_FACTOR`, because the network also
         has to learn larger misfits.

@@ -66,9 +66,9 @@ def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PR
     The second evaluation uses the network of one assumed film for all films. The assumed film is either the described
     film or the mean of the prior, whichever gives the smaller rms position error.
 
-    The errors are position errors in mm and relative force errors in percent over all presses, and the rms position
-    errors on the median film and on the worst film. The coverage of the 68 or 95 % intervals is the fraction of
-    coordinates, 0 to 1, that lie in their interval.
+    The errors are position errors in mm and relative force errors in percent over all presses. They also include the
+    rms position errors on the median film and on the worst film. The coverage of the 68 or 95 % intervals is the
+    fraction of coordinates, 0 to 1, that lie in their interval.
 
     Args:
         films: The network.
@@ -91,7 +91,7 @@ def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PR
         network_films = np.tile(film, (n_film, 1))  # the same film for all presses
         candidate_errors[name] = _errors_with_networks(films, network_films, true_contact, noisy_charge)
     rms_mm = {name: errors["position_rms_mm"] for name, errors in candidate_errors.items()}
-    best_name, other_name = sorted(rms_mm, key=lambda name: rms_mm[name])  # the smaller error first
+    best_name, other_name = sorted(rms_mm, key=lambda name: rms_mm[name])  # the name with the smaller error first
     assumed_film = candidate_films[best_name]
     pretension_MPa = assumed_film[films.prior.index("pretension")]
     description = (
@@ -162,13 +162,13 @@ def _error_statistics(contact: Array, std: Array, truth: Array) -> Mapping[str, 
     all_contacts = contact.reshape(-1, 3)
     all_truth = truth.reshape(-1, 3)
     errors = contact_errors(all_contacts, std.reshape(-1, 3), all_truth)
-    position_errors = position_error(all_contacts, all_truth).reshape(truth.shape[:2])
+    statistics = {name: error for name, error in errors.items() if name not in ONLY_SIMULATED}  # no 99th percentiles
+
+    position_errors = position_error(all_contacts, all_truth).reshape(truth.shape[:2])  # shape (n_film, n_press)
     film_rms = np.sqrt((position_errors**2).mean(axis=1))
-    return {
-        **{name: error for name, error in errors.items() if name not in ONLY_SIMULATED},  # without the 99th percentiles
-        "position_rms_median_film_mm": rounded(np.median(film_rms)),
-        "position_rms_worst_film_mm": rounded(film_rms.max()),
-    }
+    statistics["position_rms_median_film_mm"] = rounded(np.median(film_rms))
+    statistics["position_rms_worst_film_mm"] = rounded(film_rms.max())
+    return statistics
 
 
 def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command: str = "") -> Release:
@@ -196,8 +196,8 @@ def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command:
     errors = evaluate_films(rounded_films)
     made_with = {**films.made_with, "films": dict(errors.with_known_film)}
     provenance = Provenance(made_with=made_with, files={FILE: data})
-    assumed_film = rounded_films.film(errors.parameters, provenance=provenance)
-    fitted = replace(assumed_film, outside=_outside_presses(rounded_films, errors.parameters))
+    assumed_film_model = rounded_films.film(errors.parameters, provenance=provenance)
+    fitted = replace(assumed_film_model, outside=_outside_presses(rounded_films, errors.parameters))
     return release(fitted, folder, version=version, command=command, card=partial(films_card, rounded_films, errors))
 
 
@@ -213,7 +213,7 @@ def _outside_presses(films: FilmsModel, parameters: Array) -> OutsidePresses | N
         cannot be simulated.
     """
     sensor, probe = films.prior.film(parameters)
-    whole_film = OutsidePresses.of(sensor, (probe.notation,), films.domain.force_range)
+    whole_film = OutsidePresses.simulate(sensor, (probe.notation,), films.domain.force_range)
     return None if whole_film is None else whole_film.beyond(films.domain.radius)
 
 

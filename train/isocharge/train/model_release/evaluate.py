@@ -44,16 +44,16 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     Args:
         fitted: The network, with its noise and its presses for the test.
         presses: Presses on which the errors are measured; None for the test presses of `fitted`. Noise is added to the
-            charges of simulated presses. Measured presses are used as they are, so the errors include the errors of the
-            measured places and forces.
+            charges of simulated presses. Measured presses already contain noise. Their errors also include the errors
+            of the measured places and forces.
         seed: Seed of the noise.
 
     Returns:
         Errors by name. The position errors are in mm, and the force errors are in percent of the force. The coverages
         of the 68 and 95 % intervals are fractions of the coordinates, 0 to 1. Further entries are the misfits that 1 %
-        and 0.1 % of the good presses exceed. For simulated presses, the result also contains the errors without noise,
-        and the fractions of faults that cause an alarm. For measured presses, the result also contains the number of
-        presses.
+        and, if there are enough presses, 0.1 % of the good presses exceed. For simulated presses, the result also
+        contains the errors without noise, and the fractions of faults that cause an alarm. For measured presses, the
+        result also contains the number of presses.
     """
     if presses is None:
         test_presses = fitted.test
@@ -64,12 +64,13 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     if not test_presses.measured and isinstance(fitted.noise, NoiseModel):
         return simulated_errors(fitted.predict, test_presses, fitted.noise, seed)
 
-    # If a network was trained on its own test presses, the estimates of the cross-validation are used.
+    # If the network was trained on its own test presses, use the estimates of the cross-validation instead.
     if presses is None and fitted.cross_validated is not None:
         contact, std, _ = fitted.cross_validated
     else:
         contact, std, _ = fitted.predict(test_presses.charge)
     all_errors = contact_errors(contact, std, test_presses.contact)
+    # Too few presses are measured for the 99th percentiles.
     errors = {name: error for name, error in all_errors.items() if name not in ONLY_SIMULATED}
     errors[HELD_PRESSES] = float(len(test_presses))
     return errors | _good_press_misfits(fitted, seed)
@@ -78,18 +79,20 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
 def _good_press_misfits(fitted: Fitted, seed: int) -> dict[str, float]:
     """Compute the misfits that only a few good presses exceed, for a network that is tested on measured presses.
 
-    There are three cases:
+    Good presses are presses without faults. There are three cases:
 
-    - Good presses that were simulated: noise is added to their charges.
-    - Measured good presses with a cross-validation: the misfits of the cross-validation are used.
-    - Measured good presses without a cross-validation: the misfits of the network itself are used.
+    - The good presses were simulated: noise is added to their charges.
+    - The good presses were measured, and there is a cross-validation: the misfits of the cross-validation are used.
+    - The good presses were measured, and there is no cross-validation: the misfits of the network itself are used. They
+      are too few for the misfit that 0.1 % of the presses exceed.
 
     Args:
         fitted: The network, with its good presses.
         seed: Seed of the noise.
 
     Returns:
-        Misfits by name, as `evaluate` returns them.
+        Misfits by name, as `evaluate` returns them. For simulated good presses, the result also contains the fractions
+        of faults that cause an alarm.
     """
     if not fitted.good.measured and isinstance(fitted.noise, NoiseModel):
         return misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)
@@ -154,23 +157,23 @@ def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel,
     Args:
         predict: Function that computes the answers of the network.
         presses: Presses without noise.
-        noise: Noise of the training.
+        noise: Noise of the training, from which the noise that is added here is derived by `misfit_noise`.
         seed: Seed of the noise.
 
     Returns:
         Errors by name, as `evaluate` returns them.
     """
-    noise_of_misfit = misfit_noise(noise)
+    added_noise = misfit_noise(noise)
     misfits_by_draw = []
     for draw in range(N_NOISE_DRAWS):
-        _, _, misfit = predict(presses.noisy(noise_of_misfit, seed + draw))
+        _, _, misfit = predict(presses.noisy(added_noise, seed + draw))
         misfits_by_draw.append(misfit)
     all_misfits = np.concatenate(misfits_by_draw)
     threshold = alarm_threshold(all_misfits)
 
     force = presses.contact[:, 2]
     presses_near_1_N = presses[is_near_1_N(force)]
-    detected_fractions = _measure_detection(predict, presses_near_1_N, noise_of_misfit, threshold, seed + N_NOISE_DRAWS)
+    detected_fractions = _measure_detection(predict, presses_near_1_N, added_noise, threshold, seed + N_NOISE_DRAWS)
     return {
         "misfit_p99": rounded(threshold),
         "misfit_p999": rounded(np.percentile(all_misfits, 99.9)),
@@ -179,7 +182,9 @@ def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel,
 
 
 def alarm_threshold(good_misfits: Array) -> float:
-    """Compute the misfit above which there is an alarm. The fraction `FALSE_ALARM_RATE` of good presses exceeds it.
+    """Compute the misfit above which there is an alarm.
+
+    The fraction `FALSE_ALARM_RATE` of the good presses has a larger misfit.
 
     Args:
         good_misfits: Misfits of good presses, array of any shape.
@@ -201,7 +206,7 @@ def rounded(value: float | np.floating) -> float:
 def _measure_detection(
     predict: Predict, presses: LabelledPresses, noise: NoiseModel, threshold: float, seed: int
 ) -> Mapping[str, float]:
-    """Simulate a faulty electrode, and compute the fraction of presses whose misfits exceed a threshold.
+    """Simulate one faulty electrode at a time, and compute the fraction of presses whose misfits exceed a threshold.
 
     Args:
         predict: Function that computes the answers of the network.
@@ -234,8 +239,8 @@ def _measure_detection(
         _, _, misfit = predict(np.concatenate(faulty_charges))
         return float(np.mean(misfit > threshold))
 
-    detected_wrong_gains = 0.5 * (detected_fraction(0.8) + detected_fraction(1.2))  # 20 % too small and too large
+    mean_fraction = 0.5 * (detected_fraction(0.8) + detected_fraction(1.2))  # gains 20 % too small and too large
     return {
-        "found_gain_20_percent": rounded(detected_wrong_gains),
+        "found_gain_20_percent": rounded(mean_fraction),
         "found_dead_electrode": rounded(detected_fraction(0.0)),
     }

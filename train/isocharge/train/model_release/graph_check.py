@@ -40,7 +40,7 @@ EXTREME_CHARGES_pC = (-LARGEST, LOWEST_CHARGE, LARGEST)
 """Charges for which every output must be finite, pC.
 
 `LARGEST` is the largest float32 number. Charges below `LOWEST_CHARGE` are set to `LOWEST_CHARGE` before their logarithm
-is computed. It therefore gives the smallest logarithm.
+is computed. Therefore, `LOWEST_CHARGE` gives the smallest logarithm.
 """
 
 EXTREME_SEED = 4
@@ -54,7 +54,8 @@ For the remaining presses, the position can depend so strongly on the charges th
 STD_FACTOR = 100.0
 """Smallest number by which a difference of a contact is divided, in standard deviations of the contact.
 
-A difference of a thousandth of a standard deviation is negligible. With this divisor, it is within the tolerance."""
+A difference of a thousandth of a standard deviation is negligible. With this divisor, such a difference is within the
+tolerance."""
 
 EXTREME_FACTOR = 10.0
 """Factor by which the tolerances are multiplied for the remaining presses, and for charges that no film produces."""
@@ -69,7 +70,8 @@ def check_graph(
 ) -> Singles:
     """Compare a graph with its network, and choose charges for the golden vectors.
 
-    The outputs are compared for noisy charges of presses and, with larger tolerances, for extreme charges.
+    Golden vectors are stored with a model, so that every computer can check its answers. The outputs of the graph and
+    of the network are compared for noisy charges of presses and, with larger tolerances, for extreme charges.
 
     Args:
         graph: The ONNX file.
@@ -89,7 +91,7 @@ def check_graph(
     _check_finite_outputs(session, n_electrode=presses.charge.shape[1])
     _compare(session, compute_exact, extreme_charge, floors, tolerance_factor=EXTREME_FACTOR)
 
-    # After the last press, the first press follows again.
+    # If there are fewer than `N_COMPARED` presses, they are repeated.
     repeated_rows = np.arange(N_COMPARED) % len(presses)
     noisy_charge = presses[repeated_rows].noisy(noise, seed=3).astype(np.float32)
     _compare(session, compute_exact, noisy_charge, floors, tolerance_factor=1.0)
@@ -104,8 +106,8 @@ def _choose_golden_charges(
     Three quarters are charges of presses, and one quarter are extreme charges.
 
     Presses are only used if the standard deviation of their position is at most the median of all presses. For presses
-    with larger standard deviations, a small change of a charge may move the estimated position by millimetres. The
-    rounding of float32 numbers could then cause differences between runtimes that exceed the tolerance of the golden
+    with larger standard deviations, a small change of a charge may move the estimated position by millimetres. On these
+    presses, two runtimes that round float32 numbers differently could differ by more than the tolerance of the golden
     vectors.
 
     Args:
@@ -167,16 +169,16 @@ def _compare(
 ) -> None:
     """Check that the graph and the network agree.
 
-    For each output, the difference of a press is the largest relative difference among the columns of the output. For
-    nearly all presses (`QUANTILE`), this difference must be within the tolerance. For all presses, the difference must
-    be within a larger tolerance.
+    The difference of a press is the largest relative difference among the columns of an output. Each output must meet
+    two conditions. For the fraction `QUANTILE` of the presses, the difference must be within `tolerance_factor` times
+    the tolerance of the output. For all presses, it must be within `EXTREME_FACTOR` times this tolerance.
 
     Args:
         session: The graph.
         compute_exact: Function that computes the outputs of the network in double precision.
         charge: Charges, shape (n, n_electrode), pC.
         floors: Values of x and y, mm, and of the force, N, below which differences count as absolute differences.
-        tolerance_factor: Factor by which the tolerance for nearly all presses is multiplied.
+        tolerance_factor: Factor of the tolerance for the fraction `QUANTILE` of the presses.
 
     Raises:
         TrainingError: If the graph and the network disagree.

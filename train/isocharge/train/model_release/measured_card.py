@@ -41,7 +41,7 @@ def measured_card(metadata: ModelMetadata) -> str:
     measured = metadata.made_with["measured"]
     width, height = np.ptp(np.array(metadata.working_area_mm), axis=0)
     channels = ", ".join(metadata.electrodes)
-    white_noise, gain_noise = metadata.noise.of_each(len(metadata.electrodes))
+    white_noise, gain_noise = metadata.noise.for_each_electrode(len(metadata.electrodes))
     noise_rows = "\n".join(
         f"| noise of {name} | {white:g} and {100 * gain:.3g} % of the charge |"
         for name, white, gain in zip(metadata.electrodes, white_noise, gain_noise, strict=True)

@@ -7,6 +7,7 @@ wrote.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, NoReturn
 
 import numpy as np
@@ -57,7 +58,7 @@ class GraphBuilder:
         return result_name
 
     def add_many(self, operator: str, *inputs: str, to: tuple[str, ...], **attributes: Any) -> tuple[str, ...]:
-        """Add a node with several results, and return the names of the results, which are those in `to`."""
+        """Add a node with several results, which get the names in `to`, and return these names."""
         self.nodes.append(helper.make_node(operator, list(inputs), list(to), **attributes))
         return to
 
@@ -135,8 +136,8 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     answers = _add_answers(builder, network)
     position, logarithms, *optional_angles, misfit_vector = builder.split(answers, widths)
 
-    # The exponentials of the logarithms are the force and the standard deviations. The standard deviations already have
-    # the name of an output of the graph, `contact_std`, so they need no further node.
+    # The exponentials of the logarithms are the force and the standard deviations. The second result of the split has
+    # the name of an output of the graph, `contact_std`, so it needs no further node.
     force, _ = builder.split(builder.add("Exp", logarithms), {"force": 1, "contact_std": 3})
     builder.add("Concat", position, force, to="contact", axis=1)
     for angles in optional_angles:  # one tensor, or none if the network has no correlations
@@ -146,7 +147,9 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     compressed_misfit = builder.add("ReduceL2", misfit_vector, axes=[1], keepdims=1)
     builder.add("Mul", builder.add("Sinh", compressed_misfit), builder.constant(MISFIT_UNIT), to="misfit")
 
-    outputs = {name: width for name, width in OUTPUTS.items() if network.n_angle or name != CORRELATION}
+    outputs = dict(OUTPUTS)
+    if not network.n_angle:
+        del outputs[CORRELATION]
     return _make_model(builder, "isocharge", n_electrode, outputs, producer_name="isocharge")
 
 
@@ -159,9 +162,10 @@ def _add_answers(builder: GraphBuilder, network: FoldedNetwork) -> str:
 def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
     """Add nodes that compute the input features of the charges.
 
-    The charges Q are limited first. The features are ln(Q / typical charge), or asinh(Q / typical charge) - mean if
-    charges may be negative. If charges may be negative, each electrode has its own limits. In this case, the operators
-    `Max` and `Min` replace the operator `Clip`, which has the same limits for all electrodes.
+    The charges Q are first limited to a range. If all charges are positive, the features are ln(Q / typical charge),
+    and the operator `Clip` applies the same limits to all electrodes. If charges may be negative, the features are
+    asinh(Q / typical charge) - mean. In this case, the operators `Max` and `Min` apply separate limits to each
+    electrode.
 
     Args:
         builder: Builder of the graph.
@@ -175,8 +179,8 @@ def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
         clipped = builder.add("Clip", INPUT, builder.constant(features.low_pC), builder.constant(features.high_pC))
         ratio = builder.add("Mul", clipped, builder.constant(inverse_typical))
         return builder.add("Log", ratio)
-    not_below = builder.add("Max", INPUT, builder.constant(features.low_pC))
-    clipped = builder.add("Min", not_below, builder.constant(features.high_pC))
+    clipped_below = builder.add("Max", INPUT, builder.constant(features.low_pC))
+    clipped = builder.add("Min", clipped_below, builder.constant(features.high_pC))
     ratio = builder.add("Mul", clipped, builder.constant(inverse_typical))
     return builder.add("Sub", builder.add("Asinh", ratio), builder.constant(features.mean))
 
@@ -184,7 +188,7 @@ def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
 def _add_perceptron(builder: GraphBuilder, inputs: str, perceptron: Perceptron[Array]) -> str:
     """Add nodes that evaluate a perceptron with hidden layers and a skip layer.
 
-    The operator `Gemm` computes inputs @ weights + bias.
+    The operator `Gemm` computes inputs @ weights + bias. The last layer adds the output of the skip layer.
 
     Args:
         builder: Builder of the graph.
@@ -255,8 +259,8 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
         _refuse(where, f"expected ONNX operators of version {OPSET} alone, got {versions}")
 
     # A graph that is written for the recovered network must have the same nodes as the file. The nodes are compared
-    # before their numbers, because a message about the first different node is more helpful.
-    network = _network_of(model.graph, where)
+    # before the counts of the nodes, because a message about the first different node is more helpful.
+    network = _recover_network(model.graph, where)
     expected_nodes = list(_plain_nodes(_whole_model(network).graph))
     given_nodes = list(_plain_nodes(model.graph))
     for expected_node, given_node in zip(expected_nodes, given_nodes, strict=False):
@@ -267,7 +271,7 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
     return network
 
 
-def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
+def _recover_network(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
     """Return the network that a graph of `write_graph` evaluates.
 
     Args:
@@ -278,7 +282,7 @@ def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
         ModelError: If the number or the shapes of the constants do not fit a network.
     """
     operators = [node.op_type for node in graph.node]
-    activation = _activation_of(operators, where)
+    activation = _hidden_activation(operators, where)
     constants = _constants_in_order(graph, where)
     is_signed = operators[:1] == ["Max"]  # the first node of a graph for charges of both signs
     n_hidden = operators.count(activation.onnx_operator)  # each hidden layer has one activation
@@ -296,22 +300,24 @@ def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
     return FoldedNetwork(features, perceptron)
 
 
-def _activation_of(operators: Sequence[str], where: str) -> Activation:
+def _hidden_activation(operators: Sequence[str], where: str) -> Activation:
     """Return the activation of the hidden layers, which is the operator after the first linear layer.
 
     Args:
         operators: Operators of the nodes, in order.
         where: Beginning of the error message.
+
+    Raises:
+        ModelError: If this operator is not an activation, or does not exist.
     """
     activation_of_operator = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
-    # The operator `Gemm` is a linear layer. The list `following` contains the operator after the first `Gemm`. It is
-    # empty if the graph has no `Gemm`, or ends with the first one.
-    first_layer = operators.index("Gemm") if "Gemm" in operators else len(operators)
-    following = operators[first_layer + 1 : first_layer + 2]
-    if not following or following[0] not in activation_of_operator:
+    # The operator `Gemm` is a linear layer.
+    operators_after_gemm = [following for operator, following in pairwise(operators) if operator == "Gemm"]
+    first_following = operators_after_gemm[:1]  # empty if no operator follows a Gemm
+    if not first_following or first_following[0] not in activation_of_operator:
         known_operators = ", ".join(activation_of_operator)
-        _refuse(where, f"expected one of the activations {known_operators} after a Gemm, got {following}")
-    return activation_of_operator[following[0]]
+        _refuse(where, f"expected one of the activations {known_operators} after a Gemm, got {first_following}")
+    return activation_of_operator[first_following[0]]
 
 
 def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
@@ -336,7 +342,10 @@ def _take_features(constants: Iterator[Array], *, is_signed: bool) -> ChargeFeat
 
     Args:
         constants: Iterator over the constants, which is advanced.
-        is_signed: Whether charges may be negative, so that the features have a mean.
+        is_signed: Whether charges may be negative. Only the features of such charges have a mean.
+
+    Raises:
+        StopIteration: If there are too few constants.
     """
     low = next(constants)
     high = next(constants)
@@ -426,13 +435,13 @@ class _PlainNode:
 def _plain_nodes(graph: onnx.GraphProto) -> Iterator[_PlainNode]:
     """Yield a description of each node of a graph, for a comparison with another graph.
 
-    The names of the tensors inside a graph are arbitrary. The name of a tensor is replaced by the number of the node
-    that computes the tensor. The name of a constant is replaced by the values of the constant.
+    The names of the tensors inside a graph are arbitrary. The name of a constant is replaced by the values of the
+    constant. The name of every other inner tensor is replaced by the number of the node that computes the tensor.
 
     Args:
         graph: The graph.
     """
-    # Descriptions of all tensors that can be inputs of the next node, by the name of the tensor
+    # This dictionary contains the descriptions of all tensors that can be inputs of the next node, by their names.
     description_of_tensor: dict[str, object] = {tensor.name: tensor.name for tensor in graph.input}
     for tensor in graph.initializer:
         description_of_tensor[tensor.name] = _plain_constant(numpy_helper.to_array(tensor))
@@ -440,6 +449,7 @@ def _plain_nodes(graph: onnx.GraphProto) -> Iterator[_PlainNode]:
     for node_index, node in enumerate(graph.node):
         yield _PlainNode(
             operator=node.op_type,
+            # An unknown name, such as the empty name of an omitted input, gets the description None.
             inputs=tuple(description_of_tensor.get(name) for name in node.input),
             outputs=tuple(name if name in graph_outputs else None for name in node.output),
             attributes={attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute},

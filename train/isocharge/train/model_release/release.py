@@ -7,7 +7,7 @@ import json
 import platform
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib import metadata
+from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any
 
@@ -134,8 +134,8 @@ model-index:
 def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     """Return the text of `card.md`.
 
-    For a model of measured presses alone, `measured_card` writes the card. In all other cards, the sections about the
-    errors and the limits depend on whether the test presses were measured or simulated.
+    If the model was trained on measured presses alone, `measured_card` writes the card. In all other cards, the
+    sections about the errors and the limits depend on whether the test presses were measured or simulated.
 
     Args:
         metadata: Metadata of the model.
@@ -166,9 +166,12 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
 
 
 def yield_text(metadata: ModelMetadata) -> str:
-    """Return a text about the force at which the film yields, for the row of the forces in a card.
+    """Return a text about the force at which the film yields. The text is empty if the film does not yield.
 
-    The text is empty if the film does not yield within the range of forces.
+    The text is the end of the row of the forces in a card. Only forces within the range of the model are considered.
+
+    Args:
+        metadata: Metadata of the model.
     """
     if metadata.yield_force_N is None:
         return ""
@@ -195,7 +198,8 @@ def _interface_section(metadata: ModelMetadata, fitted: Fitted) -> str:
     domain_text = ""
     if requested != fitted.domain:
         domain_text = f" ({requested.radius:g} mm were requested; farther out two contacts can have the same charges)"
-    correlation = ", `contact_correlation` (xy, xF, yF)" if fitted.network.n_angle else ""
+    has_correlations = fitted.network.n_angle > 0
+    correlations = ", `contact_correlation` (xy, xF, yF)" if has_correlations else ""
     probe_text = "; the model does not distinguish them" if len(metadata.probes) > 1 else ""
     return f"""# {metadata.name}, version {metadata.version}
 
@@ -204,7 +208,7 @@ Estimates the position and the force of one press from the touch charges of the 
 | | |
 |---|---|
 | input | `charge_pC`, float32 [n, {len(metadata.electrodes)}], touch charges of {electrodes} in pC |
-| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlation}, `misfit` |
+| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlations}, `misfit` |
 | working area | within {fitted.domain.radius:g} mm of the centre{domain_text} |
 | forces | {min_force:g} to {max_force:g} N{yield_text(metadata)} |
 | probes | {", ".join(metadata.probes)}{probe_text} |
@@ -241,6 +245,7 @@ def _misfit_section(metadata: ModelMetadata, fitted: Fitted) -> str:
     """
     errors = metadata.errors
     noise = fitted.misfit_noise
+    # The unit is only named if it is not the noise of the training, which the card has already named.
     unit_text = f" `{noise.name}` (1 pC and 0.2 %)" if noise != fitted.noise else ""
     if fitted.good.measured:
         presses_text = "measured presses"
@@ -285,11 +290,12 @@ def release(
 ) -> Release:
     """Write a trained network as a version of a model.
 
-    The errors of the network are measured first, and the exported graph is compared with the network.
+    Before the files are written, the errors of the network are measured, and the exported graph is compared with the
+    network.
 
     Args:
         fitted: The network.
-        folder: Folder of the model, `models/NAME`. Its name is the name of the model.
+        folder: Folder of the model, for example `models/NAME`. The name of the folder is the name of the model.
         version: Number of the version folder.
         command: Command that makes this model again, for the card.
         errors: Errors for the metadata; None to measure them with `evaluate`.
@@ -305,8 +311,8 @@ def release(
     """
     names = fitted.sensor.electrode_names
     check_target(folder, version, names)
-    package_versions = {name: metadata.version(name) for name in ("isocharge", "numpy", "onnx", "onnxruntime")}
-    about_without_unnoticed = ModelMetadata(
+    package_versions = {name: installed_version(name) for name in ("isocharge", "numpy", "onnx", "onnxruntime")}
+    metadata_without_unnoticed = ModelMetadata(
         name=folder.resolve().name,
         version=version,
         sensor=_sensor_table(fitted),
@@ -325,14 +331,15 @@ def release(
         },
         yield_force_N=_yield_force(fitted),
     )
-    unnoticed = unnoticed_presses(fitted, about_without_unnoticed)
-    about = structs.replace(about_without_unnoticed, unnoticed=unnoticed)
+    unnoticed = unnoticed_presses(fitted, metadata_without_unnoticed)
+    complete_metadata = structs.replace(metadata_without_unnoticed, unnoticed=unnoticed)
 
-    graph = write_graph(fitted.network, about.to_props())
-    golden_charges = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, contact_floors(about))
-    card_text = hub_block(about) + card(about, fitted)
-    version_folder = write_model(folder, graph, about, golden_charges, card_text, fitted.provenance.files)
-    return Release(version_folder, about)
+    graph = write_graph(fitted.network, complete_metadata.to_props())
+    floors = contact_floors(complete_metadata)
+    golden_charges = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, floors)
+    card_text = hub_block(complete_metadata) + card(complete_metadata, fitted)
+    version_folder = write_model(folder, graph, complete_metadata, golden_charges, card_text, fitted.provenance.files)
+    return Release(version_folder, complete_metadata)
 
 
 def _sensor_table(fitted: Fitted) -> dict[str, Any]:
@@ -386,24 +393,25 @@ def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
         radius: Radius of the disk, mm.
     """
     angle = 2.0 * np.pi * np.arange(N_CORNERS) / N_CORNERS
-    corner_radius = radius / np.cos(np.pi / N_CORNERS)  # the sides touch the disk
+    corner_radius = radius / np.cos(np.pi / N_CORNERS)  # `radius` is the distance of the sides from the centre
     corners: Array = np.round(corner_radius * np.stack([np.cos(angle), np.sin(angle)], axis=1), 4)
     return tuple((x, y) for x, y in corners.tolist())
 
 
-def model_domain(about: ModelMetadata) -> Domain:
-    """Read from the metadata of a model the domain of the contacts for which it was trained.
+def model_domain(metadata: ModelMetadata) -> Domain:
+    """Determine the domain of the contacts for which a model was trained, using its metadata.
 
     In a model of simulated presses, the working area is a polygon around a disk, whose centre is the origin. For such a
     polygon, the domain is the largest disk in the polygon, with a radius rounded to 0.001 mm. For every other working
     area, the domain is a `PressedArea` with the same corners.
 
     Args:
-        about: Metadata of the model.
+        metadata: Metadata of the model.
     """
-    corners = np.array(about.working_area_mm)
+    corners = np.array(metadata.working_area_mm)
 
-    # The distance of an edge from the origin is the cross product of the edge and a corner over the edge's length.
+    # The distance of an edge from the origin is the cross product of the edge and one of its corners, divided by the
+    # length of the edge.
     edges = np.roll(corners, -1, axis=0) - corners
     cross_product = edges[:, 0] * corners[:, 1] - edges[:, 1] * corners[:, 0]
     edge_distance = np.abs(cross_product) / np.hypot(edges[:, 0], edges[:, 1])
@@ -412,5 +420,5 @@ def model_domain(about: ModelMetadata) -> Domain:
     disk_corners = np.array(_disk_polygon(radius))
     is_disk = corners.shape == disk_corners.shape and np.abs(corners - disk_corners).max() < CORNER_TOLERANCE_mm
     if is_disk:
-        return Domain(radius, about.force_range_N)
-    return PressedArea.of_corners(corners, about.force_range_N)
+        return Domain(radius, metadata.force_range_N)
+    return PressedArea.of_corners(corners, metadata.force_range_N)

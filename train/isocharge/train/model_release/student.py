@@ -54,19 +54,19 @@ class StudentCase:
     domain: Domain
 
     @classmethod
-    def of(cls, about: ModelMetadata) -> "StudentCase":
+    def of(cls, metadata: ModelMetadata) -> "StudentCase":
         """Read the sensor, the probes and the contacts of a model from its metadata.
 
         Raises:
             ModelError: If the model was trained on measured presses, which cannot be simulated.
         """
-        if HELD_PRESSES in about.errors:
+        if HELD_PRESSES in metadata.errors:
             raise ModelError(
-                f"{about.label} was trained on measured presses, and simulated presses of its sensor are not like "
+                f"{metadata.label} was trained on measured presses, and simulated presses of its sensor are not like "
                 "those; distil a model of simulated presses, such as one of 'isocharge train calibrate'"
             )
-        probes = tuple(parse_probe(notation) for notation in about.probes)
-        return cls(sensor_from_dict(dict(about.sensor)), probes, model_domain(about))
+        probes = tuple(parse_probe(notation) for notation in metadata.probes)
+        return cls(sensor_from_dict(dict(metadata.sensor)), probes, model_domain(metadata))
 
 
 def student_data(model: Path, dataset: Dataset) -> TrainingData:
@@ -80,11 +80,11 @@ def student_data(model: Path, dataset: Dataset) -> TrainingData:
         DatasetError: If the presses were made on another sensor, or if a network cannot be trained on the dataset.
     """
     predictor = Predictor(model)
-    about = predictor.metadata
-    if sensor_to_dict(dataset.sensor) != dict(about.sensor):
+    metadata = predictor.metadata
+    if sensor_to_dict(dataset.sensor) != dict(metadata.sensor):
         raise DatasetError(
-            f"expected presses on the sensor of the model {about.label}, {about.sensor['name']!r}, got presses on "
-            f"{dataset.sensor.name!r}; simulate them on the model's own sensor"
+            f"expected presses on the sensor of the model {metadata.label}, {metadata.sensor['name']!r}, got presses "
+            f"on {dataset.sensor.name!r}; simulate them on the model's own sensor"
         )
 
     def estimate(charge: Array) -> tuple[Array, Array]:
@@ -95,4 +95,4 @@ def student_data(model: Path, dataset: Dataset) -> TrainingData:
         return contact.astype(float), std.astype(float)
 
     checksum = sha256_of((model / "model.onnx").read_bytes())
-    return replace(TrainingData.of(dataset), teacher=Teacher(about.label, checksum, estimate))
+    return replace(TrainingData.of(dataset), teacher=Teacher(metadata.label, checksum, estimate))

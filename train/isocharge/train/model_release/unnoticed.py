@@ -13,7 +13,7 @@ from isocharge.serve.prediction.contact import Contacts, Validity
 from isocharge.train.training.fitted import Fitted
 
 WRONG_STDS = 4.0
-"""Error of a coordinate, in reported standard deviations, above which an answer counts as wrong."""
+"""Error of a coordinate or of the force above which an answer counts as wrong, in reported standard deviations."""
 
 NOISE_SEED = 11
 """Seed of the noise of the presses."""
@@ -28,14 +28,15 @@ MIN_NAMED_SHARE = 0.005
 """Smallest total share of wrong answers without a flag for which a card contains a table."""
 
 
-def unnoticed_presses(fitted: Fitted, about: ModelMetadata) -> UnnoticedPresses | None:
+def unnoticed_presses(fitted: Fitted, metadata: ModelMetadata) -> UnnoticedPresses | None:
     """Measure how often the answer to a simulated press outside the working area is wrong and carries no flag.
 
-    An answer is wrong if one of its values differs from the truth by more than `WRONG_STDS` standard deviations.
+    An answer is wrong if an estimated coordinate or the estimated force differs from the true value by more than
+    `WRONG_STDS` standard deviations that the network reports.
 
     Args:
         fitted: The network.
-        about: Metadata, which contain the thresholds of the flags.
+        metadata: Metadata of the model, which contain the thresholds of the flags.
 
     Returns:
         The shares of wrong answers without a flag, by place; None if the film outside the working area was not
@@ -46,19 +47,19 @@ def unnoticed_presses(fitted: Fitted, about: ModelMetadata) -> UnnoticedPresses 
         return None
     presses = outside.grid()
     contact, std, misfit = fitted.predict(presses.noisy(fitted.misfit_noise, NOISE_SEED))
-    is_coordinate_wrong = np.abs(contact - presses.contact) > WRONG_STDS * std
-    is_wrong = is_coordinate_wrong.any(axis=1)
-    is_unnoticed = is_wrong & ~is_flagged(about, contact, std, misfit)
-    return outside.unnoticed(is_unnoticed)
+    is_value_wrong = np.abs(contact - presses.contact) > WRONG_STDS * std  # for x, y and F, shape (n, 3)
+    is_wrong = is_value_wrong.any(axis=1)
+    is_unnoticed = is_wrong & ~is_flagged(metadata, contact, std, misfit)
+    return outside.unnoticed_shares(is_unnoticed)
 
 
-def is_flagged(about: ModelMetadata, contact: Array, std: Array, misfit: Array) -> Booleans:
-    """Return whether each answer carries a flag other than `stress`.
+def is_flagged(metadata: ModelMetadata, contact: Array, std: Array, misfit: Array) -> Booleans:
+    """Return whether each answer carries a flag that warns of a wrong answer.
 
-    The flag `stress` does not mean that an answer is wrong.
+    All flags except `stress` are such warnings. The flag `stress` means that the film may be damaged.
 
     Args:
-        about: Metadata of the model.
+        metadata: Metadata of the model.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         std: Standard deviations of the contacts, shape (n, 3), mm, mm and N.
         misfit: Misfits, shape (n, 1).
@@ -68,7 +69,7 @@ def is_flagged(about: ModelMetadata, contact: Array, std: Array, misfit: Array) 
     """
     correlation = np.full_like(std, np.nan)  # no flag depends on the correlations
     fields = np.concatenate([contact, std, misfit, correlation], axis=1).T  # one row for each field of `Contacts`
-    flags = Validity.of(about).batch_flags(Contacts(*fields))
+    flags = Validity.of(metadata).batch_flags(Contacts(*fields))
     return np.array([any(flag != STRESS for flag in answer_flags) for answer_flags in flags])
 
 
@@ -86,16 +87,19 @@ def unnoticed_section(unnoticed: UnnoticedPresses | None) -> str:
     if unnoticed is None:
         return ""
     sentence = fill(f"{unnoticed.summary}.", CARD_WIDTH)
-    text = f"## Presses outside the working area\n\n{sentence}\n"
+    heading_and_sentence = f"## Presses outside the working area\n\n{sentence}\n"
     if unnoticed.total_share < MIN_NAMED_SHARE:
-        return text + "\n"
+        return heading_and_sentence + "\n"
 
     table_rows = "".join(_ring_rows(unnoticed))
-    return f"{text}\n| distance from the centre | wrong without a flag |\n|---|---|\n{table_rows}\n"
+    return f"{heading_and_sentence}\n| distance from the centre | wrong without a flag |\n|---|---|\n{table_rows}\n"
 
 
 def _ring_rows(unnoticed: UnnoticedPresses) -> Iterator[str]:
-    """Yield the rows of the table in a card. Each row states a range of distances and the share in this range.
+    """Yield the rows of the table in a card.
+
+    Each row states a range of distances from the centre, and the share of wrong answers without a flag in this range. A
+    row combines several neighbouring rings.
 
     Args:
         unnoticed: Shares of the presses to which the model gives a wrong answer without a flag.

@@ -1,7 +1,7 @@
 """Evaluation of all datasets of a report, and writer of its JSON record, its pictures and its page.
 
-The folder of the report appears when the report is complete. A stopped report keeps its completed solves and limits,
-and the same call of `write_report` continues the report.
+The folder of the report appears when the report is complete. A stopped report keeps the simulations of the film and the
+theoretical limits that are already complete. The same call of `write_report` then continues the report.
 """
 
 import json
@@ -39,8 +39,8 @@ def write_report(
 
     Methods are fitted to the presses of a dataset and tested on other presses. If the dataset was measured, a fifth of
     its presses is held out for the test. If the dataset was simulated, the test presses are simulated as well. A
-    stopped report leaves its completed solves and limits in the folder `FOLDER.part`, and the same call continues the
-    report.
+    stopped report keeps completed simulations of the film and completed theoretical limits in the folder `FOLDER.part`.
+    The same call then continues the report.
 
     Args:
         folder: Folder to write; it must not exist.
@@ -54,7 +54,7 @@ def write_report(
         The content of `report.json`.
 
     Raises:
-        OutputExists: If the folder exists, or a stopped report had other settings.
+        OutputExists: If the folder exists, or a stopped report had other settings, datasets or models.
         DatasetError: If the methods cannot be fitted to a dataset.
         ModelError: If a model is for another sensor or for a smaller range of forces than its dataset.
         PressError: If there are too few measured presses.
@@ -72,6 +72,7 @@ def write_report(
     # A stopped report is continued only if its settings, its datasets and its models are the same.
     run_identity = {**header, "datasets": [evaluation.identity() for evaluation in evaluations]}
     file_stems = _file_stems([evaluation.case.sensor.name for evaluation in evaluations])
+    # All methods are timed with one thread.
     with resume_folder(folder, run_identity, fresh=fresh) as run, threads_and_seed(1, settings.seed):
         sections = []
         for file_stem, evaluation in zip(file_stems, evaluations, strict=True):
@@ -79,7 +80,7 @@ def write_report(
             picture_files = section.save_pictures(run.data, file_stem)
             sections.append({**section.content, "pictures": picture_files})
 
-        # The page is written from the records of the methods, and `report.json` from their JSON form.
+        # The page needs the methods as `MethodRecord` objects. For `report.json`, these are converted to dictionaries.
         page = report_page({**header, "datasets": sections})
         record = {**header, "datasets": [_json_section(section) for section in sections]}
         write_whole(run.data / "report.md", page.encode())

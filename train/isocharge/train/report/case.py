@@ -105,7 +105,7 @@ TEST_PRESSES_SEED = 7919
 
 @dataclass(frozen=True)
 class EvaluationCase:
-    """Conditions of a dataset, under which all methods are evaluated.
+    """Conditions under which all methods are evaluated on a dataset.
 
     Attributes:
         sensor: The sensor of the dataset.
@@ -126,7 +126,7 @@ class EvaluationCase:
     press_count: int
 
     @classmethod
-    def of(cls, dataset: Dataset, max_presses: int, seed: int) -> "EvaluationCase":
+    def for_dataset(cls, dataset: Dataset, max_presses: int, seed: int) -> "EvaluationCase":
         """Create the case of a dataset, with the reference noise.
 
         Args:
@@ -137,8 +137,8 @@ class EvaluationCase:
         Raises:
             DatasetError: If the dataset names a probe that is not in the notation of `parse_probe`.
         """
-        probes, is_rotated = _probes_of(dataset.samples)
-        press_count = max_presses - max_presses % len(probes)
+        probes, is_rotated = _read_probes(dataset.samples)
+        press_count = max_presses - max_presses % len(probes)  # the same number of presses for each probe
         noise = noise_model("reference")
         return cls(dataset.sensor, probes, domain_of(dataset), is_rotated, noise, seed, press_count)
 
@@ -170,20 +170,23 @@ class EvaluationCase:
         Args:
             range_factor: Factor by which the ranges of distances and forces of the maps exceed those of the dataset.
             accuracy: Relative accuracy of the charges.
-            executor: Executor of the solves; None to solve in this process.
+            executor: Executor of the simulations of the film; None to simulate in this process.
         """
         sweep = self.test_sweep(range_factor)
         return solve_maps(self.sensor, self.probes, sweep, SolveSettings(accuracy=accuracy), executor=executor)
 
 
-def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
-    """Return the probes of a dataset, and whether any of the probes pressed in several orientations.
+def _read_probes(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
+    """Return the probes of a dataset, and whether the presses of any probe have several orientations.
 
-    If all presses of a probe have the same angle, the probe is returned with this rotation. The angles of an
-    axisymmetric probe are ignored, because they have no effect.
+    If all presses of a probe have the same angle, the probe is returned with this rotation. Different angles of an
+    axisymmetric probe do not count as several orientations, because they have no effect.
 
     Args:
         samples: The presses of the dataset, each with the notation of its probe and its orientation.
+
+    Returns:
+        The probes in the order of their notations, and whether at least one of them has several orientations.
 
     Raises:
         DatasetError: If the notation of a probe is not valid.
@@ -199,7 +202,7 @@ def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
         angles_deg = samples.orientation_deg[samples.probe == notation]
         smallest_angle_deg = angles_deg.min()
         is_single_angle = bool(angles_deg.max() == smallest_angle_deg)
-        is_axisymmetric = probe.period == 0.0
+        is_axisymmetric = probe.period == 0.0  # `period` is the smallest angle of rotation that changes nothing
         if is_single_angle:
             probe = probe.rotated(float(np.deg2rad(smallest_angle_deg)))
         elif not is_axisymmetric:
@@ -219,7 +222,8 @@ def simulate_presses(forward_maps: tuple[ForwardMap, ...], sweep: Sweep) -> Labe
         The contacts and charges of all presses.
     """
     presses = sweep.over([forward_map.probe for forward_map in forward_maps])
-    charge = np.empty((len(presses), len(forward_maps[0].electrodes)))
+    n_electrode = len(forward_maps[0].electrodes)
+    charge = np.empty((len(presses), n_electrode))
     for probe_index, forward_map in enumerate(forward_maps):
         rows = np.flatnonzero(presses.probe == probe_index)
         charge[rows] = forward_map.charges(presses.contact[rows], presses.rotation[rows])
@@ -234,13 +238,13 @@ CRAMER_RAO = "Cramér-Rao"
 
 
 @dataclass(frozen=True)
-class ErrorBounds:
+class ErrorLimits:
     """Theoretical limits of the error on the test presses.
 
     Attributes:
         posterior_mean: Posterior means (x, y, F) of the first m test presses with noise, shape (m, 3), mm and N. The
-            error of these means is the Bayes limit. None if there are several probes or random rotations, because the
-            posterior would then have to include the unknown probe.
+            error of these means is the Bayes limit. None if there are several probes or orientations of a probe,
+            because the probe or its orientation would then be a further unknown.
         cramer_rao: Cramér-Rao limit of each test press, for unbiased estimators. If there are several probes, it is the
             limit for the first probe.
     """
@@ -249,28 +253,30 @@ class ErrorBounds:
     cramer_rao: CramerRao
 
     @classmethod
-    def of(
+    def compute(
         cls,
         case: EvaluationCase,
         charge_map: ChargeSpline,
         clean_presses: LabelledPresses,
         noisy_charge: Array,
         executor: Executor | None = None,
-    ) -> "ErrorBounds":
+    ) -> "ErrorLimits":
         """Compute the Cramér-Rao limit for all test presses, and the Bayes limit for the first test presses.
 
-        The Bayes limit is left out if the case has several probes or several orientations of a probe.
+        The Bayes limit is the error of the posterior means. It is left out if there are several probes or several
+        orientations of a probe, because these would be further unknowns.
 
         Args:
-            case: The case, with sensor, probes, working area, forces and noise.
-            charge_map: Charges of the first probe of the case, over exactly the contacts of the case.
+            case: The conditions of the test: sensor, probes, working area, forces and noise.
+            charge_map: Map from contacts to charges for the first probe. Its domain is that of the case.
             clean_presses: The test presses without noise.
             noisy_charge: Charges of the first m test presses with noise, for the Bayes limit, shape (m, n_electrode),
                 pC.
             executor: Executor of the integrals of the Bayes limit; None to compute them in this process.
 
         Returns:
-            Cramér-Rao limits of all presses, and posterior means of the first m presses.
+            Cramér-Rao limits of all presses, and posterior means of the first m presses (None if the Bayes limit is
+            left out).
         """
         cramer_rao = limits_at(charge_map, clean_presses.contact, case.noise)
         if len(case.probes) > 1 or case.is_rotated:
@@ -291,7 +297,7 @@ class ErrorBounds:
         bayes = None
         if self.posterior_mean is not None:
             count = len(self.posterior_mean)
-            errors = ContactErrors.of(self.posterior_mean, truth[:count])
+            errors = ContactErrors.compute(self.posterior_mean, truth[:count])
             bayes = {**asdict(errors), "presses": count}
         position_mm = self.cramer_rao.position
         force_percent = 100.0 * rms(self.cramer_rao.force)

@@ -28,7 +28,7 @@ from isocharge.train.baselines.networks import RELEASED, ReleasedModel, TrainedN
 from isocharge.train.data.presses import LabelledPresses, held_out, is_measured, presses_of, split_by_position
 from isocharge.train.model_release.evaluate import alarm_threshold
 from isocharge.train.report import pictures, studies
-from isocharge.train.report.case import BAYES, ErrorBounds, EvaluationCase, Settings, simulate_presses
+from isocharge.train.report.case import BAYES, ErrorLimits, EvaluationCase, Settings, simulate_presses
 from isocharge.train.report.measures import compare_with_released, round_significant
 from isocharge.train.report.methods import FittedMethod, fit_all, measure_methods
 from isocharge.train.report.press_selection import measured_presses_for, select_presses, simulated_presses_for
@@ -129,15 +129,15 @@ class DatasetEvaluation:
             ModelError: If the model is for another sensor or for a smaller range of forces than the dataset.
             PressError: If there are too few measured presses.
         """
-        # The released model, and the small models of the same sensor
+        # Read the released model, and find the small models of the same sensor.
         model = Predictor(model_folder).metadata
-        unique_students = dict.fromkeys(students)
+        unique_students = dict.fromkeys(students)  # without repetitions, in the given order
         own_students = tuple(path for path in unique_students if Predictor(path).metadata.sensor == model.sensor)
 
-        # The presses within the working area and the forces of the model
+        # Select the presses within the working area and the range of forces of the model.
         select_for_model = measured_presses_for if is_measured(dataset) else simulated_presses_for
         usable_dataset = select_for_model(model, dataset)
-        case = EvaluationCase.of(usable_dataset, settings.presses, settings.seed)
+        case = EvaluationCase.for_dataset(usable_dataset, settings.presses, settings.seed)
 
         # Separate the test presses from the presses for the fits.
         held_out_presses = None
@@ -153,11 +153,16 @@ class DatasetEvaluation:
 
         # Separate the validation presses from the training presses.
         train, validation = split_by_position(fitting_presses, settings.hold_out, settings.seed)
-        task = FittingTask(train, validation, case.domain, case.noise, settings.seed, settings.quick)
+        task = FittingTask(
+            train, validation, domain=case.domain, noise=case.noise, seed=settings.seed, quick=settings.quick
+        )
         return cls(fitting_dataset, ReleasedModel(model_folder), own_students, task, case, settings, held_out_presses)
 
     def identity(self) -> dict[str, Any]:
-        """Return the checksum of the dataset and the folders of the models. Together they identify a stopped report."""
+        """Return the checksum of the dataset and the folders of the models.
+
+        A stopped report is continued only if these values are the same.
+        """
         folders = [self.released.folder, *self.students]
         return {"dataset_sha256": self.dataset.sha256, "models": [str(folder) for folder in folders]}
 
@@ -165,7 +170,7 @@ class DatasetEvaluation:
         """Fit all methods, measure their errors and costs, and prepare the plots of the error against each cost.
 
         Args:
-            executor: Executor of the solves and of the integrals of the Bayes limit.
+            executor: Executor of the simulations of the film and of the integrals of the Bayes limit.
 
         Returns:
             The results with the functions that draw their pictures.
@@ -186,16 +191,17 @@ class DatasetEvaluation:
         """Simulate test presses, evaluate all methods on them, and return the section of a simulated dataset.
 
         The test presses are simulated first, and the theoretical limits of the error are computed for these presses.
-        All methods are then fitted and measured. Finally, the released model is studied under several noise draws and
-        under mismatches.
+        All methods are then fitted and measured. Finally, the released model is studied for several draws of the noise
+        and for mismatches, which are conditions that differ from the assumptions of the model.
 
         Args:
-            executor: Executor of the solves and of the integrals of the Bayes limit.
+            executor: Executor of the simulations of the film and of the integrals of the Bayes limit.
         """
         case = self.case
         settings = self.settings
 
-        # Simulate the test presses. They come from other solves of the film than the limits, except in a quick report.
+        # Simulate the test presses. Except in a quick report, the film is solved again for them, so that the errors of
+        # the solutions are not the same as in the theoretical limits.
         forward_maps = case.forward_maps(range_factor=1.0, accuracy=settings.accuracy, executor=executor)
         test_maps = self._test_maps(forward_maps, executor)
         clean_presses = simulate_presses(test_maps, case.test_sweep())
@@ -204,7 +210,7 @@ class DatasetEvaluation:
 
         # Compute the theoretical limits: the Cramér-Rao limit of all presses, and the Bayes limit of the first presses.
         charge_map = ChargeSpline.of(forward_maps[0])
-        limits = ErrorBounds.of(case, charge_map, clean_presses, noisy_charge[: settings.limited], executor)
+        limits = ErrorLimits.compute(case, charge_map, clean_presses, noisy_charge[: settings.limited], executor)
 
         # Fit and measure the methods. On simulated presses, a method that cannot be fitted raises an error, so there
         # are no failures to report.
@@ -213,8 +219,8 @@ class DatasetEvaluation:
         fitted_by_name = {fitted.method.name: fitted for fitted in fitted_methods}
         records = measure_methods(fitted_methods, test_presses, settings, limits.posterior_mean)
 
-        # Study the released model.
-        noise_draws = studies.NoiseDraws.of(self.released, clean_presses, case, settings.draws)
+        # Study the released model for several draws of the noise, and all studied methods for mismatches.
+        noise_draws = studies.NoiseDraws.draw(self.released, clean_presses, case, settings.draws)
         threshold = alarm_threshold(noise_draws.misfit)
         content = {
             **self._description(len(test_presses)),
@@ -236,16 +242,16 @@ class DatasetEvaluation:
 
         Args:
             forward_maps: Forward maps with which the theoretical limits are computed.
-            executor: Executor of the solves.
+            executor: Executor of the simulations of the film.
         """
         if self.settings.quick:
             return forward_maps
         return self.case.forward_maps(executor=executor)
 
     def _errors_by_force(
-        self, fitted_by_name: Mapping[str, FittedMethod], limits: ErrorBounds, test: LabelledPresses
+        self, fitted_by_name: Mapping[str, FittedMethod], limits: ErrorLimits, test: LabelledPresses
     ) -> dict[str, Any]:
-        """For the theoretical limits and for some methods, compute the position error in each bin of the force.
+        """Compute the position error of some methods and of the theoretical limits in each bin of the force.
 
         The methods are the released model and the methods of `STUDIED_METHODS`. The Bayes limit is left out if it was
         not computed.
@@ -274,11 +280,13 @@ class DatasetEvaluation:
     ) -> list[dict[str, Any]]:
         """Measure the errors of the released model and of the studied methods for all mismatches.
 
+        A mismatch is a condition that differs from the assumptions of the models, such as another probe.
+
         Args:
             fitted_by_name: Fitted methods by name.
             clean_presses: The test presses without noise.
             threshold: Misfit above which the released model gives an alarm, in standard deviations of the noise.
-            executor: Executor of the solves.
+            executor: Executor of the simulations of the film.
 
         Returns:
             The results of `studies.measure_mismatch`, one for each mismatch.
@@ -310,9 +318,10 @@ class DatasetEvaluation:
         return Section(content, {})
 
     def _released_models(self) -> list[ComparedMethod]:
-        """Return the released model and its students. None of them is fitted again.
+        """Return the released model and its students, which are small models of the same sensor.
 
-        Each model is listed twice: with all outputs, and reduced to the contact.
+        Each model is listed twice: with all outputs, and with the contact as its only output. The released model with
+        all outputs comes first.
         """
         models = {RELEASED: self.released}
         for path in self.students:
@@ -322,14 +331,14 @@ class DatasetEvaluation:
         methods = []
         for name, model in models.items():
             full_model = ComparedMethod(name, "network", "Predictor", model, choice="as released")
-            reduced_model = ComparedMethod(
+            contact_model = ComparedMethod(
                 f"{name}, contact only",
                 "network",
                 "ONNX Runtime, bound",
                 model.contact_only(),
                 choice="as released, only the contact",
             )
-            methods += [full_model, reduced_model]
+            methods += [full_model, contact_model]
         return methods
 
     def _new_networks(self) -> list[ComparedMethod]:
@@ -352,7 +361,7 @@ class DatasetEvaluation:
         return methods
 
     def _description(self, test_count: int) -> dict[str, Any]:
-        """Return the first entries of the section: sensor, contacts, noise, numbers of presses, and the model.
+        """Return the entries of the section that describe the dataset, the conditions of the test, and the model.
 
         Args:
             test_count: Number of test presses.
@@ -380,7 +389,7 @@ class DatasetEvaluation:
 
 
 def _first_presses(dataset: Dataset, max_presses: int) -> Dataset:
-    """Return the dataset with at most its first `max_presses` presses."""
+    """Return a dataset with the first `max_presses` presses of a dataset, or with all presses if there are fewer."""
     is_first = np.arange(len(dataset.samples)) < max_presses
     return select_presses(dataset, is_first)
 
@@ -390,8 +399,8 @@ def _study_drawings(
 ) -> dict[str, DrawPicture]:
     """Return the functions that draw the pictures of the studies, by the name of the picture.
 
-    The results of the noise studies are listed in the order of `studies.NOISE_FACTORS`, so that the errors of each
-    method can be drawn against these factors.
+    In the section, the mismatches of the noise have the same order as `studies.NOISE_FACTORS`. The errors of each
+    method can therefore be drawn against these factors.
 
     Args:
         content: Section of the report of a simulated dataset.

@@ -57,7 +57,7 @@ class ContactErrors:
     answered: float
 
     @classmethod
-    def of(cls, estimate: Array, truth: Array) -> "ContactErrors":
+    def compute(cls, estimate: Array, truth: Array) -> "ContactErrors":
         """Compute the errors of estimated contacts.
 
         Args:
@@ -127,7 +127,7 @@ class MethodRecord:
 
     @property
     def is_comparable(self) -> bool:
-        """Whether the method estimates the contacts of all presses, and from the charges alone."""
+        """Whether the method estimates the contacts of all presses and does not need the true force."""
         return not self.method.given_force and self.errors.answered == 1.0
 
     @property
@@ -174,10 +174,10 @@ class MethodRecord:
 
 
 def with_pareto_fronts(records: Sequence[MethodRecord]) -> list[MethodRecord]:
-    """Determine the Pareto front of each cost, and return the records with their `pareto_costs`.
+    """Determine the Pareto front of each cost, and return the records with the attribute `pareto_costs`.
 
-    The function `pareto_front` states when a method is on the Pareto front of a cost. Methods that are not comparable
-    are on no Pareto front, and are ignored when the fronts are determined.
+    The documentation of `pareto_front` defines the front. Methods that are not comparable are on no front, and they are
+    ignored when the fronts are determined.
 
     Args:
         records: Records of all methods.
@@ -245,9 +245,10 @@ def compare_with_released(records: Sequence[MethodRecord]) -> dict[str, Any]:
         records: Records of all methods; the first one is the record of the released model.
 
     Returns:
-        The value of "verdict" in `report.json`, which has two entries. The entry "sentences" is a list of sentences.
-        The entry "both" contains a list of labels for "latency" and one for "throughput". Each list names the methods
-        that are both faster and more accurate than the released model.
+        The value of "verdict" in `report.json`, which has two entries. The entry "sentences" is a list of sentences
+        about the methods and the networks other than the released model. The entry "both" contains a list of labels for
+        "latency" and a list of labels for "throughput". Each list contains the methods that are both faster and more
+        accurate than the released model.
     """
     released = records[0]
     comparable = [record for record in records[1:] if record.is_comparable]
@@ -275,6 +276,8 @@ def _speed_ratio(record: MethodRecord, released: MethodRecord, cost: Cost) -> fl
         cost: Kind of speed: "latency" or "throughput".
     """
     cost_ratio = released.cost(cost) / record.cost(cost)
+    # A latency is a duration, so its inverse is the speed. The throughput is a speed itself. Its sign of -1 inverts the
+    # ratio.
     return float(cost_ratio ** COST_SIGNS[cost])
 
 
@@ -284,10 +287,10 @@ def _faster_records(records: Sequence[MethodRecord], released: MethodRecord, cos
 
 
 def _comparison_sentence(cost: Cost, released: MethodRecord, group: Sequence[MethodRecord], group_name: str) -> str:
-    """Return sentences about the methods of a group that are both faster and more accurate than the released model.
+    """Return sentences that compare the methods of a group with the released model.
 
-    The sentences also compare the released model with the most accurate of the faster methods. If no method is faster
-    than the released model, a single sentence states this.
+    The first sentence states how many methods are both faster and more accurate than the released model. The second
+    sentence describes the most accurate of the faster methods. If no method is faster, a single sentence states this.
 
     Args:
         cost: The kind of speed: "latency" or "throughput".

@@ -92,8 +92,8 @@ def measure_methods(
 ) -> list[MethodRecord]:
     """Measure the errors, durations and sizes of all methods.
 
-    The predictions of all methods are timed in turns. A change of the speed of the machine therefore affects all
-    methods in the same way.
+    The methods take turns in short periods of timing. If the speed of the machine changes, the change therefore affects
+    all methods in the same way.
 
     Args:
         fitted_methods: The fitted methods with their estimates.
@@ -130,7 +130,8 @@ def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callabl
     """Return a function without arguments that predicts one press.
 
     Each call predicts the next of the first `SINGLE_PRESSES` presses. After the last of these presses, the first press
-    follows again. For ONNX networks, the arrays of each press are bound before the timing, as `Predictor` binds them.
+    follows again. For ONNX networks, the arrays for the input and the outputs are given to the runtime before the
+    timing, as in `Predictor`.
 
     Args:
         method: Fitted method.
@@ -140,19 +141,19 @@ def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callabl
     regressor = method.regressor
     calls: list[Callable[[], object]]
     if isinstance(regressor, OnnxContact | ReleasedModel):
-        calls = [regressor.single(press_input) for press_input in inputs]
+        calls = [regressor.single_press_function(press_input) for press_input in inputs]
     else:
         # `predict` expects a batch, so each press becomes a batch of one press, shape (1, n_input).
         calls = [partial(regressor.predict, press_input[None]) for press_input in inputs]
     cyclic_calls = cycle(calls)
-    return lambda: next(cyclic_calls)()  # take the call of the next press, and make it
+    return lambda: next(cyclic_calls)()  # takes the function of the next press, and calls it
 
 
 def _batch_contender(method: ComparedMethod, test: LabelledPresses, batch_size: int) -> Contender:
-    """Return the batch prediction that is timed in order to measure the throughput of a method.
+    """Return the prediction of a batch that will be timed in order to measure the throughput of a method.
 
     The duration of a small batch is measured first. If the whole batch would take longer than `MAX_BATCH_SECONDS`, the
-    small batch is timed instead of the whole batch.
+    returned prediction is that of the small batch.
 
     Args:
         method: The fitted method.
@@ -187,7 +188,7 @@ def _method_record(
         single_timing: Durations of predictions of one press.
         batch_timing: Durations of predictions of a batch of presses.
     """
-    errors = ContactErrors.of(fitted_method.estimate, truth)
+    errors = ContactErrors.compute(fitted_method.estimate, truth)
     if fitted_method.method.given_force:
         errors = replace(errors, force_rms_percent=None, force_median_percent=None)
     error_ratio = None
@@ -216,15 +217,15 @@ def bayes_ratio(estimate: Array, posterior_mean: Array, truth: Array) -> float |
         The ratio of the root-mean-square position errors over the first m presses; None if there is no estimate.
     """
     count = len(posterior_mean)
-    method_error = ContactErrors.of(estimate[:count], truth[:count]).position_rms_mm
-    bayes_error = ContactErrors.of(posterior_mean, truth[:count]).position_rms_mm
+    method_error = ContactErrors.compute(estimate[:count], truth[:count]).position_rms_mm
+    bayes_error = ContactErrors.compute(posterior_mean, truth[:count]).position_rms_mm
     if method_error is None or bayes_error is None:
         return None
     return round_significant(method_error / bayes_error)
 
 
 def _serialised_bytes(method: ComparedMethod) -> int:
-    """Return the size of the ONNX file of a network, or of the pickle of another regressor, bytes."""
+    """Return the size of the ONNX file of a network, or the size of the pickle of another regressor, in bytes."""
     regressor = method.regressor
     if isinstance(regressor, OnnxContact | ReleasedModel):
         return len(regressor.graph)

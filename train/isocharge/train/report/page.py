@@ -154,13 +154,19 @@ def _method_comparison(section: SectionContent) -> Iterator[str]:
 
 
 def _error_and_latency(record: MethodRecord) -> tuple[float, float]:
-    """Return the key that sorts methods by the error and then by the latency. Methods without an error come last."""
-    error_mm = record.errors.position_rms_mm or float("inf")
+    """Return the key that sorts methods by the error and then by the latency. Methods without an estimate come last."""
+    error_mm = record.errors.position_rms_mm
+    if error_mm is None:
+        error_mm = float("inf")
     return error_mm, record.single_timing.p50_us
 
 
 def _limit_rows(limits: Mapping[str, Any]) -> Iterator[list[str]]:
-    """Yield rows for the table of methods, one for each theoretical limit that was computed."""
+    """Yield rows for the table of methods, one for each theoretical limit that was computed.
+
+    Args:
+        limits: The entry "limits" of a section. Each limit is None if it was not computed.
+    """
     for name, key, bayes_ratio in (("*Bayes limit*", "bayes", "1"), ("*Cramér-Rao limit, unbiased*", "cramer_rao", "")):
         limit = limits[key]
         if limit:
@@ -182,7 +188,8 @@ def _limit_rows(limits: Mapping[str, Any]) -> Iterator[list[str]]:
 def _method_row(record: MethodRecord) -> list[str]:
     """Return the row of a method in the table of methods.
 
-    The row is in bold if the method is on the Pareto front of the latency.
+    The row is in bold if no other method is better in both the position error and the duration of one prediction, which
+    means that the method is on the Pareto front of the latency.
 
     Args:
         record: Record of the method.
@@ -234,7 +241,7 @@ def _mismatch_effects(section: SectionContent) -> Iterator[str]:
 
 
 def _mismatch_row(result: Mapping[str, Any], method_names: Sequence[str]) -> list[str]:
-    """Return the row of a mismatch in the table of mismatches.
+    """Return the row of a mismatch in the table of conditions that differ from the assumptions of the models.
 
     Args:
         result: Result of `studies.measure_mismatch`.

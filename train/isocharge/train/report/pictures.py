@@ -63,15 +63,15 @@ def cost_plot(records: Sequence[MethodRecord], cost: Cost, limits: Mapping[str, 
     Args:
         records: Records of the methods.
         cost: Name of the cost.
-        limits: Theoretical limits of the position error, mm, by name. Each limit is drawn as a horizontal line. A limit
-            that is larger than the errors of all methods without the true force is left out, which can happen for the
-            limit of unbiased estimators.
+        limits: Theoretical limits of the position error, mm, by name. Each limit is drawn as a horizontal line, unless
+            it is larger than the errors of all methods that do not use the true force. The limit of unbiased estimators
+            can be so large, because the methods may be biased.
 
     Returns:
         Figure with logarithmic axes and the Pareto front.
     """
     figure, axes = new_axes(10.5, 6.0)
-    # A logarithmic axis can show neither methods without an estimate nor methods with an error of zero.
+    # Methods without an error (None) cannot be drawn, and neither can an error of zero on a logarithmic axis.
     drawn_records = [record for record in records if record.errors.position_rms_mm]
     drawn_records.sort(key=lambda record: record.error_mm)
     _draw_methods(axes, drawn_records, cost)
@@ -94,8 +94,8 @@ def cost_plot(records: Sequence[MethodRecord], cost: Cost, limits: Mapping[str, 
 def _draw_methods(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> None:
     """Draw one point for each method.
 
-    The colour shows the kind of the method. Methods of one kind have different markers. Points of methods that are not
-    comparable are hollow, and the released model is a star.
+    The colour shows the kind of the method. Methods of one kind have different markers. If a method uses the true force
+    or has no estimate for some presses, its point is hollow. The released model is a star.
 
     Args:
         axes: Axes of matplotlib.
@@ -116,10 +116,11 @@ def _draw_methods(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> No
 
 
 def _draw_pareto_front(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> None:
-    """Draw the Pareto front as steps.
+    """Draw the Pareto front of a cost as steps.
 
-    Between two methods, the steps show the error of the method with the lower cost. For the throughput, a higher value
-    is a lower cost, so the direction of the steps is reversed.
+    A method is on the front if no other method is better in both error and cost. Between two methods, the steps show
+    the error of the cheaper method. For the throughput, the method with the higher value is the cheaper one, so the
+    direction of the steps is reversed.
 
     Args:
         axes: Axes of matplotlib.
@@ -240,7 +241,8 @@ def coverage_plot(record: Mapping[str, Any]) -> Figure:
 def mismatch_plot(results: Sequence[Mapping[str, Any]], nominal_error_mm: float | None) -> Figure:
     """Draw the position errors and the alarms for all mismatches except those of the noise.
 
-    Each mismatch is one row, which both panels of the figure share.
+    A mismatch is a condition that differs from the assumptions of the models, such as another probe. Each mismatch is
+    one row, which both panels of the figure share.
 
     Args:
         results: Results of `studies.measure_mismatch`.
@@ -259,6 +261,7 @@ def mismatch_plot(results: Sequence[Mapping[str, Any]], nominal_error_mm: float 
         errors_mm = [result["errors"][name]["position_rms_mm"] for result in shown_results]
         point_style = {**_line_style(name), "ls": ""}
         error_axes.plot(errors_mm, labels, **point_style, label=name)
+    # Without a nominal error, no line is drawn at NaN, and only the legend contains the line.
     error_axes.axvline(nominal_error_mm or np.nan, color=FELT, lw=0.9, ls="--", label="without mismatch")
     error_axes.set(xlabel=POSITION_ERROR_LABEL, xscale="log")
     error_axes.invert_yaxis()  # the first mismatch is the top row

@@ -32,9 +32,10 @@ def select_presses(dataset: Dataset, is_selected: Booleans) -> Dataset:
 
 
 def simulated_presses_for(model: ModelMetadata, dataset: Dataset) -> Dataset:
-    """Select the presses in the working area of a model from a simulated dataset.
+    """Select from a simulated dataset the presses that lie in the working area of a model.
 
-    If presses are excluded, the radius in the manifest becomes the radius of the model's working area.
+    If presses are excluded, the radius of the presses in the manifest of the dataset is reduced to the radius of the
+    working area.
 
     Args:
         model: Metadata of the model.
@@ -91,7 +92,7 @@ def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
 
 
 def measured_presses_for(model: ModelMetadata, dataset: Dataset) -> Dataset:
-    """Select the presses within the working area and the range of forces of a model from a measured dataset.
+    """Select from a measured dataset the presses within the working area and the range of forces of a model.
 
     The manifest of the returned dataset is empty, because the ranges in the original manifest include the excluded
     presses.

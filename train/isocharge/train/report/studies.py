@@ -52,7 +52,7 @@ class NoiseDraws:
     misfit: Array
 
     @classmethod
-    def of(
+    def draw(
         cls, released: ReleasedModel, clean_presses: LabelledPresses, case: EvaluationCase, draw_count: int
     ) -> "NoiseDraws":
         """Draw the noise of the test presses several times, and estimate all contacts each time.
@@ -77,7 +77,7 @@ class NoiseDraws:
 def errors_by_force(
     domain: Domain, truth: Array, estimates: Mapping[str, Array], cramer_rao_mm: Array
 ) -> dict[str, Any]:
-    """For several methods, compute the root-mean-square position error in logarithmic bins of the force.
+    """Compute the root-mean-square position error of several methods in logarithmic bins of the force.
 
     Args:
         domain: The range of forces.
@@ -88,7 +88,8 @@ def errors_by_force(
 
     Returns:
         The geometric centres of the bins ("force_N"), and the errors in the bins by the name of the method
-        ("position_rms_mm"). An error is None if a bin contains no estimate.
+        ("position_rms_mm"). The Cramér-Rao limit is one of these methods. An error is None if a bin contains no
+        estimate.
     """
     min_force, max_force = domain.force_range
     edges = np.geomspace(min_force, max_force, FORCE_BINS + 1)
@@ -196,20 +197,21 @@ def mismatches(
 ) -> Iterator[Mismatch]:
     """Yield the presses of all mismatches: other noise, other probes, another pretension, wrong gains, dead electrodes.
 
-    Only the other probes and the other pretension need new solutions of the film.
+    A mismatch is a condition that differs from the assumptions of the models. Only the other probes and the other
+    pretension require new solutions of the film. The test with another pretension can be excluded by the settings.
 
     Args:
         case: The conditions that the models assume.
         clean_presses: The test presses of the case without noise.
         settings: Settings of the report: the other probes, the accuracy, and whether the pretension is changed.
-        executor: Executor of the solves; None to solve in this process.
+        executor: Executor of the simulations of the film; None to simulate in this process.
     """
     noise_seed = case.seed + MISMATCH_NOISE_SEED
     for factor in NOISE_FACTORS:
         noise = NoiseModel(f"x {factor:g}", factor * case.noise.white, factor * case.noise.gain)
         yield Mismatch("noise", noise.name, clean_presses.contact, clean_presses.noisy(noise, noise_seed))
 
-    probe_accuracy = max(MISMATCH_ACCURACY, settings.accuracy)
+    probe_accuracy = max(MISMATCH_ACCURACY, settings.accuracy)  # a quick report solves the film less accurately
     for notation in settings.shapes:
         case_of_other_probe = replace(case, probes=(parse_probe(notation),))
         yield _solved_mismatch("probe", notation, case_of_other_probe, probe_accuracy, executor)
@@ -229,7 +231,7 @@ def mismatches(
 def _solved_mismatch(
     group: str, name: str, other_case: EvaluationCase, accuracy: float, executor: Executor | None
 ) -> Mismatch:
-    """Return presses that are simulated with the sensor and the probes of another case.
+    """Simulate presses with the sensor and the probes of another case, and return them as a mismatch.
 
     Args:
         group: Kind of the mismatch, such as "probe".
@@ -247,9 +249,9 @@ def _solved_mismatch(
 def _gain_mismatches(
     case: EvaluationCase, truth: Array, noisy_charge: Array, rng: np.random.Generator
 ) -> Iterator[Mismatch]:
-    """Yield presses with random errors in all gains and then, for each electrode, presses with only its gain wrong.
+    """Yield presses with random errors of all gains. Then yield, for each electrode, presses with only its gain wrong.
 
-    The random errors are drawn anew for each press.
+    The random errors are drawn separately for each press.
 
     Args:
         case: Case that contains the sensor.
@@ -268,7 +270,7 @@ def _gain_mismatches(
 def _dead_electrodes(
     case: EvaluationCase, truth: Array, noisy_charge: Array, rng: np.random.Generator
 ) -> Iterator[Mismatch]:
-    """For each electrode, yield presses in which this electrode measures only white noise.
+    """Yield, for each electrode, presses in which this electrode measures only white noise.
 
     Args:
         case: Case that contains the sensor and the noise.
@@ -305,15 +307,15 @@ def measure_mismatch(
     Returns:
         One entry of "cases" in `report.json`. It contains the errors of each method. For the released model, it also
         contains the percentage of presses with an alarm, and the fraction of the true values within one standard
-        deviation of the estimate.
+        deviation of the estimate ("coverage_68").
     """
     estimate, std, misfit = released.answer(mismatch.charge)
-    errors = {released_name: asdict(ContactErrors.of(estimate, mismatch.truth))}
+    errors = {released_name: asdict(ContactErrors.compute(estimate, mismatch.truth))}
     for method in other_methods:
         with np.errstate(over="ignore"):  # a diverging polynomial may overflow
             method_estimate = method.regressor.predict(mismatch.charge)
         clipped_estimate = np.clip(method_estimate, -CLIP_LIMIT, CLIP_LIMIT)
-        errors[method.name] = asdict(ContactErrors.of(clipped_estimate, mismatch.truth))
+        errors[method.name] = asdict(ContactErrors.compute(clipped_estimate, mismatch.truth))
     alarm_fraction = float(np.mean(misfit[:, 0] > alarm_threshold))
     inside_fraction = float(np.mean(np.abs(estimate - mismatch.truth) < std))
     return {

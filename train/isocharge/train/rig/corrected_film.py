@@ -84,7 +84,7 @@ def correct_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Doma
     # residuals minus the effective number of fitted coefficients, and at least one.
     good_residuals = residuals[~is_gross]
     total_chi2 = good_residuals.chi2(correction.log_factor(good_residuals.contact)).sum()
-    degrees_of_freedom = max(good_residuals.log_ratio.size - correction.freedom, 1.0)
+    degrees_of_freedom = max(good_residuals.log_ratio.size - correction.effective_count, 1.0)
     scatter = float(np.sqrt(total_chi2 / degrees_of_freedom))
 
     # The scatter is reported if it is both large and unlikely to be due to chance.

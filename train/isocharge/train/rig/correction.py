@@ -71,7 +71,8 @@ class Residuals:
         log_ratio = _log_ratio(presses.charge_pC / map_charge)
 
         # Covariance by errors of the contacts: J diag(std^2) J' for each press n, with J = d ln Q / d(x, y, ln F). The
-        # relative standard deviation of the force is the standard deviation of ln F.
+        # relative standard deviation of the force is the standard deviation of ln F. The indices of `einsum` are the
+        # press n, the electrodes e and f, and the coordinate i of the contact.
         charge_slopes = differences(charge_map.charges, presses.contact, CONTACT_STEPS)
         log_slopes = charge_slopes / map_charge[:, :, None]
         contact_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
@@ -100,20 +101,20 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Correction:
-    """Smooth factors on the charges of a forward map.
+    """Smooth correction of a forward map: factors by which the charges are multiplied.
 
-    A contact outside the range of the presses has the factors of the nearest press.
+    A contact outside the range of the presses has the factors of the nearest contact in this range.
 
     Attributes:
         domain: Places and forces of the presses.
         coefficients: Coefficients of the polynomials, shape (n_term, n_electrode).
-        freedom: Effective number of coefficients that the presses determine. The prior determines the other
+        effective_count: Effective number of coefficients that the presses determine. The prior determines the other
             coefficients.
     """
 
     domain: Domain
     coefficients: Array
-    freedom: float
+    effective_count: float
 
     @property
     def is_zero(self) -> bool:
@@ -164,10 +165,10 @@ def fit_correction(residuals: Residuals) -> Correction:
     hypotheses = [Hypothesis(discrepancy=size) for size in SIZES]
     mixture = mix_hypotheses(models_by_force_scatter, prior_covariance, hypotheses)
 
-    # Without a correction if this is most probable; otherwise with the averaged coefficients
+    # If the most probable size is zero, the charges are not corrected. Otherwise, the averaged coefficients are used.
     most_probable_size = mixture.best.discrepancy
     if most_probable_size == 0.0:
-        return Correction(domain, coefficients=np.zeros((n_term, n_electrode)), freedom=0.0)
+        return Correction(domain, coefficients=np.zeros((n_term, n_electrode)), effective_count=0.0)
     coefficients = mixture.mean.reshape(n_term, n_electrode)
     # The residuals determine some of the coefficients, and the prior determines the others. The effective number of
     # coefficients that the residuals determine is the trace of the posterior covariance times the normal matrix.
@@ -211,6 +212,9 @@ def _linear_model(residuals: Residuals, domain: Domain) -> LinearModel:
     Args:
         residuals: Residuals of n presses.
         domain: Domain of the polynomials.
+
+    Returns:
+        The matrix and the right-hand side of the normal equations, and the sum of squares without a correction.
     """
     whitening = np.linalg.inv(np.linalg.cholesky(residuals.covariance))  # shape (n, n_electrode, n_electrode)
     log_ratio_column = residuals.log_ratio[:, :, None]

@@ -175,7 +175,7 @@ def _draw_dataset(film: CorrectedFilm, count: int, seed: int) -> Dataset:
 
 
 def _provenance(film: CorrectedFilm, presses: MeasuredPresses, is_held_out: Booleans) -> Provenance:
-    """Describe the origin of a model of the corrected film: section of the card, metadata and files.
+    """Return the origin of a model of the corrected film: a section of the model card, metadata and files.
 
     Args:
         film: Corrected film.

@@ -42,7 +42,7 @@ class DefaultSizes(NamedTuple):
     rate_factor: float
 
     @classmethod
-    def of(cls, n_electrode: int) -> "DefaultSizes":
+    def for_electrodes(cls, n_electrode: int) -> "DefaultSizes":
         """Return the default sizes for a number of electrodes."""
         return FEW_ELECTRODE_SIZES if n_electrode <= FEW_ELECTRODES else MANY_ELECTRODE_SIZES
 
@@ -107,7 +107,7 @@ class NetworkConfig(Settings, frozen=True):
         """
         if self.hidden is not None:
             return self.hidden
-        sizes = DefaultSizes.of(n_electrode)
+        sizes = DefaultSizes.for_electrodes(n_electrode)
         return (sizes.width,) * self._layer_count(sizes)
 
     def misfit_widths(self, n_electrode: int) -> Widths:
@@ -118,7 +118,7 @@ class NetworkConfig(Settings, frozen=True):
         """
         if self.misfit_hidden is not None:
             return self.misfit_hidden
-        sizes = DefaultSizes.of(n_electrode)
+        sizes = DefaultSizes.for_electrodes(n_electrode)
         return (sizes.misfit_width,) * self._layer_count(sizes)
 
     def _layer_count(self, sizes: DefaultSizes) -> int:
@@ -168,7 +168,7 @@ class TrainingConfig(Settings, frozen=True):
         Args:
             n_electrode: Number of electrodes, which determines the number of steps if the setting is None.
         """
-        return self.steps if self.steps is not None else DefaultSizes.of(n_electrode).steps
+        return self.steps if self.steps is not None else DefaultSizes.for_electrodes(n_electrode).steps
 
     def misfit_step_count(self, n_electrode: int) -> int:
         """Return the number of optimiser steps of the misfit network.
@@ -176,7 +176,11 @@ class TrainingConfig(Settings, frozen=True):
         Args:
             n_electrode: Number of electrodes, which determines the number of steps if the setting is None.
         """
-        return self.misfit_steps if self.misfit_steps is not None else DefaultSizes.of(n_electrode).misfit_steps
+        return (
+            self.misfit_steps
+            if self.misfit_steps is not None
+            else DefaultSizes.for_electrodes(n_electrode).misfit_steps
+        )
 
     def misfit_charge_count(self, n_electrode: int) -> int:
         """Return the number of sets of charges in the training of the misfit network.
@@ -184,7 +188,11 @@ class TrainingConfig(Settings, frozen=True):
         Args:
             n_electrode: Number of electrodes, which determines the result if the setting is None.
         """
-        return self.misfit_charges if self.misfit_charges is not None else DefaultSizes.of(n_electrode).misfit_charges
+        return (
+            self.misfit_charges
+            if self.misfit_charges is not None
+            else DefaultSizes.for_electrodes(n_electrode).misfit_charges
+        )
 
     @property
     def noise_model(self) -> NoiseModel:

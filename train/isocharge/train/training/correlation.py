@@ -83,9 +83,9 @@ The arguments are a, b, a - b, a + b, a - b - c, a - b + c, a + b - c and a + b 
 def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: NoiseModel, seed: int) -> FoldedNetwork:
     """Return a network that also estimates the correlations between its errors of x, y and ln F.
 
-    Three angles a, b and c determine the correlations (see the description of this module). Each angle is a linear
-    function of the input features and of the hidden units that influence the contact. The linear functions are fitted
-    to the errors of the network on presses with noise. The other outputs of the network do not change.
+    Three angles a, b and c determine the correlations. The description of this module explains the angles. Each angle
+    is a linear function of the input features and of the hidden units that influence the contact. The linear functions
+    are fitted to the errors of the network on presses with noise. The other outputs of the network do not change.
 
     Args:
         network: The trained network.
@@ -94,9 +94,10 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
         seed: Seed of the noise.
 
     Returns:
-        Network with eight additional answers, which are the arguments of the cosines.
+        Network with eight additional answers: the sums and differences of a, b and c from whose cosines the
+        correlations are computed.
     """
-    # Outputs of the network for copies of the presses with noise
+    # Compute the outputs of the network for copies of the presses with noise.
     layers = network.layers
     examples = presses.repeated(N_EXAMPLES)
     features = network.features.evaluate(examples.noisy(noise, seed))
@@ -126,7 +127,7 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
 
 
 def _errors_over_std(true_contact: Array, contact: Array, std: Array) -> Array:
-    """Return the errors of estimated (x, y, ln F), divided by their estimated standard deviations, shape (n, 3).
+    """Return true minus estimated (x, y, ln F), divided by the estimated standard deviations, shape (n, 3).
 
     Args:
         true_contact: True contacts (x, y, F), shape (n, 3), mm and N.
@@ -135,7 +136,7 @@ def _errors_over_std(true_contact: Array, contact: Array, std: Array) -> Array:
     """
     position_error = true_contact[:, :2] - contact[:, :2]
     log_force_error = np.log(true_contact[:, 2] / contact[:, 2])
-    log_force_std = std[:, 2] / contact[:, 2]  # d ln F = dF / F
+    log_force_std = std[:, 2] / contact[:, 2]  # because d ln F = dF / F
     error = np.column_stack([position_error, log_force_error])
     error_std = np.column_stack([std[:, :2], log_force_std])
     return np.asarray(error / error_std)
@@ -147,17 +148,17 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     The fit minimises `correlation_loss` plus a penalty on the squared weights. For the fit, the inputs are whitened: a
     linear map gives them unit variances without correlations. The returned layer includes this map.
 
-    The variables of the minimisation are the bias and the weights divided by `FIRST_STEP`. The L-BFGS method makes a
-    first step with a length of about 1 in the variables, and thus of about `FIRST_STEP` in the bias and the weights.
+    The variables of the minimisation are the bias and the weights divided by `FIRST_STEP`. The first step of the L-BFGS
+    method changes the variables by about 1. It therefore changes the bias and the weights by about `FIRST_STEP`.
 
     Args:
-        inputs: Inputs of the layer, shape (n, k).
+        inputs: Inputs of the layer, shape (n, n_input).
         deviation: Errors of (x, y, ln F) divided by their standard deviations, shape (n, 3).
 
     Returns:
-        Layer from the inputs to the angles: weight, shape (k, 3), and bias, shape (3,).
+        Layer from the inputs to the angles: weight, shape (n_input, 3), and bias, shape (3,).
     """
-    # Whitened inputs, shape (n, n_input), and limited errors, shape (3, n), in single precision
+    # Compute whitened inputs, shape (n, n_input), and limited errors, shape (3, n), in single precision.
     mean, matrix = whitening(inputs[::WHITENING_STRIDE], MIN_RELATIVE_STD)
     whitened_inputs = np.ascontiguousarray((inputs - mean) @ matrix, dtype=np.float32)
     clipped_deviation = np.clip(deviation, -MAX_DEVIATION, MAX_DEVIATION)
@@ -177,13 +178,14 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
         loss_without_penalty, angle_gradient = correlation_loss(angles, transposed_deviation)
         penalty = RIDGE * float((weight**2).sum())
 
-        # Gradient with respect to the parameters by the chain rule, and then with respect to the scaled parameters
+        # Compute the gradient with respect to the parameters by the chain rule. The gradient with respect to the scaled
+        # parameters is `FIRST_STEP` times as large.
         bias_gradient = angle_gradient.sum(axis=1, dtype=float)
         weight_gradient = whitened_inputs.T @ angle_gradient.T + 2.0 * RIDGE * float32_weight
         parameter_gradient = np.vstack([bias_gradient, weight_gradient])
         return loss_without_penalty + penalty, FIRST_STEP * parameter_gradient.ravel()
 
-    # The search begins without correlations: all angles are right angles, whose cosines are zero.
+    # The minimisation begins without correlations: all angles are right angles, whose cosines are zero.
     start = np.zeros((1 + n_input, 3))  # the first row contains the bias
     start[0] = 0.5 * np.pi / FIRST_STEP
     scaled_solution = _minimise(loss, start.ravel())
@@ -199,18 +201,18 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
 def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Array:
     """Minimise a loss by the L-BFGS method, and start the method again if a line search fails.
 
-    The search ends if all derivatives are below a tolerance, or after `MAX_ITERATIONS` iterations. If a line search
-    fails after each of `MAX_STARTS` starts, the search also ends, and a warning is logged.
+    The minimisation ends if no derivative exceeds a tolerance, or after `MAX_ITERATIONS` iterations. If a line search
+    fails in each of `MAX_STARTS` starts, the minimisation also ends, and a warning is logged.
 
     The variables are parameters divided by `FIRST_STEP`. The derivatives with respect to the variables are therefore
     `FIRST_STEP` times the derivatives with respect to the parameters.
 
     Args:
         loss: Function that returns the loss and its gradient for given variables.
-        start: Variables at which the search starts, shape (n,).
+        start: Variables at which the minimisation starts, shape (n,).
 
     Returns:
-        Variables at which the search ended, shape (n,).
+        Variables at which the minimisation ended, shape (n,).
     """
     tolerance = FIRST_STEP * GRADIENT_TOLERANCE  # for derivatives with respect to the variables
     # With ftol = 0, a small change of the loss does not end the search.
@@ -225,6 +227,7 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Arr
         is_converged = np.abs(result.jac).max() <= tolerance
         if is_converged or remaining_iterations <= 0:
             return np.asarray(variables)
+        # Otherwise, a line search has failed. The next start begins at the present variables.
     largest_gradient = np.abs(result.jac).max() / FIRST_STEP  # in the last start, with respect to the parameters
     _log.warning("the training of the correlations has not converged: the gradient is %.1g", largest_gradient)
     return np.asarray(variables)
@@ -233,9 +236,9 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Arr
 def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tuple[float, Array | Singles]:
     """Compute the negative logarithm of the Gaussian likelihood of correlated errors with unit variances.
 
-    The constant term is omitted. The Cholesky factor of the correlation matrix has the rows (1, 0, 0), (cos a, sin a,
-    0) and (cos b, sin b cos c, sin b sin c). The errors are whitened with the inverse of this factor. The absolute
-    values of the sines are limited to at least `MIN_SINE`.
+    Terms that do not depend on the angles are omitted. The Cholesky factor of the correlation matrix has the rows (1,
+    0, 0), (cos a, sin a, 0) and (cos b, sin b cos c, sin b sin c). The errors are whitened with the inverse of this
+    factor. The absolute values of the sines are limited to at least `MIN_SINE`.
 
     Args:
         angles: Angles a, b and c, shape (3, n), rad.
@@ -249,14 +252,14 @@ def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tup
     sin_a, sin_b, sin_c = np.copysign(np.maximum(np.abs(sines), MIN_SINE), sines)
 
     # Whiten the errors by the inverse of the Cholesky factor, row by row. The determinant of the factor is
-    # sin a sin b sin c. The loss does not include the square of the first error, which does not depend on the angles.
+    # sin a sin b sin c. The square of `white_x` is omitted, because it does not depend on the angles.
     x_deviation, y_deviation, force_deviation = deviation
     white_x = x_deviation
     white_y = (y_deviation - cos_a * white_x) / sin_a
     white_force = (force_deviation - cos_b * white_x - sin_b * cos_c * white_y) / (sin_b * sin_c)
     loss = np.log(np.abs(sin_a * sin_b * sin_c)) + 0.5 * (white_y**2 + white_force**2)
 
-    # Derivatives of the loss with respect to a, b and c
+    # Compute the derivatives of the loss with respect to a, b and c.
     cot_a = cos_a / sin_a
     cot_b = cos_b / sin_b
     cot_c = cos_c / sin_c

@@ -1,12 +1,12 @@
 """Training of a network only on measured presses, for a sensor without a simulation.
 
-For a cross-validation, five networks are trained, each without the presses at a fifth of the places. The errors of the
-model are estimated from the answers of the five networks to the presses that were left out of their training. The same
-answers determine factors by which the standard deviations are multiplied. With these factors, the confidence intervals
-contain the true values as often as they should (split conformal prediction, Papadopoulos et al., 2002). The mean answer
-of the five networks has smaller errors than the answer of a single network. One further network learns this mean answer
-(Hinton et al., 2015). Only the further network is released, so the model is as small and fast as the models of
-simulated sensors.
+For a cross-validation, five networks are trained, each without the presses at a fifth of the places. Each network then
+estimates the contacts of the presses that were left out of its training. The errors of the model are computed from
+these answers. The same answers determine factors by which the standard deviations are multiplied. With these factors,
+the confidence intervals contain the true values as often as they should (split conformal prediction, Papadopoulos et
+al., 2002). The mean answer of the five networks has smaller errors than the answer of a single network. One further
+network learns this mean answer (Hinton et al., 2015). Only the further network is released, so the model is as small
+and fast as the models of simulated sensors.
 
 The noise of the charges is estimated from the presses themselves (`isocharge.train.data.channel_noise`). In every
 training step, random noise with half of the estimated size is added to the charges as a regularisation.
@@ -95,8 +95,8 @@ def fit_presses(
 ) -> Fitted:
     """Train a network on measured presses of any sensor with three to eight channels.
 
-    Several networks are trained for a cross-validation. One further network is trained on the mean outputs of these
-    networks (distillation), and on misfits. A warning is logged if presses are left out. Another warning is logged if
+    Several networks are trained for a cross-validation. One further network learns the mean outputs of these networks
+    (distillation), and then learns misfits. A warning is logged if presses are left out. Another warning is logged if
     all presses have nearly the same force.
 
     Args:
@@ -120,17 +120,17 @@ def fit_presses(
     training = _with_defaults_for_measured(settings.training, presses.charge_pC.shape[1])
     usable = usable_presses(presses)
     labelled = LabelledPresses(usable.contact, usable.charge_pC, measured=True)
-    domain = PressedArea.of(labelled.contact)
-    noise = ChannelNoise.of(labelled.charge, domain.to_unit(labelled.contact))
+    domain = PressedArea.of_contacts(labelled.contact)
+    noise = ChannelNoise.estimate(labelled.charge, domain.to_unit(labelled.contact))
     with threads_and_seed(training.threads, training.seed):
         features = WhitenedFeatures.fit_signed(labelled.charge, noise.transition_charge(labelled.charge))
         # The first network will be returned. The other networks each belong to one fold of the cross-validation.
         network, *fold_networks = (InverseNetwork(domain, features, settings.network) for _ in range(1 + N_FOLDS))
-        # Cross-validation: for each fold, train a network on the presses of all other folds.
-        fold = folds_by_place(labelled.contact, N_FOLDS)
-        steps = _train_fold_networks(fold_networks, labelled, fold, noise, training, run)
-        contact, std = _cross_validated_contact(fold_networks, labelled.charge, fold)
-        position_factor, force_factor = std_factors(contact, std, labelled.contact)  # correct the stated errors
+        # For the cross-validation, train a network for each fold on the presses of all other folds.
+        fold_of_press = folds_by_place(labelled.contact, N_FOLDS)
+        steps = _train_fold_networks(fold_networks, labelled, fold_of_press, noise, training, run)
+        contact, std = _cross_validated_contact(fold_networks, labelled.charge, fold_of_press)
+        position_factor, force_factor = std_factors(contact, std, labelled.contact)
 
         # Train the returned network: its contacts on the mean outputs of the other networks, then its misfits.
         distillation = _distillation_stage(network, fold_networks, labelled, noise, training)
@@ -142,7 +142,7 @@ def fit_presses(
     cross_validated = Answers(
         contact=contact,
         std=std * [position_factor, position_factor, force_factor],
-        misfit=_cross_validated_misfit(labelled, domain, noise, fold),
+        misfit=_cross_validated_misfit(labelled, domain, noise, fold_of_press),
     )
     made_with = _made_with(settings, labelled, steps, (position_factor, force_factor))
     return Fitted(
@@ -161,7 +161,10 @@ def fit_presses(
 
 
 def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, object]:
-    """Return all values on which the trained weights depend, as the identity of a resumable run."""
+    """Return all values on which the trained weights depend.
+
+    An interrupted training is continued only if its values were the same.
+    """
     return {
         "presses_sha256": presses_sha256(presses),
         "electrodes": list(presses.electrodes),
@@ -172,15 +175,15 @@ def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, o
 
 
 def _made_with(
-    settings: FitConfig, presses: LabelledPresses, steps: int, factors: tuple[float, float]
+    settings: FitConfig, presses: LabelledPresses, steps: int, std_factors: tuple[float, float]
 ) -> dict[str, object]:
-    """Return what the metadata of the network state about its training.
+    """Return the entries that describe the training in the metadata of the network.
 
     Args:
         settings: Settings of the training.
         presses: Presses on which the network was trained.
         steps: Number of steps with which the networks of the cross-validation were trained.
-        factors: Factors on the standard deviations of the position and of the force.
+        std_factors: Factors by which the standard deviations of the position and of the force were multiplied.
     """
     return {
         "config": settings.to_dict(),
@@ -190,7 +193,7 @@ def _made_with(
             "places": len(np.unique(presses.contact[:, :2], axis=0)),
             "folds": N_FOLDS,
             "steps": steps,
-            "std_factors": [float(f"{factor:.4g}") for factor in factors],
+            "std_factors": [float(f"{factor:.4g}") for factor in std_factors],
         },
     }
 
@@ -239,9 +242,9 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
 def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]:
     """Compute the factors by which standard deviations must be multiplied to agree with the observed errors.
 
-    Each factor is the geometric mean of two other factors. With the first of them, the intervals of one standard
-    deviation contain 68 % of the true values. With the second of them, the 95 % intervals contain 95 % of the true
-    values.
+    Two requirements determine two candidates for each factor. With the first candidate, the intervals of one standard
+    deviation contain 68 % of the true values. With the second candidate, the 95 % intervals contain 95 % of the true
+    values. The factor is the geometric mean of both candidates.
 
     Args:
         contact: Contacts (x, y, F) that were estimated by networks that were not trained on these presses, shape (n,
@@ -257,21 +260,22 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
 
 
 def _std_factor(deviation: Array) -> float:
-    """Compute the factor for the position or the factor for the force; see `std_factors`.
+    """Compute the factor by which standard deviations must be multiplied, as described for `std_factors`.
 
     Args:
         deviation: Absolute errors divided by their standard deviations, any shape.
     """
     # If the standard deviations were right, the first quantile would be 1 and the second would be `TWO_STD_LIMIT`.
-    first_quantile, second_quantile = np.quantile(deviation, [ONE_STD_COVERAGE, TWO_STD_COVERAGE])
-    return float(np.sqrt(first_quantile * second_quantile / TWO_STD_LIMIT))  # geometric mean of two factors
+    one_std_quantile, two_std_quantile = np.quantile(deviation, [ONE_STD_COVERAGE, TWO_STD_COVERAGE])
+    # The two candidates for the factor are therefore `one_std_quantile` and `two_std_quantile / TWO_STD_LIMIT`.
+    return float(np.sqrt(one_std_quantile * two_std_quantile / TWO_STD_LIMIT))  # their geometric mean
 
 
 def _with_defaults_for_measured(config: TrainingConfig, n_electrode: int) -> TrainingConfig:
     """Return a copy of the settings with default numbers of steps and charges for measured presses.
 
     Numbers that are given in the settings are not replaced. Measured presses are few and noisy. Therefore, the default
-    numbers for measured presses are larger than those for simulated presses of sensors with few electrodes.
+    numbers for measured presses are larger than the defaults for simulated presses of a sensor with few electrodes.
 
     Args:
         config: Settings in which the numbers may be missing.
@@ -289,7 +293,7 @@ def _with_defaults_for_measured(config: TrainingConfig, n_electrode: int) -> Tra
 def _train_fold_networks(
     fold_networks: list[InverseNetwork],
     presses: LabelledPresses,
-    fold: Integers,
+    fold_of_press: Integers,
     noise: ChannelNoise,
     config: TrainingConfig,
     run: ResumableRun | None,
@@ -302,7 +306,7 @@ def _train_fold_networks(
     Args:
         fold_networks: Networks to train, one for each fold.
         presses: All presses.
-        fold: Index of the fold of each press, shape (n,).
+        fold_of_press: Index of the fold of each press, shape (n,).
         noise: Noise of the charges.
         config: Largest number of steps, learning rate and seed.
         run: Run that saves the state; None to save nothing.
@@ -320,7 +324,7 @@ def _train_fold_networks(
             fold_index: Index of the fold and of its network.
             steps: Number of steps.
         """
-        is_validation = fold == fold_index
+        is_validation = fold_of_press == fold_index
         stage = contact_stage(
             fold_networks[fold_index],
             presses[~is_validation],
@@ -366,20 +370,22 @@ def _train_with_best_steps(network: TrainablePerceptron, train: Callable[[int], 
         longer_training = train(2 * steps)
         is_better = longer_training.best_score < best_training.best_score
         if not is_better:
-            network.load_state_dict(best_training.best_weights)
+            network.load_state_dict(best_training.best_weights)  # the longer training has replaced these weights
             break
         best_training = longer_training
         steps = 2 * steps
     return steps
 
 
-def _cross_validated_contact(fold_networks: list[InverseNetwork], charge: Array, fold: Integers) -> tuple[Array, Array]:
+def _cross_validated_contact(
+    fold_networks: list[InverseNetwork], charge: Array, fold_of_press: Integers
+) -> tuple[Array, Array]:
     """Estimate the contact of each press with a network that was not trained on this press.
 
     Args:
         fold_networks: Networks, one for each fold, which were trained on the presses of all other folds.
         charge: Charges of all presses, shape (n, n_electrode), pC.
-        fold: Index of the fold of each press, shape (n,).
+        fold_of_press: Index of the fold of each press, shape (n,).
 
     Returns:
         Contacts, shape (n, 3), mm and N, and their standard deviations, shape (n, 3).
@@ -390,7 +396,7 @@ def _cross_validated_contact(fold_networks: list[InverseNetwork], charge: Array,
         # The network estimates the contacts of all presses. Only the contacts of its own fold are used.
         with torch.no_grad():
             estimated_contact, estimated_std, _ = network(as_tensor(charge))
-        is_in_fold = fold == fold_index
+        is_in_fold = fold_of_press == fold_index
         contact[is_in_fold] = estimated_contact.double().numpy()[is_in_fold]
         std[is_in_fold] = estimated_std.double().numpy()[is_in_fold]
     return contact, std
@@ -405,8 +411,9 @@ def _distillation_stage(
 ) -> TrainingStage:
     """Define the training of a network on the mean outputs of other networks (distillation).
 
-    The inputs are copies of the charges, with noise of several sizes and in random order. The last copies are used for
-    validation, and their number is half the number of presses.
+    The inputs are copies of the charges, with noise of several sizes and in random order. The last of these copies are
+    used for validation. Their number is half the number of presses. The training has half as many steps as the settings
+    allow for the contact network.
 
     Args:
         network: Network to train.
@@ -415,7 +422,7 @@ def _distillation_stage(
         noise: Noise of the charges.
         config: Number of steps, batch size and seed.
     """
-    # Inputs: copies of the charges with noise, in random order, shape (n_copy * n_press, n_electrode)
+    # Compute the inputs: copies of the charges with noise, in random order, shape (n_copy * n_press, n_electrode).
     rng = np.random.default_rng(config.seed)
     copies = [noise.scaled(factor).add(presses.charge, rng) for factor in DISTILLATION_NOISE_FACTORS]
     order = rng.permutation(len(copies) * len(presses))
@@ -423,15 +430,15 @@ def _distillation_stage(
     n_validation = len(presses) // 2
     n_train = len(charge) - n_validation
 
-    # Targets: outputs of the networks, averaged over the networks. The outputs of one network have the shape (2, n, 3):
-    # means of the unit coordinates, and logarithms of their standard deviations.
+    # Compute the targets: the outputs of the fold networks, averaged over these networks. The outputs of one network
+    # have the shape (2, n, 3): unit coordinates, and logarithms of their standard deviations.
     with torch.no_grad():
         outputs = [torch.stack(fold_network.posterior(charge)) for fold_network in fold_networks]
     target_mean, target_log_std = torch.stack(outputs).mean(dim=0)
     network.contact.fit_linear_part(network.inputs(charge[:n_train]), target_mean[:n_train])
 
     def divergence(rows: Tensor | slice) -> Tensor:
-        """Return the divergence between the outputs of the network and the targets for selected rows of the inputs."""
+        """Return the Kullback-Leibler divergence between the outputs of the network and the targets for some inputs."""
         mean, log_std = network.posterior(charge[rows])
         return distillation_loss(mean, log_std, target_mean[rows], target_log_std[rows])
 
@@ -461,9 +468,10 @@ def _misfit_examples(
 ) -> Array:
     """Draw charges for the training of the misfit perceptron, and compute their residuals.
 
-    The charges are of many kinds, also such that no contact causes. The residual of charges is their difference from
-    the charges of the most similar contact. The charges of contacts are known only at the measured presses. Near each
-    press, they are therefore approximated by linear functions of the contact, which are fitted to neighbouring presses.
+    Some of the charges are charges of contacts, and others are charges that no contact causes. The residual of a set of
+    charges is its difference from the charges of the most similar contact. The charges of contacts are known only at
+    the measured presses. Near each press, the charges are therefore approximated by linear functions of the contact.
+    These functions are fitted to neighbouring presses.
 
     Args:
         presses: All presses.
@@ -475,9 +483,9 @@ def _misfit_examples(
         Charges, pC, and residuals in standard deviations of the noise, shape (2, n, n_electrode).
     """
     rng = np.random.default_rng(config.seed)
-    # The linear functions, as one plane for each press. They approximate the levels of the charges. A level is a charge
-    # on a scale on which the noise has the standard deviation 1.
-    planes = LocalPlanes.through(domain.to_unit(presses.contact), noise.level(presses.charge))
+    # Fit the linear functions, which are planes, one for each press. They approximate the levels of the charges. A
+    # level is a charge on a scale on which the noise has the standard deviation 1.
+    planes = LocalPlanes.fit(domain.to_unit(presses.contact), noise.level(presses.charge))
 
     # Draw charges, which are made from the charges of randomly chosen presses.
     n_electrode = presses.charge.shape[1]
@@ -496,23 +504,25 @@ def _saved_or_drawn(draw: Callable[[], Array], run: ResumableRun | None) -> Arra
     """
     if run is None:
         return draw()
+    # This executor calls `draw` only if the run has not saved a result under this name.
     examples: Array = run.storing_executor("misfit-charges").submit(draw).result()
     return examples
 
 
 def _cross_validated_misfit(
-    presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, fold: Integers
+    presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, fold_of_press: Integers
 ) -> Array:
     """Compute the misfit of each press with respect to the presses of all other folds.
 
-    The misfit is the length of the residual: the difference of the charges of the press from those of the most similar
-    contact. Near each of the other presses, the charges of contacts are approximated by linear functions (planes).
+    The residual is the difference between the charges of the press and the charges of the most similar contact. The
+    misfit is the length of the residual. Near each press of the other folds, the charges of contacts are approximated
+    by linear functions (planes).
 
     Args:
         presses: All presses.
         domain: Area of the presses, which defines the unit coordinates.
         noise: Noise of the charges.
-        fold: Index of the fold of each press, shape (n,).
+        fold_of_press: Index of the fold of each press, shape (n,).
 
     Returns:
         Misfits, shape (n, 1), in standard deviations of the noise.
@@ -521,8 +531,8 @@ def _cross_validated_misfit(
     charge_level = noise.level(presses.charge)  # charges on a scale on which the noise has the standard deviation 1
     misfit = np.empty((len(presses), 1))
     for fold_index in range(N_FOLDS):
-        is_in_fold = fold == fold_index
-        planes = LocalPlanes.through(unit_contact[~is_in_fold], charge_level[~is_in_fold])
+        is_in_fold = fold_of_press == fold_index
+        planes = LocalPlanes.fit(unit_contact[~is_in_fold], charge_level[~is_in_fold])
         residual = planes.residuals(charge_level[is_in_fold])
         misfit[is_in_fold] = np.linalg.norm(residual, axis=1, keepdims=True)
     return misfit

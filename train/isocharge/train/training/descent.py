@@ -67,11 +67,12 @@ def soap_optimiser(stage: "TrainingStage") -> list[Optimiser]:
     Returns:
         A list with the optimiser.
     """
-    # Tensors are compared by identity, because == compares their elements.
+    # The operator == would compare the elements of tensors, so the tensors are compared by their identity.
     slow_ids = {id(parameter) for parameter in stage.slow_parameters}
     trained_parameters = [parameter for parameter in stage.network.parameters() if parameter.requires_grad]
     slow_parameters = [parameter for parameter in trained_parameters if id(parameter) in slow_ids]
     other_parameters = [parameter for parameter in trained_parameters if id(parameter) not in slow_ids]
+    # Descent multiplies the learning rate of each group by its `rate_factor`.
     groups: list[dict[str, Any]] = [
         {"params": other_parameters, "rate_factor": 1.0},
         {"params": slow_parameters, "rate_factor": SLOW_RATE_FACTOR},
@@ -131,7 +132,7 @@ class Descent:
 
         Args:
             stage: Network, loss and validation score.
-            rate: Largest learning rate.
+            rate: Largest learning rate, by which the `rate_factor` of the stage is multiplied.
             patience: Number of steps without a better validation score after which the training ends.
             seed: Seed of the batches and of the noise.
         """
@@ -148,7 +149,8 @@ class Descent:
     def run(self, resumable_run: ResumableRun | None = None) -> None:
         """Train the network, and finally restore the weights with the best validation score.
 
-        The training ends after all steps of the stage, or earlier if the validation score no longer improves.
+        The training ends after all steps of the stage, or earlier if the validation score has not improved in the last
+        `patience` steps.
 
         Args:
             resumable_run: Run that saves the state every few seconds. An interrupted training can then be continued,
@@ -177,9 +179,10 @@ class Descent:
         self.stage.network.load_state_dict(self.best_weights)
 
     def take_step(self) -> Tensor:
-        """Change the weights by one step of the optimisers, and return the loss before the change.
+        """Change the weights by one step of the optimisers, and return the loss of the batch before the change.
 
-        After the warm-up steps, a gradient whose norm exceeds `largest_gradient` is scaled down to this norm.
+        The method first sets the learning rates of this step. After the warm-up, a gradient whose norm exceeds
+        `largest_gradient` is scaled down to this norm.
         """
         stage = self.stage
         rate = self.rate * stage.rate_factor * _relative_rate(self.step / stage.steps)
@@ -224,14 +227,14 @@ class Descent:
         report(f"training the {self.stage.name} network", self.step, self.stage.steps, f"loss {loss:.3f}, {text}")
 
     def _is_stalled(self) -> bool:
-        """Return whether the validation score has not improved in the last `patience` steps after the warm-up."""
+        """Return whether the validation score has not improved for `patience` steps. Warm-up steps are not counted."""
         first_counted_step = max(self.best_step, self.stage.warm_up_steps)
         return self.step - first_counted_step >= self.patience
 
     def _state(self) -> dict[str, Any]:
         """Return the state that a checkpoint contains."""
         return {
-            "part": self.stage.network.state_dict(),  # the present weights
+            "part": self.stage.network.state_dict(),  # the present weights, not the best weights
             "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
             "random": self.random.get_state(),
             "step": self.step,
@@ -264,7 +267,7 @@ def tensor_bytes(state: object) -> bytes:
 def tensors_from_bytes(data: bytes) -> Any:
     """Convert the result of `tensor_bytes` back to tensors, numbers and texts.
 
-    No code in the bytes is executed.
+    The bytes cannot contain code that would be executed.
     """
     return torch.load(io.BytesIO(data), weights_only=True)
 
@@ -272,8 +275,8 @@ def tensors_from_bytes(data: bytes) -> Any:
 def _relative_rate(progress: float) -> float:
     """Return the learning rate divided by its largest value.
 
-    The relative rate first increases from `INITIAL_RATE` to 1 along half a period of a cosine. The relative rate then
-    decreases from 1 to 0 along another half period of a cosine.
+    During the first steps (`RATE_INCREASE_FRACTION`), the relative rate increases from `INITIAL_RATE` to 1 along half a
+    period of a cosine. The relative rate then decreases from 1 to 0 along another half period of a cosine.
 
     Args:
         progress: Number of completed steps divided by the number of all steps.

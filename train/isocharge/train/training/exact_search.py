@@ -26,17 +26,24 @@ def error_cautions(
 ) -> tuple[str, ...]:
     """Return a caution if the errors of a network are much larger than the errors of an exact search.
 
+    The search finds the contact whose charges are nearest to given charges with noise. The first `MAX_PRESSES` presses
+    are used for the comparison.
+
     Args:
         network: The trained network.
         presses: Simulated presses that were not used in the training.
-        charge_map: Map from contacts to charges, in which the search is made.
+        charge_map: Map from contacts to charges, which the search uses.
         noise: Noise that is added to the charges.
         seed: Seed of the noise.
+
+    Returns:
+        One sentence about the errors, or an empty tuple if the errors of the network are small enough.
     """
-    compared_presses = presses[np.arange(len(presses)) < MAX_PRESSES]
+    first_rows = np.arange(min(len(presses), MAX_PRESSES))
+    compared_presses = presses[first_rows]
     charge = compared_presses.noisy(noise, seed)
     network_contact, _, _ = network.predict(charge)
-    # The search starts at the true contacts, so that it ends at the nearest solution.
+    # The search starts at the true contacts, so that it does not end at another contact with similar charges.
     search_contact, _ = nearest_contact(charge_map, noise, charge, compared_presses.contact)
     network_errors = ContactErrorStatistics.of(network_contact, compared_presses.contact)
     search_errors = ContactErrorStatistics.of(search_contact, compared_presses.contact)

@@ -39,12 +39,13 @@ class WhitenedFeatures:
         Args:
             charge: Charges of presses without noise, shape (n, n_electrode), pC.
         """
-        clipped = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
-        return cls._fit(logarithmic_features(np.log(clipped).mean(axis=0)), charge)
+        clipped_charge = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
+        mean_logarithm = np.log(clipped_charge).mean(axis=0)
+        return cls._fit(logarithmic_features(mean_logarithm), charge)
 
     @classmethod
     def fit_signed(cls, charge: Array, typical: Array) -> "WhitenedFeatures":
-        """Create whitened features for charges of both signs, which are inverse hyperbolic sines of the charges.
+        """Fit whitened inverse hyperbolic sines to charges of both signs.
 
         Args:
             charge: Charges of presses, shape (n, n_electrode), pC.
@@ -81,9 +82,10 @@ def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
 
 
 def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
-    """Return features for charges of both signs: the inverse hyperbolic sines of charge / typical charge.
+    """Return features for charges of both signs: asinh(charge / typical charge) minus its mean over the given charges.
 
-    Before the conversion, each charge is limited to the range of the given charges plus a margin on both sides.
+    Before the conversion, each charge is limited to the range of the given charges plus a margin on both sides. The
+    margin is `CLIPPING_MARGIN` times the range of the inverse hyperbolic sines.
 
     Args:
         charge: Charges of presses, shape (n, n_electrode), pC.
@@ -104,10 +106,11 @@ def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
 def whitening(values: Array, min_relative_std: float = 0.0) -> tuple[Array, Array]:
     """Compute the whitening transform of values by a principal component analysis.
 
-    The covariance of the transformed values (values - mean) @ matrix is the identity matrix.
+    The covariance of the transformed values (values - mean) @ matrix is the identity matrix, unless a component has a
+    standard deviation below the limit `min_relative_std`.
 
     Args:
-        values: Values, shape (n, k).
+        values: Values, shape (n, k), where n is at least k.
         min_relative_std: Smallest standard deviation of a principal component that is scaled to unit variance, relative
             to the largest standard deviation. A component with a smaller standard deviation is scaled as if it had this
             smallest standard deviation.

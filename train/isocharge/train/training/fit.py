@@ -2,8 +2,9 @@
 
 The contact perceptron learns the mean and the standard deviation of the contact by maximum likelihood, with fresh noise
 on the charges in every step. In the first steps, it learns only the mean by least squares. If a teacher is given, the
-contact perceptron learns the teacher's answers to these charges instead. The misfit perceptron learns the residuals of
-many kinds of charges with respect to the nearest contact. These residuals are computed before the training.
+contact perceptron learns the teacher's answers to these charges instead. The misfit perceptron learns residuals, which
+are computed before the training. The residual of a set of charges is its difference from the charges of the nearest
+contact.
 """
 
 import logging
@@ -96,12 +97,13 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
     settings = checked_config.for_electrodes(n_electrode)
     trained = train_network(data, settings, run=run)
 
-    # The threshold of the alarm needs many good presses, so all measured presses are used, not only those for the test.
+    # The threshold of the misfit needs many good presses. Of few measured presses, those for training are used, too.
     split = trained.split
     good_presses = data.presses.within(split.domain.radius) if data.presses.measured else split.test
     network = _fold_and_calibrate(trained, settings.training)
     cautions = split.cautions
     noise = settings.training.noise_model
+    # A search for the true contacts can only be compared with a network that has learned the true contacts.
     if data.teacher is None and _is_noise_known(data, noise):
         for caution in error_cautions(network, split.test, split.field, noise, settings.training.seed):
             _log.warning("%s", caution)
@@ -111,7 +113,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
         sensor=data.sensor,
         probes=data.probes,
         domain=split.domain,
-        noise=settings.training.noise_model,
+        noise=noise,
         test=split.test if data.test is None else data.test,
         good=good_presses,
         sha256=data.sha256,
@@ -138,18 +140,20 @@ def _fold_and_calibrate(trained: "TrainedNetwork", config: TrainingConfig) -> Fo
         network = fold_network(trained.network)
         if not train.measured:
             presses = train.repeated(N_STD_PRESSES)
-            network = fit_std(network, presses.noisy(noise, config.seed + 1), presses.contact)
+            noisy_charge = presses.noisy(noise, config.seed + 1)  # other noise than for the correlations
+            network = fit_std(network, noisy_charge, presses.contact)
         return with_correlation(network, train, noise, config.seed)
 
 
 def _is_noise_known(data: TrainingData, noise: NoiseModel) -> bool:
-    """Return whether the training adds noise to charges that have no other noise.
+    """Return whether the charges have noise during the training, and the standard deviation of this noise is known.
 
-    Measured charges already contain noise with unknown standard deviations.
+    Simulated charges only have the noise that the training adds, unless its standard deviation is zero. Measured
+    charges already contain noise with unknown standard deviations.
 
     Args:
         data: Training data.
-        noise: Noise of the training.
+        noise: Noise that the training adds.
     """
     return not data.presses.measured and noise.white > 0.0
 
@@ -157,12 +161,12 @@ def _is_noise_known(data: TrainingData, noise: NoiseModel) -> bool:
 def _provenance(
     data: TrainingData, folded_charges: ChargeSeries | None, cautions: tuple[str, ...], config: FitConfig
 ) -> Provenance:
-    """Return the provenance of the training data, to which the settings of the training are added.
+    """Return the provenance of the training data, with the settings of the training and other additional entries.
 
     Args:
-        data: Training data.
-        folded_charges: Charges of all presses, which are added as a file, if two contacts of the requested domain have
-            the same charges; None otherwise.
+        data: Training data, which may contain entries and files of their own and a teacher.
+        folded_charges: Approximation of the charges by a series, which is added as a file; None if the map from
+            contacts to charges does not fold.
         cautions: Sentences about the limits of the network.
         config: Settings of the training.
     """
@@ -179,7 +183,10 @@ def _provenance(
 
 
 def fit_identity(data: TrainingData, config: FitConfig) -> dict[str, object]:
-    """Return all values on which the trained weights depend, as the identity of a resumable run."""
+    """Return all values on which the trained weights depend.
+
+    An interrupted training is continued only if its values were the same.
+    """
     identity: dict[str, object] = {
         "dataset_sha256": data.sha256,
         "noise": config.training.noise_model.to_dict(),
@@ -221,12 +228,14 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
     training = config.training
     with threads_and_seed(training.threads, training.seed), second_thread() as executor:
         # Second thread: simulate the whole film
-        whole_film = None
+        film_simulation = None
         if not data.presses.measured:
-            whole_film = executor.submit(OutsidePresses.of, data.sensor, data.probes, data.domain.force_range)
+            film_simulation = executor.submit(
+                OutsidePresses.simulate, data.sensor, data.probes, data.domain.force_range
+            )
 
         # This thread: split the presses, and draw the examples from the working area
-        split = Split.of(data, training)
+        split = Split.by_position(data, training)
         for caution in split.cautions:
             _log.warning("%s", caution)
         features = split.features(misfit_noise(training.noise_model))
@@ -237,14 +246,15 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
         def train_misfit() -> OutsidePresses | None:
             """Train the misfit perceptron, and return the presses outside the working area.
 
-            The perceptron learns examples from the working area and, if the presses are simulated, from the rest of the
-            film. The function returns None if there are no presses outside.
+            The perceptron learns examples from the working area and, if the presses are simulated, also from the rest
+            of the film. The function returns None if there are no presses outside the working area.
             """
             # Wait until the presses on the whole film are simulated, and select those outside the working area.
             outside = None
-            film_presses = whole_film.result() if whole_film is not None else None
-            if film_presses is not None:
-                outside = film_presses.beyond(split.domain.radius)
+            if film_simulation is not None:
+                film_presses = film_simulation.result()  # None if the film cannot be simulated
+                if film_presses is not None:
+                    outside = film_presses.beyond(split.domain.radius)
             all_examples = examples.with_outside(inner_examples, outside)
             train_perceptron(misfit_stage(network, all_examples, training), network.misfit_vector, config, run)
             return outside
@@ -254,7 +264,7 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
         linear_targets = None
         has_many_electrodes = network.n_electrode > FEW_ELECTRODES
         if has_many_electrodes and data.teacher is None and _is_noise_known(data, training.noise_model):
-            linear_targets = LinearTargets.of(split.train, split.field, training.noise_model)
+            linear_targets = LinearTargets.compute(split.train, split.field, training.noise_model)
         stage = contact_stage(
             network,
             split.train,
@@ -283,8 +293,9 @@ def _check_electrodes(config: NetworkConfig, sensor: Sensor) -> None:
 def threads_and_seed(count: int, seed: int) -> Iterator[None]:
     """Set the seed and the number of threads of PyTorch for a `with` block (context manager).
 
-    BLAS and OpenMP get the same number of threads. After the block, the previous values are restored. The threads of
-    these libraries wait actively at barriers, so a busy second core would make the libraries many times slower.
+    BLAS and OpenMP get the same number of threads. After the block, the previous values are restored. The number of
+    threads is limited because the threads of these libraries wait for each other without sleeping. If another program
+    used a core, the libraries would be many times slower.
 
     Args:
         count: Number of threads.
@@ -304,10 +315,10 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
 def train_perceptron(
     stage: TrainingStage, perceptron: TrainablePerceptron, config: FitConfig, run: ResumableRun | None
 ) -> None:
-    """Train a perceptron, and if necessary round its hidden weights to 8 bits.
+    """Train a perceptron. If the configuration requires it, also round the hidden weights to 8 bits.
 
-    After the rounding, the other weights are trained further. The further training continues to count the steps of the
-    first training, so that its loss has no warm-up.
+    After the rounding, the other weights are trained further. In the further training, the steps are counted from the
+    beginning of the first training. Its loss is therefore the loss after the warm-up.
 
     Args:
         stage: Loss, validation score and number of steps.
@@ -360,15 +371,17 @@ def contact_stage(
         noise: Noise that is added to the charges in every step.
         config: Number of steps, batch size and seed.
         teacher: Model whose answers are learned; None to learn the contacts of the presses.
-        linear_targets: Targets of the presses of `train` for the first phases; None to use only the contacts.
+        linear_targets: Targets of the presses of `train` for the first steps; None to use only the contacts or the
+            teacher.
     """
     domain = network.domain
     steps = config.contact_step_count(network.n_electrode)
     warm_up_steps = round(WARM_UP_FRACTION * steps)
     charge = as_tensor(train.charge)
     unit_contact = as_tensor(domain.to_unit(train.contact))
-    # Measured charges have noise of their own.
-    validation_charge = as_tensor(validation.charge if validation.measured else validation.noisy(noise, config.seed))
+    # Measured charges already contain noise. Noise is only added to simulated charges.
+    noisy_validation_charge = validation.charge if validation.measured else validation.noisy(noise, config.seed)
+    validation_charge = as_tensor(noisy_validation_charge)
     validation_target = as_tensor(domain.to_unit(validation.contact))
     batch = min(config.batch, len(charge))
     noisy_charge = with_fresh_noise(charge, noise, torch.Generator().manual_seed(config.seed))
@@ -404,7 +417,7 @@ def contact_stage(
             if is_warm_up:
                 return warm_up_loss(mean, log_std, teacher_mean)
             posterior_loss = distillation_loss(mean, log_std, teacher_mean, teacher_log_std)
-        return posterior_loss + correlation_loss(angles, contact - mean, log_std)
+        return posterior_loss + weighted_correlation_loss(angles, contact - mean, log_std)
 
     def linear_loss(linear_batch: TargetBatch, contact: Tensor, *, is_warm_up: bool) -> Tensor:
         """Return the loss of a batch with linear targets.
@@ -424,10 +437,10 @@ def contact_stage(
         # usual noise would cause, from which the standard deviations and the correlations learn.
         error = (contact - mean) / linear_batch.noise_factor
         mean_and_std_loss = linear_target_loss(mean, log_std, linear_batch.target, error)
-        return mean_and_std_loss + correlation_loss(angles, error, log_std)
+        return mean_and_std_loss + weighted_correlation_loss(angles, error, log_std)
 
-    def correlation_loss(angles: Tensor, error: Tensor, log_std: Tensor) -> Tensor:
-        """Return the weighted loss of the correlations between errors that are divided by their standard deviations."""
+    def weighted_correlation_loss(angles: Tensor, error: Tensor, log_std: Tensor) -> Tensor:
+        """Divide errors by their standard deviations, and return the weighted loss of the correlations between them."""
         return CORRELATION_WEIGHT * robust_correlation_loss(angles, error * torch.exp(-log_std))
 
     def score() -> tuple[float, str]:
@@ -443,5 +456,5 @@ def contact_stage(
         steps,
         warm_up_steps,
         slow_parameters=(network.contact.skip.weight,),
-        rate_factor=DefaultSizes.of(network.n_electrode).rate_factor,
+        rate_factor=DefaultSizes.for_electrodes(network.n_electrode).rate_factor,
     )

@@ -18,7 +18,7 @@ from isocharge.train.training.folded_network import FoldedNetwork
 class Provenance:
     """Additional information about the origin of a model.
 
-    A release writes this information together with the information that it writes for every model.
+    The release of a model writes this information in addition to the information that is written for every model.
 
     Attributes:
         card: Additional section of the model card, in Markdown.
@@ -83,7 +83,10 @@ class Fitted:
 
     @property
     def misfit_noise(self) -> Noise:
-        """Noise whose standard deviation is the unit of the misfit."""
+        """Noise whose standard deviation is the unit of the misfit.
+
+        For simulated presses, this noise is derived from the noise of the training by `misfit_noise`.
+        """
         return misfit_noise(self.noise) if isinstance(self.noise, NoiseModel) else self.noise
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:

@@ -1,4 +1,4 @@
-"""Whole network that computes contacts from charges, and is evaluated with NumPy in double precision.
+"""Whole network that computes contacts from charges. NumPy evaluates the network in double precision.
 
 The network has three parts:
 
@@ -147,16 +147,20 @@ class FoldedNetwork:
         return tuple(outputs)
 
     def with_scaled_std(self, position_factor: float, force_factor: float) -> "FoldedNetwork":
-        """Return a network that multiplies its standard deviations of position and force by two given factors."""
+        """Return a network whose standard deviations of position and force are multiplied by two given factors.
+
+        The answers are logarithms of the standard deviations. Therefore, the logarithms of the factors are added to the
+        bias of the last layer.
+        """
         weight, bias = self.layers.last
         bias_change = np.zeros_like(bias)
         bias_change[LOG_STD] = np.log([position_factor, position_factor, force_factor])
         return replace(self, layers=replace(self.layers, last=Layer(weight, bias + bias_change)))
 
     def with_angles(self, angle_layer: Layer[Array], angle_skip: Array) -> "FoldedNetwork":
-        """Return a network with eight additional answers, which are the angles of the correlations.
+        """Return a network with eight additional answers: angles, from whose cosines the correlations are computed.
 
-        The correlations are computed from the cosines of these angles.
+        The new answers are inserted between the answers about the contact and the misfit vector.
 
         Args:
             angle_layer: Output layer of the angles: weight, shape (n_hidden, 8), and bias, shape (8,).

@@ -78,9 +78,9 @@ def transform_inputs(perceptron: Perceptron[Array], transform: Layer[Array]) -> 
 def linear_answer_map(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer[Array]:
     """Return the linear map from the outputs of the contact perceptron and the misfit perceptron to the answers.
 
-    The outputs are in unit coordinates, and are converted to (x, y, ln F). The outputs also contain the logarithm of
-    the relative standard deviation of the force. The answers contain the logarithm of its absolute standard deviation
-    in N. The map therefore adds ln F to this logarithm.
+    The contact perceptron estimates unit coordinates, which the map converts to (x, y, ln F). The perceptron also
+    computes the logarithm of the relative standard deviation of the force. The corresponding answer is the logarithm of
+    the absolute standard deviation of the force in N. The map therefore adds ln F to the logarithm.
 
     Args:
         domain: Domain that defines the centre and the scale of the unit coordinates.
@@ -108,12 +108,12 @@ def linear_answer_map(domain: Domain, rotation: Array, offset: Array, n_electrod
 
 def _join_perceptrons(perceptrons: Sequence[Perceptron[Array]]) -> Perceptron[Array]:
     """Join several perceptrons with the same inputs into one perceptron, which computes all their outputs."""
-    # Each entry of `first` and `others` contains the layers of all perceptrons at one depth.
-    first, *others = zip(*(perceptron.hidden for perceptron in perceptrons), strict=True)
-    hidden = [_join_layers(first, np.hstack)]  # the first layers have the same inputs
-    hidden += [_join_layers(layers, _block_diagonal) for layers in others]
+    # Group the hidden layers by depth: each group contains one layer of each perceptron.
+    first_layers, *later_groups = zip(*(perceptron.hidden for perceptron in perceptrons), strict=True)
+    first = _join_layers(first_layers, np.hstack)  # the first layers have the same inputs
+    later = [_join_layers(layers, _block_diagonal) for layers in later_groups]  # each layer has its own inputs
     return Perceptron(
-        hidden=tuple(hidden),
+        hidden=(first, *later),
         last=_join_layers([perceptron.last for perceptron in perceptrons], _block_diagonal),
         skip=np.hstack([perceptron.skip for perceptron in perceptrons]),
         activation=perceptrons[0].activation,

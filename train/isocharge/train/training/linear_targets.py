@@ -7,7 +7,7 @@ estimate (Aitken 1936), which is linear in the noise:
     m = c + A n,   A = (J' W J + P)^-1 J' W.
 
 Here J contains the derivatives of the charges with respect to the contact, W is the inverse of the covariance of the
-noise, and P is the inverse of the covariance of all contacts.
+noise, and P is the inverse of the covariance of the contacts in the domain (the prior).
 
 The posterior mean m is a better target for the network than the contact c, for two reasons. First, m is nearly a
 function of the charges, while the relation between c and the charges contains random noise. Second, A hardly depends on
@@ -62,29 +62,30 @@ class TargetBatch(NamedTuple):
 
 @dataclass(frozen=True)
 class LinearTargets:
-    """Presses without noise, and matrices with which targets follow the noise that is added later.
+    """Presses without noise, and matrices that determine how the targets change with the noise that is added later.
 
     Attributes:
         charge: Charges without noise, shape (n, n_electrode), pC.
         contact: Contacts in unit coordinates, shape (n, 3).
-        gain: The matrices A, shape (n, 3, n_electrode), 1/pC; zero for presses whose estimate is not linear.
+        noise_response: Matrices A, shape (n, 3, n_electrode), 1/pC. The noise n changes the estimated contact by A n.
+            The matrix is zero if the estimated contact of a press is not linear in the noise.
         noise_factor: Factor by which the noise of each press is enlarged, shape (n, 1).
         noise: Noise of the charges.
     """
 
     charge: Tensor
     contact: Tensor
-    gain: Tensor
+    noise_response: Tensor
     noise_factor: Tensor
     noise: Noise
 
     @classmethod
-    def of(cls, presses: LabelledPresses, charge_map: ChargeMap, noise: Noise) -> "LinearTargets":
-        """Compute, for each press, the matrix A with which its estimated contact follows the noise of its charges.
+    def compute(cls, presses: LabelledPresses, charge_map: ChargeMap, noise: Noise) -> "LinearTargets":
+        """Compute for each press the matrix A. If the noise n is added to the charges, the estimate changes by A n.
 
-        If the noise n is added to the charges, the linear estimate of the contact changes by A n. With the derivatives
-        J of the charges, the inverse W of the noise covariance, and the prior precision P, the matrix is
-        A = (J' W J + P)^-1 J' W. It is zero where the estimate is not linear in the noise.
+        With the derivatives J of the charges, the inverse W of the noise covariance, and the prior precision P, the
+        matrix is A = (J' W J + P)^-1 J' W, where J' is the transpose of J. If the estimate of a press is not linear in
+        the noise, its matrix is zero.
 
         Args:
             presses: Presses without noise.
@@ -92,26 +93,25 @@ class LinearTargets:
             noise: Noise of the charges.
         """
         domain = charge_map.domain
-        derivatives = charge_map.derivatives(presses.contact)
+        unit_derivatives = charge_map.derivatives(presses.contact) * domain.scale  # J, shape (n, n_electrode, 3)
         noise_std = noise.sigma(presses.charge)
-        # W^(1/2) J in unit coordinates, shape (n, n_electrode, 3), and its transpose
-        whitened_jacobian = derivatives * domain.scale / noise_std[:, :, None]
-        transposed = whitened_jacobian.swapaxes(1, 2)
+        whitened_jacobian = unit_derivatives / noise_std[:, :, None]  # W^(1/2) J
+        transposed = whitened_jacobian.swapaxes(1, 2)  # J' W^(1/2), shape (n, 3, n_electrode)
         precision = transposed @ whitened_jacobian + UNIT_PRECISION * np.eye(3)  # J' W J + P, shape (n, 3, 3)
-        gain = np.linalg.solve(precision, transposed / noise_std[:, None, :])
+        noise_response = np.linalg.solve(precision, transposed / noise_std[:, None, :])
 
-        # If the contact is too uncertain, the estimate is not linear. If it is very certain, the noise is enlarged up
-        # to the limit of linearity. The inverse of the precision is the covariance of the contact, and its diagonal
-        # contains the variances.
+        # If the contact is too uncertain, the estimate is not linear, and the noise is not enlarged (factor 1). If the
+        # contact is very certain, the noise is enlarged up to the limit of linearity. The inverse of the precision is
+        # the covariance of the contact, and its diagonal contains the variances.
         contact_variance = np.linalg.inv(precision).diagonal(axis1=1, axis2=2)
         largest_std = np.sqrt(contact_variance.max(axis=1))
         is_linear = largest_std <= LARGEST_LINEAR_STD
-        gain[~is_linear] = 0.0
+        noise_response[~is_linear] = 0.0
         noise_factor = np.clip(LARGEST_LINEAR_STD / largest_std, 1.0, MAX_NOISE_FACTOR)
         return cls(
             charge=as_tensor(presses.charge),
             contact=as_tensor(domain.to_unit(presses.contact)),
-            gain=as_tensor(np.asarray(gain, dtype=float)),
+            noise_response=as_tensor(np.asarray(noise_response, dtype=float)),
             noise_factor=as_tensor(np.asarray(noise_factor[:, None], dtype=float)),
             noise=noise,
         )
@@ -120,11 +120,11 @@ class LinearTargets:
         """Add new noise to the charges of some presses, and compute the targets for these charges.
 
         Args:
-            rows: Numbers of the presses, shape (n,).
-            random: Random number generator.
+            rows: Indices of the presses, shape (n,).
+            random: Random number generator of the noise.
         """
         charge = self.charge[rows]
         noise_factor = self.noise_factor[rows]
         noise = noise_factor * fresh_noise(charge, self.noise, random)
-        contact_change = (self.gain[rows] @ noise[:, :, None])[:, :, 0]  # A n, shape (n, 3)
+        contact_change = (self.noise_response[rows] @ noise[:, :, None])[:, :, 0]  # A n, shape (n, 3)
         return TargetBatch(charge + noise, self.contact[rows] + contact_change, noise_factor)

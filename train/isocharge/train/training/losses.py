@@ -109,7 +109,7 @@ def linear_target_loss(mean: Tensor, log_std: Tensor, target: Tensor, error: Ten
 
 
 def _weighted_mean_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
-    """Compute the weighted squared errors of the mean.
+    """Compute half of the weighted squared errors of the mean.
 
     The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Therefore, a network
     learns the mean slowly where it overestimates the standard deviation (Seitzer et al., 2022, arXiv 2203.09168). In
@@ -148,10 +148,10 @@ def _std_loss(log_std: Tensor, error: Tensor) -> Tensor:
 def robust_correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:
     """Compute the negative logarithm of a likelihood of correlated errors with unit variances.
 
-    The constant term is omitted. The loss trains the hidden layers to represent the correlations. The likelihood is
-    Gaussian for whitened errors up to `MAX_NORMAL_ERROR`. For larger errors, the likelihood has longer tails, so that
-    single presses do not dominate the gradient. The errors receive no gradient. Therefore, this loss does not train the
-    outputs for the mean and the standard deviation.
+    Terms that do not depend on the angles are omitted. The loss trains the hidden layers to represent the correlations.
+    The likelihood is Gaussian for whitened errors up to `MAX_NORMAL_ERROR`. For larger errors, the likelihood has
+    longer tails, so that single presses do not dominate the gradient. The errors receive no gradient. Therefore, this
+    loss does not train the outputs for the mean and the standard deviation.
 
     Args:
         angles: Angles a, b and c of `isocharge.train.training.correlation` minus a right angle, shape (n, 3), rad.
@@ -161,13 +161,14 @@ def robust_correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:
     # With x = a - pi / 2: sin a = cos x and cos a = -sin x.
     sin_a, sin_b, sin_c = torch.cos(angles).clamp(min=MIN_TRAINING_SINE).unbind(dim=1)
     cos_a, cos_b, cos_c = torch.sin(-angles).unbind(dim=1)
-    first, second, third = deviation.detach().clamp(-MAX_DEVIATION, MAX_DEVIATION).unbind(dim=1)
+    x_deviation, y_deviation, force_deviation = deviation.detach().clamp(-MAX_DEVIATION, MAX_DEVIATION).unbind(dim=1)
 
     # The Cholesky factor of the correlations has the rows (1, 0, 0), (cos a, sin a, 0) and (cos b, sin b cos c,
-    # sin b sin c). It is inverted row by row: `first` and the two whitened errors have unit covariance.
-    white_second = (second - cos_a * first) / sin_a
-    white_third = (third - cos_b * first - sin_b * cos_c * white_second) / (sin_b * sin_c)
-    squares = _long_tailed_square(white_second) + _long_tailed_square(white_third)
+    # sin b sin c). It is inverted row by row. The results and `x_deviation`, whose square does not depend on the
+    # angles, have unit covariance.
+    white_y = (y_deviation - cos_a * x_deviation) / sin_a
+    white_force = (force_deviation - cos_b * x_deviation - sin_b * cos_c * white_y) / (sin_b * sin_c)
+    squares = _long_tailed_square(white_y) + _long_tailed_square(white_force)
     log_determinant = torch.log(sin_a * sin_b * sin_c)
     return (log_determinant + 0.5 * squares).mean()
 
@@ -223,7 +224,9 @@ def focused_squared_distance(vector: Tensor, target: Tensor, focus: float) -> Te
     return (weight * squared_distance).sum() / weight.sum()
 
 
-def validation_score(mean: Tensor, log_std: Tensor, target: Tensor, domain: Domain, samples: str) -> tuple[float, str]:
+def validation_score(
+    mean: Tensor, log_std: Tensor, target: Tensor, domain: Domain, data_noun: str
+) -> tuple[float, str]:
     """Compute the likelihood loss for validation data, and a text about the errors for the progress report.
 
     Args:
@@ -231,11 +234,14 @@ def validation_score(mean: Tensor, log_std: Tensor, target: Tensor, domain: Doma
         log_std: Logarithms of their standard deviations, shape (n, 3).
         target: True unit coordinates, shape (n, 3).
         domain: Scale of the unit coordinates.
-        samples: Noun for the validation data in the text, for example "presses".
+        data_noun: Noun for the validation data in the text, for example "presses".
+
+    Returns:
+        The loss, and a text with the loss and with the rms errors of position and force.
     """
     loss = likelihood_loss(mean, log_std, target).item()
     error = (mean - target).double().numpy() * domain.scale
     x_error_mm, y_error_mm, log_force_error = error.T
     position_mm = rms(np.hypot(x_error_mm, y_error_mm))
     force_percent = 100.0 * rms(log_force_error)
-    return loss, f"{loss:.3f} on watched {samples}: {position_mm:.4f} mm and {force_percent:.3f} % of force rms"
+    return loss, f"{loss:.3f} on watched {data_noun}: {position_mm:.4f} mm and {force_percent:.3f} % of force rms"

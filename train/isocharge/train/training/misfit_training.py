@@ -70,7 +70,8 @@ It is twice the smallest threshold of the flag `misfit`.
 class MisfitExamples:
     """Source of the examples from which the misfit network learns.
 
-    The examples are saved in the run, because the search for the nearest contacts takes a long time.
+    An example consists of a set of charges and their residuals with respect to the nearest contact. The examples are
+    saved in the run, because the search for the nearest contacts takes a long time.
 
     Attributes:
         split: Presses for training, and the charge field in which the search finds the nearest contacts.
@@ -87,15 +88,18 @@ class MisfitExamples:
     def inner(self) -> Array:
         """Draw examples from presses inside the working area; see `draw_misfit_examples`.
 
+        If the run has saved examples, these are returned instead.
+
         Returns:
-            Charges, pC, and residuals, shape (2, n, n_electrode).
+            Array of shape (2, n, n_electrode): first the charges, pC, and then their residuals with respect to the
+            nearest contact, in standard deviations of the noise.
         """
         draw = partial(
             draw_misfit_examples,
             self.split.train,
             self.split.field,
             self._noise(),
-            self._charge_count,
+            self._example_count,
             self.config.seed,
             options=self._options,
         )
@@ -106,17 +110,17 @@ class MisfitExamples:
 
         Args:
             inner_examples: Result of `inner`.
-            outside: Presses outside the working area; None if they are not simulated. The examples are then returned
+            outside: Presses outside the working area. If they were not simulated (None), the examples are returned
                 unchanged.
 
         Returns:
-            Charges, pC, and residuals, in random order, with the shape of `inner_examples`.
+            Charges and residuals in random order, with the shape and the units of `inner_examples`.
         """
         if outside is None:
             return inner_examples
         seed = self.config.seed
         outside_share = MANY_OUTSIDE_SHARE if self._has_many_electrodes else OUTSIDE_SHARE
-        n_outside = round(outside_share * self._charge_count)
+        n_outside = round(outside_share * self._example_count)
         draw = partial(
             draw_outside_examples,
             outside.draw(N_OUTSIDE_PRESSES, seed).charge,
@@ -128,14 +132,15 @@ class MisfitExamples:
         )
         outside_examples = self._saved_or_drawn("misfit-outside", draw)
 
-        # Arrays of examples have the shape (2, n, n_electrode). The second axis is shuffled, because the last examples
-        # are used for validation.
-        examples = np.concatenate([inner_examples[:, n_outside:], outside_examples], axis=1)
+        # Arrays of examples have the shape (2, n, n_electrode). The first `n_outside` examples are replaced. The second
+        # axis is then shuffled, because the last examples are used for validation.
+        kept_examples = inner_examples[:, n_outside:]
+        examples = np.concatenate([kept_examples, outside_examples], axis=1)
         return np.random.default_rng(seed).permutation(examples, axis=1)
 
     @property
-    def _charge_count(self) -> int:
-        """Number of examples."""
+    def _example_count(self) -> int:
+        """Number of all examples: sets of charges with their residuals."""
         return self.config.misfit_charge_count(self.features.charge_features.n_electrode)
 
     @property
@@ -145,14 +150,14 @@ class MisfitExamples:
 
     @property
     def _has_positive_charges(self) -> bool:
-        """Whether all charges are positive. The input features of positive charges are logarithms."""
+        """Whether all charges are positive, so that the input features are logarithms."""
         return self.features.charge_features.mean is None  # only features of charges of both signs have a mean
 
     @property
     def _options(self) -> ExampleOptions:
-        """Options for drawing examples.
+        """Options for drawing examples: the number of starts of each search, and the limits of the charges.
 
-        For charges of both signs, the options limit the charges to the range of the input features.
+        The limits are those of the input features. For positive charges, the default limits are used.
         """
         starts = MANY_SEARCH_STARTS if self._has_many_electrodes else SEARCH_STARTS
         if self._has_positive_charges:
@@ -163,14 +168,14 @@ class MisfitExamples:
     def _noise(self) -> Noise:
         """Return the noise of presses without faults.
 
-        For charges of both signs, the result contains a separate value for each channel.
+        For charges of both signs, the values of the noise are repeated for each channel.
         """
         noise = misfit_noise(self.config.noise_model)
         if self._has_positive_charges:
             return noise
         return ChannelNoise.alike(noise, self.features.charge_features.n_electrode)
 
-    def _saved_or_drawn(self, name: str, draw: Callable[..., Array]) -> Array:
+    def _saved_or_drawn(self, name: str, draw: Callable[[], Array]) -> Array:
         """Return the examples that the run has saved under a name. If the run has saved none, draw and save examples.
 
         Args:
@@ -179,6 +184,7 @@ class MisfitExamples:
         """
         if self.run is None:
             return draw()
+        # This executor calls `draw` only if the run has not saved a result under this name.
         examples: Array = self.run.storing_executor(name).submit(draw).result()
         return examples
 

@@ -1,15 +1,16 @@
 """Trainable network in PyTorch that estimates contacts, standard deviations and misfits from charges.
 
-The inputs are whitened logarithms of the charges (`isocharge.train.training.features`). The force scales all charges by
-nearly the same factor. Therefore, the common factor of the charges depends mostly on the force, and the ratios of the
-charges depend mostly on the position. A first perceptron estimates the means of x, y and ln F and the logarithms of
-their standard deviations.
+The inputs are whitened logarithms of the charges (`isocharge.train.training.features`). A larger force increases all
+charges by nearly the same factor. Therefore, the common factor of the charges depends mostly on the force, and the
+ratios of the charges depend mostly on the position. A first perceptron estimates the means of x, y and ln F and the
+logarithms of their standard deviations.
 
 A second perceptron estimates the misfit vector (Q - Q(c)) / sigma. Here, Q are the measured charges, sigma are the
 standard deviations of their noise, and Q(c) are the charges of a contact c. The contact c is chosen so that the vector
 is as short as possible. The length of the misfit vector is the misfit. If the measured charges agree exactly with the
 charges of a contact, the vector is zero. Near such charges, the vector is a smooth function of the charges, but its
-length is not. The length of the vector may be a tenth or several thousand, so it is compressed by the function asinh.
+length is not smooth. Therefore, the perceptron learns the vector instead of the length. The length may be a tenth or
+several thousand, so it is compressed by the function asinh.
 """
 
 from collections.abc import Sequence
@@ -90,8 +91,8 @@ class TrainablePerceptron(nn.Module):
 
         Near the rim of the working area, the posterior mean of the contact is a strongly nonlinear function of the
         charges. Units that are nearly linear for all inputs learn such a function slowly. Therefore, each unit gets a
-        random direction in the space of the inputs, a random slope along this direction, and a random centre. At the
-        centre, the argument of the activation is zero.
+        random direction in the space of the inputs, a random slope along this direction, and a random centre. The
+        centre is the point of this space at which the argument of the activation is zero.
         """
         first, *_ = self.linear_layers()
         n_unit = first.out_features
@@ -104,10 +105,11 @@ class TrainablePerceptron(nn.Module):
             first.bias.copy_(-(first.weight * centre).sum(dim=1))  # weight @ centre + bias = 0
 
     def fit_linear_part(self, inputs: Tensor, targets: Tensor) -> None:
-        """Fit the first outputs to targets by linear least squares, and store the coefficients in the skip layer.
+        """Fit the first outputs to targets by linear least squares.
 
-        The weights from the hidden layers to these outputs are reduced, so that the hidden layers contribute little at
-        first. During the training, the hidden layers learn the nonlinear part of the outputs.
+        The slopes are stored in the skip layer, and the offset is stored in the bias of the last layer. The weights
+        from the last hidden layer to these outputs are reduced, so that the hidden layers contribute little at first.
+        During the training, the hidden layers learn the nonlinear part of the outputs.
 
         Args:
             inputs: Inputs, shape (n, n_input).
@@ -156,11 +158,11 @@ class TrainablePerceptron(nn.Module):
     def round_hidden_matrices(self) -> None:
         """Round the weights between hidden layers to 8 bits, and exclude these weights from further training.
 
-        Each rounded weight is the product of a scale and an integer from -127 to 127. All weights of an output have the
-        same scale.
+        Each rounded weight is the product of a scale and an integer from -127 to 127. All weights that lead to the same
+        unit have the same scale.
         """
         for matrix in self.hidden_matrices():
-            weights = matrix.detach()  # shares its memory with the matrix, which is therefore changed below
+            weights = matrix.detach()  # shares its memory with the matrix, so that `copy_` below changes the matrix
             scale = weights.abs().amax(dim=1, keepdim=True) / LARGEST_INT8  # shape (n_output, 1)
             integers = torch.round(weights / scale.clamp(min=MIN_SCALE))
             weights.copy_(integers * scale)
@@ -182,8 +184,8 @@ class InverseNetwork(nn.Module):
     def __init__(self, domain: Domain, features: WhitenedFeatures, config: NetworkConfig) -> None:
         """Create the perceptrons with random weights.
 
-        The centre and the scale of the contacts and the whitening of the features are stored as buffers, because they
-        are not trained.
+        The following tensors are stored as buffers, because they are not trained: centre and scale of the unit
+        coordinates, and mean and whitening matrix of the features.
 
         Args:
             domain: Contacts for which the network is trained.
@@ -316,7 +318,8 @@ def fold_network(network: InverseNetwork) -> FoldedNetwork:
 def fold_contact_mean(network: InverseNetwork) -> FoldedNetwork:
     """Fold the contact perceptron of a trained network without its standard deviations.
 
-    The answers of the folded network are x and y in mm, and ln F.
+    The answers of the folded network are x and y in mm, and ln F. The outputs for the standard deviations get weights
+    of zero.
     """
     weights_of_means = np.diag(network.domain.scale)
     weights_of_log_stds = np.zeros((3, 3))

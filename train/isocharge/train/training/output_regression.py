@@ -48,7 +48,8 @@ class Regression:
     """One ridge regression of the last layer.
 
     Attributes:
-        target: Function that computes the target answers from the present answers, both of shape (n, n_answer).
+        target: Function that computes the targets of the last layer from its present outputs, both of shape (n,
+            n_output).
         ridge: Factor of the penalty on squared changes of the weights. The mean squared error has the factor 1.
     """
 
@@ -93,6 +94,7 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent_charge: A
 
     def std_targets(outputs: Array) -> Array:
         """Return the present outputs with new standard deviations, which one scoring step computes."""
+        # The limit reduces the mean square of normal errors by only 0.5 %, so the expected square remains 1.
         return _scoring_step(outputs, log_contact, MAX_ERROR, expected_square=1.0)
 
     # Fit the last layer first to the contacts, and then in several scoring steps to the standard deviations.
@@ -174,7 +176,7 @@ def _mean_square_of_limited_normal(limit: float) -> float:
     """
     normal = NormalDist()
     probability_within = normal.cdf(limit) - normal.cdf(-limit)
-    square_within = probability_within - 2.0 * limit * normal.pdf(limit)
+    square_within = probability_within - 2.0 * limit * normal.pdf(limit)  # integration by parts
     return square_within + limit**2 * (1.0 - probability_within)
 
 
@@ -207,7 +209,7 @@ def refit_last_layer(
 ) -> Perceptron[Array]:
     """Fit the last layer and the skip layer to new outputs by ridge regressions, which penalise changes of the weights.
 
-    Weights of the last layer that are zero remain zero. Each output therefore depends on the same hidden units as
+    If a weight of the last layer is zero, it is not fitted. Each output therefore depends on the same hidden units as
     before.
 
     Args:
@@ -240,6 +242,7 @@ def refit_last_layer(
             # Solve the normal equations for those weights of this output that are fitted.
             rows = np.flatnonzero(is_fitted[:, column])
             fitted_matrix = normal_matrix[np.ix_(rows, rows)]  # rows and columns of the fitted weights
+            # The normal equations are sums over the samples, so the penalty on a mean is multiplied by their number.
             damped_matrix = fitted_matrix + regression.ridge * n_sample * np.eye(len(rows))
             weights[rows, column] += np.linalg.solve(damped_matrix, right_side[rows, column])
 

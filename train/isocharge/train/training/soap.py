@@ -23,9 +23,9 @@ EPSILON = 1e-10
 class Soap:
     """The optimiser SOAP. Parameters with one dimension, such as biases, are trained by Adam.
 
-    The class has only a few methods of PyTorch's optimisers, which suffice for a training. The class is not derived
-    from `torch.optim.Optimizer`, because the first object of that class imports PyTorch's compiler, which takes a long
-    time.
+    The class has only those methods of PyTorch's optimisers that a training requires. The class is not derived from
+    `torch.optim.Optimizer`, because creating the first object of that class imports PyTorch's compiler. The import
+    takes a long time.
 
     Args:
         params: Parameters, or groups of parameters in the form that all optimisers of PyTorch accept. A parameter with
@@ -84,8 +84,9 @@ def _update(
 ) -> None:
     """Change one parameter and its state by one step of SOAP (Vyas et al., 2024, algorithm 3).
 
-    The averaged gradient is rotated into the eigenbasis. The entries of the rotated gradient are divided by their root
-    mean squares, as in Adam. The result is rotated back, and is the direction of the step.
+    The averaged gradient is rotated into the eigenbasis. As in Adam, each entry of the rotated gradient is divided by
+    the root mean square of this entry over the past steps. The result is rotated back and gives the direction of the
+    step.
 
     Args:
         parameter: Parameter to change.

@@ -34,17 +34,20 @@ class Teacher:
     answer: Callable[[Array], tuple[Array, Array]]
 
     def posterior(self, charge: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
-        """Estimate the means of the unit coordinates and the logarithms of their standard deviations, using the model.
+        """Compute the model's estimates of the unit coordinates and the logarithms of their standard deviations.
+
+        The unit coordinates are x, y and ln F after a shift and a scaling, so that each of them ranges from -1 to 1 in
+        the domain.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
             domain: Domain that defines the centre and the scale of the unit coordinates.
 
         Returns:
-            Means and logarithms of the standard deviations, each of shape (n, 3).
+            Estimated unit coordinates and logarithms of their standard deviations, each of shape (n, 3).
         """
         contact, std = self.answer(charge.double().numpy())
-        log_force_std = std[:, 2] / contact[:, 2]  # the standard deviation of ln F
+        log_force_std = std[:, 2] / contact[:, 2]  # the standard deviation of ln F, because d ln F = dF / F
         unit_std = np.column_stack([std[:, :2], log_force_std]) / domain.scale
         return as_tensor(domain.to_unit(contact)), as_tensor(np.log(unit_std))
 

@@ -14,7 +14,7 @@ from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.source import TrainingData
 
 VALIDATION_FRACTION = 0.5
-"""Number of validation positions relative to the number of test positions, dimensionless."""
+"""Fraction of the positions for validation, relative to the fraction of the positions for the test, dimensionless."""
 
 SIGNED_FEATURE_SCALE = 0.1
 """Charge above which features of charges of both signs are logarithmic, dimensionless.
@@ -26,7 +26,9 @@ gave smaller position errors than the value 1.
 
 @dataclass(frozen=True)
 class Split:
-    """Presses that are split by position. In their domain, the map from contacts to charges can be inverted.
+    """Presses that are split by position into presses for training, for validation and for the test.
+
+    In the domain of the presses, the map from contacts to charges can be inverted.
 
     Attributes:
         domain: Contacts for which the network is trained.
@@ -49,24 +51,25 @@ class Split:
     folded_charges: ChargeSeries | None
 
     @classmethod
-    def of(cls, data: TrainingData, training: TrainingConfig) -> "Split":
+    def by_position(cls, data: TrainingData, training: TrainingConfig) -> "Split":
         """Split presses into three parts for training, validation and test, and fit a charge field to them.
 
         A charge field is a smooth map from contacts to charges. The map folds where different contacts have the same
-        charges. A first field is fitted to all presses. It determines the largest disk in which the map certainly does
-        not fold. Only the presses within this disk are distributed among the three parts.
+        charges. A first field is fitted to all presses and determines the largest disk in which the map certainly does
+        not fold. Only the presses within this disk are distributed among the three parts. If the map folds or the
+        presses are measured, a second field is fitted to the presses for training.
 
         Args:
             data: Presses of the sensor.
             training: Fractions of the presses, noise and seed.
         """
-        # First field, and the domain without folds
+        # Fit the first field, and determine the domain without folds.
         presses = data.presses
         electrode_names = data.sensor.electrode_names
         field_train, field_validation = split_by_position(presses, training.hold_out, training.seed)
-        whole_field = ChargeField.fit(data.domain, electrode_names, field_train, field_validation)
-        domain, cautions = invertible_domain(whole_field, presses, misfit_noise(training.noise_model))
-        is_folded = domain != data.domain  # the domain is only reduced if the map folds
+        first_field = ChargeField.fit(data.domain, electrode_names, field_train, field_validation)
+        domain, cautions = invertible_domain(first_field, presses, misfit_noise(training.noise_model))
+        is_folded = domain != data.domain  # `invertible_domain` reduces the domain only if the map folds
         used_presses = presses.within(domain.radius) if is_folded else presses
 
         train, validation, test = _split_presses(used_presses, training)
@@ -74,12 +77,12 @@ class Split:
         # A second field, without the test presses, is fitted in two cases. If the map folds, the first field was also
         # fitted to presses beyond the fold. Then the more accurate of both fields is used. If the presses are measured,
         # the first field was also fitted to test presses.
-        field: ChargeMap = whole_field
+        field: ChargeMap = first_field
         if is_folded or presses.measured:
-            field = ChargeField.fit(domain, electrode_names, train, validation)
-            if is_folded and whole_field.error < field.error:
-                field = within(whole_field, domain.radius)
-        folded_charges = whole_field.of_positive if is_folded else None
+            second_field = ChargeField.fit(domain, electrode_names, train, validation)
+            is_first_better = is_folded and first_field.error < second_field.error
+            field = within(first_field, domain.radius) if is_first_better else second_field
+        folded_charges = first_field.positive_series if is_folded else None  # also None if some charges are negative
         return cls(domain, train, validation, test, field, cautions, folded_charges)
 
     def features(self, noise: NoiseModel) -> WhitenedFeatures:
@@ -107,11 +110,13 @@ def _split_presses(
 ) -> tuple[LabelledPresses, LabelledPresses, LabelledPresses]:
     """Split presses by position into three parts: for training, for validation and for the test.
 
-    If the presses are measured, the same presses are always used for the test. Simulated presses are split at random.
+    If the presses are measured, their positions alone determine which presses are used for the test (`held_out`).
+    Simulated presses are chosen for the test at random. The presses for validation are always chosen at random.
 
     Args:
         presses: Presses to split.
-        training: Fraction of the positions for the test, and the seed.
+        training: Fraction of the positions for the test, and the seed. Measured presses do not use this fraction for
+            the test, but half of it for the validation.
 
     Returns:
         Presses for training, for validation and for the test.

@@ -12,7 +12,7 @@ from isocharge.common.perceptron import Layer, Perceptron
 
 
 def evaluate_features(features: ChargeFeatures, charge: Tensor) -> Tensor:
-    """Compute the input features of charges. Finite charges give finite features.
+    """Compute the input features of charges. Finite charges give finite features, because the charges are clipped.
 
     Args:
         features: Definition of the features: limits, typical charges and means.
@@ -22,15 +22,15 @@ def evaluate_features(features: ChargeFeatures, charge: Tensor) -> Tensor:
         Features, same shape, dimensionless.
     """
 
-    def as_charge_type(values: Array) -> Tensor:
+    def to_tensor(values: Array) -> Tensor:
         """Convert an array to a tensor with the data type of the charges."""
         return torch.as_tensor(values, dtype=charge.dtype)
 
-    clipped_charge = charge.clamp(as_charge_type(features.low_pC), as_charge_type(features.high_pC))
-    ratio = clipped_charge / as_charge_type(features.typical_pC)
-    if features.mean is None:
+    clipped_charge = charge.clamp(to_tensor(features.low_pC), to_tensor(features.high_pC))
+    ratio = clipped_charge / to_tensor(features.typical_pC)
+    if features.mean is None:  # all charges of the presses are positive
         return torch.log(ratio)
-    return torch.asinh(ratio) - as_charge_type(features.mean)
+    return torch.asinh(ratio) - to_tensor(features.mean)
 
 
 def evaluate_hidden_layers(layers: Sequence[Layer[Tensor]], activation: Activation, inputs: Tensor) -> Tensor:
@@ -52,12 +52,12 @@ def evaluate_hidden_layers(layers: Sequence[Layer[Tensor]], activation: Activati
 
 
 def evaluate(perceptron: Perceptron[Tensor], inputs: Tensor) -> Tensor:
-    """Evaluate a perceptron.
+    """Evaluate a perceptron: the hidden layers, the last layer, and the skip layer from the inputs to the outputs.
 
     Args:
         perceptron: One perceptron, or n_batch perceptrons with weights of shape (n_batch, n_input, n_output) and biases
             of shape (n_batch, 1, n_output).
-        inputs: Inputs, shape (n, n_input) or (n_batch, n, n_input).
+        inputs: Inputs, shape (n, n_input) for one perceptron, or (n_batch, n, n_input) for several perceptrons.
 
     Returns:
         Outputs, shape (n, n_output) or (n_batch, n, n_output).

@@ -6,7 +6,12 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 
 from isocharge.serve import Port, Predictor, load_device, stream
-from isocharge.serve.export.record_messages import DEFLECTION_STD_m, ROTATION_VARIANCE_rad2, contact_of, time_of
+from isocharge.serve.export.record_messages import (
+    DEFLECTION_STD_m,
+    ROTATION_VARIANCE_rad2,
+    ros_time_ns,
+    with_tracked_contact,
+)
 
 DEFAULT_PARAMETERS = {"model": "three-25um-biaxial", "port": "/dev/ttyACM0", "device": "", "wait_s": 60.0}
 """Parameters of the node with their default values."""
@@ -34,7 +39,7 @@ class TouchNode(Node):
         """Publish the wrench of a prediction record and, if something touches the film, the pose of the contact."""
         if record.force_N is None:  # the force is unknown, for example because the board has sent a value that is NaN
             return
-        record_values = contact_of(record.json_values)  # a tracked contact replaces the contact of the frame
+        record_values = with_tracked_contact(record.json_values)  # a tracked contact replaces the contact of the frame
         self.publish_wrench(record_values, record)
         if record.contact:
             self.publish_pose(record_values, record)
@@ -84,7 +89,7 @@ class TouchNode(Node):
 
     def with_header(self, message, record):
         """Copy the coordinate frame and the time of a record into the header of a message, and return the message."""
-        time_ns = time_of({"timestamp": record.timestamp})  # checks that ROS 2 can express the time
+        time_ns = ros_time_ns({"timestamp": record.timestamp})  # checks that ROS 2 can express the time
         seconds, nanoseconds = divmod(time_ns, NANOSECONDS_PER_SECOND)
         message.header.frame_id = record.frame_id
         message.header.stamp.sec = seconds

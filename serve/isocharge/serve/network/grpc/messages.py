@@ -55,7 +55,7 @@ def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> Infer
 
     Args:
         message: The ModelInferRequest.
-        loaded: Version of the model for which the request is meant.
+        loaded: Version of the model that is requested.
         max_presses: Largest number of presses in one request.
 
     Raises:
@@ -115,6 +115,9 @@ def write_response(answer: InferAnswer) -> Any:
 
     If an output was requested as a binary tensor, its values are sent as raw contents. The values of every other output
     are sent as a list of texts or numbers.
+
+    Args:
+        answer: Outputs of the model, and the names of the outputs that were requested as binary tensors.
     """
     _, response_type = METHODS["ModelInfer"]
     message = response_type()

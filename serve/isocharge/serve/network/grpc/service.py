@@ -70,9 +70,9 @@ class Service:
         # values is used as an ordered set.
         self._waiting: dict[asyncio.Timeout, None] = {}
         self._traffic.open["grpc"] = lambda: self._open_count
-        self._functions = self._functions_of_methods()
+        self._answer_functions = self._create_answer_functions()
 
-    def _functions_of_methods(self) -> dict[str, Callable[[Any], Any]]:
+    def _create_answer_functions(self) -> dict[str, Callable[[Any], Any]]:
         """Return the function that answers each method, by the name of the method.
 
         Each function receives the message of a request. Each function returns the message of the response, the content
@@ -102,12 +102,12 @@ class Service:
         methods[STREAM] = grpc.stream_stream_rpc_method_handler(partial(self._handle, STREAM))
         return grpc.method_handlers_generic_handler(SERVICE, methods)
 
-    async def _handle(self, name: str, _: object, context: grpc.aio.ServicerContext) -> Any:
+    async def _handle(self, name: str, _messages: object, context: grpc.aio.ServicerContext) -> Any:
         """Answer a call. Then count the call by its status, and log the call if there is a log.
 
         Args:
             name: Name of the method.
-            _: Iterator over the messages. It is not used, because the messages are read from the context.
+            _messages: Iterator over the messages. It is not used, because the messages are read from the context.
             context: Context of the call, from which messages are read.
 
         Returns:
@@ -205,7 +205,11 @@ class Service:
         Args:
             name: Name of the method.
             data: The serialized message of the request.
-            call: Properties of the call. The model and the sizes of the request and of the response are added to them.
+            call: Properties of the call, in which the model is set and the sizes of the messages are added up.
+
+        Raises:
+            RequestError: If the data are not a message of the expected type.
+            IsochargeError: If the request is refused.
         """
         request_type, response_type = METHODS[name]
         call.bytes_in += len(data)
@@ -214,14 +218,14 @@ class Service:
         except DecodeError as error:
             expected = request_type.DESCRIPTOR.name
             raise RequestError(f"expected a {expected}, got {len(data)} bytes of another kind") from error
-        # The fields with the model and its version are called `model_name` and `model_version` in some messages of the
-        # protocol, and `name` and `version` in the other messages.
+        # The name and the version of the model are called `model_name` and `model_version` in some messages of the
+        # protocol, and `name` and `version` in other messages. Messages about the server contain none of these fields.
         model_name = getattr(request, "model_name", "") or getattr(request, "name", "")
         model_version = getattr(request, "model_version", "") or getattr(request, "version", "")
         call.model = self._store.label(model_name, model_version)
 
         # The response is a message, a JSON object with the content of the message, or None if the message is empty.
-        response = self._functions[name](request)
+        response = self._answer_functions[name](request)
         if not isinstance(response, Message):
             response = ParseDict(response or {}, response_type())
         response_data: bytes = response.SerializeToString()
@@ -229,10 +233,12 @@ class Service:
         return response_data
 
     def _load(self, request: Any) -> None:
-        """Read the files of the requested model again.
+        """Read the files of the requested model again. The response is empty.
 
         Raises:
             RequestError: If the request has parameters.
+            ModelNotFound: If the repository does not contain the model.
+            ModelError: If a version of the model is refused.
         """
         if request.parameters:
             raise RequestError(describe.NO_LOAD_PARAMETERS)
@@ -241,6 +247,7 @@ class Service:
     def _infer(self, request: Any) -> Any:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
         loaded = self._store.get(request.model_name, request.model_version)
+        # `answer_inference` calls `read` and `write_response`, because it measures the duration of these steps.
         read = partial(read_request, request, loaded, self._limits.batch)
         return answer_inference(loaded, read, write_response)
 
@@ -263,7 +270,7 @@ class Service:
     def _count_open_call(self) -> Iterator[None]:
         """Return a context manager that counts a call as open until the `with` block ends.
 
-        If there are already too many open calls, the service ends the call that has waited longest for a message.
+        If there are already too many open calls, the service first ends the call that has waited longest for a message.
 
         Raises:
             TooMany: If there are too many open calls, and none of them waits for a message.

@@ -87,8 +87,8 @@ class Connection(asyncio.Protocol):
         self._expects_continue = False
 
         # The data that are being parsed. A piece is the part of the data that is passed to the parser in one call.
-        self._piece_bytes = 0  # size of the piece that is being parsed
-        self._unchecked_bytes = 0  # bytes since the request began, or since the latest part of its body
+        self._piece_size = 0  # bytes in the piece that is being parsed
+        self._unchecked_size = 0  # bytes since the request began, or since the latest part of its body
         self._piece_begins_with_request = True  # false after the first request of the piece has begun
         self._piece_was_answered = False  # whether a request of the present piece was answered
         self._unparsed = bytearray()  # received data that have not been parsed yet
@@ -98,7 +98,7 @@ class Connection(asyncio.Protocol):
         # its total size are stored, too. A request with the same head is then recognised without parsing it.
         self._head: Head | None = None
         self._remembered_head = b""
-        self._remembered_bytes = 0
+        self._remembered_size = 0
 
         # The task that computes an answer in another thread, and the heads and bodies of the requests that wait for it
         self._answering: asyncio.Task[None] | None = None
@@ -112,8 +112,8 @@ class Connection(asyncio.Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin the connection.
 
-        If there are too many connections, the oldest unused connection is ended. If every other connection is in use,
-        the new connection is refused.
+        If there are too many connections, the oldest other connection on which no complete request has arrived is
+        ended. If there is no such connection, the new connection is refused.
         """
         self._transport = transport
         peer = transport.get_extra_info("peername")
@@ -128,7 +128,7 @@ class Connection(asyncio.Protocol):
             self._refuse(refusal(503, f"all {self._limits.connections} connections are taken; try again later"))
 
     def _end_oldest_unused(self) -> bool:
-        """End the oldest other connection on which no complete request has arrived.
+        """End the oldest other connection on which no complete request has arrived, in order to make room for this one.
 
         The oldest connection is the connection with the earliest deadline.
 
@@ -153,13 +153,14 @@ class Connection(asyncio.Protocol):
         """Process data that the client has sent.
 
         There are three cases. Data that are long or that must wait are stored, and are parsed in slices. A request with
-        the same head as the previous request is answered without parsing it. All other data are parsed at once.
+        the same head as the previous request is answered without parsing it. All other data are parsed at once. After a
+        refusal, the data are ignored.
         """
         if self._is_refused or self._transport.is_closing():  # the data are ignored
             return
 
         # Case 1: the data are long, or must wait for earlier data, for an answer, or for the client to read responses.
-        must_wait = self._unparsed or self._answering or self._is_blocked
+        must_wait = bool(self._unparsed) or self._answering is not None or self._is_blocked
         if must_wait or len(data) > SLICE_BYTES:
             self._unparsed += data
             if self._next_turn is None:  # otherwise the event loop will call `_parse_stored_data`
@@ -167,7 +168,7 @@ class Connection(asyncio.Protocol):
             return
 
         # Case 2: the data have the same head and the same size as the previous request.
-        repeats_head = len(data) == self._remembered_bytes and data.startswith(self._remembered_head)
+        repeats_head = len(data) == self._remembered_size and data.startswith(self._remembered_head)
         if repeats_head and self._head is not None:  # `_head` is the parsed head of the previous request
             body = data[len(self._remembered_head) :]
             self._answer(self._head, body)
@@ -186,6 +187,7 @@ class Connection(asyncio.Protocol):
             Whether the connection stays open, because responses must still be sent.
         """
         self._is_half_closed = bool(self._unparsed or self._answering)
+        # With TLS, both directions can only be closed together, and `can_write_eof` returns False.
         return self._is_half_closed and self._transport.can_write_eof()
 
     def pause_writing(self) -> None:
@@ -193,7 +195,7 @@ class Connection(asyncio.Protocol):
 
         The connection is closed unless the client reads its responses within `body_seconds`.
         """
-        self._set_deadline(self._limits.body_seconds)
+        self._set_deadline(self._limits.body_seconds)  # before `_is_blocked` is set, which protects the deadline
         self._is_blocked = True
         self._transport.pause_reading()
 
@@ -201,14 +203,14 @@ class Connection(asyncio.Protocol):
         """Continue to read and parse requests, because the client has read its responses."""
         self._is_blocked = False
         self._set_deadline(self._limits.idle_seconds)
-        if self._next_turn is None:
+        if self._next_turn is None:  # otherwise the event loop will call `_parse_stored_data`
             self._parse_stored_data()
 
     def shutdown(self) -> None:
         """Close the connection, because the server is being stopped.
 
         If a request is incomplete, or if its answer is being computed, the connection is closed only after the response
-        was sent.
+        was sent. After a refusal, the connection is ended at once.
         """
         self._is_stopping = True  # the next response closes the connection
         has_open_request = self._phase is not Phase.IDLE or self._answering is not None
@@ -281,11 +283,11 @@ class Connection(asyncio.Protocol):
         request.
         """
         # Set the state of the piece, which the `on_...` methods use.
-        self._piece_bytes = len(data)
-        self._unchecked_bytes += self._piece_bytes  # the bytes that `_check_incomplete_request` compares with the limit
+        self._piece_size = len(data)
+        self._unchecked_size += self._piece_size  # the bytes that `_check_incomplete_request` compares with the limit
         self._piece_begins_with_request = self._phase is Phase.IDLE
         self._piece_was_answered = False
-        self._remembered_bytes = 0  # discards the head of the previous request, because another request may follow
+        self._remembered_size = 0  # discards the head of the previous request, because another request may follow
 
         try:
             self._parser.feed_data(data)
@@ -304,7 +306,7 @@ class Connection(asyncio.Protocol):
         counted. If the body is sent in chunks, the sizes of the trailers and of the chunk extensions are also counted.
         The deadline is set once for the headers and once for the body. Further pieces do not extend it.
         """
-        if self._unchecked_bytes > self._limits.header_bytes:
+        if self._unchecked_size > self._limits.header_bytes:
             self._refuse_headers()
         elif self._timed_phase is not self._phase:  # the present deadline was set for an earlier phase
             self._timed_phase = self._phase
@@ -341,7 +343,7 @@ class Connection(asyncio.Protocol):
         where in the piece the request begins.
         """
         self._phase = Phase.HEADERS
-        self._unchecked_bytes = self._piece_bytes if self._piece_begins_with_request else 0
+        self._unchecked_size = self._piece_size if self._piece_begins_with_request else 0
         self._piece_begins_with_request = False  # the next request in the same piece begins later
         self._expects_continue = False
         self._url = b""
@@ -355,7 +357,8 @@ class Connection(asyncio.Protocol):
     def on_header(self, name: bytes, value: bytes) -> None:
         """Convert the name of a header to lower case, and store the header.
 
-        Trailers, which are headers after the body, are ignored.
+        The header `Expect` also determines whether the client waits for the response `100 Continue`. Trailers, which
+        are headers after the body, are ignored.
         """
         if self._phase is Phase.BODY:
             return
@@ -366,13 +369,13 @@ class Connection(asyncio.Protocol):
 
     def on_headers_complete(self) -> None:
         """Check the size of the complete headers, and send `100 Continue` if the client waits for this response."""
-        # Computing the exact size of the headers takes time. It is only computed if the headers may be too long. Up to
-        # SLICE_BYTES bytes of the headers have not been counted if the request began in the middle of a piece.
-        max_possible_bytes = self._unchecked_bytes + SLICE_BYTES
-        may_be_too_long = max_possible_bytes > self._limits.header_bytes
+        # Computing the exact size of the headers takes time. The size is only computed if the headers may be too long.
+        # If the request began in the middle of a piece, up to SLICE_BYTES bytes of its headers were not counted.
+        max_possible_size = self._unchecked_size + SLICE_BYTES
+        may_be_too_long = max_possible_size > self._limits.header_bytes
         self._phase = Phase.BODY
-        self._unchecked_bytes = 0  # the headers are complete, and the body has its own limit
-        if may_be_too_long and self._header_bytes() > self._limits.header_bytes:
+        self._unchecked_size = 0  # the headers are complete, and the body has its own limit
+        if may_be_too_long and self._header_size() > self._limits.header_bytes:
             self._refuse_headers()
             return
 
@@ -385,7 +388,7 @@ class Connection(asyncio.Protocol):
         """Store a part of the body, and refuse the request if its body is too large."""
         if self._is_refused:
             return
-        self._unchecked_bytes = 0  # the body has its own limit, which is checked here
+        self._unchecked_size = 0  # the body has its own limit, which is checked here
         self._body += body
         try:
             self._limits.check_body(len(self._body))
@@ -403,7 +406,7 @@ class Connection(asyncio.Protocol):
         self._phase = Phase.IDLE
         self.has_completed_request = True
         method = self._parser.get_method().decode("latin-1")
-        is_last = not self._parser.should_keep_alive()
+        is_last = not self._parser.should_keep_alive()  # the client wants to close the connection after the response
         head = Head(method, request_path(self._url), self._headers, is_last)
         self._head = head
         body = bytes(self._body)
@@ -464,10 +467,13 @@ class Connection(asyncio.Protocol):
         head, blank_line, body = data.partition(b"\r\n\r\n")
         if body == self._body and self._phase is Phase.IDLE:
             self._remembered_head = head + blank_line
-            self._remembered_bytes = len(data)
+            self._remembered_size = len(data)
 
     def _write(self, response: Response, head: Head) -> None:
         """Send a response, and set the deadline by which the next request must begin.
+
+        After the last response, the connection is closed. If the client does not read its responses and more than
+        `MAX_UNSENT_BYTES` bytes wait to be read, the connection is ended at once.
 
         Args:
             response: The response.
@@ -498,10 +504,10 @@ class Connection(asyncio.Protocol):
         if not (self._is_blocked or self._answering):
             self.deadline = self._loop.time() + seconds
 
-    def _header_bytes(self) -> int:
-        """Return the total size of the target and the headers, bytes."""
-        separator_bytes = len(b": \r\n")
-        return len(self._url) + sum(len(name) + len(value) + separator_bytes for name, value in self._headers)
+    def _header_size(self) -> int:
+        """Return the total size of the URL in the request line and of the headers, bytes."""
+        separator_size = len(b": \r\n")
+        return len(self._url) + sum(len(name) + len(value) + separator_size for name, value in self._headers)
 
     def _refuse_headers(self) -> None:
         """Refuse a request whose request line and headers are too long."""

@@ -13,7 +13,7 @@ STATUS_LINES = {status.value: b"HTTP/1.1 %d %s\r\n" % (status, status.phrase.enc
 """Status line of a response, by status code."""
 
 CLOSING_HEADER = b"connection: close\r\n\r\n"
-"""End of the headers of the last response on a connection, which tells the client that the connection is closed."""
+"""End of the headers of the last response on a connection. It announces that the connection is closed afterwards."""
 
 
 class Head(NamedTuple):
@@ -39,13 +39,13 @@ def response_bytes(response: Response, *, is_last: bool, with_body: bool = True)
 
     Args:
         response: The response.
-        is_last: Whether the connection is closed after the response. If it is, a header tells this to the client.
+        is_last: Whether the connection is closed after the response. In this case, a header announces the end.
         with_body: Whether the body is sent. The body of a response to a HEAD request is not sent.
     """
     parts = [STATUS_LINES[response.status]]
     for name, value in response.headers:
         parts += (name, b": ", value, b"\r\n")
-    parts.append(CLOSING_HEADER if is_last else b"\r\n")  # both end with the blank line
+    parts.append(CLOSING_HEADER if is_last else b"\r\n")  # both end with the blank line after the headers
     if with_body:
         parts.append(response.body)
     return b"".join(parts)

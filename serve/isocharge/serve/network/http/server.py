@@ -124,7 +124,8 @@ class HttpServer:
             except OSError:  # the client has disconnected, or no file descriptor is left
                 await asyncio.sleep(TICK_SECONDS)
                 continue
-            is_full = len(self._connections) + len(self._handshakes) >= self._limits.connections
+            open_count = len(self._connections) + len(self._handshakes)  # without the new connection
+            is_full = open_count >= self._limits.connections
             # The connection of a client that has not finished its handshake is ended in favour of the new client.
             if is_full and self._tls is not None and self._handshakes:
                 oldest_handshake = next(iter(self._handshakes))
@@ -140,9 +141,11 @@ class HttpServer:
             accepted: The accepted socket, which is closed if the handshake fails.
             loop: Event loop of the server.
         """
-        new_connection = partial(Connection, self._handler, self._connections, loop)
+        create_connection = partial(Connection, self._handler, self._connections, loop)
         timeout_s = self._limits.header_seconds if self._tls else None  # asyncio refuses a timeout without TLS
         try:
-            await loop.connect_accepted_socket(new_connection, accepted, ssl=self._tls, ssl_handshake_timeout=timeout_s)
+            await loop.connect_accepted_socket(
+                create_connection, accepted, ssl=self._tls, ssl_handshake_timeout=timeout_s
+            )
         except (OSError, asyncio.CancelledError):  # OSError includes ssl.SSLError and TimeoutError
             accepted.close()  # no error is raised, because an error of one client must not affect the server

@@ -50,14 +50,14 @@ class Match(NamedTuple):
 NO_ROUTE = Match(None, "unknown")
 
 _PARAMETERS = {"{model}": "(?P<model>[^/]*)", "{version}": "(?P<version>[^/]+)"}
-"""Regular expression for each parameter that a template of a path may contain."""
+"""Regular expression for each placeholder that a template of a path may contain."""
 
 
 def _pattern(template: str) -> re.Pattern[str]:
-    """Return a regular expression that matches the paths of a template."""
+    """Return a regular expression that matches the paths of a template, such as `/v2/models/{model}/infer`."""
     expression = re.escape(template)
-    for name, parameter in _PARAMETERS.items():
-        expression = expression.replace(re.escape(name), parameter)
+    for placeholder, parameter_expression in _PARAMETERS.items():
+        expression = expression.replace(re.escape(placeholder), parameter_expression)
     return re.compile(expression)
 
 
@@ -81,7 +81,7 @@ def match_path(path: str) -> Match:
 
 
 class Handler:
-    """Answers HTTP requests with the models of a store, counts the requests, and writes them to the log."""
+    """Handler that answers HTTP requests with the models of a store, and counts and logs the requests."""
 
     def __init__(
         self,
@@ -141,7 +141,7 @@ class Handler:
             response = error_response(error)
         self.traffic.count("http", match.label, response.status)
         log = self.traffic.log
-        if log is not None:
+        if log is not None:  # the properties of the exchange are only determined for the log
             exchange = Exchange(
                 transport="http",
                 route=match.label,
@@ -177,7 +177,7 @@ class Handler:
         self.traffic.count_and_log(exchange)
 
     def _check_and_answer(
-        self, method: str, path: str, match: Match, fields: dict[bytes, bytes], body: bytes
+        self, method: str, path: str, match: Match, headers: dict[bytes, bytes], body: bytes
     ) -> Response:
         """Check whether a request is allowed, answer the request, and return the response.
 
@@ -185,18 +185,18 @@ class Handler:
             method: Method in capitals.
             path: Path without the query, for error messages.
             match: Route of the path.
-            fields: Value of each header by the name of the header in lower case.
+            headers: Value of each header by the name of the header in lower case.
             body: Body of the request, which may be compressed.
 
         Raises:
             IsochargeError: If the request is refused.
         """
-        self._browser_check.check(method, fields)
+        self._browser_check.check(method, headers)
         route = match.route
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
         # which paths exist.
         if self.token is not None and (route is None or route.needs_token):
-            self.token.check(fields.get(b"authorization", b""))
+            self.token.check(headers.get(b"authorization", b""))
         if route is None:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
         # A HEAD request is answered like a GET request. The server then sends the response without its body.
@@ -204,6 +204,6 @@ class Handler:
         if method != route.method and not is_head_of_get:
             raise WrongMethod(f"{path}: expected the method {route.method}, got {method[:20]}", route.method)
         self.limits.check_body(len(body))
-        encoding = fields.get(b"content-encoding", b"").lower()
+        encoding = headers.get(b"content-encoding", b"").lower()
         plain_body = decompress(body, encoding, self.limits.body_bytes)
-        return route.respond(Request(self._service, fields, plain_body, match.model, match.version))
+        return route.respond(Request(self._service, headers, plain_body, match.model, match.version))

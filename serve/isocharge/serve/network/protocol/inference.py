@@ -145,7 +145,7 @@ def parse_request(
         ChargeError: If a charge is not finite.
         TooLarge: If the request contains more than `max_presses` presses.
     """
-    body = convert(content, InferBody, where="", error=RequestError)  # `where` is empty, because there is no file
+    body = convert(content, InferBody, where="", error_class=RequestError)  # `where` is empty, because there is no file
     default_is_binary = body.parameters.binary_data_output
     if body.outputs:
         names, binary_names = _requested_outputs(body.outputs, loaded, default_is_binary=default_is_binary)
@@ -164,16 +164,18 @@ def _requested_outputs(
     Args:
         outputs: Outputs that the request contains.
         loaded: Version of the model that is requested.
-        default_is_binary: Whether an output is sent as a binary tensor if the request makes no statement about this
+        default_is_binary: Whether an output is sent as a binary tensor if the request contains no choice for this
             output.
 
     Raises:
         RequestError: If the request contains an output twice, or an output that the model does not have.
     """
     names = tuple(output.name for output in outputs)
-    if len(set(names)) < len(names):
+    has_duplicate_names = len(set(names)) < len(names)
+    if has_duplicate_names:
         raise RequestError("outputs: expected each name once")
-    # Unknown names were refused when the request was parsed. All known outputs except this one exist in every model.
+    # Unknown names were refused when the request was parsed. Every model has all known outputs, except that older
+    # models do not compute the correlations.
     if CORRELATION in names and CORRELATION not in loaded.outputs:
         raise RequestError(
             f"outputs: expected one of {', '.join(loaded.outputs)}, got {CORRELATION!r}, which "
@@ -309,8 +311,8 @@ def _from_array(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> S
     press_count, electrode_count = shape
     flat_shape = [press_count * electrode_count]
     is_numeric = numbers.dtype.kind in "fiu"  # floating-point numbers, and integers with and without sign
-    has_shape = list(numbers.shape) in (shape, flat_shape)
-    if not (is_numeric and has_shape):
+    has_valid_shape = list(numbers.shape) in (shape, flat_shape)
+    if not (is_numeric and has_valid_shape):
         raise RequestError(
             f"input {INPUT!r}: expected `data`, numbers for the shape {shape}, flat or in rows, "
             f"got {numbers.dtype} of shape {list(numbers.shape)}"
@@ -334,6 +336,7 @@ def _as_array(values: Any) -> np.ndarray[Any, Any]:
 
 def _contains_booleans(values: Any) -> bool:
     """Return whether a list, or a list of lists, contains true or false."""
+    # Only the first element is examined, because a mixture of lists and other values is refused in any case.
     is_nested = isinstance(values, list) and bool(values) and isinstance(values[0], list)
     rows = values if is_nested else [values]
     return any(type(row) is list and any(type(value) is bool for value in row) for row in rows)
@@ -346,8 +349,8 @@ def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
         answer: Outputs of the model, and the names of the outputs that are sent as binary tensors.
 
     Returns:
-        The body, which is a JSON text that may be followed by binary tensors. The length of the JSON text, bytes, or
-        None if no binary tensors follow.
+        Two values. The first value is the body, which is a JSON text that may be followed by binary tensors. The second
+        value is the length of the JSON text, bytes, or None if no binary tensors follow.
     """
     content: dict[str, Any] = {"model_name": answer.name, "model_version": answer.version}
     if answer.id:  # empty if the request has no identifier
@@ -394,7 +397,21 @@ def _json_tensor(name: str, rows: Rows, binary: bytes | None) -> dict[str, Any]:
 ResponseType = TypeVar("ResponseType")
 
 
-def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> tuple[dict[str, Rows], int, int]:
+class Inference(NamedTuple):
+    """Outputs of a model for the presses of a request, and numbers of presses for the statistics.
+
+    Attributes:
+        outputs: Values of each requested output by its name, each of shape (n, width).
+        unchecked: Number of presses whose misfit was not computed, because it was not requested.
+        alarms: Number of presses whose misfit is NaN or exceeds the limit of the model.
+    """
+
+    outputs: dict[str, Rows]
+    unchecked: int
+    alarms: int
+
+
+def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> Inference:
     """Run a model on the charges of presses. Any thread may call this function.
 
     Args:
@@ -402,20 +419,16 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
         charge_pC: Charges, shape (n, electrodes), pC.
         names: Names of the requested outputs.
 
-    Returns:
-        A tuple of three values. The first value contains the outputs by name, each of shape (n, width). The second
-        value is the number of presses whose misfit was not computed, because it was not requested. The third value is
-        the number of presses whose misfit is NaN or exceeds the limit of the model.
-
     Raises:
         ModelError: If onnxruntime fails to run the graph.
     """
-    # The graph does not compute the flags. They are computed from all outputs of the graph. A second call of this
-    # function therefore requests all these outputs.
+    # The graph does not compute the flags. The flags are computed from all outputs of the graph, which the following
+    # call requests.
     if FLAGS in names:
         outputs, unchecked, alarms = infer(loaded, charge_pC, loaded.outputs)
         outputs[FLAGS] = _flags(loaded, outputs)
-        return {name: outputs[name] for name in names}, unchecked, alarms
+        requested_outputs = {name: outputs[name] for name in names}
+        return Inference(requested_outputs, unchecked, alarms)
 
     press_count = len(charge_pC)
     if press_count == 1:  # a single press is computed in a faster way
@@ -423,29 +436,22 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
     outputs = dict[str, Rows](run(loaded.model.session, charge_pC, names))
     check_output_shapes(outputs, press_count, loaded.metadata.label)
     if "misfit" not in outputs:
-        return outputs, press_count, 0
+        return Inference(outputs, unchecked=press_count, alarms=0)
     is_good = outputs["misfit"] <= loaded.validity.misfit_limit  # false if the misfit is NaN
     alarms = press_count - int(np.count_nonzero(is_good))
-    return outputs, 0, alarms
+    return Inference(outputs, unchecked=0, alarms=alarms)
 
 
-def _infer_single_press(
-    loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]
-) -> tuple[dict[str, Rows], int, int]:
+def _infer_single_press(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> Inference:
     """Run a model on the charges of one press.
 
     The session of the model uses memory that is allocated once and reused. Reusing the memory is faster than calling
-    `session.run`.
+    `session.run`. The misfit is always computed, even if it is not requested.
 
     Args:
         loaded: Version of the model that is run.
         charge_pC: Charges of the press, shape (electrodes,), pC.
         names: Names of the requested outputs.
-
-    Returns:
-        The three values that `infer` returns. The first value contains the outputs by name, each of shape (1, width).
-        The second value is 0, because the misfit is always computed. The third value is 1 if the misfit is NaN or
-        exceeds the limit of the model, and otherwise 0.
     """
     press = loaded.press_of_thread()
     row = np.empty((1, press.size), np.float32)  # all outputs of the press, one after the other
@@ -457,7 +463,7 @@ def _infer_single_press(
     outputs = {name: row[:, columns[name]] for name in names}
     misfit = row[:, columns["misfit"]].item()
     is_alarm = not misfit <= loaded.validity.misfit_limit  # also true if the misfit is NaN
-    return outputs, 0, int(is_alarm)
+    return Inference(outputs, unchecked=0, alarms=int(is_alarm))
 
 
 def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:

@@ -28,22 +28,22 @@ def openapi_document(routes: Iterable[Route], store: ModelStore) -> Json:
     The document describes the routes that have a summary. The document also lists the names and versions of the loaded
     models.
     """
-    listed = [route for route in routes if route.summary]
+    documented_routes = [route for route in routes if route.summary]
     models = {loaded.metadata.name for loaded in store.loaded_versions()}
     versions = {loaded.version for loaded in store.loaded_versions()}
     return {
         "openapi": "3.1.0",
         "info": {"title": "isocharge", "version": server_metadata()["version"], "description": DESCRIPTION},
-        "paths": {path: _path_item(path, route) for route in listed for path in route.paths},
+        "paths": {path: _path_item(path, route) for route in documented_routes for path in route.paths},
         "components": {
             "parameters": {"model": _path_parameter("model", models), "version": _path_parameter("version", versions)},
-            "schemas": _schemas(listed),
+            "schemas": _schemas(documented_routes),
             "responses": {
                 "error": {"description": "Reason for the refusal", "content": _content(ERROR, "application/json")}
             },
             "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
         },
-        "security": [{}, {"token": []}],
+        "security": [{}, {"token": []}],  # either nothing or a token, because not every server has a token
     }
 
 
@@ -81,7 +81,13 @@ def _content(schema: Schema, media_type: str) -> Json:
 
 
 def _path_parameter(name: str, values: set[str]) -> Json:
-    """Return the description of a parameter of a path, including its possible values."""
+    """Return the description of a parameter of a path, including its possible values.
+
+    Args:
+        name: Name of the parameter: "model" or "version".
+        values: The possible values, which are the names or the versions of the loaded models. Without values, the
+            description contains the value "none", because OpenAPI requires at least one.
+    """
     schema = {"type": "string", "enum": sorted(values) or ["none"]}
     return {"name": name, "in": "path", "required": True, "schema": schema}
 

@@ -129,7 +129,7 @@ def _example(loaded: LoadedVersion, path: str) -> str:
 def _card(model: Model) -> str:
     """Read the model card in the folder of a model, and return the card as preformatted HTML.
 
-    If the card cannot be read, the function returns a paragraph that says so.
+    If the card cannot be read, the function returns a paragraph with a message instead.
     """
     try:
         text = read_whole(model.folder / "card.md", MAX_CARD_BYTES).decode("utf-8")

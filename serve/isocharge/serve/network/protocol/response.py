@@ -23,7 +23,10 @@ _STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (errors.InputError, 400, "INVALID_ARGUMENT"),
     (Exception, 500, "INTERNAL"),
 )
-"""Class of an error, its HTTP status and its gRPC status. The first row whose class matches an error is used."""
+"""Each row contains a class of errors, their HTTP status and their gRPC status.
+
+For a given error, the first row with a matching class is used.
+"""
 
 INTERNAL_MESSAGE = "internal error; the server's log says more"
 """Message to the client for an error that is not an IsochargeError."""
@@ -31,11 +34,15 @@ INTERNAL_MESSAGE = "internal error; the server's log says more"
 
 def statuses(error: Exception) -> tuple[int, str]:
     """Return the HTTP status and the name of the gRPC status that report an error to the client."""
-    return next((code, name) for kind, code, name in _STATUSES if isinstance(error, kind))
+    return next(
+        (http_status, grpc_status)
+        for error_class, http_status, grpc_status in _STATUSES
+        if isinstance(error, error_class)
+    )
 
 
 def client_message(error: Exception) -> str:
-    """Return the message that tells the client about an error.
+    """Return the message about an error that is sent to the client.
 
     Every error other than an IsochargeError is unexpected, and its message may contain secrets. An unexpected error is
     therefore written to the log, and the client receives a general message.
@@ -76,7 +83,7 @@ def response_of(status: int, content_type: bytes, body: bytes, error: str | None
 
 
 def json_response(content: Any) -> Response:
-    """Return a response with the status 200 whose body is a value in JSON."""
+    """Return a response with the status 200 whose body is the given value in JSON."""
     return response_of(200, b"application/json", orjson.dumps(content))
 
 
@@ -128,16 +135,17 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
         raise errors.UnknownEncoding(f"Content-Encoding {_quoted(encoding)}: expected gzip, deflate or identity")
     decompressor = zlib.decompressobj(_WINDOW_BITS[encoding])
     try:
-        plain = decompressor.decompress(body, limit + 1)  # the additional byte shows that the limit is exceeded
+        plain_body = decompressor.decompress(body, limit + 1)  # the additional byte shows that the limit is exceeded
     except zlib.error as error:
         raise errors.RequestError(
             f"the body is not {_quoted(encoding)}, as its Content-Encoding states: {error}"
         ) from error
-    if len(plain) > limit:
+    if len(plain_body) > limit:
         raise errors.TooLarge(f"the body unpacks to more than {limit} bytes; send smaller batches")
+    # `eof` is False if the end of the data is missing, and `unused_data` are the bytes after the end.
     if not decompressor.eof or decompressor.unused_data:
         raise errors.RequestError(f"the body ends before, or goes on after, the end of its {_quoted(encoding)} data")
-    return plain
+    return plain_body
 
 
 def compress(body: bytes, accepted: bytes) -> tuple[bytes, bytes]:

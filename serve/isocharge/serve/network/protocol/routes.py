@@ -80,7 +80,13 @@ class Schema(NamedTuple):
 
 
 class Body(NamedTuple):
-    """Description of the body of a request, which consists of its schema, whether it is required, and an example."""
+    """Description of the body of a request.
+
+    Attributes:
+        schema: Schema of the body.
+        is_required: Whether a request must have a body.
+        example: Example of the body; None if there is no example.
+    """
 
     schema: Schema
     is_required: bool = False

@@ -38,12 +38,12 @@ class RoundProbe(CurvedProbe):
 
     @property
     def angle(self) -> float:
-        """Rotation of the footprint. It is always zero, because a rotation does not change a circle."""
+        """Rotation of the footprint. The rotation is always zero, because a rotation does not change a circle."""
         return 0.0
 
     @property
     def period(self) -> float:
-        """Period of the footprint. It is always zero, because every rotation maps a circle onto itself."""
+        """Period of the footprint. The period is always zero, because every rotation maps a circle onto itself."""
         return 0.0
 
     @property

@@ -68,15 +68,17 @@ class Polygon(Probe):
             SceneError: If the corners do not form such a polygon, or if the polygon is too small.
         """
         corners = np.array(self.corners, dtype=float)
-        is_table = corners.ndim == 2 and corners.shape[1:] == (2,)
-        if not is_table or not 3 <= len(corners) <= MAX_CORNERS or not np.isfinite(corners).all():
+        has_two_columns = corners.ndim == 2 and corners.shape[1:] == (2,)
+        is_list_of_points = has_two_columns and 3 <= len(corners) <= MAX_CORNERS and np.isfinite(corners).all()
+        if not is_list_of_points:
             raise SceneError(f"probe: expected 3 to {MAX_CORNERS} corners (x, y), got {self.corners}")
         check_angle(self.angle)
         if not is_convex(corners):
             raise SceneError(
                 f"probe: expected a convex polygon with its corners anticlockwise, got {corners.tolist()} mm"
             )
-        if not np.linalg.norm(centroid_of(corners)) <= 1e-9 * np.linalg.norm(corners, axis=1).max():
+        rounding_tolerance = 1e-9 * np.linalg.norm(corners, axis=1).max()
+        if not np.linalg.norm(centroid_of(corners)) <= rounding_tolerance:
             raise SceneError(
                 f"probe: expected corners relative to their centroid, got {corners.tolist()} mm; use Polygon.of"
             )
@@ -157,15 +159,15 @@ class Polygon(Probe):
     def period(self) -> float:
         """Smallest rotation that maps the polygon onto itself, rad."""
         # A rotation that maps the polygon onto itself maps each corner to another corner, which is a fixed number of
-        # corners ahead (`step`). The smallest possible step divides the number of corners.
+        # corners ahead (`corner_shift`). The smallest possible shift divides the number of corners.
         corners = to_complex(np.array(self.corners))
-        for step in range(1, corners.size):
-            if corners.size % step != 0:
+        for corner_shift in range(1, corners.size):
+            if corners.size % corner_shift != 0:
                 continue
-            rotation = np.exp(2j * np.pi * step / corners.size)
-            corners_ahead = np.roll(corners, -step)
+            rotation = np.exp(2j * np.pi * corner_shift / corners.size)
+            corners_ahead = np.roll(corners, -corner_shift)
             if np.allclose(corners_ahead, corners * rotation, rtol=0.0, atol=1e-9 * self.reach):
-                return float(math.tau * step / corners.size)
+                return float(math.tau * corner_shift / corners.size)
         return math.tau  # only a full turn maps the polygon onto itself
 
     @property
