@@ -23,8 +23,24 @@ from isocharge.train.calibration.press_data import PressData
 CANDIDATE_POSITIONS = 300
 """Number of positions that are compared in order to choose the first contact of a press with an unknown position."""
 
+UNKNOWN_POSITION_STARTS = 3
+"""Number of searches for the contact of a press with an unknown position. The search with the best result is used."""
+
+START_DISTANCE = 0.15
+"""Smallest distance between the starts of two searches for the same contact, relative to the radius of the domain."""
+
 MIN_CHANGE = 1e-5
 """Smallest change of chi2, relative to 1 + chi2, for which the search for the contact of a press continues."""
+
+MAX_SEARCHES = 5
+"""Largest number of successive searches for the contact of a press.
+
+Each search approximates the effect of imperfections by a linear function about the result of the previous search."""
+
+LINEAR_DISTANCE = 0.02
+"""Largest distance of a contact from the start of a search for which the linear function is accurate.
+
+The distance is in scaled coordinates."""
 
 
 class AdjustedContacts(NamedTuple):
@@ -72,11 +88,34 @@ def with_force(contact: Array) -> Array:
     return np.column_stack([contact[:, :2], np.exp(contact[:, 2])])
 
 
+def best_adjusted_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> AdjustedContacts:
+    """Find the contacts that agree best with the measurements, by searches from all starts of `start_contacts`.
+
+    Args:
+        charges: Model of the charges of all films.
+        unknowns: Unknowns of the pressed film, as `FilmCharges.film` expects them.
+        data: The measured presses.
+    """
+    first_start, *other_starts = start_contacts(charges, unknowns, data)
+    best = adjust_contacts(charges, unknowns, data, first_start)
+    for start in other_starts:
+        other = adjust_contacts(charges, unknowns, data, start)
+        is_better = (other.chi2 < best.chi2)[:, None]
+        contact = np.where(is_better, other.contact, best.contact)
+        residual = np.where(is_better, other.residual, best.residual)
+        best = AdjustedContacts(contact, residual)
+    return best
+
+
 def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> AdjustedContacts:
     """Find the contacts that agree best with the measured charges and with the measurements of the rig.
 
     For each press, the sum of the squared residuals is minimised over the contact (x, y, ln F). The search uses scaled
     contacts. In these coordinates, the positions of the domain fill the unit disk, and ln F lies in [-1, 1].
+
+    The effect of imperfections is approximated by a linear function about the start of the search. If the contact of a
+    press lies far from this start, for example because its position was unknown, the search is repeated from the
+    contact that was found.
 
     Args:
         charges: Model of the charges of all films.
@@ -84,10 +123,19 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
         data: The measured presses.
         start: Contacts (x, y, ln F) at which the search begins, shape (n, 3).
     """
-    residuals = _ContactResiduals.of(charges, unknowns, data, start)
     domain = charges.domain
-    scaled_start = (start - domain.centre) / domain.scale
-    scaled_contact, residual = minimise(residuals.at, scaled_start, min_change=MIN_CHANGE)
+    scaled_contact = (start - domain.centre) / domain.scale
+    residual = np.empty(data.measured.shape)
+    rows = np.arange(len(data))  # the presses whose contacts are searched for
+    has_imperfections = bool(unknowns[charges.layout.coefficients].any())
+    for _ in range(MAX_SEARCHES):
+        scaled_start = scaled_contact[rows]
+        residuals = _ContactResiduals.of(charges, unknowns, data[rows], scaled_start * domain.scale + domain.centre)
+        scaled_contact[rows], residual[rows] = minimise(residuals.at, scaled_start, min_change=MIN_CHANGE)
+        distance = np.abs(scaled_contact[rows] - scaled_start).max(axis=1)
+        rows = rows[distance > LINEAR_DISTANCE]
+        if not has_imperfections or not rows.size:
+            break
     return AdjustedContacts(scaled_contact * domain.scale + domain.centre, residual)
 
 
@@ -270,12 +318,12 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
     return value, np.stack(slopes, axis=2)
 
 
-def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Array:
-    """Return the contacts at which the search for the adjusted contacts begins.
+def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> list[Array]:
+    """Return the contacts at which searches for the adjusted contacts begin.
 
-    If the rig measured the position of a press, the search begins at this position. If the position of a press is
-    unknown, the search begins at the position where the ratios of the film's charges are most similar to the ratios of
-    the measured charges. The force is the measured force. If the force is unknown, the search begins at the middle of
+    If the rig measured the position of a press, the searches begin at this position. If the position of a press is
+    unknown, each search begins at another position where the ratios of the film's charges are similar to the ratios of
+    the measured charges. The force is the measured force. If the force is unknown, the searches begin at the middle of
     the range of forces.
 
     Args:
@@ -284,21 +332,28 @@ def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Ar
         data: The measured presses.
 
     Returns:
-        Contacts (x, y, ln F), shape (n, 3).
+        The starts (x, y, ln F) of each search, each of shape (n, 3). There is a single search if all positions were
+        measured, and otherwise one for each of `UNKNOWN_POSITION_STARTS` positions.
     """
-    start = data.contact.copy()
     is_position_unknown = ~data.has_place
-    if is_position_unknown.any():
-        start[is_position_unknown, :2] = _most_similar_positions(charges, unknowns, data[is_position_unknown])
-    return start
+    if not is_position_unknown.any():
+        return [data.contact.copy()]
+    starts = []
+    for position in _similar_positions(charges, unknowns, data[is_position_unknown]):
+        start = data.contact.copy()
+        start[is_position_unknown, :2] = position
+        starts.append(start)
+    return starts
 
 
-def _most_similar_positions(charges: FilmCharges, unknowns: Array, data: PressData) -> Array:
-    """Find the positions where the ratios of a film's charges are most similar to the ratios of the measured charges.
+def _similar_positions(charges: FilmCharges, unknowns: Array, data: PressData) -> list[Array]:
+    """Find positions where the ratios of a film's charges are similar to the ratios of the measured charges.
 
-    For each press, `CANDIDATE_POSITIONS` positions are compared. The ratios of charges hardly depend on the stiffness
-    of the film and on its piezoelectric coefficients. The estimates of these properties may still be inaccurate at this
-    stage of a calibration.
+    For each press, `CANDIDATE_POSITIONS` positions are compared. The first result is the most similar position. Each
+    further result is the most similar position that is farther than `START_DISTANCE` from the results before.
+
+    The ratios of charges hardly depend on the stiffness of the film and on its piezoelectric coefficients. The
+    estimates of these properties may still be inaccurate at this stage of a calibration.
 
     Args:
         charges: Model of the charges of all films.
@@ -306,7 +361,7 @@ def _most_similar_positions(charges: FilmCharges, unknowns: Array, data: PressDa
         data: The presses whose positions are searched for.
 
     Returns:
-        Positions (x, y), shape (n, 2), mm.
+        A list of `UNKNOWN_POSITION_STARTS` arrays with a position (x, y) for each press, each of shape (n, 2), mm.
     """
     # Candidates (x, y, F) with the same typical force. Their positions are distributed evenly over the domain, and are
     # first computed as complex numbers x + i y.
@@ -322,5 +377,12 @@ def _most_similar_positions(charges: FilmCharges, unknowns: Array, data: PressDa
     # If the ratios agree exactly, the logarithms of measured and computed charges differ by the same amount on all
     # electrodes. The variance of this difference over the electrodes is then zero.
     log_quotient = log_measured[:, None] - log_computed  # shape (n, n_candidate, n_electrode)
-    most_similar = np.nanvar(log_quotient, axis=2).argmin(axis=1)
-    return candidates[most_similar, :2]
+    dissimilarity = np.nanvar(log_quotient, axis=2)  # shape (n, n_candidate)
+    candidate_distance = np.abs(complex_positions[:, None] - complex_positions) / charges.domain.radius
+    positions = []
+    for _ in range(UNKNOWN_POSITION_STARTS):
+        most_similar = dissimilarity.argmin(axis=1)
+        positions.append(candidates[most_similar, :2])
+        is_near = candidate_distance[most_similar] < START_DISTANCE  # shape (n, n_candidate)
+        dissimilarity = np.where(is_near, np.inf, dissimilarity)
+    return positions

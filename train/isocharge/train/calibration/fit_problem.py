@@ -21,9 +21,9 @@ from isocharge.train.calibration.bounded_normal import most_probable_within
 from isocharge.train.calibration.contacts import (
     AdjustedContacts,
     adjust_contacts,
+    best_adjusted_contacts,
     derivatives_with_adjusted_contacts,
     neighbouring_films,
-    start_contacts,
     weighted_sum,
     with_force,
 )
@@ -379,12 +379,13 @@ class FitProblem:
         Args:
             unknowns: Unknowns of the film and nuisances, shape (n_unknown,).
             data: The presses as they were measured.
-            start: Contacts (x, y, ln F) at which the search begins, shape (n, 3); by default those of `start_contacts`.
+            start: Contacts (x, y, ln F) at which the search begins, shape (n, 3); if it is None, the search
+                has several starts; see `best_adjusted_contacts`.
         """
         film = self._film(unknowns)
         corrected_data = self._without_nuisances(unknowns, data)
         if start is None:
-            start = start_contacts(self.charges, film, corrected_data)
+            return best_adjusted_contacts(self.charges, film, corrected_data)
         return adjust_contacts(self.charges, film, corrected_data, start)
 
     def derivatives(self, solved: SolvedFilm, data: PressData, *, with_coefficients: bool = True) -> Array:
