@@ -1,4 +1,4 @@
-"""Arrays of small companion files of a model: `charges.npz`, `pretensions.npz` and `film_directions.npz`."""
+"""Arrays of small companion files of a model, such as `charges.npz`, `pretensions.npz` and `film_directions.npz`."""
 
 import io
 
@@ -27,17 +27,32 @@ def direction_arrays():
     series = np.zeros((2, 2, 2, 2, 4))
     series[0, 0, 0, 0] = 0.01
     series[1, 0, 0, 1] = [0.02, -0.02, 0.01, 0.0]
-    log_charge = np.zeros((2, 2, 2, 4))
-    log_charge[0, 0, 0] = np.log(200.0)
-    log_charge[1, 0, 0] = [0.1, 0.0, -0.1, 0.0]  # of x
-    log_charge[0, 1, 0] = [0.0, 0.1, 0.0, -0.1]  # of y
-    log_charge[0, 0, 1] = 0.7  # of the force
     return {
         "series": series,
         "radius_mm": np.array(8.0),
         "force_N": np.array([0.05, 2.0]),
         "by_pretension": np.array([0.1, -0.2]),
-        "log_charge": log_charge,
+    }
+
+
+def film_charge_arrays():
+    """The arrays of a small `film_charges.npz` with four electrodes, whose charges fall as the pretension rises.
+
+    The position moves charge between opposite electrodes, and the force scales all charges equally.
+    """
+    log_charge = np.zeros((2, 2, 2, 4))
+    log_charge[0, 0, 0] = np.log(200.0)
+    log_charge[1, 0, 0] = [0.1, 0.0, -0.1, 0.0]  # of x
+    log_charge[0, 1, 0] = [0.0, 0.1, 0.0, -0.1]  # of y
+    log_charge[0, 0, 1] = 0.7  # of the force
+    log_change_per_MPa = np.zeros_like(log_charge)
+    log_change_per_MPa[0, 0, 0] = [-0.5, -0.4, -0.5, -0.4]
+    node_MPa = np.array([0.5, 1.0, 2.0])
+    return {
+        "series": log_charge + node_MPa[:, None, None, None, None] * log_change_per_MPa,
+        "node_MPa": node_MPa,
+        "radius_mm": np.array(8.0),
+        "force_N": np.array([0.05, 2.0]),
     }
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from attacks.companions import charge_arrays, direction_arrays, pretension_arrays
+from attacks.companions import charge_arrays, direction_arrays, film_charge_arrays, pretension_arrays
 from attacks.faults import mutated, with_junk
 from isocharge.common.files import sha256_of
 from isocharge.common.resumable_run import resume_folder
@@ -28,6 +28,7 @@ from isocharge.serve import (
     read_charges,
 )
 from isocharge.serve.model.charge_series import read_charges as read_charge_series
+from isocharge.serve.model.film_charges import read_film_charges
 from isocharge.serve.model.film_directions import read_film_directions
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.pretensions import read_pretensions
@@ -336,13 +337,14 @@ def series_with_faults(rng, arrays):
     return changed
 
 
-@pytest.mark.parametrize("name", ["charges.npz", "pretensions.npz", "film_directions.npz"])
+@pytest.mark.parametrize("name", ["charges.npz", "pretensions.npz", "film_directions.npz", "film_charges.npz"])
 def test_companion_files_with_faults(name, tmp_path, attack):
     """A file that is accepted gives finite numbers."""
     arrays_of_file = {
         "charges.npz": charge_arrays,
         "pretensions.npz": pretension_arrays,
         "film_directions.npz": direction_arrays,
+        "film_charges.npz": film_charge_arrays,
     }
     good = arrays_of_file[name]()
 
@@ -360,9 +362,10 @@ def test_companion_files_with_faults(name, tmp_path, attack):
             directions = read_film_directions(tmp_path, 4)
             log_changes = directions.log_changes(np.array([[0.0, 0.0, 0.5], [30.0, -20.0, 100.0]]))
             assert np.isfinite(np.exp(log_changes)).all()
-            charge_pC = np.full((1, 4), 200.0)
-            slopes = directions.misfit_slopes(np.array([[1.0, -2.0, 0.5]]), charge_pC, np.ones((1, 4)))
-            assert slopes is None or np.isfinite(slopes).all()
+        elif name == "film_charges.npz":
+            charges = read_film_charges(tmp_path, 4).at(np.array([0.7]))
+            unit_contact = charges.unit_contact(np.array([[0.0, 0.0, 0.5], [30.0, -20.0, 100.0]]))
+            assert np.isfinite(charges.charges(unit_contact[None])[0]).all()
         else:
             pretensions = read_pretensions(tmp_path)
             middle = np.array([sum(pretensions.range_MPa) / 2.0])

@@ -7,13 +7,20 @@ import shutil
 import numpy as np
 import pytest
 
-from attacks.companions import charge_arrays, direction_arrays, linear_series, pretension_arrays
+from attacks.companions import (
+    charge_arrays,
+    direction_arrays,
+    film_charge_arrays,
+    linear_series,
+    pretension_arrays,
+)
 from isocharge.common.chebyshev_series import Series
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import load_model, write_model
 from isocharge.serve.model.charge_series import ChargeSeries, read_charges
 from isocharge.serve.model.companion_files import read_companion_file
+from isocharge.serve.model.film_charges import FilmChargeSeries, read_film_charges
 from isocharge.serve.model.film_directions import FilmDirections, read_film_directions
 from isocharge.serve.model.pretensions import read_pretensions
 
@@ -150,35 +157,17 @@ def test_pretensions_that_nothing_can_be_computed_from_are_refused(tmp_path, cha
 
 def test_film_directions_are_read_as_they_were_written(tmp_path):
     arrays = direction_arrays()
-    written = FilmDirections(
-        arrays["series"], 8.0, (0.05, 2.0), arrays["by_pretension"], log_charge_coefficients=arrays["log_charge"]
-    )
+    written = FilmDirections(arrays["series"], 8.0, (0.05, 2.0), arrays["by_pretension"])
     (tmp_path / "film_directions.npz").write_bytes(written.to_bytes())
     read = read_film_directions(tmp_path, 4)
     np.testing.assert_allclose(read.coefficients, written.coefficients, rtol=1e-6)
     np.testing.assert_array_equal(read.by_pretension, written.by_pretension)
-    np.testing.assert_allclose(read.log_charge_coefficients, written.log_charge_coefficients, rtol=1e-6)
     assert (read.radius_mm, read.force_N, read.count) == (8.0, (0.05, 2.0), 2)
 
 
-def test_charges_that_a_contact_explains_have_no_misfit(tmp_path):
-    """In the small file, x moves charge from C to A, y from D to B, and the force scales all charges equally."""
-    write_npz(tmp_path, "film_directions.npz", direction_arrays())
-    directions = read_film_directions(tmp_path, 4)
-    contact = np.array([[1.0, 2.0, 0.5]])
-    (slopes,) = directions.misfit_slopes(contact, np.full((1, 4), 200.0), np.full((1, 4), 2.0))
-    explained = np.array([[1.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
-    np.testing.assert_allclose(slopes @ explained.T, 0.0, atol=1e-9)
-    unexplained = np.array([1.0, -1.0, 1.0, -1.0])
-    np.testing.assert_allclose(slopes @ unexplained, 100.0 * unexplained)
-
-
-def test_film_directions_of_an_earlier_version_have_no_misfit_slopes(tmp_path):
-    arrays = direction_arrays()
-    del arrays["log_charge"]
-    write_npz(tmp_path, "film_directions.npz", arrays)
-    directions = read_film_directions(tmp_path, 4)
-    assert directions.misfit_slopes(np.array([[1.0, 2.0, 0.5]]), np.ones((1, 4)), np.ones((1, 4))) is None
+def test_film_directions_of_an_earlier_version_with_another_array_are_read(tmp_path):
+    write_npz(tmp_path, "film_directions.npz", direction_arrays() | {"log_charge": np.zeros((2, 2, 2, 4))})
+    assert read_film_directions(tmp_path, 4).count == 2
 
 
 def test_film_directions_change_the_charges_as_the_chebyshev_series_says(tmp_path):
@@ -208,9 +197,6 @@ def test_model_without_film_directions_has_none(tmp_path):
         ({"series": np.zeros((40, 40, 2, 2, 4))}, "degrees up to 30"),
         ({"series": np.full((2, 2, 2, 2, 4), 1e3)}, "changes of ln Q up to 10"),
         ({"series": np.full((2, 2, 2, 2, 4), np.nan)}, "expected finite numbers"),
-        ({"log_charge": np.zeros((2, 2, 2, 3))}, "expected an array of shape"),
-        ({"log_charge": np.zeros((2, 3, 2, 4))}, "log_charge: expected equal degrees"),
-        ({"log_charge": np.full((2, 2, 2, 4), 1e3)}, "values of ln Q up to 100"),
         ({"by_pretension": np.zeros(3)}, "expected an array of shape"),
         ({"by_pretension": np.full(2, 1e6)}, "changes up to 1000 per MPa"),
         ({"radius_mm": np.array(0.0)}, "expected a radius"),
@@ -221,6 +207,56 @@ def test_film_directions_that_describe_no_film_are_refused(tmp_path, change, rea
     write_npz(tmp_path, "film_directions.npz", direction_arrays() | change)
     with pytest.raises(ModelError, match=rf"film_directions\.npz: .*{reason}.*calibrate again"):
         read_film_directions(tmp_path, 4)
+
+
+def test_film_charges_are_read_as_they_were_written(tmp_path):
+    arrays = film_charge_arrays()
+    written = FilmChargeSeries(arrays["node_MPa"], arrays["series"], 8.0, (0.05, 2.0))
+    (tmp_path / "film_charges.npz").write_bytes(written.to_bytes())
+    read = read_film_charges(tmp_path, 4)
+    assert read is not None
+    np.testing.assert_allclose(read.coefficients, written.coefficients, rtol=1e-6)
+    np.testing.assert_array_equal(read.node_MPa, written.node_MPa)
+    assert (read.radius_mm, read.force_N) == (8.0, (0.05, 2.0))
+
+
+def test_film_charges_are_those_of_the_chebyshev_series(tmp_path):
+    """The logarithms of the charges in the small file are linear in x, y, the scaled ln F and the pretension."""
+    write_npz(tmp_path, "film_charges.npz", film_charge_arrays())
+    charges = read_film_charges(tmp_path, 4).at(np.array([0.6, 1.5]))
+    contact = np.array([[4.0, -2.0, 2.0], [0.0, 0.0, np.sqrt(0.05 * 2.0)]])
+    unit_contact = np.broadcast_to(charges.unit_contact(contact), (2, 2, 3))
+    charge_pC, slopes_pC = charges.charges(unit_contact)
+    expected_log_charge = np.log(200.0) + np.array([0.05, -0.025, -0.05, 0.025]) + 0.7
+    falls = np.array([0.5, 0.4, 0.5, 0.4])
+    np.testing.assert_allclose(np.log(charge_pC[0, 0]), expected_log_charge - 0.6 * falls, rtol=1e-5)
+    np.testing.assert_allclose(np.log(charge_pC[1, 1]), np.log(200.0) - 1.5 * falls, rtol=1e-5)
+    np.testing.assert_allclose(slopes_pC[1, 0, :, 0], charge_pC[1, 0] * [0.1, 0.0, -0.1, 0.0], rtol=1e-5, atol=1e-9)
+
+
+def test_model_of_an_earlier_version_has_no_film_charges(tmp_path):
+    assert read_film_charges(tmp_path, 4) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"series": None}, "the array 'series' is missing"),
+        ({"series": np.zeros((2, 2, 2, 2, 4))}, "expected an array of shape"),
+        ({"series": np.zeros((3, 2, 3, 2, 4))}, "equal degrees in x and y"),
+        ({"series": np.zeros((3, 40, 40, 2, 4))}, "degrees up to 30"),
+        ({"series": np.full((3, 2, 2, 2, 4), 1e3)}, "values of ln Q up to 100"),
+        ({"series": np.full((3, 2, 2, 2, 4), np.nan)}, "expected finite numbers"),
+        ({"node_MPa": np.array([0.5, 0.5, 2.0])}, "rising pretensions"),
+        ({"node_MPa": np.array([0.5, 1.0, 1e9])}, "rising pretensions up to 50 MPa"),
+        ({"radius_mm": np.array(0.0)}, "expected a radius"),
+        ({"force_N": np.array([1.0, 0.5])}, "got 1 and 0.5 N"),
+    ],
+)
+def test_film_charges_that_describe_no_film_are_refused(tmp_path, change, reason):
+    write_npz(tmp_path, "film_charges.npz", film_charge_arrays() | change)
+    with pytest.raises(ModelError, match=rf"film_charges\.npz: .*{reason}.*calibrate again"):
+        read_film_charges(tmp_path, 4)
 
 
 def test_released_models_hold_the_checksums_of_their_files(pytestconfig):

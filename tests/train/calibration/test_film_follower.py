@@ -20,11 +20,14 @@ from isocharge.serve import (
     device_from_table,
     encode_frame,
 )
+from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.pretensions import read_pretensions
 from isocharge.serve.signal_chain.thermal import TRIED_PC, ThermalRule
 from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule
+from isocharge.serve.tracking.touch_misfits import SeriesMisfits
 from isocharge.simulate import load_sensor
 from isocharge.train import write_calibration
+from isocharge.train.calibration.film_charge_series import film_charge_series
 from isocharge.train.calibration.film_directions import film_directions
 from isocharge.train.calibration.problem import FilmEstimate
 from isocharge.train.calibration.result import film_without_presses
@@ -145,10 +148,11 @@ def mean_warming(mine, problem, film, seed):
 def test_common_mode_estimates_warming_by_the_followed_film(mine, problem, film):
     """The signal chain uses the misfit of the followed film, here at one place after each of four sets of touches.
 
-    As calibrated, the mean of the warming at this place would be -16 pC.
+    As calibrated, the mean of the warming at this place would be -16 pC. An error of the pretension of 0.05 MPa, which
+    is half of the reported standard deviation, changes it by 7 pC.
     """
     warming_pC = [mean_warming(mine, problem, film, seed) for seed in (8, 9, 10, 11)]
-    assert rms(np.array(warming_pC)) < 6.0
+    assert rms(np.array(warming_pC)) < 9.0
 
 
 def estimated_film(problem, gain_std=0.0, coefficients=None):
@@ -179,28 +183,61 @@ def test_directions_of_an_unknown_gain_change_one_charge(problem):
     np.testing.assert_allclose(log_changes, np.tile([0.2, 0.0, 0.0, 0.0], (50, 1)), atol=0.01)
 
 
-def test_misfit_slopes_agree_with_contacts_that_scipy_fits(problem):
-    """The misfit after a small change of one charge is the residual of the best contact, which SciPy searches."""
+def test_series_of_the_charges_agree_with_the_film_at_other_pretensions(problem):
+    """An uneven tension changes the charges of a tauter film less than those of the calibrated film."""
+    result = estimated_film(problem, coefficients=[2.0, -1.5])
+    calibrated_MPa = float(result.posterior.unknowns[0])
+    series = film_charge_series(result, (0.3, 2.0))
+    contact = draw_contacts(np.random.default_rng(6), problem.domain, 200)
+    for pretension_MPa, tolerance in ((calibrated_MPa, 1e-3), (0.7, 2.5e-3), (1.4, 2.5e-3)):
+        film = series.at(np.array([pretension_MPa]))
+        charge_pC, _ = film.charges(film.unit_contact(contact)[None])
+        unknowns = result.posterior.unknowns.copy()
+        unknowns[0] = pretension_MPa
+        expected_pC = problem.charges.charges(unknowns, contact)
+        assert rms(np.log(charge_pC[0] / expected_pC)) < tolerance  # the noise is 2e-3 or more
+
+
+def test_charges_of_both_signs_have_no_series(problem, monkeypatch):
     result = estimated_film(problem)
-    film = problem.charges.film(result.posterior.unknowns)
+    monkeypatch.setattr("isocharge.simulate.ForwardMap.charges", lambda _map, contact: -np.ones((len(contact), 4)))
+    assert film_charge_series(result, (0.5, 2.0)) is None
+
+
+@pytest.mark.parametrize("pretension_MPa", [0.7, 1.0, 1.4])
+def test_misfits_of_touches_agree_with_contacts_that_scipy_fits(problem, pretension_MPa):
+    """The misfit vector is the residual of the best contact, which SciPy searches, also after a change of a charge."""
+    result = estimated_film(problem)
+    unknowns = result.posterior.unknowns.copy()
+    unknowns[0] = pretension_MPa
+    film = problem.charges.film(unknowns)
+    noise = ModelNoise(name="reference", white_pC=1.0, gain=0.002)
+    series = film_charge_series(result, (0.3, 2.0))
+    at_nodes = SeriesMisfits(series, noise, series.node_MPa, series.node_MPa)
+    misfits = at_nodes.at(pretension_MPa)
+
+    # The touches are those of the calibrated film, so the film at another pretension does not explain them completely.
     domain = replace(problem.domain, radius=0.7 * problem.domain.radius)
     contact = draw_contacts(np.random.default_rng(7), domain, 8)
-    charge = film.charges(contact)
-    noise_std = problem.noise.sigma(charge)
-    slopes = film_directions(result).misfit_slopes(contact, charge, noise_std)
+    charge = problem.charges.charges(result.posterior.unknowns, contact)
+    log_changes = 0.01 * np.eye(4)
+    for touch_contact, touch_charge in zip(contact, charge, strict=True):
+        noise_std = np.sqrt(noise.variance(touch_charge))
 
-    log_change = 1e-3
-    for row, start in enumerate(contact):
-        for electrode in range(charge.shape[1]):
-            changed_charge = charge[row].copy()
-            changed_charge[electrode] *= 1.0 + log_change
+        def fitted_misfit(measured, start=touch_contact, noise_std=noise_std):
+            def residual(trial):
+                return (measured - film.charges(trial[None])[0]) / noise_std
 
-            def residual(trial, row=row, changed_charge=changed_charge):
-                return (changed_charge - film.charges(trial[None])[0]) / noise_std[row]
+            return least_squares(residual, start, x_scale=[1.0, 1.0, start[2]], xtol=1e-12, ftol=1e-12).fun
 
-            fit = least_squares(residual, start, x_scale=[1.0, 1.0, start[2]], xtol=1e-12, ftol=1e-12)
-            largest_slope = np.abs(slopes[row]).max()
-            np.testing.assert_allclose(fit.fun / log_change, slopes[row, :, electrode], atol=0.15 * largest_slope)
+        linearised = misfits.linearise(touch_charge[None], touch_contact, log_changes)
+        expected = fitted_misfit(touch_charge)
+        np.testing.assert_allclose(linearised.vectors[0, 0], expected, atol=0.15 + 0.02 * np.abs(expected).max())
+        largest_change = np.abs(linearised.changes).max()
+        for electrode, log_change in enumerate(log_changes):
+            expected_change = fitted_misfit(touch_charge * np.exp(log_change)) - expected
+            change = linearised.changes[0, :, electrode]
+            np.testing.assert_allclose(change, expected_change, atol=0.15 * largest_change)
 
 
 def test_network_at_another_pretension_has_the_uneven_tension_of_the_film(problem):

@@ -15,8 +15,6 @@ are independent and have the standard deviation 1. Each function s_ke is a Cheby
     radius_mm          largest distance of a contact from the centre, mm
     force_N            smallest and largest force, N
     by_pretension      derivative of the mean of each z_k with respect to the pretension, shape (n_direction,), 1/MPa
-    log_charge         optional: coefficients of ln Q of the calibrated film, shape (degree + 1, degree + 1,
-                       force_degree + 1, n_electrode), where the degrees may differ from those of `series`
 """
 
 import io
@@ -34,6 +32,7 @@ from isocharge.common.errors import ModelError, cut
 from isocharge.common.npz import DAMAGED_FILE_ERRORS, finite_array, npz_arrays
 from isocharge.serve.model.charge_series import read_contact_range
 from isocharge.serve.model.companion_files import read_companion_file
+from isocharge.serve.model.contact_range import clipped_unit_contact
 
 FILE = "film_directions.npz"
 """Name of the file in a version folder."""
@@ -50,12 +49,6 @@ MAX_DEGREE = 30
 MAX_LOG_CHANGE = 10.0
 """Largest change of ln Q by one unit of a direction. The changes of calibrated films are below 0.5."""
 
-LOG_CHARGE = "log_charge"
-"""Name of the array with the series of ln Q of the calibrated film."""
-
-MAX_LOG_CHARGE = 100.0
-"""Largest magnitude of ln Q. The charges of calibrated films are between 0.01 and 1e5 pC."""
-
 MAX_CHANGE_WITH_PRETENSION = 1e3
 """Largest derivative of the mean of a direction with respect to the pretension, 1/MPa."""
 
@@ -71,15 +64,12 @@ class FilmDirections:
         force_N: Smallest and largest force, N.
         by_pretension: Derivative of the mean of each direction with respect to the pretension, shape (n_direction,),
             1/MPa.
-        log_charge_coefficients: Coefficients of the series of ln Q of the calibrated film, shape (degree + 1, degree +
-            1, force_degree + 1, n_electrode). None if the file does not contain them.
     """
 
     coefficients: Array
     radius_mm: float
     force_N: tuple[float, float]
     by_pretension: Array
-    log_charge_coefficients: Array | None = None
 
     @classmethod
     def none(cls, n_electrode: int) -> "FilmDirections":
@@ -100,11 +90,6 @@ class FilmDirections:
         """Chebyshev series of every direction and electrode. Directions and electrodes share one axis."""
         return Series(self.coefficients.reshape(*self.coefficients.shape[:3], -1))
 
-    @cached_property
-    def _log_charge_series(self) -> Series | None:
-        """Chebyshev series of ln Q, the logarithms of the charges of the calibrated film. None if it is unknown."""
-        return None if self.log_charge_coefficients is None else Series(self.log_charge_coefficients)
-
     def log_changes(self, contact: Array) -> Array:
         """Compute the change of ln Q, the logarithm of each charge, that one unit of each direction causes.
 
@@ -123,67 +108,9 @@ class FilmDirections:
             return np.zeros((len(contact), 0, n_electrode))
 
         # The first entry of axis 1 is the value of the series. Its derivatives follow in this axis.
-        log_changes = self._series.values_and_derivatives(self._unit_contact(contact))[:, 0]
+        unit_contact = clipped_unit_contact(contact, self.radius_mm, self.force_N)
+        log_changes = self._series.values_and_derivatives(unit_contact)[:, 0]
         return np.asarray(log_changes.reshape(len(contact), n_direction, n_electrode))
-
-    def misfit_slopes(self, contact: Array, charge_pC: Array, noise_std_pC: Array) -> Array | None:
-        """Compute the derivatives of the misfit vectors of touches with respect to the logarithms of their charges.
-
-        The misfit vector is the part of the charges, in units of their noise, that no contact explains. Let d be a
-        small change of ln Q, the logarithms of the charges. In units of the noise sigma, the charges change by the
-        vector D = Q d / sigma. The derivatives of the charges with respect to the contact span a subspace. A change of
-        the contact explains the projection of D onto this subspace. The misfit vector changes by the remaining part of
-        D.
-
-        Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            charge_pC: Charges Q of these contacts, shape (n, n_electrode), pC.
-            noise_std_pC: Standard deviation sigma of the noise of each charge, shape (n, n_electrode), pC.
-
-        Returns:
-            Derivatives of the misfit vectors, shape (n, n_electrode, n_electrode), in units of the noise. None if the
-            file does not contain the charges of the calibrated film.
-        """
-        if self._log_charge_series is None:
-            return None
-        # The first entry of axis 1 is ln Q. The derivatives of ln Q with respect to the three coordinates follow. The
-        # derivatives span the same subspace for any choice of the coordinates.
-        unit_contact = self._unit_contact(contact)
-        values = self._log_charge_series.values_and_derivatives(unit_contact)  # shape (n, 4, n_electrode)
-        log_slopes = values[:, 1:].swapaxes(1, 2)  # shape (n, n_electrode, 3)
-
-        # Change of each charge, in units of its noise, by one unit of ln Q and by one unit of each coordinate
-        charge_slopes = charge_pC / noise_std_pC  # Q / sigma, shape (n, n_electrode)
-        contact_slopes = charge_slopes[:, :, None] * log_slopes  # shape (n, n_electrode, 3)
-
-        # Matrices that project a change D of the charges, each of shape (n, n_electrode, n_electrode)
-        explained_projection = contact_slopes @ np.linalg.pinv(contact_slopes)
-        unexplained_projection = np.eye(charge_pC.shape[1]) - explained_projection
-
-        # If ln Q of one electrode changes by one unit, the component of D at this electrode is Q / sigma, and all other
-        # components are 0. The misfit vector then changes by the column of the projection for this electrode,
-        # multiplied by Q / sigma.
-        return np.asarray(unexplained_projection * charge_slopes[:, None, :])
-
-    def _unit_contact(self, contact: Array) -> Array:
-        """Convert contacts to the variables of the series, which are coordinates between -1 and 1.
-
-        Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-
-        Returns:
-            Coordinates of x, of y and of the logarithm of the force, shape (n, 3), dimensionless.
-        """
-        # Logarithm of the force, scaled to [-1, 1]; forces outside the range are replaced by its nearest end.
-        min_force_N, max_force_N = self.force_N
-        min_log_force, max_log_force = np.log(self.force_N)
-        log_force = np.log(np.clip(contact[:, 2], min_force_N, max_force_N))
-        unit_force = (2.0 * log_force - min_log_force - max_log_force) / (max_log_force - min_log_force)
-
-        # Positions in multiples of the radius; positions beyond the radius are moved onto the circle.
-        distance_mm = np.hypot(contact[:, 0], contact[:, 1])
-        unit_position = contact[:, :2] / np.maximum(distance_mm, self.radius_mm)[:, None]
-        return np.column_stack([unit_position, unit_force])
 
     def to_bytes(self) -> bytes:
         """Return the content of the file."""
@@ -193,8 +120,6 @@ class FilmDirections:
             "force_N": np.array(self.force_N),
             "by_pretension": self.by_pretension,
         }
-        if self.log_charge_coefficients is not None:
-            arrays[LOG_CHARGE] = self.log_charge_coefficients.astype(np.float32)
         file = io.BytesIO()
         np.savez_compressed(file, **arrays)
         return file.getvalue()
@@ -257,36 +182,7 @@ def _directions_from_arrays(arrays: Mapping[str, np.ndarray], n_electrode: int) 
             f"by_pretension: expected changes up to {MAX_CHANGE_WITH_PRETENSION:g} per MPa, got {steepest_change:g}"
         )
     radius_mm, force_N = read_contact_range(arrays)
-    return FilmDirections(
-        coefficients, radius_mm, force_N, by_pretension, _log_charge_coefficients(arrays, n_electrode)
-    )
-
-
-def _log_charge_coefficients(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Array | None:
-    """Check and return the coefficients of the Chebyshev series for the charges of the calibrated film.
-
-    The series gives ln Q, the logarithm of each charge. The result is None if the file does not contain the series.
-
-    Args:
-        arrays: Arrays of the file by name.
-        n_electrode: Number of electrodes of the model.
-
-    Raises:
-        ValueError: If the array is not valid.
-    """
-    if LOG_CHARGE not in arrays:  # written by an earlier version, or a charge of the film is negative and has no ln Q
-        return None
-    coefficients = finite_array(arrays, LOG_CHARGE, (None, None, None, n_electrode))
-    _check_degrees(LOG_CHARGE, coefficients)
-    # The magnitude of a Chebyshev polynomial is at most 1. The magnitude of a series is therefore at most the sum of
-    # the magnitudes of its coefficients.
-    log_charge_limits = np.abs(coefficients).sum(axis=(0, 1, 2))  # shape (n_electrode,)
-    largest_log_charge = float(log_charge_limits.max(initial=0.0))
-    if largest_log_charge > MAX_LOG_CHARGE:
-        raise ValueError(
-            f"{LOG_CHARGE}: expected values of ln Q up to {MAX_LOG_CHARGE:g}, got up to {largest_log_charge:g}"
-        )
-    return coefficients
+    return FilmDirections(coefficients, radius_mm, force_N, by_pretension)
 
 
 def _check_degrees(name: str, coefficients: Array) -> None:

@@ -27,6 +27,7 @@ from isocharge.common.npz import DAMAGED_FILE_ERRORS, finite_array, npz_arrays, 
 from isocharge.common.perceptron import Layer, Perceptron, evaluate
 from isocharge.common.structs import NotNegative, Positive, Text, parse_json
 from isocharge.serve.model.companion_files import read_companion_file
+from isocharge.serve.model.pretension_nodes import check_nodes, interpolation_weights
 
 FILE = "pretensions.npz"
 """Name of the file in a version folder."""
@@ -36,12 +37,6 @@ FORMAT = 1
 
 MAX_CONSTANTS = 100
 """Largest number of weight arrays."""
-
-MAX_NODES = 50
-"""Largest number of pretensions at which weights are given."""
-
-MAX_PRETENSION_MPa = 50.0
-"""Largest pretension, MPa; PVDF yields at about 45 MPa."""
 
 MAX_WEIGHT = 1e6
 """Largest absolute value of a weight. The weights of trained networks are below 100."""
@@ -55,9 +50,6 @@ CALIBRATION_ADVICE = (
 
 CHECKED_PRETENSIONS = 50
 """Number of pretensions at which a reader of the file checks that the misfits are finite."""
-
-MIN_NODE_DISTANCE_MPa = 1e-3
-"""Smallest distance of two pretensions for which the interpolation is well conditioned, MPa."""
 
 MIN_LENGTH = 1e-12
 """Smallest length of a misfit vector. It prevents a division by zero."""
@@ -135,29 +127,6 @@ class Pretensions:
         output_layer = Layer(output_weight, output_bias[:, None])
         return Perceptron(tuple(hidden_layers), output_layer, skip_weight, ACTIVATIONS[self.activation])
 
-    def interpolation_weights(self, pretension_MPa: Array) -> Array:
-        """Compute the weights with which values at the pretensions `node_MPa` are interpolated to other pretensions.
-
-        The pretensions `node_MPa` are called nodes. An interpolated value is the sum of the values at the k nodes, each
-        multiplied by its weight. The weight of node
-        i at the pretension p is a Lagrange polynomial, which is the product of (p - p_j) / (p_i - p_j) over all nodes j
-        other than i.
-
-        Args:
-            pretension_MPa: Pretensions p, shape (n,), MPa.
-
-        Returns:
-            Weights, shape (n, k), dimensionless. Each row contains the weights for one pretension p, whose sum is 1.
-        """
-        is_other_node = ~np.eye(self.node_MPa.size, dtype=bool)  # shape (k, k), False where i equals j
-        node_difference_MPa = self.node_MPa[:, None] - self.node_MPa  # p_i - p_j, shape (k, k)
-        difference_MPa = pretension_MPa[:, None, None] - self.node_MPa  # p - p_j, shape (n, 1, k)
-
-        # The factors with i equal to j are no part of the product. Their denominator is replaced, because it is 0.
-        denominator_MPa = np.where(is_other_node, node_difference_MPa, 1.0)
-        factors = difference_MPa / denominator_MPa  # shape (n, k nodes i, k nodes j)
-        return np.asarray(np.prod(factors, axis=2, where=is_other_node))
-
     def at(self, pretension_MPa: Array) -> "Pretensions":
         """Return the same network with weights that are interpolated to other pretensions.
 
@@ -166,7 +135,7 @@ class Pretensions:
         Args:
             pretension_MPa: The other pretensions, shape (n,), MPa, within `range_MPa` and in ascending order.
         """
-        interpolation = self.interpolation_weights(pretension_MPa)  # shape (n, k)
+        interpolation = interpolation_weights(self.node_MPa, pretension_MPa)  # shape (n, k)
         network_weights = {}
         for name, node_weights in self.weights.items():  # arrays of shape (k, ...), one entry for each of `node_MPa`
             interpolated_weights = np.tensordot(interpolation, node_weights, axes=1)  # shape (n, ...)
@@ -287,7 +256,7 @@ def _pretensions_from_arrays(arrays: Mapping[str, np.ndarray]) -> Pretensions:
     if about.activation not in ACTIVATIONS:
         raise ValueError(f"activation: expected one of {', '.join(ACTIVATIONS)}, got {about.activation!r}")
     node_MPa = finite_array(arrays, "node_MPa", (None,))
-    _check_nodes(node_MPa, about.calibrated_MPa)
+    check_nodes(node_MPa, about.calibrated_MPa)
     typical_pC = finite_array(arrays, "typical_pC", (None,))
     low_pC, high_pC = about.limits_pC
     if not ((typical_pC > 0.0).all() and low_pC < high_pC):
@@ -317,27 +286,6 @@ def _check_misfits(pretensions: Pretensions) -> None:
         misfit_vectors = interpolated_network.vectors(charges_pC, checked_MPa)
     if not np.isfinite(misfit_vectors).all():
         raise ValueError("the weights give misfits that are not finite")
-
-
-def _check_nodes(node_MPa: Array, calibrated_MPa: float) -> None:
-    """Check the pretensions (nodes) at which the weights of a network are given.
-
-    Args:
-        node_MPa: The pretensions, shape (k,), MPa.
-        calibrated_MPa: Pretension of the calibration, MPa.
-
-    Raises:
-        ValueError: If the pretensions are not in ascending order or too close to each other, if there are fewer than
-            two or too many, if a pretension is too large, or if the pretension of the calibration is not one of them.
-    """
-    has_valid_count = 2 <= node_MPa.size <= MAX_NODES
-    is_rising = bool((np.diff(node_MPa) >= MIN_NODE_DISTANCE_MPa).all())
-    is_in_range = bool((np.abs(node_MPa) <= MAX_PRETENSION_MPa).all())
-    if not (has_valid_count and is_rising and is_in_range and calibrated_MPa in node_MPa):
-        raise ValueError(
-            f"node_MPa: expected 2 to {MAX_NODES} rising pretensions up to {MAX_PRETENSION_MPa:g} MPa with "
-            f"{calibrated_MPa:g} MPa among them, got {cut(str(node_MPa))}"
-        )
 
 
 def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: int) -> list[str]:

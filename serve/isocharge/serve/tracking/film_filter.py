@@ -31,16 +31,11 @@ from isocharge.serve.tracking.film_unknowns import UnknownsLayout
 from isocharge.serve.tracking.film_update import TouchResiduals, kalman_update, multiply_stacks
 from isocharge.serve.tracking.pretension_grid import (
     GRID_STEP_MPa,
-    evenly_spaced,
     normal_probabilities,
+    pretension_grid,
     smooth_moments,
 )
-
-NETWORK_STEP_MPa = 0.1
-"""Distance between the pretensions at which the network is evaluated, MPa.
-
-The misfit vectors of other pretensions are interpolated.
-"""
+from isocharge.serve.tracking.touch_misfits import TouchMisfits
 
 JUMP_PROBABILITY = 5e-4
 """Probability that the pretension jumps between two touches. After a jump, all pretensions are equally likely."""
@@ -104,6 +99,7 @@ class FilmFilter:
         self,
         pretensions: Pretensions,
         directions: FilmDirections,
+        misfits: TouchMisfits,
         drift_MPa_per_root_hour: float,
         largest_offset_pC: float,
         offset_ratio: Array,
@@ -115,6 +111,7 @@ class FilmFilter:
         Args:
             pretensions: Weights of the network at any pretension.
             directions: Combinations of film parameters that are uncertain at a given pretension.
+            misfits: Method that computes the misfit vectors of touches at the pretensions of `pretension_grid`.
             drift_MPa_per_root_hour: Standard deviation of the change of the pretension in an hour, MPa. The standard
                 deviation is proportional to the square root of the time.
             largest_offset_pC: Largest standard deviation of the offsets that the filter tolerates, pC; 0 if touches
@@ -122,11 +119,9 @@ class FilmFilter:
             offset_ratio: Charge that an offset adds to each electrode, relative to the common offset, shape
                 (n_electrode,).
         """
-        low_MPa, high_MPa = pretensions.range_MPa
-        self.grid_MPa = evenly_spaced(low_MPa, high_MPa, GRID_STEP_MPa)
+        self.grid_MPa = pretension_grid(pretensions)
         self._pretensions = pretensions
-        # The network is evaluated on a coarser grid. Its results are interpolated to the pretensions of `grid_MPa`.
-        self._network = pretensions.at(evenly_spaced(low_MPa, high_MPa, NETWORK_STEP_MPa))
+        self._misfits = misfits
         self._drift_MPa_per_root_hour = drift_MPa_per_root_hour
         self._largest_offset_pC = largest_offset_pC
         self._offset_ratio = offset_ratio
@@ -398,27 +393,24 @@ class FilmFilter:
         self._mean = normalised_moments[..., mean_columns]
         self._covariance = normalised_moments[..., covariance_columns].reshape(level_count, grid_size, size, size)
 
-    def update(self, charge_pC: Array, log_changes: Array, misfit_slopes: Array | None = None) -> TouchResiduals:
+    def update(self, charge_pC: Array, contact: Array, log_changes: Array) -> TouchResiduals:
         """Update the probability distribution of the unknowns with a touch.
 
         With a small probability, the touch is an outlier. The changes that the Kalman update computes are therefore
         multiplied by the probability that the touch is not an outlier.
 
-        The misfit vector is the part of the charges that no contact explains. A direction is a combination of film
-        parameters that remained uncertain after the calibration.
+        A direction is a combination of film parameters that remained uncertain after the calibration.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
+            contact: Contact (x, y, F) that the network computed from the charges, shape (3,), mm and N.
             log_changes: Changes of the logarithms of the charges by one unit of each direction at the contact, shape
                 (n_direction, n_electrode).
-            misfit_slopes: Derivatives of the misfit vector with respect to the logarithms of the charges, shape
-                (n_electrode, n_electrode), in units of the noise. If None, the derivatives are computed as finite
-                differences with the network.
 
         Returns:
             The squared misfits that remain after the update.
         """
-        misfit, jacobian = self._linearise(charge_pC, log_changes, misfit_slopes)
+        misfit, jacobian = self._linearise(charge_pC, contact, log_changes)
         noise_covariance = self._noise_covariance(jacobian)
         kalman = kalman_update(misfit, jacobian, noise_covariance, self._mean, self._covariance)
 
@@ -454,7 +446,7 @@ class FilmFilter:
         scatter_covariance = scatter_variance * outer_product
         return np.asarray(np.eye(self._layout.electrodes) + scatter_covariance)
 
-    def _linearise(self, charge_pC: Array, log_changes: Array, misfit_slopes: Array | None) -> tuple[Array, Array]:
+    def _linearise(self, charge_pC: Array, contact: Array, log_changes: Array) -> tuple[Array, Array]:
         """Compute the misfit vectors of a touch, and their Jacobian with respect to the linear unknowns.
 
         The misfit vector is the part of the charges that no contact explains. There is one misfit vector for each
@@ -462,20 +454,15 @@ class FilmFilter:
         directions (uncertain combinations of film parameters), and the offset (a charge that is added to all
         electrodes).
 
-        A unit step of a gain or of a direction changes the logarithms of the charges. The derivative with respect to
-        the gain or the direction is the product of the misfit slopes and the change of the logarithms. Without misfit
-        slopes, this derivative is a finite difference.
-
-        The derivative with respect to the offset is always a finite difference. The step of this difference is the mean
-        offset that was estimated at the offset level. The linearised misfit vector is therefore exact for charges from
-        which the mean offset is subtracted.
+        The derivative with respect to the offset is a finite difference. The step of this difference is the mean offset
+        that was estimated at the offset level. The linearised misfit vector is therefore exact for charges from which
+        the mean offset is subtracted.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
+            contact: Contact (x, y, F) that the network computed from the charges, shape (3,), mm and N.
             log_changes: Changes of the logarithms of the charges by one unit of each direction at the contact, shape
                 (n_direction, n_electrode).
-            misfit_slopes: Derivatives of the misfit vector with respect to the logarithms of the charges, as for
-                `update`.
 
         Returns:
             Misfit vectors, shape (n_pretension, n_electrode). Jacobian of the misfit vectors, shape (n_level,
@@ -485,50 +472,20 @@ class FilmFilter:
         gain_changes = GAIN_STD * np.eye(layout.electrodes)  # changes of the logarithms; one row for each gain
         offset_step_pC = self._offset_steps()  # shape (n_level,)
 
-        # One call evaluates the network for the charges of the touch (first row) and for the charges without the offset
-        # of each level (all other rows).
+        # The first row contains the charges of the touch. All other rows are the charges without the offset of a level.
         charges_without_offset = charge_pC - np.outer(offset_step_pC, self._offset_ratio)
-        misfit_vectors = self._misfit_vectors(np.vstack([charge_pC, charges_without_offset]))
-        misfit = misfit_vectors[0]  # shape (n_pretension, n_electrode)
-        misfit_without_offset = misfit_vectors[1:]  # shape (n_level, n_pretension, n_electrode)
+        linearised = self._misfits.linearise(
+            np.vstack([charge_pC, charges_without_offset]), contact, np.vstack([gain_changes, log_changes])
+        )
+        misfit = linearised.vectors[0]  # shape (n_pretension, n_electrode)
+        misfit_without_offset = linearised.vectors[1:]  # shape (n_level, n_pretension, n_electrode)
 
         # The derivatives with respect to gains and directions are the same at every level.
         jacobian = np.empty((*self._joint_probability.shape, layout.electrodes, layout.size))
         jacobian[..., layout.offset] = (misfit - misfit_without_offset) / offset_step_pC[:, None, None]
-        if misfit_slopes is None:
-            jacobian[..., layout.gains] = self._misfit_differences(charge_pC, misfit, gain_changes)
-            jacobian[..., layout.directions] = self._misfit_differences(charge_pC, misfit, log_changes)
-        else:
-            slopes = misfit_slopes / self._pretensions.misfit_rms
-            jacobian[..., layout.gains] = slopes @ gain_changes.T
-            jacobian[..., layout.directions] = slopes @ log_changes.T
+        jacobian[..., layout.gains] = linearised.changes[..., : layout.electrodes]
+        jacobian[..., layout.directions] = linearised.changes[..., layout.electrodes :]
         return misfit, jacobian
-
-    def _misfit_vectors(self, charge_pC: Array) -> Array:
-        """Compute the misfit vectors of the given charges at every pretension of the grid.
-
-        Args:
-            charge_pC: Charges, shape (n, n_electrode), pC.
-
-        Returns:
-            Misfit vectors, shape (n, n_pretension, n_electrode), relative to the root mean square misfit of good
-            touches.
-        """
-        return self._network.vectors(charge_pC, self.grid_MPa) / self._pretensions.misfit_rms
-
-    def _misfit_differences(self, charge_pC: Array, misfit: Array, log_changes: Array) -> Array:
-        """Compute how given changes of the charges of a touch change the misfit vectors of the touch.
-
-        Args:
-            charge_pC: Touch charges, shape (n_electrode,), pC.
-            misfit: Misfit vectors of the unchanged charges, shape (n_pretension, n_electrode).
-            log_changes: Changes of the logarithms of the charges, shape (n_change, n_electrode).
-
-        Returns:
-            Changes of the misfit vectors, shape (n_pretension, n_electrode, n_change).
-        """
-        changed_misfit = self._misfit_vectors(charge_pC * np.exp(log_changes))
-        return np.moveaxis(changed_misfit - misfit, 0, 2)  # the axis of the changes becomes the last axis
 
     def _offset_steps(self) -> Array:
         """Return the step of the finite difference with respect to the offset at each level, shape (n_level,), pC.

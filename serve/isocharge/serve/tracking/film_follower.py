@@ -39,6 +39,7 @@ from isocharge.serve.tracking.film_state import FilmStateEstimate
 from isocharge.serve.tracking.film_update import TouchResiduals
 from isocharge.serve.tracking.followable_pretensions import followable_pretensions
 from isocharge.serve.tracking.pretension_grid import odds_of_no_change
+from isocharge.serve.tracking.touch_misfits import touch_misfits
 
 HARMLESS_FLAGS = frozenset({STRESS, GAP, REPEAT})
 """Flags of a frame with which its touch remains usable. GAP and REPEAT only mean that frames were lost."""
@@ -79,7 +80,7 @@ The reduction is the smallest sum for any pretension minus the smallest sum for 
 OFFSET_CORRECTION_ERROR = 0.5
 """Standard deviation of the correction of the pretension for offsets, in units of the correction."""
 
-UNCHANGED_PROBABILITY = 0.2
+UNCHANGED_PROBABILITY = 0.3
 """Probability before the first touch that the pretension has not changed since the calibration."""
 
 SENSITIVITY_STEP_MPa = 0.05
@@ -179,10 +180,13 @@ class FilmFollower:
         self._pretensions = followable_pretensions(predictor)
         electrodes = self._pretensions.typical_pC.size
         self._directions = read_film_directions(predictor.folder, electrodes)
+        self._misfits = touch_misfits(predictor, self._pretensions)
+        self._calibrated_misfits = self._misfits.at(self._pretensions.calibrated_MPa)
         rule = rule or FollowRule()
         self._filter = FilmFilter(
             self._pretensions,
             self._directions,
+            self._misfits,
             rule.drift_MPa_per_root_hour,
             rule.largest_offset_pC,
             np.broadcast_to(np.asarray(offset_ratio, dtype=float), (electrodes,)),
@@ -202,6 +206,7 @@ class FilmFollower:
         """Discard all touches, and assume again that the film has not changed since the calibration."""
         self._filter.reset()
         self.predictor = self._calibrated_predictor
+        self._applied_misfits = self._calibrated_misfits
         self.is_lost = False
         self._applied_estimate = self._calibrated_estimate
 
@@ -329,10 +334,9 @@ class FilmFollower:
         contacts = np.array([peak.contact[:3]])  # one contact (x, y, force), shape (1, 3)
         log_changes = self._directions.log_changes(contacts)[0]
         self._filter.predict(clock_s)
-        misfit_slopes = self._misfit_slopes(contacts, peak.charge_pC)
-        residuals = self._filter.update(peak.charge_pC, log_changes, misfit_slopes)
+        residuals = self._filter.update(peak.charge_pC, contacts[0], log_changes)
         self._touch_count += 1
-        self._recent_misfits.append(self._squared_misfits(peak.charge_pC, log_changes, residuals))
+        self._recent_misfits.append(self._squared_misfits(peak, log_changes, residuals))
         if len(self._recent_misfits) < FEWEST_TOUCHES:
             return
 
@@ -346,21 +350,6 @@ class FilmFollower:
             self._apply_estimate(self._estimate_before_recent_touches())
             self._recent_estimates.clear()
 
-    def _misfit_slopes(self, contacts: Array, charge_pC: Array) -> Array | None:
-        """Return the derivatives of the misfit vector of a touch with respect to the logarithms of its charges.
-
-        Args:
-            contacts: The contact (x, y, F), shape (1, 3), mm and N.
-            charge_pC: Touch charges, shape (n_electrode,), pC.
-
-        Returns:
-            Derivatives, shape (n_electrode, n_electrode), in units of the noise; None if the file of directions does
-            not contain the charges of the calibrated film.
-        """
-        noise_std_pC = np.sqrt(self._calibrated_predictor.metadata.noise.variance(charge_pC))
-        slopes = self._directions.misfit_slopes(contacts, charge_pC[None], noise_std_pC[None])
-        return None if slopes is None else slopes[0]
-
     def _estimate_before_recent_touches(self) -> FilmStateEstimate:
         """Return the estimate before the latest `RECENT_TOUCHES` touches.
 
@@ -369,13 +358,13 @@ class FilmFollower:
         is_long_enough = len(self._recent_estimates) == RECENT_TOUCHES
         return self._recent_estimates[0] if is_long_enough else self._calibrated_estimate
 
-    def _squared_misfits(self, charge_pC: Array, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
+    def _squared_misfits(self, peak: PeakFrame, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
         """Compute the squared misfits of a touch, which are needed to decide whether the film is lost.
 
         Each squared misfit is limited to `LARGEST_SQUARE`, so that a single touch has little influence.
 
         Args:
-            charge_pC: Touch charges Q of the frame with the largest force, shape (n_electrode,), pC.
+            peak: The frame with the largest force, with the touch charges Q.
             log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode). A direction is
                 an uncertain combination of film parameters.
             residuals: Squared misfits that the filter computed for the touch.
@@ -384,8 +373,8 @@ class FilmFollower:
 
         # Remove the estimated offset, and the estimated changes of the film along the directions.
         direction_means = self._filter.direction_means(self._filter.mean_MPa)
-        corrected_pC = (charge_pC - self._filter.offset_pC) * np.exp(-direction_means @ log_changes)
-        wrong_gain = self._squared_misfits_of_wrong_gains(corrected_pC, residuals.offset_variance)
+        corrected_pC = (peak.charge_pC - self._filter.offset_pC) * np.exp(-direction_means @ log_changes)
+        wrong_gain = self._squared_misfits_of_wrong_gains(corrected_pC, peak.contact, residuals.offset_variance)
         return SquaredMisfits(
             with_gains=with_gains,
             at_touch_estimate=float(with_gains[self._filter.nearest_index]),
@@ -393,25 +382,27 @@ class FilmFollower:
             wrong_gain=np.minimum(wrong_gain, LARGEST_SQUARE),
         )
 
-    def _squared_misfits_of_wrong_gains(self, corrected_pC: Array, offset_variance: float) -> Array:
+    def _squared_misfits_of_wrong_gains(self, corrected_pC: Array, contact: Contact, offset_variance: float) -> Array:
         """Compute the squared misfit of a touch for each hypothesis that the gain of one electrode is wrong.
 
         Args:
             corrected_pC: Charges after a correction for the offset and the directions, shape (n_electrode,), pC.
+            contact: Contact that the model computed for the touch.
             offset_variance: Variance of the misfit that is caused by the deviation of the offset of this touch from
                 the mean offset, relative to the mean squared misfit of good touches.
 
         Returns:
-            Squared misfits, first with the model of the calibrated film and then with the model of the estimated
-            pretension, shape (2 * n_wrong_gain * n_electrode,). They are relative to the mean squared misfit of good
-            touches.
+            Squared misfits, first at the calibrated pretension and then at the estimated pretension, shape
+            (2 * n_wrong_gain * n_electrode,). They are relative to the mean squared misfit of good touches.
         """
         charges_with_wrong_gain_pC = corrected_pC * self._wrong_gains  # one row for each wrong gain
-        calibrated_misfit = self._calibrated_predictor.predict_batch(charges_with_wrong_gain_pC).misfit
-        followed_misfit = self.predictor.predict_batch(charges_with_wrong_gain_pC).misfit
-        misfit = np.concatenate([calibrated_misfit, followed_misfit]).astype(float)
-        mean_square_of_good_touches = self._pretensions.misfit_rms**2 * (1.0 + offset_variance)
-        return np.asarray(misfit**2 / mean_square_of_good_touches)
+        start = np.array(contact[:3])
+        no_changes = np.empty((0, corrected_pC.size))
+        squares = []
+        for misfits in (self._calibrated_misfits, self._applied_misfits):
+            linearised = misfits.linearise(charges_with_wrong_gain_pC, start, no_changes)
+            squares.append((linearised.vectors[:, 0] ** 2).sum(axis=1))  # there is only one pretension
+        return np.concatenate(squares) / (1.0 + offset_variance)
 
     def _is_unexplained(self) -> bool:
         """Return whether no pretension explains the latest touches.
@@ -493,6 +484,7 @@ class FilmFollower:
         else:
             self._applied_estimate = estimate
             self.predictor = self._model_with_pretension(estimate.pretension_MPa)
+            self._applied_misfits = self._misfits.at(estimate.pretension_MPa)
 
         # The first estimate needs the neighbouring model even if the pretension has not changed.
         if not is_same_pretension or self._neighbouring_model is None:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from isocharge.common.arrays import Array, Reals
+from isocharge.serve.model.pretensions import Pretensions
 
 GRID_STEP_MPa = 0.02
 """Distance between neighbouring pretensions of the grid, MPa."""
@@ -17,6 +18,16 @@ def evenly_spaced(low: float, high: float, step: float) -> Array:
     """
     interval_count = max(round((high - low) / step), 1)
     return np.linspace(low, high, interval_count + 1)
+
+
+def pretension_grid(pretensions: Pretensions) -> Array:
+    """Return the evenly spaced pretensions at which a follower computes probabilities, MPa.
+
+    Args:
+        pretensions: Weights of the network, which define the range of the grid.
+    """
+    low_MPa, high_MPa = pretensions.range_MPa
+    return evenly_spaced(low_MPa, high_MPa, GRID_STEP_MPa)
 
 
 def normal_probabilities(deviation: Reals, std: float) -> Array:

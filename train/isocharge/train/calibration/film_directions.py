@@ -14,7 +14,6 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.model.film_directions import FilmDirections
 from isocharge.simulate import Domain
-from isocharge.train.calibration.contact_error import spread_contacts
 from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.data.charge_field import fit_series
 
@@ -29,12 +28,6 @@ LEAST_MISFIT = 0.2
 
 The effect is the root mean square of the misfit that one standard deviation of the direction causes. More directions
 hardly change the followed contacts."""
-
-N_CHARGE_CONTACTS = 1200
-"""Number of contacts to which the series of ln Q of the calibrated film is fitted."""
-
-CHARGE_DEGREES = (12, 3)
-"""Degrees in the position and in ln F of the series of ln Q. The service also uses the derivatives of this series."""
 
 MAX_DIRECTIONS = 16
 """Largest number of directions. With more directions, the computation for each touch would take longer."""
@@ -84,27 +77,7 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
         radius_mm=problem.domain.radius,
         force_N=problem.domain.force_range,
         by_pretension=mean_by_pretension / problem.prior.std[pretension],
-        log_charge_coefficients=_fitted_log_charge(result),
     )
-
-
-def _fitted_log_charge(result: CalibrationResult) -> Array | None:
-    """Fit a polynomial series in the contact to the logarithms of the charges of the calibrated film.
-
-    Args:
-        result: Result of the calibration of the film.
-
-    Returns:
-        Coefficients of the series, shape (degree + 1, degree + 1, force_degree + 1, n_electrode). None if some charge
-        of the film is not positive and therefore has no logarithm.
-    """
-    problem = result.problem
-    contact = spread_contacts(problem.domain, N_CHARGE_CONTACTS)
-    charge = problem.charges.charges(result.posterior.unknowns, contact)
-    if charge.min() <= 0.0:
-        return None
-    degree, force_degree = CHARGE_DEGREES
-    return fit_series(problem.domain.to_unit(contact), np.log(charge), degree, force_degree)
 
 
 def _visible_directions(misfit_jacobian: Array, root: Array) -> Array:

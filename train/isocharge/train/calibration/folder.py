@@ -6,6 +6,7 @@
     FOLDER/<version>/calibration.json    parameters, errors, correlations, and quantities of the film
     FOLDER/<version>/presses.csv   the presses; missing if the calibration was only moved to another temperature
     FOLDER/<version>/pretensions.npz     weights for `serve stream --follow`, with four electrodes or more
+    FOLDER/<version>/film_charges.npz       charges of the film at several pretensions, for `serve stream --follow`
     FOLDER/<version>/film_directions.npz    further uncertainty of the film, for `serve stream --follow`
     FOLDER/<version>/calibration.png     picture of the calibration
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the files of the last version
@@ -31,6 +32,7 @@ from isocharge.common.files import as_output_errors, remove_empty, write_whole
 from isocharge.common.json_values import plain_values
 from isocharge.common.measured_presses import presses_text
 from isocharge.common.resumable_run import locked
+from isocharge.serve.model.film_charges import FILE as FILM_CHARGES
 from isocharge.serve.model.film_directions import FILE as DIRECTIONS
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, version_folders
@@ -39,6 +41,7 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.calibration_file import film_table, read_film
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.cross_validation import FOLD_COUNT
+from isocharge.train.calibration.film_charge_series import film_charge_series
 from isocharge.train.calibration.film_directions import film_directions
 from isocharge.train.calibration.following import pretensions_of
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
@@ -198,6 +201,9 @@ def _write_version(result: CalibrationResult, folder: Path, command: str) -> Pat
     if pretensions is not None:
         files[PRETENSIONS] = pretensions.to_bytes()
         files[DIRECTIONS] = film_directions(result).to_bytes()
+        series = film_charge_series(result, pretensions.range_MPa)
+        if series is not None:
+            files[FILM_CHARGES] = series.to_bytes()
 
     released_model = release(
         replace(fitted, provenance=Provenance(files=files)),
