@@ -35,7 +35,7 @@ from isocharge.simulate import Circle, ForwardMap, load_sensor
 from isocharge.simulate.plots.figure import new_figure
 from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.baselines.gauss_newton import GaussNewton
-from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
+from isocharge.train.calibration.contact_error import ContactSensitivity, fisher_information
 from isocharge.train.calibration.quantities import NORMAL_95
 from isocharge.train.data.presses import draw_contacts
 
@@ -72,9 +72,9 @@ def linearised_limit(problem: CalibrationProblem, truth: np.ndarray, contact: np
     Returns:
         Root-mean-square errors of the position, mm, and of the force, %.
     """
-    press_information = information_of(problem, truth, contact, POSITION_STD_mm, FORCE_STD).sum(axis=0)
+    press_information = fisher_information(problem, truth, contact, POSITION_STD_mm, FORCE_STD).sum(axis=0)
     covariance = np.linalg.inv(np.eye(truth.size) + press_information)
-    error = ContactSensitivity.at(problem, truth).contact_error(covariance)
+    error = ContactSensitivity.for_film(problem, truth).contact_error(covariance)
     return error.position_mm, error.force_percent
 
 

@@ -18,8 +18,8 @@ from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_di
 from isocharge.simulate.solver.stress_limit import largest_stress
 from isocharge.train import CalibrationProblem, calibrate, next_presses
 from isocharge.train.calibration import hypotheses
-from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
-from isocharge.train.calibration.contacts import with_force
+from isocharge.train.calibration.contact_error import ContactSensitivity, fisher_information
+from isocharge.train.calibration.contacts import from_log_contact
 from isocharge.train.calibration.film_fit import fit_film
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.data.presses import draw_contacts
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.usefixtures("no_closed_backs")
 
 def press_data(problem, presses) -> PressData:
     """Return presses in the form of the least-squares fit."""
-    return PressData.of(presses, problem.noise, problem.charges.domain)
+    return PressData.from_presses(presses, problem.noise, problem.charges.domain)
 
 
 def fit(problem, presses):
@@ -62,7 +62,7 @@ def test_fit_is_the_minimum_over_parameters_and_contacts(count, seed, problem, m
         scaled_parameters, flat_contact = np.split(unknowns, [n_parameter])
         parameters = scaled_parameters * prior.std
         contact = flat_contact.reshape(-1, 3)
-        charge_residual = data.weight * (charges.charges(parameters, with_force(contact)) - data.charge)
+        charge_residual = data.weight * (charges.charges(parameters, from_log_contact(contact)) - data.charge)
         rig_residual = data.contact_weight * (contact - data.contact)
         prior_residual = (parameters - prior.mean) / prior.std
         return np.concatenate([charge_residual.ravel(), rig_residual.ravel(), prior_residual])
@@ -243,8 +243,8 @@ def test_error_by_the_film_is_near_the_linearised_limit(layout):
     for seed in range(3):
         truth, presses = rig(layout, 8, seed=200 + seed)
         result = calibrate(presses, layout)
-        sensitivity = ContactSensitivity.at(layout, truth)
-        information = np.eye(truth.size) + information_of(layout, truth, presses.contact).sum(axis=0)
+        sensitivity = ContactSensitivity.for_film(layout, truth)
+        information = np.eye(truth.size) + fisher_information(layout, truth, presses.contact).sum(axis=0)
         limit = sensitivity.contact_error(np.linalg.inv(information))
         deviation = (result.posterior.parameters - truth) / layout.prior.std
         contact_error = sensitivity.contact_jacobian @ deviation
@@ -314,11 +314,11 @@ def test_press_far_from_the_centre_is_left_out_and_named(problem):
 def test_proposed_presses_reduce_the_error_more_than_random_presses(problem):
     proposed = next_presses(problem, 8)
     film = problem.expected
-    sensitivity = ContactSensitivity.at(problem, film.unknowns)
+    sensitivity = ContactSensitivity.for_film(problem, film.unknowns)
 
     def remaining_error_mm(contact):
         """Return the position error after presses at contacts (x, y, F), by the information of all presses."""
-        information = information_of(problem, film.unknowns, contact).sum(axis=0)
+        information = fisher_information(problem, film.unknowns, contact).sum(axis=0)
         covariance = film.joint @ np.linalg.inv(np.eye(len(film.joint)) + information @ film.joint)
         return sensitivity.contact_error(covariance).position_mm
 

@@ -7,7 +7,7 @@ from tests.train.calibration.conftest import film_of
 
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem
-from isocharge.train.calibration.contacts import adjust_contacts, best_adjusted_contacts, with_force
+from isocharge.train.calibration.contacts import adjust_contacts, best_adjusted_contacts, from_log_contact
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.data.presses import draw_contacts
 
@@ -32,7 +32,7 @@ def touch_data(problem, unknowns, seed):
     contact = draw_contacts(rng, problem.domain, 100)
     charge = problem.noise.add(problem.charges.charges(unknowns, contact), rng)
     presses = measured_presses(problem, np.full_like(contact, np.nan), charge)
-    return contact, PressData.of(presses, problem.noise, problem.charges.domain)
+    return contact, PressData.from_presses(presses, problem.noise, problem.charges.domain)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_residuals_of_unknown_contacts_are_those_of_the_film_at_these_contacts(p
     """The search uses a linear approximation of the imperfections, which is inaccurate far from its start."""
     _, data = touches
     adjusted = best_adjusted_contacts(problem.charges, uneven_film, data)
-    charge = problem.charges.charges(uneven_film, with_force(adjusted.contact))
+    charge = problem.charges.charges(uneven_film, from_log_contact(adjusted.contact))
     np.testing.assert_allclose(adjusted.residual, data.residual(charge, adjusted.contact), atol=0.15)
 
 
@@ -65,7 +65,7 @@ def test_measured_contacts_need_only_one_search(problem, uneven_film, touches):
     """The search begins at the measured contact, which is so close that no further start is tried."""
     contact, data = touches
     presses = measured_presses(problem, contact, data.charge)
-    measured = PressData.of(presses, problem.noise, problem.charges.domain)
+    measured = PressData.from_presses(presses, problem.noise, problem.charges.domain)
     start = np.column_stack([contact[:, :2], np.log(contact[:, 2])])
     from_measured = adjust_contacts(problem.charges, uneven_film, measured, start)
     best = best_adjusted_contacts(problem.charges, uneven_film, measured)

@@ -14,7 +14,7 @@ def test_evidence_and_posterior_of_a_linear_model():
     jacobian = rng.normal(size=(12, 5))
     residual = rng.normal(size=12)
     prior_covariance = np.diag([1.0, 0.25, 4.0, 1.0, 0.0])  # the last unknown is excluded
-    model = hypotheses.LinearModel.of(jacobian, residual, np.zeros(5))
+    model = hypotheses.LinearModel.from_residuals(jacobian, residual, np.zeros(5))
     mean, covariance = model.posterior(prior_covariance)
 
     residual_covariance = np.eye(12) + jacobian @ prior_covariance @ jacobian.T
@@ -28,7 +28,7 @@ def test_evidence_and_posterior_of_a_linear_model():
 def test_mixture_has_the_mean_and_second_moments_of_its_hypotheses():
     """Each hypothesis is weighted by the product of its evidence and its prior probability."""
     rng = np.random.default_rng(4)
-    model = hypotheses.LinearModel.of(rng.normal(size=(12, 3)), rng.normal(size=12), np.zeros(3))
+    model = hypotheses.LinearModel.from_residuals(rng.normal(size=(12, 3)), rng.normal(size=12), np.zeros(3))
     prior_covariances = {
         hypotheses.Hypothesis(prior_probability=0.7): np.eye(3),
         hypotheses.Hypothesis(discrepancy=1.0, prior_probability=0.3): np.eye(3) / 4,
@@ -40,8 +40,8 @@ def test_mixture_has_the_mean_and_second_moments_of_its_hypotheses():
     second_moments = [covariance + np.outer(mean, mean) for mean, covariance in posteriors]
 
     mixture = hypotheses.mix_hypotheses({0.0: model}, prior_covariances.get, prior_covariances)
-    np.testing.assert_allclose(mixture.mean, weights @ [mean for mean, _ in posteriors])
-    found_second_moment = mixture.covariance + np.outer(mixture.mean, mixture.mean)
+    np.testing.assert_allclose(mixture.mean_change, weights @ [mean for mean, _ in posteriors])
+    found_second_moment = mixture.covariance + np.outer(mixture.mean_change, mixture.mean_change)
     np.testing.assert_allclose(found_second_moment, np.einsum("h,hij->ij", weights, second_moments))
     assert list(mixture.probabilities.values()) == pytest.approx(weights)
 
@@ -58,7 +58,7 @@ def test_scatter_of_forces_is_noise_along_one_direction_of_each_press():
 
     jacobian_along = np.einsum("nk,nku->nu", direction, jacobian)
     residual_along = (direction * residual).sum(axis=1)
-    model = hypotheses.LinearModel.of(jacobian.reshape(12, 2), residual.ravel(), at_mean)
+    model = hypotheses.LinearModel.from_residuals(jacobian.reshape(12, 2), residual.ravel(), at_mean)
     noisy_model = model.with_added_noise(jacobian_along, residual_along, at_mean, noise_variance)
 
     press_noises = [

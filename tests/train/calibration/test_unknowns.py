@@ -43,7 +43,7 @@ def test_the_probabilities_of_all_hypotheses_add_up():
 @pytest.mark.parametrize("nuisance", NUISANCES, ids=lambda nuisance: nuisance.name)
 def test_derivatives_with_respect_to_a_nuisance_are_finite_differences(problem, nuisance):
     parameters, presses = rig(problem, 6, seed=7)
-    data = PressData.of(presses, problem.noise, problem.charges.domain)
+    data = PressData.from_presses(presses, problem.noise, problem.charges.domain)
     friction_charge = np.linspace(-9.0, 9.0, data.charge.size).reshape(data.charge.shape)
     data = replace(data, warming_K=np.linspace(-1.0, 1.0, 6), friction_charge=friction_charge)
     pretension = problem.charges.layout.parameter("pretension")

@@ -12,8 +12,9 @@ def most_probable_within(bounds: tuple[Array, Array], mean: Array, covariance: A
     """Return the most probable point of a multivariate normal distribution within bounds.
 
     The search begins at the mean. In each step, the unknown that is farthest beyond its bound is fixed at this bound.
-    The other unknowns are set to their conditional mean, given the fixed unknown. The steps are repeated until every
-    unknown lies within its bounds.
+    The other unknowns are set to their conditional mean, given all fixed unknowns. The steps are repeated until every
+    unknown lies within its bounds. A fixed unknown is never released again. If several unknowns are fixed, the result
+    may therefore differ slightly from the exact solution.
 
     Args:
         bounds: Lower and upper bounds, each of shape (n_unknown,).
@@ -25,7 +26,7 @@ def most_probable_within(bounds: tuple[Array, Array], mean: Array, covariance: A
     """
     unknowns = mean
     for _ in range(len(mean)):  # each step fixes one unknown, so there are at most as many steps as unknowns
-        excess = unknowns - np.clip(unknowns, *bounds)
+        excess = unknowns - np.clip(unknowns, *bounds)  # signed distance beyond a bound; 0 within the bounds
         farthest = int(np.abs(excess).argmax())
         if abs(excess[farthest]) < BOUND_TOLERANCE:
             break

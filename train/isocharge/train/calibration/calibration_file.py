@@ -1,10 +1,11 @@
 """Writer and reader of `calibration.json`, the file with the estimate of a film.
 
 The file contains the value and the standard deviation of each parameter of the film. The section `correlations`
-contains the correlations of all parameters, rounded to six digits. If the film has a discrepancy, the section
-`discrepancy` contains the coefficients of the film. The section `discrepancy` also contains the standard deviations and
-the correlations of all parameters and coefficients. If temperatures were measured, the section `temperature` states how
-the pretension changes with temperature.
+contains the correlations of all parameters, rounded to six digits. The unknowns of a film are its parameters and, if
+the film has imperfections or a discrepancy, coefficients that describe these effects. The section `discrepancy`
+contains the coefficients. This section also contains the standard deviations and the correlations of the parameters and
+coefficients together. If temperatures were measured, the section `temperature` states how the pretension changes with
+temperature.
 
 If the standard deviation of an unknown is zero, its correlations with other unknowns are not defined, and zeros are
 written for them. Older versions of this module wrote null for undefined correlations. The reader replaces such a null
@@ -28,7 +29,7 @@ from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 FORMAT_VERSION = 1
 """Version of the file format that this module writes and reads."""
 
-PASCAL_FACTOR = 1e6
+PA_PER_MPA = 1e6
 """Factor that converts MPa to Pa. The file contains the pretension in Pa."""
 
 LARGEST_STD = 100.0
@@ -41,15 +42,19 @@ BOUND_TOLERANCE = 1e-6
 """Largest distance of a parameter beyond its bounds that counts as a rounding error, in prior standard deviations."""
 
 CORRELATION_TOLERANCE = 2e-6
-"""Largest difference of two correlations that counts as rounding, because correlations are written with six digits."""
+"""Largest difference of two equal correlations that counts as a rounding error.
+
+Correlations are written with six digits."""
 
 EIGENVALUE_TOLERANCE = 1e-4
-"""Largest magnitude of a negative eigenvalue of a correlation matrix that counts as rounding.
+"""Largest magnitude of a negative eigenvalue of a correlation matrix that counts as a rounding error.
 
 Rounding the correlations of 160 unknowns causes negative eigenvalues of about 1e-5."""
 
 TEMPERATURES_C = (-100.0, 200.0)
-"""Lowest and highest temperature of a film that the reader accepts, degrees Celsius, as in files of presses."""
+"""Lowest and highest temperature of a film that the reader accepts, degrees Celsius.
+
+The limits are the same in files of presses."""
 
 
 class _Estimate(Struct, frozen=True):
@@ -71,7 +76,10 @@ class _Temperature(Struct, frozen=True):
 
 
 class _Discrepancy(Struct, frozen=True):
-    """Section `discrepancy` of the file, which contains the coefficients of the film."""
+    """Section `discrepancy` of the file, which contains the coefficients of the film.
+
+    The standard deviations and correlations are those of the parameters, followed by those of the coefficients.
+    """
 
     coefficients: list[Finite]
     std: list[NotNegative]
@@ -107,9 +115,9 @@ def film_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, Any]:
 
 
 def _parameter_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, dict[str, float]]:
-    """Return the value and the standard deviation of each parameter, by the name of the parameter.
+    """Return the value and the standard deviation of each parameter in the units of the file.
 
-    The values have the units of the file.
+    The keys of the result are the names of the parameters.
 
     Args:
         prior: Distribution of the films, with the names and units of the parameters.
@@ -117,7 +125,7 @@ def _parameter_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, di
     """
     file_factors = prior.file_factors  # factors from the units of the prior to those of the file
     values = file_factors * posterior.parameters
-    # The covariance is in units of the prior standard deviations.
+    # The covariance is in units of the prior standard deviations, so its square roots are multiplied by them.
     stds = file_factors * prior.std * np.sqrt(np.diag(posterior.covariance))
     return {
         name: {"value": float(value), "std": float(std)}
@@ -128,7 +136,8 @@ def _parameter_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, di
 def _correlation_table(covariance: Array) -> list[list[float]]:
     """Convert a covariance matrix into rows of correlations, rounded to six digits.
 
-    If the variance of an unknown is zero, its correlations with all other unknowns are set to zero.
+    If the variance of an unknown is zero, its correlations with all other unknowns are set to zero. All diagonal
+    elements are one.
 
     Args:
         covariance: Covariance matrix, shape (n, n).
@@ -142,8 +151,8 @@ def _correlation_table(covariance: Array) -> list[list[float]]:
 def _discrepancy_table(posterior: FilmPosterior) -> dict[str, Any] | None:
     """Return the section `discrepancy` of the file, or None if the film probably needs no coefficients.
 
-    The section contains the coefficients of the film. The section also contains the standard deviations and the
-    correlations of the parameters and coefficients together.
+    The coefficients describe the imperfections and the discrepancy of the film. The section contains the coefficients,
+    and the standard deviations and correlations of the parameters and coefficients together.
 
     Args:
         posterior: The estimate of the film from presses.
@@ -177,13 +186,13 @@ def _temperature_table(posterior: FilmPosterior) -> dict[str, Any] | None:
     correlations = _divide_by_std(covariance_with_film, warming.std * film_std)
     return {
         "at_C": warming.at_C,
-        "pretension_per_K": {"value": PASCAL_FACTOR * warming.MPa_per_K, "std": PASCAL_FACTOR * warming.std},
+        "pretension_per_K": {"value": PA_PER_MPA * warming.MPa_per_K, "std": PA_PER_MPA * warming.std},
         "correlations": np.round(correlations, 6).tolist(),
     }
 
 
 def _divide_by_std(covariance: Array, product_of_std: Array) -> Array:
-    """Divide covariances by products of standard deviations. The result is zero where a product is zero.
+    """Divide covariances by products of standard deviations. Where a product is zero, the result is zero.
 
     Args:
         covariance: Covariances of pairs of unknowns, an array of any shape.
@@ -214,17 +223,17 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
 
     # The unknowns of the film are its parameters, followed by its coefficients if the file has them.
     parameters, parameter_std = _read_parameters(path, content, prior)
-    parameter_correlations = _correlations(path, "correlations", content.correlations, parameter_std)
+    parameter_correlations = _read_correlations(path, "correlations", content.correlations, parameter_std)
     if content.discrepancy is None:
         coefficients = np.empty(0)
         film_std = parameter_std
         film_correlations = parameter_correlations
     else:
         coefficients, film_std = _read_coefficients(path, content.discrepancy, problem, parameter_std)
-        film_correlations = _film_correlations(path, content.discrepancy, film_std, parameter_correlations)
+        film_correlations = _read_film_correlations(path, content.discrepancy, film_std, parameter_correlations)
 
-    # If the file has a section `temperature`, the correlations of the film are checked together with those of the
-    # change of the pretension.
+    # A covariance matrix must have no negative eigenvalues. If the file has a section `temperature`, this is checked
+    # for all unknowns of the film together with the change of the pretension.
     if content.temperature is None:
         film_covariance = _positive_semidefinite(path, film_correlations) * np.outer(film_std, film_std)
         warming = None
@@ -239,7 +248,7 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
     )
 
 
-def _film_correlations(path: Path, section: _Discrepancy, film_std: Array, parameter_correlations: Array) -> Array:
+def _read_film_correlations(path: Path, section: _Discrepancy, film_std: Array, parameter_correlations: Array) -> Array:
     """Read the correlations of the parameters and coefficients of a film from the section `discrepancy`.
 
     The file contains the correlations of the parameters in two sections, which must agree with each other.
@@ -257,9 +266,10 @@ def _film_correlations(path: Path, section: _Discrepancy, film_std: Array, param
     Raises:
         PressError: If the matrix is not a correlation matrix, or contradicts the section `correlations`.
     """
-    correlations = _correlations(path, "discrepancy.correlations", section.correlations, film_std)
+    correlations = _read_correlations(path, "discrepancy.correlations", section.correlations, film_std)
     n_parameter = len(parameter_correlations)
     shared_correlations = correlations[:n_parameter, :n_parameter]  # the parameters are the first unknowns
+    # Both matrices were rounded, so the tolerance is doubled.
     if np.abs(shared_correlations - parameter_correlations).max() > 2.0 * CORRELATION_TOLERANCE:
         raise PressError(
             f"{path}: discrepancy.correlations: expected those of the parameters, as under correlations, in the "
@@ -286,14 +296,14 @@ def _read_temperature(
         PressError: If the section has wrong numbers, or its correlations are not possible together with those of the
             film.
     """
-    correlations = _with_temperature(path, section, film_correlations, film_std)
-    change = section.pretension_per_K
-    change_std = change.std / PASCAL_FACTOR
+    correlations = _with_pretension_change(path, section, film_correlations, film_std)
+    change = section.pretension_per_K  # in Pa/K
+    change_std = change.std / PA_PER_MPA  # in MPa/K
     std = np.append(film_std, change_std)
     covariance = _positive_semidefinite(path, correlations) * np.outer(std, std)
     n_film = film_std.size  # number of unknowns of the film, and index of the change, which follows them
     warming = Warming(
-        MPa_per_K=change.value / PASCAL_FACTOR,
+        MPa_per_K=change.value / PA_PER_MPA,
         std=change_std,
         at_C=section.at_C,
         covariance=covariance[:n_film, n_film],
@@ -368,7 +378,7 @@ def _read_coefficients(
         )
 
     coefficients = np.array(section.coefficients)
-    std = np.array(section.std)
+    std = np.array(section.std)  # of the parameters, followed by the coefficients
     for key, values, limit in (
         ("coefficients", coefficients, LARGEST_COEFFICIENT),
         ("std", std, LARGEST_STD),
@@ -389,23 +399,24 @@ def _read_coefficients(
     return coefficients, std
 
 
-def _with_temperature(path: Path, section: _Temperature, correlations: Array, std: Array) -> Array:
+def _with_pretension_change(path: Path, section: _Temperature, film_correlations: Array, film_std: Array) -> Array:
     """Extend the correlations of a film by one row and one column for the change of the pretension per kelvin.
 
     Args:
         path: The file, for error messages.
         section: Section `temperature` of the file, which contains the added correlations.
-        correlations: Correlations of the unknowns of the film, shape (n, n).
-        std: Standard deviations of the unknowns of the film, shape (n,).
+        film_correlations: Correlations of the unknowns of the film, shape (n, n).
+        film_std: Standard deviations of the unknowns of the film, shape (n,).
 
     Returns:
         Correlations, shape (n + 1, n + 1). The last row and column are those of the change of the pretension.
 
     Raises:
-        PressError: If the number of correlations is wrong, or the change of the pretension is too large.
+        PressError: If the number of correlations is wrong, if a correlation is null although it is defined, or if the
+            change of the pretension or its standard deviation is too large.
     """
     change = section.pretension_per_K
-    largest_Pa_per_K = LARGEST_STD * PRETENSION_PER_KELVIN.std_with_temperatures * PASCAL_FACTOR
+    largest_Pa_per_K = LARGEST_STD * PRETENSION_PER_KELVIN.std_with_temperatures * PA_PER_MPA
     for key, number in (("value", change.value), ("std", change.std)):
         if abs(number) > largest_Pa_per_K:
             raise PressError(
@@ -413,24 +424,24 @@ def _with_temperature(path: Path, section: _Temperature, correlations: Array, st
                 f"got {number:g}"
             )
     # Older versions wrote no correlations of the change, because they assumed that it is uncorrelated with the film.
-    given_row: list[Correlation] = section.correlations or [0.0] * std.size
-    if len(given_row) != std.size:
+    given_row: list[Correlation] = section.correlations or [0.0] * film_std.size
+    if len(given_row) != film_std.size:
         raise PressError(
-            f"{path}: temperature.correlations: expected {std.size} numbers, one for each unknown of the film, "
+            f"{path}: temperature.correlations: expected {film_std.size} numbers, one for each unknown of the film, "
             f"got {len(given_row)}"
         )
-    may_be_null = (std == 0.0) | (change.std == 0.0)  # the correlation of a constant is not defined
+    may_be_null = (film_std == 0.0) | (change.std == 0.0)  # the correlation of a constant is not defined
     # `_correlation_array` converts a matrix, so the row is passed and returned as a matrix with one row.
     (temperature_row,) = _correlation_array(path, "temperature.correlations", [given_row], may_be_null[None])
 
-    extended = np.eye(std.size + 1)
-    extended[:-1, :-1] = correlations
+    extended = np.eye(film_std.size + 1)
+    extended[:-1, :-1] = film_correlations
     extended[-1, :-1] = temperature_row
     extended[:-1, -1] = temperature_row
     return extended
 
 
-def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Array) -> Array:
+def _read_correlations(path: Path, key: str, rows: list[list[Correlation]], std: Array) -> Array:
     """Read a matrix of correlations, and check that the matrix is symmetric with ones on its diagonal.
 
     Args:
@@ -444,7 +455,7 @@ def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Arra
 
     Raises:
         PressError: If the matrix has the wrong shape, is not symmetric, has a diagonal entry other than 1, or contains
-            null for an unknown with a variance.
+            null for a pair of unknowns that both have a variance.
     """
     is_square = len(rows) == std.size and all(len(row) == std.size for row in rows)
     if not is_square:
@@ -453,6 +464,7 @@ def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Arra
     involves_constant = is_constant[:, None] | is_constant[None, :]  # shape (n, n)
     matrix = _correlation_array(path, key, rows, may_be_null=involves_constant)
 
+    # The diagonal element of an unknown without variance may have been null, and is not checked.
     diagonal = np.where(is_constant, 1.0, np.diag(matrix))
     deviation_from_one = np.abs(diagonal - 1.0)
     if deviation_from_one.max() > CORRELATION_TOLERANCE:
@@ -507,7 +519,7 @@ def _positive_semidefinite(path: Path, correlations: Array) -> Array:
         correlations: Symmetric matrix, shape (n, n).
 
     Returns:
-        The nearest positive semidefinite matrix, shape (n, n).
+        The nearest positive semidefinite matrix, shape (n, n); the given matrix if it has no negative eigenvalue.
 
     Raises:
         PressError: If the magnitude of a negative eigenvalue exceeds `EIGENVALUE_TOLERANCE`.

@@ -1,9 +1,9 @@
-"""Detection of a closed back from the presses of a calibration. A closed back traps air behind the film.
+"""Detection of a closed back, which traps air behind the film.
 
 A calibration assumes a vented back, which lets air flow out of the space behind the film. If the back is closed, the
 trapped air carries a part of the load. The electrodes away from the probe then collect much less charge than on any
-film with a vented back. Therefore, a calibration with such presses either estimates a large discrepancy or refuses the
-presses.
+film with a vented back. A calibration that does not examine the back would therefore estimate a large discrepancy, or
+refuse the presses and not name the reason.
 
 If no film with a vented back agrees with the presses, the presses are also compared with a few films that have a closed
 back. The charges of the films with a closed back are simulated directly. This simulation takes a few seconds.
@@ -21,7 +21,7 @@ from isocharge.train.calibration.diagnosis import CLEARER, PRETENSIONS, charge_m
 from isocharge.train.calibration.film_charges import FilmCharges
 
 MIN_VENTED_MISFIT = 0.5
-"""Misfit of films with a vented back, as `charge_misfit` returns it, below which the back is not examined."""
+"""Misfit of films with a vented back, as `charge_misfit` returns it, up to which a closed back is not considered."""
 
 CAVITY_DEPTH_mm = 20.0
 """Depth of the cavity behind the simulated films with a closed back, mm.
@@ -30,10 +30,10 @@ Up to a depth of about 200 mm, the trapped air is so stiff that the depth hardly
 """
 
 INTERPOLATED_COUNT = 25
-"""Number of pretensions, from the first to the last of `PRETENSIONS`, for which charges are interpolated."""
+"""Number of pretensions for which charges are interpolated, from the first to the last of `PRETENSIONS`."""
 
 MAX_EXAMINED = 8
-"""Largest number of presses that are compared with films with a closed back."""
+"""Largest number of presses that are compared with the films with a closed back."""
 
 ACCURACY = 5e-3
 """Relative error of the simulated charges, which is far below the effect of a closed back."""
@@ -42,14 +42,14 @@ CLOSED_BACK_CAUTION = (
     "films with a closed back explain the presses far better than films with a vented back: air is probably trapped "
     "behind the film and carries a part of the load; vent the back and press again"
 )
-"""Warning for presses that a calibration describes by a large discrepancy."""
+"""Warning for presses that a calibration explains by a large discrepancy, although the back is probably closed."""
 
 
 def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
     """Return whether films with a closed back explain the presses much better than films with a vented back.
 
     At most `MAX_EXAMINED` presses are examined, because each press on a film with a closed back has to be simulated.
-    Nothing is simulated if a film with a vented back explains the presses well.
+    Nothing is simulated if a film with a vented back explains the presses well. The result is then False.
 
     Args:
         presses: The presses. A press whose place or force is unknown is not used.
@@ -63,19 +63,19 @@ def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
     examined = placed[np.unique(evenly_spaced_rows)]
 
     # The charges are computed for the pretensions in `PRETENSIONS`, and interpolated for pretensions between them.
-    vented_charges = _interpolated(expected_charges(charges, examined.contact))
+    vented_charges = _interpolate_pretensions(expected_charges(charges, examined.contact))
     vented_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, vented_charges)
     is_explained = vented_misfit <= MIN_VENTED_MISFIT
     is_comparable = vented_misfit < np.inf  # the misfit is infinite if many presses lie outside the domain
     if is_explained or not is_comparable:
         return False
 
-    contact = charges.into_domain(examined.contact)
+    contact = charges.into_domain(examined.contact)  # as `expected_charges` moves the contacts for a vented back
     try:
-        solved_charges = np.array([_closed_charges(charges, share, contact) for share in PRETENSIONS])
+        solved_charges = np.array([_simulate_closed_back(charges, share, contact) for share in PRETENSIONS])
     except (SceneError, SolveError):
         return False  # a film with a closed back cannot be simulated, so there is no evidence for a closed back
-    closed_charges = _interpolated(solved_charges)
+    closed_charges = _interpolate_pretensions(solved_charges)
     closed_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, closed_charges)
     return closed_misfit < CLEARER * vented_misfit
 
@@ -97,7 +97,7 @@ def refuse_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> None:
         )
 
 
-def _interpolated(charge: Array) -> Array:
+def _interpolate_pretensions(charge: Array) -> Array:
     """Interpolate charges linearly between the pretensions in `PRETENSIONS`.
 
     Args:
@@ -115,8 +115,10 @@ def _interpolated(charge: Array) -> Array:
     return np.asarray(np.einsum("ki,kne->ine", weights, charge))
 
 
-def _closed_charges(charges: FilmCharges, pretension_share: float, contact: Array) -> Array:
-    """Simulate the charges of presses on the mean film of the prior, with a closed back and a given pretension.
+def _simulate_closed_back(charges: FilmCharges, pretension_share: float, contact: Array) -> Array:
+    """Simulate the charges of presses on the mean film of the prior, with a given pretension and a closed back.
+
+    The back is closed by a cavity with the depth `CAVITY_DEPTH_mm` and the area of the film.
 
     Args:
         charges: Model of the charges of all films of the calibration, with their prior.

@@ -11,8 +11,8 @@ the parameters, and W is the inverse of the noise covariance. If the parameters 
 have the covariance G C G'. Noise alone causes errors with the covariance (J' W J)^-1, which is the Cramer-Rao limit.
 
 In the code, the inverse of a prior covariance of the contact is added to J' W J. According to this prior, the contact
-lies in the working area and in the range of forces. At folds of the charge map, the matrix J' W J is singular, but with
-this prior the errors are finite.
+lies in the working area and in the range of forces. The prior keeps the errors finite at folds of the charge map, where
+the matrix J' W J is singular.
 
 The information that a press adds about the film depends on the contact of the press, but hardly on its charges.
 Therefore, the best next press can be chosen before any charge is measured. Several presses are chosen one after the
@@ -51,7 +51,9 @@ FORCE_GRID_N = 0.05
 """Grid to which the forces of proposed presses are rounded, N."""
 
 MIN_LOG_FORCE_RANGE = 0.1
-"""Smallest width of the prior of ln F, so that its standard deviation is not zero for a single force."""
+"""Smallest width of the prior distribution of ln F.
+
+The limit keeps the standard deviation above zero if the range of forces is a single force."""
 
 AVOIDED_DISTANCE_MM = 1.0
 """Distance from an avoided position within which no press is proposed, mm."""
@@ -72,7 +74,7 @@ class ContactError:
     each_mm: Array
 
     @classmethod
-    def of(cls, covariance: Array) -> "ContactError":
+    def from_covariance(cls, covariance: Array) -> "ContactError":
         """Compute root-mean-square errors from the covariances of estimated contacts.
 
         Args:
@@ -116,8 +118,8 @@ class ContactSensitivity:
     charge_gain: Array
 
     @classmethod
-    def at(cls, problem: CalibrationProblem, unknowns: Array) -> "ContactSensitivity":
-        """Linearise the charges of a film at contacts that are spread over the domain.
+    def for_film(cls, problem: CalibrationProblem, unknowns: Array) -> "ContactSensitivity":
+        """Linearise the charges of a film at `N_CONTACTS` contacts that are spread over the domain of the problem.
 
         Args:
             problem: The calibration problem, with the films and the noise.
@@ -135,19 +137,19 @@ class ContactSensitivity:
         prior_information = np.diag(_prior_contact_std(domain) ** -2)
         noise_covariance = np.linalg.inv(charge_information + prior_information)
 
-        # If the charges change, the estimated contact moves by a matrix, the gain, times this change. The whitened gain
-        # is for changes in units of the noise, shape (n, 3, n_electrode).
+        # The gain is the matrix that converts a change of the charges into the change of the estimated contact. The
+        # whitened gain converts changes of the charges in units of the noise, shape (n, 3, n_electrode).
         whitened_gain = noise_covariance @ contact_slopes.swapaxes(1, 2)
         charge = problem.charges.charges(unknowns, contact)
         noise_std = problem.noise.sigma(charge)
         return cls(
             contact=contact,
-            # The estimate assumes the wrong film, and moves to compensate the wrong charges: hence the minus sign.
+            # The estimator assumes wrong charges, and the estimated contact compensates them: hence the minus sign.
             contact_jacobian=-(whitened_gain @ film_slopes),
             noise_covariance=noise_covariance,
             misfit_jacobian=derivatives_with_adjusted_contacts(film_slopes, contact_slopes),
             log_charge_jacobian=film_slopes * (noise_std / charge)[:, :, None],  # d ln Q = dQ / Q
-            charge_gain=whitened_gain / noise_std[:, None, :],  # for changes in pC
+            charge_gain=whitened_gain / noise_std[:, None, :],  # converts changes in pC
         )
 
     def contact_error(self, covariance: Array) -> ContactError:
@@ -156,7 +158,7 @@ class ContactSensitivity:
         Args:
             covariance: Covariance of the unknowns of the film, shape (n_unknown, n_unknown).
         """
-        return ContactError.of(self.contact_covariance(covariance))
+        return ContactError.from_covariance(self.contact_covariance(covariance))
 
     def contact_covariance(self, covariance: Array) -> Array:
         """Compute the part of the covariance of each estimated contact that is caused by the uncertainty of the film.
@@ -172,7 +174,7 @@ class ContactSensitivity:
     @property
     def noise_error(self) -> ContactError:
         """Errors of contacts that noise alone causes."""
-        return ContactError.of(self.noise_covariance)
+        return ContactError.from_covariance(self.noise_covariance)
 
     def error_weights(self) -> Array:
         """Return a matrix S such that trace(S C) is the mean squared error of the contacts.
@@ -185,7 +187,8 @@ class ContactSensitivity:
             Matrix S, shape (n_unknown, n_unknown).
         """
         noise_error = self.noise_error
-        noise_std = np.array([noise_error.position_mm, noise_error.position_mm, 0.01 * noise_error.force_percent])
+        log_force_error = 0.01 * noise_error.force_percent  # a relative error is an error of ln F
+        noise_std = np.array([noise_error.position_mm, noise_error.position_mm, log_force_error])
         scaled_jacobian = self.contact_jacobian / noise_std[:, None]
         # Sums over the contacts n and the components i of the contact, for each pair of unknowns p and q
         sum_of_products = np.einsum("nip,niq->pq", scaled_jacobian, scaled_jacobian)
@@ -206,6 +209,7 @@ def spread_contacts(domain: Domain, count: int) -> Array:
     """
     position = sunflower(count)  # complex numbers x + i y in the unit disk
     force_rank = np.random.default_rng(FORCE_ORDER_SEED).permutation(count)
+    # Centres of `count` equal parts of the interval [-1, 1], to which `domain` scales the logarithms of the forces
     unit_log_force = 2.0 * (force_rank + 0.5) / count - 1.0
     return domain.to_contact(np.column_stack([position.real, position.imag, unit_log_force]))
 
@@ -219,7 +223,8 @@ def _prior_contact_std(domain: Domain) -> Array:
     Args:
         domain: Range of contacts.
     """
-    position_std = 0.5 * domain.radius  # of x and of y, in a disk
+    # In a uniform distribution over a disk, the standard deviation of x, and also of y, is half of the radius.
+    position_std = 0.5 * domain.radius
     # The standard deviation of a uniform distribution is its width divided by the root of 12.
     min_force, max_force = domain.force_range
     log_force_range = max(np.log(max_force / min_force), MIN_LOG_FORCE_RANGE)
@@ -236,18 +241,18 @@ def _whitened_slopes(problem: CalibrationProblem, unknowns: Array, contact: Arra
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
     Returns:
-        Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3). Derivatives with respect to the unknowns of
-        the film, shape (n, n_electrode, n_unknown).
+        Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3), and derivatives with respect to the
+        unknowns of the film, shape (n, n_electrode, n_unknown).
     """
     charges = problem.charges
     contact_slopes = charges.contact_slopes(unknowns, contact)
     film_slopes = charges.unknown_slopes(unknowns, contact, contact_slopes)
     noise_std = problem.noise.sigma(charges.charges(unknowns, contact))  # shape (n, n_electrode)
-    weight = 1.0 / noise_std[:, :, None]
-    return weight * contact_slopes, weight * film_slopes
+    inverse_std = 1.0 / noise_std[:, :, None]
+    return inverse_std * contact_slopes, inverse_std * film_slopes
 
 
-def information_of(
+def fisher_information(
     problem: CalibrationProblem,
     unknowns: Array,
     contact: Array,
@@ -294,8 +299,8 @@ def _information_roots(
     # Derivatives of the residuals of the charges
     charge_contact_slopes, charge_film_slopes = _whitened_slopes(problem, unknowns, contact)
 
-    # Derivatives of the residuals of the measured contact. Each of them depends only on its own coordinate of the
-    # contact, and does not depend on the unknowns of the film.
+    # Derivatives of the residuals of the measured contact. Each residual depends only on its own coordinate of the
+    # contact, and not on the unknowns of the film. The weight of an unknown position is zero.
     rig_weights = np.array([1.0 / position_std_mm, 1.0 / position_std_mm, 1.0 / force_std])
     rig_contact_slopes = np.broadcast_to(np.diag(rig_weights), (len(contact), 3, 3))
     rig_film_slopes = np.zeros((len(contact), 3, charge_film_slopes.shape[2]))
@@ -340,9 +345,9 @@ def next_presses(
 ) -> list[ProposedPress]:
     """Choose the next presses, in the order in which they should be made.
 
-    The presses are chosen one after the other from many candidates. Each round chooses the candidate with the largest
-    reduction of the expected mean squared error of contacts. The expected error assumes that all previously chosen
-    presses are made.
+    The presses are chosen one after the other from many candidates. Each round chooses the candidate that reduces the
+    expected mean squared error of contacts most. The expected error assumes that all previously chosen presses are
+    made. A candidate may be chosen more than once.
 
     Args:
         problem: The calibration problem, with the films and the noise.
@@ -361,8 +366,8 @@ def next_presses(
         film = problem.expected
     if avoid_mm is None:
         avoid_mm = np.empty((0, 2))
-    sensitivity = ContactSensitivity.at(problem, film.unknowns)
-    candidates = _candidates(problem.domain.radius, problem.proposed_forces, avoid_mm)
+    sensitivity = ContactSensitivity.for_film(problem, film.unknowns)
+    candidates = _candidate_contacts(problem.domain.radius, problem.proposed_forces, avoid_mm)
     # For each candidate, a matrix R such that R' R is the Fisher information of the press about the film, shape
     # (n_candidate, n_residual, n_unknown)
     information_roots = _information_roots(problem, film.unknowns, candidates, position_std_mm, force_std)
@@ -372,19 +377,19 @@ def next_presses(
     covariance = film.unknown_covariance
     proposed = []
     for _ in range(count):
-        best_index, covariance = _best_candidate(information_roots, covariance, error_weights)
+        best_index, covariance = _choose_candidate(information_roots, covariance, error_weights)
         error = sensitivity.contact_error(covariance)
         x, y, force = candidates[best_index].tolist()
         proposed.append(ProposedPress(x, y, force, error.position_mm, error.force_percent))
     return proposed
 
 
-def _best_candidate(information_roots: Array, covariance: Array, error_weights: Array) -> tuple[int, Array]:
-    """Choose the candidate with the largest reduction of the mean squared error, and update the covariance.
+def _choose_candidate(information_roots: Array, covariance: Array, error_weights: Array) -> tuple[int, Array]:
+    """Choose the candidate that reduces the mean squared error of contacts most, and return the new covariance.
 
     A press with the Fisher information R' R reduces the covariance C of the unknowns by the matrix
-    D = (R C)' (1 + R C R')^-1 (R C). The mean squared error decreases by trace(S D), where S contains the error
-    weights.
+    D = (R C)' (1 + R C R')^-1 (R C). The mean squared error of contacts decreases by trace(S D), where S is the matrix
+    of error weights.
 
     Args:
         information_roots: Matrix R of each candidate, shape (n, n_residual, n_unknown).
@@ -392,30 +397,30 @@ def _best_candidate(information_roots: Array, covariance: Array, error_weights: 
         error_weights: Matrix S for which trace(S C) is the mean squared error, shape (n_unknown, n_unknown).
 
     Returns:
-        Index of the candidate, and the covariance of the unknowns after its press.
+        Index of the chosen candidate, and the covariance of the unknowns after its press.
     """
-    n_residual = information_roots.shape[1]
+    n_residual = information_roots.shape[1]  # per press
     projection = information_roots @ covariance  # R C
-    innovation = np.eye(n_residual) + projection @ information_roots.swapaxes(1, 2)  # 1 + R C R'
+    innovation_covariance = np.eye(n_residual) + projection @ information_roots.swapaxes(1, 2)  # 1 + R C R'
     weighted_projection = projection @ error_weights @ projection.swapaxes(1, 2)  # R C S C R'
     # trace(S D) of each candidate n, which equals the trace of (1 + R C R')^-1 (R C S C R')
-    error_reduction = np.einsum("nij,nji->n", np.linalg.inv(innovation), weighted_projection)
+    error_reduction = np.einsum("nij,nji->n", np.linalg.inv(innovation_covariance), weighted_projection)
     best_index = int(np.argmax(error_reduction))
 
     # The matrix D of the best candidate
     best_projection = projection[best_index]
-    covariance_reduction = best_projection.T @ np.linalg.solve(innovation[best_index], best_projection)
+    covariance_reduction = best_projection.T @ np.linalg.solve(innovation_covariance[best_index], best_projection)
     return best_index, covariance - covariance_reduction
 
 
-def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array) -> Array:
+def _candidate_contacts(radius: float, force_range: tuple[float, float], avoid_mm: Array) -> Array:
     """Return the candidates for the next press, which combine each allowed position with each candidate force.
 
     The positions are distributed evenly over the working area. The positions and forces are rounded to values that a
-    person can easily set.
+    person can easily set. Positions near the positions in `avoid_mm` are left out.
 
     Args:
-        radius: Largest distance of a press from the centre, mm.
+        radius: Radius of the working area, which is the largest distance of a press from the centre, mm.
         force_range: Smallest and largest force of a press, N.
         avoid_mm: Positions that cannot be pressed, shape (n_avoided, 2), mm.
 
@@ -439,7 +444,8 @@ def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array
         raise PressError(f"no place within {radius:.3g} mm of the centre is left to press; skip fewer")
 
     # The exact forces divide the logarithmic range of forces at the fractions `CANDIDATE_FORCES`. A force that would be
-    # rounded to zero is replaced by the smallest force of the grid.
+    # rounded to zero is replaced by the smallest force of the grid. Rounding may also move a force out of the range, so
+    # the forces are clipped, and equal forces are removed.
     min_force, max_force = force_range
     exact_forces = min_force * (max_force / min_force) ** np.array(CANDIDATE_FORCES)
     rounded_forces = np.round(exact_forces / FORCE_GRID_N) * FORCE_GRID_N

@@ -1,7 +1,7 @@
 """Adjustment of the contacts of presses to measured charges and to measurements of the rig.
 
-A rig measures the position and the force of a press with some uncertainty. The position or the force of a press may
-also be unknown. Each measured charge and each measurement of the rig has one residual. The residuals depend on the
+A rig measures the position and the force of a press with some uncertainty. The position or the force may also be
+unknown. Each measured charge and each measurement of the rig has one residual. The residuals depend on the
 contact and on the film. For a given film, the adjusted contact of a press is the contact with the smallest sum of
 squared residuals. The residuals at the adjusted contact show how well the film explains the press.
 """
@@ -21,10 +21,10 @@ from isocharge.train.calibration.film_maps import CONTACT_STEPS
 from isocharge.train.calibration.press_data import PressData
 
 CANDIDATE_POSITIONS = 300
-"""Number of positions that are compared in order to choose the first contact of a press with an unknown position."""
+"""Number of positions that are compared in order to choose the starts of the searches for an unknown position."""
 
 UNKNOWN_POSITION_STARTS = 3
-"""Number of searches for the contact of a press with an unknown position. The search with the best result is used."""
+"""Number of searches for the contact of a press with an unknown position. The best result is used."""
 
 START_DISTANCE = 0.15
 """Smallest distance between the starts of two searches for the same contact, relative to the radius of the domain."""
@@ -35,12 +35,13 @@ MIN_CHANGE = 1e-5
 MAX_SEARCHES = 5
 """Largest number of successive searches for the contact of a press.
 
-Each search approximates the effect of imperfections by a linear function about the result of the previous search."""
+Each search approximates the effect of imperfections by a linear function of the contact. The function is linearised
+about the result of the previous search."""
 
 LINEAR_DISTANCE = 0.02
-"""Largest distance of a contact from the start of a search for which the linear function is accurate.
+"""Largest distance of a contact from the start of a search at which the linear function is accurate.
 
-The distance is in scaled coordinates."""
+It is the largest difference of a coordinate, in the scaled coordinates of the domain."""
 
 
 class AdjustedContacts(NamedTuple):
@@ -76,20 +77,22 @@ def derivatives_with_adjusted_contacts(unknown_slopes: Array, contact_slopes: Ar
     Returns:
         Derivatives of the residuals with respect to the unknowns, shape (n, n_residual, n_unknown).
     """
-    # The least-squares solution of contact_slopes @ contact_change = unknown_slopes, from the normal equations. If an
+    # The normal equations give the least-squares solution of contact_slopes @ contact_change = unknown_slopes. If an
     # unknown increases by one unit, the adjusted contact moves by minus `contact_change`, shape (n, 3, n_unknown).
     transposed_slopes = contact_slopes.swapaxes(1, 2)
     contact_change = np.linalg.solve(transposed_slopes @ contact_slopes, transposed_slopes @ unknown_slopes)
     return np.asarray(unknown_slopes - contact_slopes @ contact_change)
 
 
-def with_force(contact: Array) -> Array:
+def from_log_contact(log_contact: Array) -> Array:
     """Convert contacts (x, y, ln F) into contacts (x, y, F), shape (n, 3)."""
-    return np.column_stack([contact[:, :2], np.exp(contact[:, 2])])
+    return np.column_stack([log_contact[:, :2], np.exp(log_contact[:, 2])])
 
 
 def best_adjusted_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> AdjustedContacts:
     """Find the contacts that agree best with the measurements, by searches from all starts of `start_contacts`.
+
+    For each press, the result of the search with the smallest sum of squared residuals is used.
 
     Args:
         charges: Model of the charges of all films.
@@ -100,7 +103,7 @@ def best_adjusted_contacts(charges: FilmCharges, unknowns: Array, data: PressDat
     best = adjust_contacts(charges, unknowns, data, first_start)
     for start in other_starts:
         other = adjust_contacts(charges, unknowns, data, start)
-        is_better = (other.chi2 < best.chi2)[:, None]
+        is_better = (other.chi2 < best.chi2)[:, None]  # for each press
         contact = np.where(is_better, other.contact, best.contact)
         residual = np.where(is_better, other.residual, best.residual)
         best = AdjustedContacts(contact, residual)
@@ -111,11 +114,11 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
     """Find the contacts that agree best with the measured charges and with the measurements of the rig.
 
     For each press, the sum of the squared residuals is minimised over the contact (x, y, ln F). The search uses scaled
-    contacts. In these coordinates, the positions of the domain fill the unit disk, and ln F lies in [-1, 1].
+    coordinates. In these coordinates, the positions of the domain fill the unit disk, and ln F lies in [-1, 1].
 
-    The effect of imperfections is approximated by a linear function about the start of the search. If the contact of a
-    press lies far from this start, for example because its position was unknown, the search is repeated from the
-    contact that was found.
+    The effect of imperfections on the charges is approximated by a linear function about the start of the search. If
+    the film has imperfections and a search ends far from its start, the search is repeated from the contact that was
+    found. There are at most `MAX_SEARCHES` searches.
 
     Args:
         charges: Model of the charges of all films.
@@ -126,15 +129,20 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
     domain = charges.domain
     scaled_contact = (start - domain.centre) / domain.scale
     residual = np.empty(data.measured.shape)
-    rows = np.arange(len(data))  # the presses whose contacts are searched for
+    # Without imperfections, nothing is linearised, and a single search suffices.
     has_imperfections = bool(unknowns[charges.layout.coefficients].any())
-    for _ in range(MAX_SEARCHES):
+    max_searches = MAX_SEARCHES if has_imperfections else 1
+    rows = np.arange(len(data))  # the presses whose contacts are searched for
+    for _ in range(max_searches):
         scaled_start = scaled_contact[rows]
-        residuals = _ContactResiduals.of(charges, unknowns, data[rows], scaled_start * domain.scale + domain.centre)
-        scaled_contact[rows], residual[rows] = minimise(residuals.at, scaled_start, min_change=MIN_CHANGE)
+        search_start = scaled_start * domain.scale + domain.centre
+        residuals = _ContactResiduals.linearised(charges, unknowns, data[rows], search_start)
+        scaled_contact[rows], residual[rows] = minimise(
+            residuals.values_and_slopes, scaled_start, min_change=MIN_CHANGE
+        )
         distance = np.abs(scaled_contact[rows] - scaled_start).max(axis=1)
         rows = rows[distance > LINEAR_DISTANCE]
-        if not has_imperfections or not rows.size:
+        if not rows.size:
             break
     return AdjustedContacts(scaled_contact * domain.scale + domain.centre, residual)
 
@@ -167,11 +175,11 @@ class _ContactResiduals(NamedTuple):
     factor_slopes: Array
 
     @classmethod
-    def of(cls, charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> "_ContactResiduals":
-        """Prepare the residuals by computing all values that do not change during the search for the contacts.
+    def linearised(cls, charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> "_ContactResiduals":
+        """Compute all values that do not change during the search for the contacts, and return the residuals.
 
-        Imperfections of the film multiply its charges by a factor that depends on the contact. This factor is computed
-        only at the start of the search, together with its derivatives.
+        The coefficients of the film, which describe its imperfections, multiply its charges by a factor that depends on
+        the contact. This factor and its derivatives are computed only at the start of the search.
 
         Args:
             charges: Model of the charges of all films.
@@ -189,7 +197,9 @@ class _ContactResiduals(NamedTuple):
         start_factor = np.ones_like(data.charge)
         factor_slopes = np.zeros((*data.charge.shape, 3))
         if unknowns[layout.coefficients].any():
-            film_factors = [_values_and_slopes(partial(charges.factor, film), with_force(start)) for film in films]
+            film_factors = [
+                _values_and_slopes(partial(charges.factor, film), from_log_contact(start)) for film in films
+            ]
             start_factor, factor_slopes = _interpolated(film_factors, film_weights)
         return cls(
             domain=charges.domain,
@@ -201,7 +211,7 @@ class _ContactResiduals(NamedTuple):
             factor_slopes=factor_slopes,
         )
 
-    def at(self, rows: Integers, scaled_contact: Array) -> tuple[Array, Array]:
+    def values_and_slopes(self, rows: Integers, scaled_contact: Array) -> tuple[Array, Array]:
         """Compute the residuals of selected presses, and their derivatives with respect to the contacts.
 
         Args:
@@ -211,11 +221,11 @@ class _ContactResiduals(NamedTuple):
 
         Returns:
             Residuals, shape (m, n_electrode + 3), and their derivatives with respect to the scaled contact, shape (m,
-            3, n_electrode + 3).
+            3, n_electrode + 3), with the order of the axes that `minimise` expects.
         """
         contact = scaled_contact * self.domain.scale + self.domain.centre  # (x, y, ln F)
         film_charges = [
-            _values_and_slopes(forward_map.charges, with_force(contact)) for forward_map in self.forward_maps
+            _values_and_slopes(forward_map.charges, from_log_contact(contact)) for forward_map in self.forward_maps
         ]
         charge, charge_slopes = _interpolated(film_charges, self.film_weights[rows])
 
@@ -232,10 +242,10 @@ class _ContactResiduals(NamedTuple):
 
 
 def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -> tuple[list[Array], Array]:
-    """Return copies of a film with several pretensions, for an interpolation of the charges of each press.
+    """Return copies of a film with several pretensions, between which the charges of each press are interpolated.
 
     The pretension of a film may differ from press to press, for example because of the temperature. The returned copies
-    of the film differ only in their pretension.
+    of the film differ only in their pretension. If all presses have the same pretension, there is only one copy.
 
     Args:
         charges: Model of the charges of all films.
@@ -243,17 +253,18 @@ def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -
         data: The presses, with the change of the pretension during each press.
 
     Returns:
-        The unknowns of each of the k copies, and the weight of each copy for each press, shape (n, k).
+        The unknowns of each of the k copies, and the weight of each copy for each press, shape (n, k). The charges of a
+        press are the weighted sum of the charges of the copies.
     """
-    pretension = charges.layout.parameter("pretension")  # index in the vector of unknowns
+    pretension_index = charges.layout.parameter("pretension")
     lower, upper = charges.prior.bounds
-    pretension_bounds = float(lower[pretension]), float(upper[pretension])
-    node_pretensions, film_weights = data.pretension_nodes(float(unknowns[pretension]), pretension_bounds)
+    pretension_bounds = float(lower[pretension_index]), float(upper[pretension_index])
+    node_pretensions, film_weights = data.pretension_nodes(float(unknowns[pretension_index]), pretension_bounds)
 
     films = []
     for node_pretension in node_pretensions:
         film = unknowns.copy()
-        film[pretension] = node_pretension
+        film[pretension_index] = node_pretension
         films.append(film)
     return films, film_weights
 
@@ -285,7 +296,7 @@ def weighted_sum(arrays: Sequence[Array], weights: Array) -> Array:
     """
     total = np.zeros_like(arrays[0])
     for array, row_weights in zip(arrays, weights.T, strict=True):
-        # With further axes of length 1, the weights of the rows are broadcast over all other axes of the array.
+        # NumPy would align the weights with the last axis. Further axes of length 1 align them with the first axis.
         trailing_axes = tuple(range(1, array.ndim))
         total = total + array * np.expand_dims(row_weights, trailing_axes)
     return total
@@ -309,7 +320,7 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
     displaced[2, :, 1] += y_step
     displaced[3, :, 2] *= np.exp(log_force_step)
     displaced_values = function(displaced.reshape(-1, 3)).reshape(4, len(contact), -1)
-    value, value_x, value_y, value_force = displaced_values
+    value, value_x, value_y, value_force = displaced_values  # each of shape (n, n_electrode)
     slopes = [
         (value_x - value) / x_step,
         (value_y - value) / y_step,
@@ -321,10 +332,10 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
 def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> list[Array]:
     """Return the contacts at which searches for the adjusted contacts begin.
 
-    If the rig measured the position of a press, the searches begin at this position. If the position of a press is
-    unknown, each search begins at another position where the ratios of the film's charges are similar to the ratios of
-    the measured charges. The force is the measured force. If the force is unknown, the searches begin at the middle of
-    the range of forces.
+    If the rig measured the position of a press, all searches begin at this position. If the position of a press is
+    unknown, each search begins at a different position where the ratios of the film's charges are similar to the ratios
+    of the measured charges. All searches begin at the measured force. If the force is unknown, they begin at the middle
+    of the logarithmic range of forces.
 
     Args:
         charges: Model of the charges of all films.
@@ -332,8 +343,8 @@ def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> li
         data: The measured presses.
 
     Returns:
-        The starts (x, y, ln F) of each search, each of shape (n, 3). There is a single search if all positions were
-        measured, and otherwise one for each of `UNKNOWN_POSITION_STARTS` positions.
+        For each search, the contacts (x, y, ln F) of all presses at which it begins, shape (n, 3). There is one search
+        if all positions were measured, and otherwise there are `UNKNOWN_POSITION_STARTS` searches.
     """
     is_position_unknown = ~data.has_place
     if not is_position_unknown.any():
@@ -350,9 +361,10 @@ def _similar_positions(charges: FilmCharges, unknowns: Array, data: PressData) -
     """Find positions where the ratios of a film's charges are similar to the ratios of the measured charges.
 
     For each press, `CANDIDATE_POSITIONS` positions are compared. The first result is the most similar position. Each
-    further result is the most similar position that is farther than `START_DISTANCE` from the results before.
+    further result is the most similar position whose distance from all previous results is at least `START_DISTANCE`
+    times the radius of the domain.
 
-    The ratios of charges hardly depend on the stiffness of the film and on its piezoelectric coefficients. The
+    Ratios are compared, because they hardly depend on the stiffness and the piezoelectric coefficients of the film. The
     estimates of these properties may still be inaccurate at this stage of a calibration.
 
     Args:
@@ -361,13 +373,15 @@ def _similar_positions(charges: FilmCharges, unknowns: Array, data: PressData) -
         data: The presses whose positions are searched for.
 
     Returns:
-        A list of `UNKNOWN_POSITION_STARTS` arrays with a position (x, y) for each press, each of shape (n, 2), mm.
+        List of `UNKNOWN_POSITION_STARTS` arrays. Each array contains a position (x, y) for each press, shape (n, 2),
+        mm.
     """
-    # Candidates (x, y, F) with the same typical force. Their positions are distributed evenly over the domain, and are
-    # first computed as complex numbers x + i y.
+    # Candidates (x, y, F). Their positions are distributed evenly over the domain, and are first computed as complex
+    # numbers x + i y. All candidates have the median force of the presses, because the ratios of the charges hardly
+    # depend on the force.
     complex_positions = charges.domain.radius * sunflower(CANDIDATE_POSITIONS)
-    typical_force = np.exp(np.median(data.contact[:, 2]))
-    forces = np.full(CANDIDATE_POSITIONS, typical_force)
+    median_force = np.exp(np.median(data.contact[:, 2]))
+    forces = np.full(CANDIDATE_POSITIONS, median_force)
     candidates = np.column_stack([complex_positions.real, complex_positions.imag, forces])
     log_computed = np.log(charges.charges(unknowns, candidates))  # shape (n_candidate, n_electrode)
 
@@ -378,11 +392,13 @@ def _similar_positions(charges: FilmCharges, unknowns: Array, data: PressData) -
     # electrodes. The variance of this difference over the electrodes is then zero.
     log_quotient = log_measured[:, None] - log_computed  # shape (n, n_candidate, n_electrode)
     dissimilarity = np.nanvar(log_quotient, axis=2)  # shape (n, n_candidate)
+    # Distance of each candidate from each other candidate, shape (n_candidate, n_candidate)
     candidate_distance = np.abs(complex_positions[:, None] - complex_positions) / charges.domain.radius
     positions = []
     for _ in range(UNKNOWN_POSITION_STARTS):
         most_similar = dissimilarity.argmin(axis=1)
         positions.append(candidates[most_similar, :2])
+        # Exclude the candidates near the chosen position from the next choices.
         is_near = candidate_distance[most_similar] < START_DISTANCE  # shape (n, n_candidate)
         dissimilarity = np.where(is_near, np.inf, dissimilarity)
     return positions

@@ -44,7 +44,10 @@ class HeldOutAnswers:
 
     @property
     def errors(self) -> dict[str, float]:
-        """Errors of the position (mm) and of the force (%), by the names that `model_release.evaluate` uses."""
+        """Errors of the position (mm) and of the force (%), by the names that `model_release.evaluate` uses.
+
+        Errors that are defined only for simulated presses are left out.
+        """
         contact, std, _ = self.answers
         all_errors = contact_errors(contact, std, self.presses.contact)
         return {name: error for name, error in all_errors.items() if name not in ONLY_SIMULATED}
@@ -55,7 +58,7 @@ def cross_validate(
     presses: MeasuredPresses,
     data: PressData,
     posterior: FilmPosterior,
-    network_of: Callable[[FilmPosterior], Fitted],
+    network_of_film: Callable[[FilmPosterior], Fitted],
     at_C: float | None = None,
 ) -> HeldOutAnswers | None:
     """Estimate the contact of each press with the network of a film that was fitted without this press.
@@ -68,8 +71,8 @@ def cross_validate(
         presses: The presses to which the film was fitted.
         data: The same presses in the form for a fit, with the effect of friction on their charges.
         posterior: Estimate of the film from these presses. Presses that were left out as bad are not used here either.
-        network_of: Function that returns the network of a film.
-        at_C: Temperature of the film, degrees Celsius; None if the temperatures of the presses are unknown.
+        network_of_film: Function that returns the network that belongs to the estimate of a film.
+        at_C: Mean temperature of the presses, degrees Celsius; None if their temperatures are unknown.
 
     Returns:
         The presses that can be judged, and the answers of the networks for them. None if fewer than `FEWEST_MEASURED`
@@ -80,23 +83,23 @@ def cross_validate(
     if is_judged.sum() < FEWEST_MEASURED:
         return None
 
-    # Presses that cannot be judged belong to no fold. Unless they are bad, the film is fitted to them in every round.
+    # Presses that cannot be judged belong to no fold. Unless they were left out as bad, they are used in all fits.
     no_fold = -1
     fold_of_press = np.full(len(presses), no_fold)
     fold_of_press[is_judged] = folds_by_place(presses.contact[is_judged], FOLD_COUNT)
 
-    # Answers of the networks for all presses, which are filled in fold by fold
+    # Answers of the networks, which are filled in fold by fold. The rows of presses without a fold are never read.
     contact = np.empty((len(presses), 3))
     network_std = np.empty((len(presses), 3))
     misfit = np.empty((len(presses), 1))
     for fold in range(FOLD_COUNT):
         is_held_out = fold_of_press == fold
-        is_fitted = _thinned(~is_held_out & ~posterior.bad)  # not all presses if there are very many
+        is_fitted = _thinned(~is_held_out & ~posterior.bad)  # at most `MAX_FITTED_PRESSES` presses
         with threadpool_limits(1):  # the matrices are small, so a second thread would only wait
             film = refit_film(
                 problem.charges, data[is_fitted], problem.before, posterior, at_C, friction=problem.friction
             )
-        fold_contact, fold_std, fold_misfit = network_of(film).predict(presses.charge_pC[is_held_out])
+        fold_contact, fold_std, fold_misfit = network_of_film(film).predict(presses.charge_pC[is_held_out])
         contact[is_held_out] = fold_contact
         network_std[is_held_out] = fold_std
         misfit[is_held_out] = fold_misfit

@@ -20,7 +20,7 @@ from isocharge.train.calibration.film_charges import FilmCharges
 MAX_DEAD_RATIO = 0.02
 """Ratio of the median charge of a channel to that of the other channels, below which the channel counts as dead.
 
-The limit is smaller for a channel whose charges are smaller than those of the other channels on a possible film."""
+The limit is lower for a channel whose charges are smaller than those of the other channels on some possible film."""
 
 MIN_REVERSED_RATIO = 0.3
 """Ratio of the median charge of a channel to that of the other channels, above which its sign is checked."""
@@ -36,7 +36,7 @@ MIN_POSITION_RANGE_MM = 0.05
 
 
 class OtherUnit(NamedTuple):
-    """Wrong unit that may have been used by mistake.
+    """Unit that may have been used by mistake instead of the expected unit.
 
     Attributes:
         values: Name of the values that have the unit.
@@ -64,7 +64,7 @@ OTHER_UNITS = (
     OtherUnit("charges", "pC", "C", 1e12),
     OtherUnit("charges", "pC", "fC", 1e-3),
 )
-"""Wrong units that are considered."""
+"""Wrong units that the search for mistakes considers."""
 
 PRETENSIONS = (0.03, 0.25, 0.5, 1.0)
 """Pretensions of the films with which presses are compared, relative to the largest pretension of the prior."""
@@ -83,16 +83,18 @@ MIN_CHARGE_pC = 1e-3
 """Lower limit of charges whose logarithms are compared, pC. Smaller and negative charges are replaced by it."""
 
 MAX_SQUARED_DEVIATION = 4.0
-"""Limit of the squared deviation of a logarithm of charges, which bounds the effect of outliers."""
+"""Upper limit of the squared deviation between logarithms of charges, which bounds the effect of outliers."""
 
 MAX_OUTSIDE_FRACTION = 0.2
 """Largest fraction of presses outside the domain for which a misfit is computed."""
 
 CLEARER = 0.25
-"""Ratio of the misfits with and without the correction of a mistake, below which the mistake may be named."""
+"""Ratio of two misfits below which one explanation of the presses counts as clearly better than another.
+
+For example, the correction of a mistake must reduce the misfit to less than this fraction."""
 
 MAX_MISFIT_RATIO = 2.0
-"""Largest ratio of the misfit after a correction to the smallest such misfit, up to which the mistake is named."""
+"""Largest misfit after a correction for which the mistake is named, relative to that after the best correction."""
 
 AXES = (
     ("they are turned by 90 degrees", np.array([[0.0, -1.0], [1.0, 0.0]])),
@@ -103,7 +105,9 @@ AXES = (
     ("x and y are exchanged", np.array([[0.0, 1.0], [1.0, 0.0]])),
     ("x and y are exchanged and mirrored", np.array([[0.0, -1.0], [-1.0, 0.0]])),
 )
-"""Rotations and reflections that are considered: a description, and the matrix that corrects written positions."""
+"""Rotations and reflections of the axes that the search for mistakes considers.
+
+Each entry is a description, and the matrix that converts written positions into correct positions."""
 
 
 def check_places(presses: MeasuredPresses, radius: float) -> None:
@@ -127,7 +131,7 @@ def check_places(presses: MeasuredPresses, radius: float) -> None:
             f"is off the film, whose radius is {radius:g} mm; positions are in mm from the film's centre"
         )
     measured_places = places[np.isfinite(places[:, 0])]
-    spread = np.ptp(measured_places, axis=0).max() if len(measured_places) else 0.0
+    spread = np.ptp(measured_places, axis=0).max() if len(measured_places) else 0.0  # larger range of x and y
     if 0.0 < spread < MIN_POSITION_RANGE_MM:  # a spread of zero is allowed: repeated presses at one place
         raise PressError(
             f"all places lie within {spread:.3g} mm of each other; positions are in mm: were they written in metres?"
@@ -159,14 +163,17 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
 
 def _smallest_film_ratios(presses: MeasuredPresses, charges: FilmCharges) -> Array:
-    """Compute the charge of each channel relative to the other channels, and return the smallest value of a few films.
+    """Return the smallest charge ratio of each channel among a few films.
+
+    The charge ratio of a channel is its typical charge divided by that of the other channels; see `_charge_ratios`. The
+    films have the pretensions in `PRETENSIONS`. Charge ratios above 1 are replaced by 1.
 
     Args:
         presses: The measured presses. The charges of the films are computed for presses with a known place and force.
         charges: Model of the charges of all films.
 
     Returns:
-        Ratios of charges as in `_charge_ratios`, but limited to at most 1, shape (n_electrode,). All ratios are 1 if no
+        Ratios of charges as `_charge_ratios` returns them, but at most 1, shape (n_electrode,). All ratios are 1 if no
         press has a known place and force.
     """
     placed_contact = presses.contact[presses.placed]
@@ -183,11 +190,12 @@ def _check_channel(name: str, charge: Array, ratio: float, smallest_film_ratio: 
         name: Name of the electrode.
         charge: Charges of the channel, shape (n,), pC; NaN where a charge was not measured.
         ratio: Typical charge of the channel divided by that of the other channels; see `_charge_ratios`.
-        smallest_film_ratio: Smallest value of this ratio among a few possible films.
+        smallest_film_ratio: Smallest value of this ratio among a few possible films, at most 1.
 
     Raises:
         PressError: If the channel is dead or has the wrong sign.
     """
+    # The limit is lower for a channel that also has small charges on one of the possible films.
     if ratio < MAX_DEAD_RATIO * smallest_film_ratio:
         raise PressError(
             f"electrode {name!r} is dead: half of its charges are below "
@@ -264,7 +272,7 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     placed_presses = presses[presses.placed]
     if not len(placed_presses):
         return []
-    corrections = list(_corrected_presses(placed_presses, charges))
+    corrections = list(_possible_corrections(placed_presses, charges))
 
     # The charges of the films are computed for all corrected contacts in one call, because this is faster. The result
     # has the shape (n_film, n_correction * n, n_electrode), and is then split into one array for each correction.
@@ -276,13 +284,14 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
             charges, correction.contact, correction.charge, film_charges
         )
 
-    limit_for_improvement = CLEARER * misfit(presses, charges)
-    limit_for_similarity = MAX_MISFIT_RATIO * min(corrected_misfits.values())
-    misfits_best_first = sorted(corrected_misfits.items(), key=lambda item: item[1])
+    # A correction must improve the misfit clearly, and must be nearly as good as the best correction.
+    improvement_limit = CLEARER * misfit(presses, charges)
+    similarity_limit = MAX_MISFIT_RATIO * min(corrected_misfits.values())
+    sentences_best_first = sorted(corrected_misfits, key=lambda sentence: corrected_misfits[sentence])
     return [
         sentence
-        for sentence, corrected_misfit in misfits_best_first
-        if corrected_misfit < limit_for_improvement and corrected_misfit <= limit_for_similarity
+        for sentence in sentences_best_first
+        if corrected_misfits[sentence] < improvement_limit and corrected_misfits[sentence] <= similarity_limit
     ]
 
 
@@ -308,8 +317,8 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
 
     The misfit of one film is computed from the logarithms of the ratio of measured charge to expected charge. It is the
     sum of two terms. The first term is the mean squared deviation of these logarithms from their median, divided by
-    `SCATTER_STD` squared. The second term is the squared median of the logarithms, divided by `OFFSET_STD` squared. The
-    function returns the smallest misfit of all films.
+    `SCATTER_STD` squared. Each squared deviation is limited to `MAX_SQUARED_DEVIATION`. The second term is the squared
+    median of the logarithms, divided by `OFFSET_STD` squared. The function returns the smallest misfit of all films.
 
     Args:
         charges: Model of the charges of all films, with their domain. The misfit is infinite if more than
@@ -322,8 +331,8 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
     is_outside = (charges.into_domain(contact) != contact).any(axis=1)
     if is_outside.mean() > MAX_OUTSIDE_FRACTION:
         return np.inf
-    # For each film, the median is an offset that is common to all charges. The scatter is the mean squared deviation
-    # from this offset. Both have the shape (n_film,).
+    # For each film, the offset is the median over all charges. The scatter is the mean squared deviation from this
+    # offset. Both have the shape (n_film,).
     log_ratio = _log_charge(charge) - _log_charge(expected)  # shape (n_film, n, n_electrode)
     offset = np.nanmedian(log_ratio, axis=(1, 2))
     squared_deviation = np.minimum((log_ratio - offset[:, None, None]) ** 2, MAX_SQUARED_DEVIATION)
@@ -355,7 +364,7 @@ class Correction(NamedTuple):
     charge: Array
 
 
-def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[Correction]:
+def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[Correction]:
     """Yield a corrected copy of the presses for each possible mistake.
 
     The mistakes are swapped charge columns, rotated or mirrored axes of the rig, and wrong units.
@@ -370,10 +379,10 @@ def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterat
 
     # Swapped columns. For each column, `electrode_of_column` contains the index of the electrode to which the charges
     # belong.
-    for electrode_of_column in _fitting_orders(presses, charges):
+    for electrode_of_column in _plausible_electrode_orders(presses, charges):
         held_names = ", ".join(electrodes[electrode_index] for electrode_index in electrode_of_column)
         sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {held_names}"
-        column_of_electrode = np.argsort(electrode_of_column)  # the inverse permutation
+        column_of_electrode = np.argsort(electrode_of_column)  # the inverse permutation of `electrode_of_column`
         yield Correction(sentence, contact, charge[:, column_of_electrode])
 
     # Rotated or mirrored axes
@@ -394,11 +403,12 @@ def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterat
         )
 
 
-def _fitting_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
+def _plausible_electrode_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
     """Find the assignments of charge columns to electrodes that agree best with a few films.
 
     For each pretension in `PRETENSIONS`, the columns are assigned to the electrodes of a film with this pretension. The
     best assignment minimises the sum of squared differences between the logarithms of measured and expected charges.
+    Before the logarithms are compared, a common factor of all charges is removed.
 
     Args:
         presses: The measured presses, all with a known place and force.
@@ -406,9 +416,9 @@ def _fitting_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple
 
     Returns:
         Set of assignments. Each assignment contains, for each column, the index of the electrode to which its charges
-        belong. The set does not include the assignment that the presses have in their file.
+        belong. The set does not include the order in which the columns are written.
     """
-    orders = set()
+    electrode_orders = set()
     log_measured = _log_charge(presses.charge_pC)
     for expected in expected_charges(charges, presses.contact):
         log_expected = _log_charge(expected)
@@ -416,25 +426,25 @@ def _fitting_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple
         # The median is subtracted, because a common factor of all charges does not matter here. The upper limit of the
         # squared deviations reduces the effect of outliers.
         squared_deviation = np.minimum((log_ratio - np.nanmedian(log_ratio)) ** 2, MAX_SQUARED_DEVIATION)
-        # The best assignment has the smallest sum of distances, and assigns each electrode to exactly one column.
-        distance = np.nansum(squared_deviation, axis=0)  # shape (n_column, n_electrode)
-        _, electrode_of_column = linear_sum_assignment(distance)
-        orders.add(tuple(electrode_of_column.tolist()))
-    as_written = tuple(range(len(presses.electrodes)))
-    return orders - {as_written}
+        # The best assignment has the smallest sum of costs, and assigns each column to a different electrode.
+        cost = np.nansum(squared_deviation, axis=0)  # shape (n_column, n_electrode)
+        _, electrode_of_column = linear_sum_assignment(cost)
+        electrode_orders.add(tuple(electrode_of_column.tolist()))
+    written_order = tuple(range(len(presses.electrodes)))
+    return electrode_orders - {written_order}
 
 
 FAR_FROM_ALL_FILMS = "their charges are very different from those of its films"
 """Reason why presses are refused before a film is fitted to them."""
 
 MOSTLY_OUTSIDE = "most of them lie outside the places and forces of a calibration"
-"""Reason why presses are refused if few of them remain for a fit."""
+"""Reason why presses are refused if more than half of them lie outside the domain of the films."""
 
 UNUSUAL_FILM = "only a film that differs unusually from its description has such charges"
-"""Reason why presses are refused if the correction of a common mistake explains them far better."""
+"""Reason why presses are refused if a common mistake in the records would explain them far better."""
 
 
-def large_residual(residual_over_noise: float) -> str:
+def large_residual_reason(residual_over_noise: float) -> str:
     """Return the reason for refusing presses that differ too much from the best film of a fit.
 
     Args:
@@ -452,7 +462,7 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
     Args:
         presses: The presses as they are written in the file.
         charges: Model of the charges of all films.
-        reason: Reason why the presses are refused, such as `FAR_FROM_ALL_FILMS` or a text of `large_residual`.
+        reason: Reason why the presses are refused, such as `FAR_FROM_ALL_FILMS`.
     """
     sensor_name = charges.prior.sensor.name
     statement = f"no film of {sensor_name!r} explains these {len(presses)} presses: {reason}"

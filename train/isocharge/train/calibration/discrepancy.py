@@ -31,17 +31,19 @@ FORCE_DEGREE = 2
 """Largest degree of a term in ln F."""
 
 FADING = 0.5
-"""Ratio of the standard deviation of a coefficient to that of a coefficient whose total degree is lower by one.
+"""Factor by which the prior standard deviation of a coefficient decreases if its total degree increases by one.
 
-The ratio is below 1, because the discrepancy is smooth."""
+The factor is below 1, because the discrepancy is smooth."""
 
 COMMON = 1.0
-"""Ratio of the standard deviation of the common part of the discrepancy to that of the part of each electrode.
+"""Standard deviation of the common part of the discrepancy, relative to that of the part of each electrode.
 
-Both parts are of similar size in full simulations of imperfect films. The common part causes errors of the force."""
+Both parts have a similar size in full simulations of imperfect films. The common part causes errors of the force."""
 
 TRACE_ANGLES = (-45.0, 0.0, 45.0)
-"""Directions of the lines along which the trace of an electrode may lie, degrees from the outward direction.
+"""Directions of the lines along which the trace of an electrode may lie, in degrees.
+
+The direction 0 leads straight away from the centre of the film.
 
 The effect of a trace between these lines is a weighted sum of the effects of the lines. For presses within the working
 area, the error of this approximation is below the noise."""
@@ -69,9 +71,9 @@ def terms(contact: Array, domain: Domain) -> Array:
     unit_contact[:, :2] /= np.maximum(distance, 1.0)[:, None]  # changes only positions outside the unit disk
     unit_contact[:, 2] = np.clip(unit_contact[:, 2], -1.0, 1.0)
 
-    # Polynomials of all degrees in each coordinate, shape (n, DEGREE + 1). For each term, the columns with its degrees
-    # are then selected and multiplied, shape (n, n_term).
-    x_values, y_values, force_values = (chebyshev.chebvander(column, DEGREE) for column in unit_contact.T)
+    # Values of the polynomials T_0 to T_DEGREE in each coordinate, shape (n, DEGREE + 1). For each term, the columns
+    # with its degrees are then selected and multiplied, shape (n, n_term).
+    x_values, y_values, force_values = (chebyshev.chebvander(coordinate, DEGREE) for coordinate in unit_contact.T)
     degrees = _degrees()
     x_degree, y_degree, force_degree = degrees.T
     fading = FADING ** degrees.sum(axis=1)
@@ -82,6 +84,7 @@ def terms(contact: Array, domain: Domain) -> Array:
 @cache
 def _degrees() -> Integers:
     """Return the degrees in x, y and ln F of each term, shape (n_term, 3)."""
+    # All combinations of degrees, of which those with a small total degree are selected
     all_degrees = np.indices((DEGREE + 1, DEGREE + 1, FORCE_DEGREE + 1)).reshape(3, -1).T
     total_degree = all_degrees.sum(axis=1)
     return np.asarray(all_degrees[total_degree <= DEGREE])

@@ -20,21 +20,22 @@ from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.data.charge_field import fit_series
 
 RADIUS_SHARE = 0.3
-"""Share of the ring between the working area and the edge of the known charges that the series also covers.
+"""Share of the distance from the working area to the edge of the known charges that the series also covers.
 
 The contact that is nearest to measured charges may lie slightly outside the working area.
 """
 
 
 NODE_SHARES = (0.22, 0.5, 1.0)
-"""Distances of the nodes from the calibrated pretension on either side, relative to the largest distance on this side.
+"""Distances of the nodes from the calibrated pretension on each side, relative to the largest distance on this side.
 
-The nodes are close to each other near the calibrated pretension, because small changes of the pretension are frequent.
+The nodes are the pretensions at which series are fitted. They are close to each other near the calibrated pretension,
+because small changes of the pretension are frequent.
 """
 
 
 SMALLEST_RANGE_MPa = 0.05
-"""Largest difference of the calibrated pretension from an end of its range for which this side has no nodes, MPa."""
+"""Largest distance from the calibrated pretension to an end of the range for which no nodes lie on this side, MPa."""
 
 
 class SeriesSize(NamedTuple):
@@ -76,16 +77,18 @@ def film_charge_series(result: CalibrationResult, range_MPa: tuple[float, float]
     """
     domain = _series_domain(result.problem.domain, result.problem.charges.domain)
     calibrated_unknowns = result.posterior.unknowns
-    pretension = result.problem.prior.index("pretension")
-    calibrated_MPa = float(calibrated_unknowns[pretension])
+    pretension_index = result.problem.prior.index("pretension")
+    calibrated_MPa = float(calibrated_unknowns[pretension_index])
     node_MPa = _nodes(calibrated_MPa, range_MPa)
     try:
-        calibrated_series = _fitted(
+        calibrated_series = _fit_log_charges(
             domain,
             ideal=_log_ideal_charges(result, calibrated_unknowns, _contacts(domain, IDEAL_CHARGE)),
             factor=_log_factors(result, calibrated_unknowns, _contacts(domain, FACTOR)),
             sizes=(IDEAL_CHARGE, FACTOR),
         )
+        # At the other pretensions, changes from the calibrated film are fitted. They need the charges of the calibrated
+        # film at the contacts of the smaller series.
         ideal_contact = _contacts(domain, IDEAL_CHANGE)
         factor_contact = _contacts(domain, FACTOR_CHANGE)
         calibrated_ideal = _log_ideal_charges(result, calibrated_unknowns, ideal_contact)
@@ -97,8 +100,8 @@ def film_charge_series(result: CalibrationResult, range_MPa: tuple[float, float]
                 all_series.append(calibrated_series)
                 continue
             unknowns = calibrated_unknowns.copy()
-            unknowns[pretension] = pretension_MPa
-            change = _fitted(
+            unknowns[pretension_index] = pretension_MPa
+            change = _fit_log_charges(
                 domain,
                 ideal=_log_ideal_charges(result, unknowns, ideal_contact) - calibrated_ideal,
                 factor=_log_factors(result, unknowns, factor_contact) - calibrated_factor,
@@ -130,13 +133,14 @@ def _nodes(calibrated_MPa: float, range_MPa: tuple[float, float]) -> Array:
 
     Args:
         calibrated_MPa: The calibrated pretension, MPa, which is one of the nodes.
-        range_MPa: Smallest and largest pretension, MPa. No nodes lie on a side without a range.
+        range_MPa: Smallest and largest pretension, MPa. If one of them is not farther than `SMALLEST_RANGE_MPa` from
+            the calibrated pretension, no nodes lie on this side.
     """
     nodes = [calibrated_MPa]
     for limit_MPa in range_MPa:
-        distance_MPa = limit_MPa - calibrated_MPa
-        if abs(distance_MPa) > SMALLEST_RANGE_MPa:
-            nodes += [calibrated_MPa + share * distance_MPa for share in NODE_SHARES]
+        signed_distance_MPa = limit_MPa - calibrated_MPa  # negative towards the smallest pretension
+        if abs(signed_distance_MPa) > SMALLEST_RANGE_MPa:
+            nodes += [calibrated_MPa + share * signed_distance_MPa for share in NODE_SHARES]
     return np.sort(nodes)
 
 
@@ -174,8 +178,10 @@ def _log_factors(result: CalibrationResult, unknowns: Array, contact: Array) -> 
     return np.log(result.charge_factor(unknowns, contact))
 
 
-def _fitted(domain: Domain, ideal: Array, factor: Array, sizes: tuple[SeriesSize, SeriesSize]) -> Array:
-    """Fit a series to the logarithms of ideal charges, fit another one to those of the factors, and add both series.
+def _fit_log_charges(domain: Domain, ideal: Array, factor: Array, sizes: tuple[SeriesSize, SeriesSize]) -> Array:
+    """Fit one series to the logarithms of ideal charges and one to the logarithms of factors, and add both series.
+
+    The sum is a series of the logarithm of the product of charge and factor.
 
     Args:
         domain: Contacts for which the series are valid.
@@ -184,12 +190,14 @@ def _fitted(domain: Domain, ideal: Array, factor: Array, sizes: tuple[SeriesSize
         sizes: Sizes of the series of the ideal charges and of the factors.
 
     Returns:
-        Coefficients with the degrees of `IDEAL_CHARGE`, which are the largest degrees.
+        Coefficients of the sum, shape (degree + 1, degree + 1, force_degree + 1, n_electrode). The degrees are those of
+        `IDEAL_CHARGE`, so all sums have the same shape.
     """
-    degree, force_degree, _ = IDEAL_CHARGE
-    total = np.zeros((degree + 1, degree + 1, force_degree + 1, ideal.shape[1]))
+    largest = IDEAL_CHARGE  # no series has larger degrees
+    total = np.zeros((largest.degree + 1, largest.degree + 1, largest.force_degree + 1, ideal.shape[1]))
     for values, size in zip((ideal, factor), sizes, strict=True):
         unit_contact = domain.to_unit(_contacts(domain, size))
         series = fit_series(unit_contact, values, size.degree, size.force_degree)
+        # A series of lower degree contributes only to the first coefficients along each axis.
         total[: size.degree + 1, : size.degree + 1, : size.force_degree + 1] += series
     return total

@@ -1,9 +1,10 @@
 """Charges of presses on any film of a prior, and the derivatives of these charges.
 
 A film is described by a vector of unknowns. The first unknowns are the parameters of `FilmPrior`. The parameters may be
-followed by coefficients, which describe modes of imperfections, traces and the discrepancy. The coefficient of a mode
-is in units of the standard deviation of the mode. The coefficients of traces describe only traces that the sensor file
-does not contain. `UnknownLayout` defines the order of the unknowns.
+followed by coefficients, which describe imperfections of the film (modes), traces and the discrepancy. A mode is a
+first-order change of the charges by one imperfection. The coefficient of a mode is in units of the standard deviation
+of the mode. The coefficients of traces describe only traces that the sensor file does not contain. `UnknownLayout`
+defines the order of the unknowns.
 """
 
 from dataclasses import dataclass, replace
@@ -21,11 +22,11 @@ from isocharge.train.calibration.discrepancy import term_count, terms
 from isocharge.train.calibration.film_maps import CONTACT_STEPS, STEP, FilmMaps, log_force_derivative
 from isocharge.train.calibration.imperfections import (
     ModeCharges,
-    log_unevenness,
     tension_unevenness,
     trace_charges,
     trace_lines,
     trace_widths,
+    unevenness_derivative,
 )
 from isocharge.train.calibration.unknowns import UnknownLayout
 
@@ -33,18 +34,20 @@ LOAD_PARAMETERS = ("pretension", "young", "thickness")
 """Parameters that change the stress of the film under a load."""
 
 NEGLIGIBLE = 1e-3
-"""Size of the coefficients of modes and traces below which their effects are not computed.
+"""Size of the coefficients of modes and traces up to which their effects are not computed.
 
 Modes and traces with smaller coefficients change the charges by less than 1e-4 of their value."""
 
 LARGEST_LOCAL_COEFFICIENT = 0.1
-"""Largest coefficient of modes and traces whose factor on the charges is assumed not to depend on the parameters."""
+"""Largest coefficient of modes and traces for which their factor is assumed not to depend on the parameters.
+
+The factor is that by which modes and traces multiply the charges."""
 
 MIN_FACTOR = 0.05
 """Lower bound for the factor of modes and traces. The first-order expansion is not valid for smaller factors."""
 
 MAX_CACHED_MODES = 2
-"""Number of films whose modes and mode charges are cached."""
+"""Largest number of films whose modes and mode charges are cached."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +71,9 @@ class FilmCharges(FilmMaps):
 
     @cached_property
     def _is_uneven_tension(self) -> Booleans:
-        """Whether each mode is an uneven tension, shape (n_mode,).
+        """Whether each mode is an uneven tension of the film, shape (n_mode,).
 
-        In second order, an uneven tension has the same effect as a lower mean tension.
+        In second order, such a mode has the same effect as a lower mean tension.
         """
         return np.array([MODES[name].is_uneven_tension for name in self.modes], dtype=bool)
 
@@ -92,7 +95,7 @@ class FilmCharges(FilmMaps):
             covariance: Covariance of the unknowns, in which parameters are in units of their prior standard deviations.
 
         Returns:
-            Width and standard deviation of the width, by the name of the electrode, mm.
+            For the name of each electrode, the width and the standard deviation of the width, mm.
         """
         traces = self.layout.traces
         widths, stds = trace_widths(unknowns[traces], covariance[traces, traces])
@@ -120,8 +123,8 @@ class FilmCharges(FilmMaps):
 
         Modes are imperfections of the film, such as an uneven tension. Traces are metal lines that lead to the
         electrodes and also collect charge. The discrepancy multiplies each charge by a factor whose logarithm is a
-        polynomial of the contact. The computation of the charges of modes and traces is slow. Therefore, these charges
-        are omitted if all their coefficients are negligible.
+        polynomial of the contact. The computation of the effects of modes and traces is slow. Therefore, these effects
+        are omitted if all coefficients of modes and traces are negligible.
 
         Args:
             unknowns: Parameters and coefficients of the film, as in `film`.
@@ -139,6 +142,7 @@ class FilmCharges(FilmMaps):
                 charge = self.forward_map(unknowns[layout.parameters]).charges(contact)
             factor = self._imperfection_factor(unknowns, contact, charge)
 
+        # Factor of the discrepancy, whose logarithm is a weighted sum of the terms
         term_coefficients = unknowns[layout.terms]
         if term_coefficients.any():
             coefficients_by_term = term_coefficients.reshape(term_count(), -1)  # shape (n_term, n_electrode)
@@ -151,8 +155,8 @@ class FilmCharges(FilmMaps):
 
         Modes are imperfections of the film, such as an uneven tension. Traces are metal lines that also collect charge.
         Both add charges. Therefore, the factor is 1 plus the ratio of the added charges to the charges without modes
-        and traces. An uneven tension also has a second-order effect, by which the factor is multiplied. The result is
-        at least `MIN_FACTOR`.
+        and traces. An uneven tension also has a second-order effect, which multiplies the factor. The result is at
+        least `MIN_FACTOR`.
 
         Args:
             unknowns: Parameters and coefficients of the film, as in `film`.
@@ -164,7 +168,7 @@ class FilmCharges(FilmMaps):
         """
         layout = self.layout
         parameters = unknowns[layout.parameters]
-        mode_coefficients = unknowns[layout.modes]
+        mode_coefficients = unknowns[layout.modes]  # empty if no modes were computed for these films
         trace_coefficients = unknowns[layout.traces]
         factor = np.ones_like(charge)
 
@@ -174,18 +178,18 @@ class FilmCharges(FilmMaps):
             forward_map = self.forward_map(parameters)
             trace_jacobian = trace_charges(forward_map, self._trace_lines, contact)
             factor += trace_jacobian @ trace_coefficients / charge
-        if np.abs(mode_coefficients).max(initial=0.0) > NEGLIGIBLE:  # the initial value is used if there are no modes
-            modes = self._mode_charges(parameters, contact, charge)
-            factor += modes.mode_jacobian @ mode_coefficients / charge
+        if np.abs(mode_coefficients).max(initial=0.0) > NEGLIGIBLE:
+            mode_charges = self._mode_charges(parameters, contact, charge)
+            factor += mode_charges.mode_jacobian @ mode_coefficients / charge
 
             # Second order: an uneven tension acts like a lower mean tension. The unevenness is the relative decrease of
-            # the mean tension, and `log_unevenness` is the derivative of ln Q with respect to the unevenness.
+            # the mean tension, and `unevenness_derivative` is the derivative of ln Q with respect to the unevenness.
             unevenness, _ = self._unevenness(self._pretension(parameters), mode_coefficients)
-            factor *= np.exp(unevenness * modes.log_unevenness)
+            factor *= np.exp(unevenness * mode_charges.unevenness_derivative)
         return np.maximum(factor, MIN_FACTOR)
 
     def _pretension(self, unknowns: Array) -> float:
-        """Return the pretension of a film, MPa."""
+        """Return the pretension of a film, MPa, from its unknowns or its parameters."""
         return float(unknowns[self.layout.parameter("pretension")])
 
     def _mode_charges(self, parameters: Array, contact: Array, charge: Array) -> ModeCharges:
@@ -193,8 +197,8 @@ class FilmCharges(FilmMaps):
 
         The computation has two slow parts. The first part, the modes themselves, depends only on the film and the
         probe. The second part, the charges of the modes, also depends on the sensor (its electrodes and gains) and on
-        the contacts. The cache contains one result for each film and probe. If this result also has the same sensor and
-        contacts, it is returned. Otherwise, only its modes are used again.
+        the contacts. The cache contains the latest result for each of a few films and probes. If the sensor and the
+        contacts are those of the cached result, this result is returned. Otherwise, only its modes are used again.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -204,37 +208,40 @@ class FilmCharges(FilmMaps):
         forward_map = self.forward_map(parameters)
         sensor = forward_map.sensor
         if self.family.imperfections is None:  # no modes were computed for these films, so there are no effects
-            no_modes = np.zeros((*charge.shape, 0))
-            return ModeCharges(None, sensor, contact, mode_jacobian=no_modes, log_unevenness=np.zeros_like(charge))
+            no_jacobian = np.zeros((*charge.shape, 0))
+            return ModeCharges(
+                None, sensor, contact, mode_jacobian=no_jacobian, unevenness_derivative=np.zeros_like(charge)
+            )
 
         film_and_probe = (sensor.film, forward_map.probe)
-        cached_result = self._cached_modes.get(film_and_probe)
+        cached_result = self._mode_charge_cache.get(film_and_probe)
+        modes = None
         if cached_result is not None:
-            has_same_contact = np.array_equal(cached_result.contact, contact)
-            if cached_result.sensor == sensor and has_same_contact:
+            if cached_result.sensor == sensor and np.array_equal(cached_result.contact, contact):
                 return cached_result
-        if cached_result is not None and cached_result.modes is not None:
             modes = cached_result.modes
-        else:
+        if modes is None:
             modes = self.family.imperfections.mode_map(forward_map, self.modes)
-        mode_charges = self._computed_mode_charges(modes, forward_map, parameters, contact, charge)
+        mode_charges = self._compute_mode_charges(modes, forward_map, parameters, contact, charge)
         self._cache_mode_charges(film_and_probe, mode_charges)
         return mode_charges
 
     def _cache_mode_charges(self, film_and_probe: tuple[Film, Probe], mode_charges: ModeCharges) -> None:
-        """Store a result of `_mode_charges` in the cache, and remove the oldest result if the cache is full.
+        """Store a result of `_mode_charges` in the cache, which contains at most `MAX_CACHED_MODES` results.
+
+        If the cache is full and has no result with the same key, the result with the oldest key is removed first.
 
         Args:
             film_and_probe: Key of the result.
             mode_charges: The result.
         """
-        is_full = len(self._cached_modes) >= MAX_CACHED_MODES
-        if is_full and film_and_probe not in self._cached_modes:
-            oldest_key = next(iter(self._cached_modes))
-            del self._cached_modes[oldest_key]
-        self._cached_modes[film_and_probe] = mode_charges
+        is_full = len(self._mode_charge_cache) >= MAX_CACHED_MODES
+        if is_full and film_and_probe not in self._mode_charge_cache:
+            oldest_key = next(iter(self._mode_charge_cache))
+            del self._mode_charge_cache[oldest_key]
+        self._mode_charge_cache[film_and_probe] = mode_charges
 
-    def _computed_mode_charges(
+    def _compute_mode_charges(
         self, modes: ModeMap, forward_map: ForwardMap, parameters: Array, contact: Array, charge: Array
     ) -> ModeCharges:
         """Compute the effects of given modes on the charges of presses.
@@ -243,13 +250,13 @@ class FilmCharges(FilmMaps):
 
         Args:
             modes: The modes of the film. They may have been computed for a sensor with other electrodes and gains.
-            forward_map: Forward map of the film.
+            forward_map: Forward map of the film, with the sensor for which the charges are computed.
             parameters: Parameters of the film, shape (n_parameter,).
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             charge: Charges of these contacts without modes, shape (n, n_electrode), pC.
         """
         # Charges that are added by one standard deviation of each mode, shape (n, n_electrode, n_mode). The modes are
-        # evaluated with the electrodes and the gains of the sensor of `forward_map`.
+        # evaluated with the electrodes and gains of the sensor of `forward_map`, which replaces their own sensor.
         sensor = forward_map.sensor
         fields = replace(modes.fields, sensor=sensor) if modes.fields is not None else None
         modes_of_sensor = replace(modes, film=forward_map, fields=fields)
@@ -257,13 +264,13 @@ class FilmCharges(FilmMaps):
 
         # Derivative of ln Q with respect to ln T, where T is the tension. It gives the effect of a lower mean tension,
         # which is the second-order effect of an uneven tension.
-        pretension_derivative = self.difference("pretension", parameters, contact, charge)
+        pretension_derivative = self.finite_difference("pretension", parameters, contact, charge)
         log_tension_derivative = self._pretension(parameters) * pretension_derivative / charge
-        return ModeCharges(modes, sensor, contact, mode_jacobian, log_unevenness(log_tension_derivative))
+        return ModeCharges(modes, sensor, contact, mode_jacobian, unevenness_derivative(log_tension_derivative))
 
     @cached_property
-    def _cached_modes(self) -> dict[tuple[Film, Probe], ModeCharges]:
-        """Cache of `_mode_charges`, by film and probe. The oldest entry is the first one."""
+    def _mode_charge_cache(self) -> dict[tuple[Film, Probe], ModeCharges]:
+        """Cache of `_mode_charges`. The keys are pairs of film and probe, and the oldest key is the first one."""
         return {}
 
     def _unevenness(self, pretension: float, mode_coefficients: Array) -> tuple[float, Array]:
@@ -339,7 +346,8 @@ class FilmCharges(FilmMaps):
         charge = forward_map.charges(contact)  # without the factor
 
         # Derivatives of the charges without the factor with respect to the parameters. They need the derivative with
-        # respect to ln F, also without the factor. `contact_slopes` contains it if all coefficients are zero.
+        # respect to ln F, also without the factor. If all coefficients are zero, the factor is 1, and `contact_slopes`
+        # contains this derivative. Otherwise, it is computed separately.
         force_derivative = contact_slopes[:, :, 2]
         if coefficients.any():
             force_derivative = log_force_derivative(forward_map, contact)
@@ -352,8 +360,8 @@ class FilmCharges(FilmMaps):
         factor = self.factor(unknowns, contact, charge)[:, :, None]  # shape (n, n_electrode, 1)
         film_jacobian = self._with_factor_slopes(film_jacobian, unknowns, contact, charge) * factor
 
-        # A film with uneven tension depends on the ratio of tension to Young's modulus E. An increase of ln E therefore
-        # acts like a relative decrease of the coefficients of uneven tensions.
+        # The effect of an uneven tension depends on the ratio of this tension to Young's modulus E. An increase of ln E
+        # therefore acts like the same relative decrease of the coefficients of uneven tensions.
         mode_jacobian = self._mode_jacobian(unknowns, contact, charge, factor)
         tension_coefficients = unknowns[layout.modes] * self._is_uneven_tension
         young = layout.parameter("young")
@@ -381,9 +389,12 @@ class FilmCharges(FilmMaps):
         """
         layout = self.layout
         jacobian = film_jacobian.copy()
+        # The load parameters change the factor of modes and traces. These derivatives are per unit of the parameter.
         for name, log_derivative in self._load_slopes(unknowns, contact).items():
             index = layout.parameter(name)
             jacobian[:, :, index] += charge * log_derivative * self.prior.std[index]
+
+        # The other parameters change only the factor of traces. These derivatives are per prior standard deviation.
         if np.abs(unknowns[layout.traces]).max() > LARGEST_LOCAL_COEFFICIENT:
             for name, log_derivative in self._trace_slopes(unknowns, contact).items():
                 jacobian[:, :, layout.parameter(name)] += charge * log_derivative
@@ -393,7 +404,7 @@ class FilmCharges(FilmMaps):
         """Compute the derivatives of the charges with respect to the coefficients of the modes.
 
         A mode adds charge. A mode of uneven tension also lowers the mean tension, and thereby multiplies the charge by
-        exp(unevenness * log_unevenness). The unevenness is this relative decrease of the mean tension.
+        exp(unevenness * unevenness_derivative). The unevenness is this relative decrease of the mean tension.
 
         Args:
             unknowns: Parameters and coefficients of the film.
@@ -405,12 +416,12 @@ class FilmCharges(FilmMaps):
             Derivatives, shape (n, n_electrode, n_mode), pC.
         """
         parameters = unknowns[self.layout.parameters]
-        modes = self._mode_charges(parameters, contact, charge)
+        mode_charges = self._mode_charges(parameters, contact, charge)
         # Derivatives of the unevenness with respect to the coefficients, shape (n_mode,)
         _, unevenness_slopes = self._unevenness(self._pretension(parameters), unknowns[self.layout.modes])
-        # Derivatives of the exponential by the chain rule, times the charge: shape (n, n_electrode, 1)
-        log_unevenness_charge = (charge * modes.log_unevenness)[:, :, None]
-        return np.asarray(modes.mode_jacobian + factor * log_unevenness_charge * unevenness_slopes)
+        # Derivatives of the charges with respect to the unevenness, by the chain rule, shape (n, n_electrode, 1)
+        unevenness_charge_slopes = factor * (charge * mode_charges.unevenness_derivative)[:, :, None]
+        return np.asarray(mode_charges.mode_jacobian + unevenness_charge_slopes * unevenness_slopes)
 
     def _term_jacobian(self, contact: Array, charge: Array) -> Array:
         """Compute the derivatives of the charges with respect to the coefficients of the discrepancy.
@@ -443,7 +454,7 @@ class FilmCharges(FilmMaps):
         film_without_terms[self.layout.terms] = 0.0
         return film_without_terms
 
-    def _stepped(self, unknowns: Array, name: str) -> tuple[Array, float]:
+    def _step_parameter(self, unknowns: Array, name: str) -> tuple[Array, float]:
         """Change one parameter by a small step towards the prior mean, so that the parameter stays within its bounds.
 
         Args:
@@ -451,7 +462,7 @@ class FilmCharges(FilmMaps):
             name: Name of the parameter.
 
         Returns:
-            Changed parameters and coefficients, and the step, in prior standard deviations of the parameter.
+            Copy of the unknowns with the changed parameter, and the signed step, in prior standard deviations.
         """
         index = self.layout.parameter(name)
         step = -STEP if unknowns[index] > self.prior.mean[index] else STEP
@@ -472,8 +483,9 @@ class FilmCharges(FilmMaps):
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Derivatives by the name of the parameter, each of shape (n, n_electrode). The dictionary is empty if the
-            coefficients of modes and traces are small, because the derivatives are then negligible.
+            Derivatives with respect to each parameter in its own unit, by the name of the parameter, each of shape (n,
+            n_electrode). The dictionary is empty if the coefficients of modes and traces are small, because the
+            derivatives are then negligible.
         """
         film = self._without_terms(unknowns)  # the discrepancy does not depend on the parameters
         if np.abs(film[self.layout.imperfections]).max() < LARGEST_LOCAL_COEFFICIENT:
@@ -482,13 +494,13 @@ class FilmCharges(FilmMaps):
         # Finite difference with respect to ln F
         factor = self.factor(film, contact)
         _, _, log_force_step = CONTACT_STEPS
-        factor_with_force = self.factor(film, contact * [1.0, 1.0, np.exp(log_force_step)])
-        force_derivative = (factor_with_force - factor) / log_force_step
+        contact_with_larger_force = contact * [1.0, 1.0, np.exp(log_force_step)]
+        force_derivative = (self.factor(film, contact_with_larger_force) - factor) / log_force_step
 
         # Finite difference with respect to T
-        film_with_tension, step = self._stepped(film, "pretension")
-        tension_step = step * self.prior.std[self.layout.parameter("pretension")]
-        tension_derivative = (self.factor(film_with_tension, contact) - factor) / tension_step
+        stepped_film, step = self._step_parameter(film, "pretension")
+        tension_step = step * self.prior.std[self.layout.parameter("pretension")]  # in MPa
+        tension_derivative = (self.factor(stepped_film, contact) - factor) / tension_step
 
         # By the chain rule, d/d ln h = -d/d ln F and d/d ln E = -d/d ln F - T d/dT.
         derivatives = {
@@ -496,7 +508,7 @@ class FilmCharges(FilmMaps):
             "young": -force_derivative - self._pretension(film) * tension_derivative,
             "thickness": -force_derivative,
         }
-        # Derivatives of ln(factor)
+        # Derivatives of ln(factor), because d ln(factor) = d factor / factor
         positive_factor = np.maximum(factor, MIN_FACTOR)
         return {name: derivative / positive_factor for name, derivative in derivatives.items()}
 
@@ -515,8 +527,8 @@ class FilmCharges(FilmMaps):
             Derivatives with respect to each parameter in units of its prior standard deviation, by the name of the
             parameter, each of shape (n, n_electrode).
         """
-        # The factors of the discrepancy and of the modes are assumed not to depend on these parameters. They are
-        # removed, so that the factor is that of the traces alone.
+        # Only the factor of the traces is assumed to depend on these parameters. Without the coefficients of the
+        # discrepancy and of the modes, the factor is that of the traces alone.
         film = self._without_terms(unknowns)
         film[self.layout.modes] = 0.0
         factor = self.factor(film, contact)
@@ -524,7 +536,7 @@ class FilmCharges(FilmMaps):
         for name in SHARED:
             if name in LOAD_PARAMETERS:
                 continue
-            stepped_film, step = self._stepped(film, name)
+            stepped_film, step = self._step_parameter(film, name)
             derivative = (self.factor(stepped_film, contact) - factor) / step
             log_derivatives[name] = derivative / np.maximum(factor, MIN_FACTOR)  # d ln(factor) = d factor / factor
         return log_derivatives

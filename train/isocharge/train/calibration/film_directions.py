@@ -18,7 +18,9 @@ from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.data.charge_field import fit_series
 
 DEGREES = ((5, 3), (3, 1), (1, 1))
-"""Degrees of a series in the position and in ln F. The first pair for which there are enough contacts is used."""
+"""Possible degrees of a series in the position and in ln F.
+
+The first pair for which there are enough contacts is used."""
 
 CONTACTS_PER_TERM = 2.0
 """Smallest ratio of the number of contacts to the number of coefficients of a series."""
@@ -26,14 +28,14 @@ CONTACTS_PER_TERM = 2.0
 LEAST_MISFIT = 0.2
 """Effect of a direction on the misfit below which the direction is left out, in units of the noise.
 
-The effect is the root mean square of the misfit that one standard deviation of the direction causes. More directions
-hardly change the followed contacts."""
+The effect is the root mean square of the misfit that one standard deviation of the direction causes. Directions with
+smaller effects hardly change the contacts that the service estimates."""
 
 MAX_DIRECTIONS = 16
 """Largest number of directions. With more directions, the computation for each touch would take longer."""
 
 LEAST_VARIANCE = 1e-12
-"""Variance of a combination of unknowns, relative to the largest variance, up to which it is treated as zero."""
+"""Largest variance of a combination of unknowns that is treated as zero, relative to the largest variance."""
 
 
 def film_directions(result: CalibrationResult) -> FilmDirections:
@@ -50,33 +52,34 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
     problem = result.problem
     sensitivity = result.sensitivity
     estimate = result.posterior.drifted(problem.prior)  # the film may change before it is used
-    pretension = problem.prior.index("pretension")
+    pretension_index = problem.prior.index("pretension")
 
     # Covariance C of the unknowns at a given pretension: the covariance of all unknowns minus the part that is due to
     # the pretension. The regression is the change of each unknown per unit change of the pretension.
     covariance = estimate.unknown_covariance
-    pretension_regression = covariance[:, pretension] / covariance[pretension, pretension]
-    conditional_covariance = covariance - np.outer(pretension_regression, covariance[pretension])
+    pretension_variance = covariance[pretension_index, pretension_index]
+    pretension_regression = covariance[:, pretension_index] / pretension_variance
+    conditional_covariance = covariance - np.outer(pretension_regression, covariance[pretension_index])
 
     # With a root R of the covariance, C = R R', the unknowns are R times independent variables with the standard
     # deviation 1. Each direction is a unit vector v of these variables, and changes the unknowns by R v.
     root = _covariance_root(conditional_covariance)
-    film_unknowns = slice(0, len(covariance))  # the estimate may have only the first of all unknowns
+    film_unknowns = slice(0, len(covariance))  # the estimate may contain the parameters without the coefficients
     directions = _visible_directions(sensitivity.misfit_jacobian[:, :, film_unknowns], root)
     unknown_changes = directions @ root.T  # shape (n_direction, n_unknown)
 
     # Change of ln Q by each direction: sum over the unknowns u, for each contact n, direction k and electrode e
     log_charge_jacobian = sensitivity.log_charge_jacobian[:, :, film_unknowns]
     log_changes = np.einsum("neu,ku->nke", log_charge_jacobian, unknown_changes)
-    # If the pretension changes by 1, the mean of the unknowns changes by the regression. The pseudoinverse of R
-    # converts this change to the independent variables. The result is the change along each direction, shape
-    # (n_direction,).
+    # If the pretension increases by one prior standard deviation, the mean of the unknowns changes by the regression.
+    # The pseudoinverse of R converts this change to the independent variables. Its scalar product with a direction is
+    # the change of the mean along this direction, shape (n_direction,).
     mean_by_pretension = directions @ np.linalg.pinv(root) @ pretension_regression
     return FilmDirections(
         coefficients=_fitted_series(problem.domain, sensitivity.contact, log_changes),
         radius_mm=problem.domain.radius,
         force_N=problem.domain.force_range,
-        by_pretension=mean_by_pretension / problem.prior.std[pretension],
+        by_pretension=mean_by_pretension / problem.prior.std[pretension_index],  # per MPa
     )
 
 
@@ -124,10 +127,9 @@ def _covariance_root(covariance: Array) -> Array:
 
 
 def _fitted_series(domain: Domain, contact: Array, log_changes: Array) -> Array:
-    """Fit a polynomial series in the contact to given changes of ln Q.
+    """Fit polynomial series in the contact to given changes of the logarithm of the charge Q.
 
-    The degrees of the series are the first pair in `DEGREES` for which the number of contacts suffices. If it suffices
-    for no pair, the last pair is used.
+    The number of contacts determines the degrees of the series; see `_series_degrees`.
 
     Args:
         domain: Range of positions and forces to which the variables of the series are scaled.
@@ -138,12 +140,23 @@ def _fitted_series(domain: Domain, contact: Array, log_changes: Array) -> Array:
         Coefficients of the series, shape (degree + 1, degree + 1, force_degree + 1, n_direction, n_electrode).
     """
     n_contact, n_direction, n_electrode = log_changes.shape
-    # After the loop, `degree` and `force_degree` have the chosen values.
-    for degree, force_degree in DEGREES:
-        position_term_count = (degree + 1) * (degree + 2) // 2
-        term_count = position_term_count * (force_degree + 1)
-        if CONTACTS_PER_TERM * term_count <= n_contact:
-            break
+    degree, force_degree = _series_degrees(n_contact)
     columns = log_changes.reshape(n_contact, -1)  # `fit_series` expects one column for each fitted function
     series = fit_series(domain.to_unit(contact), columns, degree, force_degree)
     return series.reshape(*series.shape[:3], n_direction, n_electrode)
+
+
+def _series_degrees(n_contact: int) -> tuple[int, int]:
+    """Return the first pair of `DEGREES` for which the number of contacts suffices, or the last pair if there is none.
+
+    The number of contacts suffices if it is at least `CONTACTS_PER_TERM` times the number of coefficients.
+
+    Args:
+        n_contact: Number of contacts to which the series is fitted.
+    """
+    for degree, force_degree in DEGREES:
+        position_term_count = (degree + 1) * (degree + 2) // 2  # terms in x and y up to this total degree
+        term_count = position_term_count * (force_degree + 1)
+        if CONTACTS_PER_TERM * term_count <= n_contact:
+            return degree, force_degree
+    return DEGREES[-1]

@@ -12,7 +12,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.train.calibration import chi_square
-from isocharge.train.calibration.contacts import with_force
+from isocharge.train.calibration.contacts import from_log_contact
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.fit_problem import BAD_PROBABILITY, FitProblem, SettledFit, SolvedFilm
 from isocharge.train.calibration.hypotheses import Hypothesis
@@ -141,7 +141,7 @@ class FilmPosterior(FilmEstimate):
 
 
 def fit_film(
-    charges: FilmCharges,
+    charge_model: FilmCharges,
     data: PressData,
     initial: FilmEstimate,
     at_C: float | None = None,
@@ -156,14 +156,14 @@ def fit_film(
     film.
 
     Args:
-        charges: Model of the charges of all films.
+        charge_model: Model of the charges of all films.
         data: The measured presses.
         initial: Estimate of the film before the presses.
         at_C: Temperature for which the initial estimate and the result hold, degrees Celsius; None if temperatures were
             not measured.
         friction: Expected coefficient of friction of the presses; 0 for presses without friction.
     """
-    problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None, friction=friction)
+    problem = FitProblem.from_estimate(charge_model, initial, knows_temperature=at_C is not None, friction=friction)
     degrees_of_freedom = _degrees_of_freedom(data)
     every_press = np.ones(len(data), dtype=bool)
     no_effects = Hypothesis()  # the hypothesis that the parameters alone explain the presses
@@ -213,7 +213,7 @@ def _refit_if_all_good(
 
 
 def refit_film(
-    charges: FilmCharges,
+    charge_model: FilmCharges,
     data: PressData,
     initial: FilmEstimate,
     previous: FilmPosterior,
@@ -227,19 +227,19 @@ def refit_film(
     `fit_film`.
 
     Args:
-        charges: Model of the charges of all films.
+        charge_model: Model of the charges of all films.
         data: The presses. No press is left out.
         initial: Estimate of the film before the presses.
         previous: Previous estimate of the film, from similar presses.
         at_C: Temperature for which all these estimates hold, degrees Celsius; None if temperatures were not measured.
         friction: Expected coefficient of friction of the presses; 0 for presses without friction.
     """
-    problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None, friction=friction)
+    problem = FitProblem.from_estimate(charge_model, initial, knows_temperature=at_C is not None, friction=friction)
 
     # The unknowns of the previous estimate, with its parameters in units of their prior standard deviations
     layout = problem.layout
     start = np.zeros(layout.count)
-    start[layout.parameters] = previous.parameters / charges.prior.std
+    start[layout.parameters] = previous.parameters / charge_model.prior.std
     start[layout.coefficients] = previous.coefficients
     start[layout.nuisances] = [previous.nuisances[nuisance.name].value for nuisance in NUISANCES]
 
@@ -364,7 +364,7 @@ def _posterior(
     # A hypothesis is a combination of effects besides the parameters. The mixture is the average of the estimates under
     # all hypotheses. Its mean is the change of the unknowns from their mean before the presses.
     mixture = settled.mixture
-    unknowns = np.clip(problem.mean + mixture.mean, *problem.bounds)
+    unknowns = np.clip(problem.mean + mixture.mean_change, *problem.bounds)
 
     # Root-mean-square scatter of the forces over all hypotheses, weighted by their probabilities
     scatter_variance = sum(
@@ -389,12 +389,12 @@ def _posterior(
         change_index = layout.nuisance(PRETENSION_PER_KELVIN.name)
         warming = Warming(change.value, change.std, at_C, mixture.covariance[change_index, layout.film])
     return FilmPosterior(
-        parameters=unknowns[layout.parameters] * problem.charges.prior.std,
+        parameters=unknowns[layout.parameters] * problem.charge_model.prior.std,
         covariance=joint[layout.parameters, layout.parameters],
         coefficients=unknowns[layout.coefficients],
         joint=joint,
         warming=warming,
-        contact=with_force(contacts.contact),
+        contact=from_log_contact(contacts.contact),
         chi2=contacts.chi2,
         degrees_of_freedom=degrees_of_freedom,
         bad=~settled.is_kept,

@@ -121,7 +121,7 @@ class FilmMaps:
             Derivatives, shape (n, n_electrode, n_parameter), pC per unit of the parameter.
         """
         pretension = parameters[self.prior.index("pretension")]
-        derivatives = {name: self.difference(name, parameters, contact, charge) for name in STEPPED}
+        derivatives = {name: self.finite_difference(name, parameters, contact, charge) for name in STEPPED}
 
         # Chain rule for the charge E q(F / (E h a), T / E, h / a), with respect to ln E and ln h. The finite difference
         # for "thickness" is computed at a constant load F / (E h a), so the effect of the load is added here.
@@ -142,7 +142,7 @@ class FilmMaps:
         gain_jacobian = charge[:, :, None] * np.eye(charge.shape[1])
         return np.concatenate([shared_jacobian, gain_jacobian], axis=2)
 
-    def difference(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
+    def finite_difference(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
         """Compute the derivative of the charges with respect to one parameter by a finite difference.
 
         If the parameter is the thickness h, the force F changes in proportion to h. The load F / h is then constant,

@@ -23,9 +23,9 @@ from isocharge.train.calibration.contacts import (
     adjust_contacts,
     best_adjusted_contacts,
     derivatives_with_adjusted_contacts,
+    from_log_contact,
     neighbouring_films,
     weighted_sum,
-    with_force,
 )
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.hypotheses import (
@@ -109,19 +109,19 @@ class FitProblem:
     """Least-squares problem of a calibration: the possible films, and the prior of their unknowns.
 
     Attributes:
-        charges: Model of the charges of all films.
+        charge_model: Model of the charges of all films.
         mean: Mean of the unknowns before the presses, shape (n_unknown,). Parameters are in units of their prior
             standard deviations.
         covariance: Covariance of the unknowns before the presses without a hypothesis, shape (n_unknown, n_unknown).
     """
 
-    charges: FilmCharges
+    charge_model: FilmCharges
     mean: Array
     covariance: Array
 
     @classmethod
-    def of(
-        cls, charges: FilmCharges, initial: FilmEstimate, *, knows_temperature: bool, friction: float = 0.0
+    def from_estimate(
+        cls, charge_model: FilmCharges, initial: FilmEstimate, *, knows_temperature: bool, friction: float = 0.0
     ) -> "FitProblem":
         """From an estimate of the film before the presses, create the problem.
 
@@ -129,7 +129,7 @@ class FitProblem:
         variance.
 
         Args:
-            charges: Model of the charges of all films.
+            charge_model: Model of the charges of all films.
             initial: Estimate of the film before the presses. If it has no coefficients, their mean and variance are
                 zero.
             knows_temperature: Whether the temperatures of the presses are known. If they are known, the nuisances that
@@ -137,13 +137,13 @@ class FitProblem:
             friction: Expected coefficient of friction, which is also its prior standard deviation; 0 for presses
                 without friction.
         """
-        layout = charges.layout
+        layout = charge_model.layout
         mean = np.zeros(layout.count)
         covariance = np.zeros((layout.count, layout.count))
 
         # The first unknowns are those of the film: the parameters, and the coefficients if the estimate has them.
         film_unknowns = slice(0, initial.unknowns.size)
-        mean[layout.parameters] = initial.parameters / charges.prior.std
+        mean[layout.parameters] = initial.parameters / charge_model.prior.std
         if initial.coefficients.size:
             mean[layout.coefficients] = initial.coefficients
         covariance[film_unknowns, film_unknowns] = initial.unknown_covariance
@@ -163,12 +163,12 @@ class FitProblem:
         friction_index = layout.nuisance(FRICTION.name)
         mean[friction_index] = friction
         covariance[friction_index, friction_index] = friction**2
-        return cls(charges, mean, covariance)
+        return cls(charge_model, mean, covariance)
 
     @property
     def layout(self) -> UnknownLayout:
         """Layout of the vector of unknowns, with the index of each unknown."""
-        return self.charges.layout
+        return self.charge_model.layout
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
@@ -177,7 +177,7 @@ class FitProblem:
         The bounds of parameters are in units of their prior standard deviations. All other unknowns are unbounded.
         """
         layout = self.layout
-        prior = self.charges.prior
+        prior = self.charge_model.prior
         parameter_lower, parameter_upper = prior.bounds
         lower = np.full(layout.count, -np.inf)
         upper = np.full(layout.count, np.inf)
@@ -246,7 +246,7 @@ class FitProblem:
             mixture = self.mixture(data[is_kept], solved)
             # The mixture is computed with derivatives at the solved film. It is accurate only if the step from the
             # solved film to the estimate of the mixture is small.
-            step = self.mean + mixture.mean - solved.unknowns
+            step = self.mean + mixture.mean_change - solved.unknowns
             is_step_small = np.abs(step[self.layout.parameters]).max() < MAX_LINEAR_STEP
 
             # Add the presses that now agree with the film, unless all presses are kept already.
@@ -294,7 +294,7 @@ class FitProblem:
         jacobian = self.derivatives(SolvedFilm(solved.unknowns, contacts), scattered_data)
 
         # Residuals r for the estimated unknowns, by a linear approximation about the solved film
-        step = self.mean + mixture.mean - solved.unknowns
+        step = self.mean + mixture.mean_change - solved.unknowns
         residual = contacts.residual + jacobian @ step
 
         # Covariance S of the residuals of each press. The noise contributes the identity matrix, because residuals are
@@ -331,8 +331,8 @@ class FitProblem:
         jacobian = self.derivatives(adjusted, data)
         models_by_scatter = self._models_by_force_scatter(adjusted, data, jacobian)
         mixture = mix_hypotheses(models_by_scatter, self.prior_covariance)
-        bounded_unknowns = most_probable_within(self.bounds, self.mean + mixture.mean, mixture.covariance)
-        return mixture._replace(mean=bounded_unknowns - self.mean)
+        bounded_unknowns = most_probable_within(self.bounds, self.mean + mixture.mean_change, mixture.covariance)
+        return mixture._replace(mean_change=bounded_unknowns - self.mean)
 
     def _models_by_force_scatter(
         self, solved: SolvedFilm, data: PressData, jacobian: Array
@@ -353,7 +353,7 @@ class FitProblem:
         """
         residual = solved.contacts.residual
         deviation = solved.unknowns - self.mean
-        model = LinearModel.of(jacobian.reshape(-1, solved.unknowns.size), residual.ravel(), deviation)
+        model = LinearModel.from_residuals(jacobian.reshape(-1, solved.unknowns.size), residual.ravel(), deviation)
 
         # Unit vector of the derivative with respect to the force for each press, shape (n, n_electrode + 3)
         force_derivative = self._force_derivative(solved.unknowns, data, solved.contacts)
@@ -385,8 +385,8 @@ class FitProblem:
         film = self._film(unknowns)
         corrected_data = self._without_nuisances(unknowns, data)
         if start is None:
-            return best_adjusted_contacts(self.charges, film, corrected_data)
-        return adjust_contacts(self.charges, film, corrected_data, start)
+            return best_adjusted_contacts(self.charge_model, film, corrected_data)
+        return adjust_contacts(self.charge_model, film, corrected_data, start)
 
     def derivatives(self, solved: SolvedFilm, data: PressData, *, with_coefficients: bool = True) -> Array:
         """Compute the derivatives of the residuals of presses with respect to the unknowns.
@@ -404,13 +404,13 @@ class FitProblem:
         """
         layout = self.layout
         film_unknowns = layout.film if with_coefficients else layout.parameters
-        contact = with_force(solved.contacts.contact)
+        contact = from_log_contact(solved.contacts.contact)
 
         # Derivatives of the charges on films with several pretensions, between which the presses are interpolated
         films, film_weights = self._neighbouring_films(solved.unknowns, data)
-        contact_slopes_of_films = [self.charges.contact_slopes(film, contact) for film in films]
+        contact_slopes_of_films = [self.charge_model.contact_slopes(film, contact) for film in films]
         unknown_slopes_of_films = [
-            self.charges.unknown_slopes(film[film_unknowns], contact, contact_slopes)
+            self.charge_model.unknown_slopes(film[film_unknowns], contact, contact_slopes)
             for film, contact_slopes in zip(films, contact_slopes_of_films, strict=True)
         ]
         charge_contact_slopes = weighted_sum(contact_slopes_of_films, film_weights)
@@ -424,7 +424,7 @@ class FitProblem:
         # A nuisance changes either the charges or the pretension. The derivative with respect to the pretension is
         # converted from prior standard deviations to MPa.
         pretension = layout.parameter("pretension")
-        pretension_derivative = jacobian[:, :, pretension] / self.charges.prior.std[pretension]
+        pretension_derivative = jacobian[:, :, pretension] / self.charge_model.prior.std[pretension]
         jacobian[:, :, layout.nuisances] = nuisance_derivatives(data, pretension_derivative)
 
         residual_contact_slopes = data.residual_slopes(charge_contact_slopes)
@@ -450,7 +450,7 @@ class FitProblem:
         gain_std = float(np.hypot(gain_std, MEAN_OVER_STD * force_scatter))
 
         common_error = np.zeros(self.layout.film_count)
-        common_error[self.charges.prior.gains] = gain_std / self.charges.prior.spread.gain
+        common_error[self.charge_model.prior.gains] = gain_std / self.charge_model.prior.spread.gain
         return np.outer(common_error, common_error)
 
     def prior_covariance(self, hypothesis: Hypothesis) -> Array:
@@ -467,7 +467,7 @@ class FitProblem:
             Parameters in their own units, followed by the coefficients, shape (n_film_unknown,).
         """
         film = unknowns[self.layout.film].copy()
-        film[self.layout.parameters] *= self.charges.prior.std
+        film[self.layout.parameters] *= self.charge_model.prior.std
         return film
 
     def _without_nuisances(self, unknowns: Array, data: PressData) -> PressData:
@@ -476,7 +476,7 @@ class FitProblem:
 
     def _neighbouring_films(self, unknowns: Array, data: PressData) -> tuple[list[Array], Array]:
         """Return the films between which the charges of presses are interpolated; see `neighbouring_films`."""
-        return neighbouring_films(self.charges, self._film(unknowns), self._without_nuisances(unknowns, data))
+        return neighbouring_films(self.charge_model, self._film(unknowns), self._without_nuisances(unknowns, data))
 
     def _force_derivative(self, unknowns: Array, data: PressData, contacts: AdjustedContacts) -> Array:
         """Compute the derivatives of the residuals with respect to the logarithm of the stated force.
@@ -491,9 +491,9 @@ class FitProblem:
         Returns:
             Derivatives, shape (n, n_electrode + 3).
         """
-        contact = with_force(contacts.contact)
+        contact = from_log_contact(contacts.contact)
         films, film_weights = self._neighbouring_films(unknowns, data)
-        contact_slopes_of_films = [self.charges.contact_slopes(film, contact) for film in films]
+        contact_slopes_of_films = [self.charge_model.contact_slopes(film, contact) for film in films]
         residual_contact_slopes = data.residual_slopes(weighted_sum(contact_slopes_of_films, film_weights))
         # The stated force is treated as the only unknown. Therefore, an axis of length 1 is added, and then removed.
         residual_force_slopes = data.force_derivative()[:, :, None]

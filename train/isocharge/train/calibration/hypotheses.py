@@ -159,7 +159,7 @@ class LinearModel(NamedTuple):
     square: float
 
     @classmethod
-    def of(cls, jacobian: Array, residual: Array, deviation: Array) -> "LinearModel":
+    def from_residuals(cls, jacobian: Array, residual: Array, deviation: Array) -> "LinearModel":
         """Create the linear model of residuals from their values and derivatives at one point.
 
         Args:
@@ -186,13 +186,14 @@ class LinearModel(NamedTuple):
             jacobian: Derivatives of the components of the residuals along the directions, shape (n_direction,
                 n_unknown).
             residual: Components of the residuals along the directions, shape (n_direction,).
-            deviation: Difference of the unknowns from their mean before the presses, as in `of`, shape (n_unknown,).
+            deviation: Difference of the unknowns from their mean before the presses, as in `from_residuals`, shape
+                (n_unknown,).
             noise_variance: Variance of the additional noise along each direction, shape (n_direction,).
         """
         # The weight decreases by the share v / (1 + v). A residual that is multiplied by the square root of this share
         # contributes the share to the sum of squares, which is then subtracted.
         root_share = np.sqrt(noise_variance / (1.0 + noise_variance))
-        removed_part = LinearModel.of(root_share[:, None] * jacobian, root_share * residual, deviation)
+        removed_part = LinearModel.from_residuals(root_share[:, None] * jacobian, root_share * residual, deviation)
         log_determinant = float(np.log1p(noise_variance).sum())
         return LinearModel(
             normal=self.normal - removed_part.normal,
@@ -290,13 +291,13 @@ class Mixture(NamedTuple):
     """Estimate of the unknowns, averaged over all hypotheses.
 
     Attributes:
-        mean: Change of the mean of the unknowns by the presses, shape (n_unknown,).
+        mean_change: Change of the mean of the unknowns by the presses, shape (n_unknown,).
         covariance: Covariance of the unknowns after the presses, shape (n_unknown, n_unknown).
         probabilities: Probability of each hypothesis after the presses.
         log_evidence: Logarithm of the evidence of all hypotheses together, up to a constant.
     """
 
-    mean: Array
+    mean_change: Array
     covariance: Array
     probabilities: dict[Hypothesis, float]
     log_evidence: float

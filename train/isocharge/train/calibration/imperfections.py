@@ -30,7 +30,7 @@ LARGEST_SQUARED_RATIO = 0.9
 """Upper limit of the squared ratio of the uneven part of the tension to the mean tension."""
 
 SLACKENING = 1.75
-"""Exponent in `log_unevenness`, which was fitted to full simulations."""
+"""Exponent in `unevenness_derivative`, which was fitted to full simulations."""
 
 MIN_TENSION = 1e-3
 """Lower limit of the mean tension by which the uneven part of the tension is divided, MPa."""
@@ -45,15 +45,15 @@ class ModeCharges(NamedTuple):
         contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
         mode_jacobian: Derivatives of the charges with respect to the coefficients of the modes, shape (n, n_electrode,
             n_mode), pC.
-        log_unevenness: Derivative of ln Q with respect to the unevenness of the tension, shape (n, n_electrode); see
-            `tension_unevenness`.
+        unevenness_derivative: Derivative of ln Q with respect to the unevenness of the tension, shape (n,
+            n_electrode); see `tension_unevenness`.
     """
 
     modes: ModeMap | None
     sensor: Sensor
     contact: Array
     mode_jacobian: Array
-    log_unevenness: Array
+    unevenness_derivative: Array
 
 
 def trace_lines(sensor: Sensor) -> Array:
@@ -160,7 +160,7 @@ def tension_unevenness(pretension: float, tension_stds: Array, coefficients: Arr
     return unevenness, relative_stds**2 * coefficients / root
 
 
-def log_unevenness(log_tension_derivative: Array) -> Array:
+def unevenness_derivative(log_tension_derivative: Array) -> Array:
     """Compute the derivative of ln Q, where Q is the charge, with respect to the unevenness of the tension.
 
     The derivative is s (1 - (1 - s / 2)^SLACKENING). Here s = -d ln Q / d ln T is the sensitivity of the charge to the

@@ -56,7 +56,7 @@ class PressData:
     friction_charge: Array
 
     @classmethod
-    def of(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
+    def from_presses(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
         """Convert measured presses into data for a fit.
 
         A missing charge gets the weight 0. A missing coordinate of a contact is replaced by its value at the centre of

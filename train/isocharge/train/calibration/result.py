@@ -64,7 +64,7 @@ class CalibrationResult:
     @cached_property
     def sensitivity(self) -> ContactSensitivity:
         """Linearised effects that noise and errors in the unknowns of the film have on estimated contacts."""
-        return ContactSensitivity.at(self.problem, self.posterior.unknowns)
+        return ContactSensitivity.for_film(self.problem, self.posterior.unknowns)
 
     @cached_property
     def error_left(self) -> ContactError:
@@ -89,7 +89,7 @@ class CalibrationResult:
         # The sensitivity of the film before the move differs from that of the moved film, so it is computed again.
         unknowns = np.zeros(unknown_count)
         unknowns[estimated] = before.unknowns
-        return ContactSensitivity.at(self.problem, unknowns).contact_error(covariance)
+        return ContactSensitivity.for_film(self.problem, unknowns).contact_error(covariance)
 
     @property
     def fitted(self) -> Fitted:
@@ -120,7 +120,7 @@ class CalibrationResult:
             return self._network_of(film.unknowns, film.joint)
 
         # If a side force is declared only for later contacts, the presses themselves have no friction.
-        data = PressData.of(self.presses, self.problem.noise, self.problem.charges.domain)
+        data = PressData.from_presses(self.presses, self.problem.noise, self.problem.charges.domain)
         has_friction = self.problem.friction > 0.0
         if self.side_force_map is not None and has_friction:
             friction = self.posterior.nuisances[FRICTION.name].value
@@ -273,7 +273,7 @@ class CalibrationResult:
         """Yield sentences about the friction of the presses, and about the side forces of later contacts."""
         if self.side_forces is None:
             return
-        error = ContactError.of(self.side_forces.contact_covariance(self.sensitivity))
+        error = ContactError.from_covariance(self.side_forces.contact_covariance(self.sensitivity))
         if self.problem.friction > 0.0:
             friction = self.side_forces.friction
             yield (

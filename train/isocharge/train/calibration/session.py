@@ -16,7 +16,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.train.calibration.calibrate import FEW, calibrate
+from isocharge.train.calibration.calibrate import FEW_PRESSES, calibrate
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.press_data import no_presses
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
@@ -213,7 +213,7 @@ class PressSession:
     @property
     def enough(self) -> bool:
         """Whether the uncertainty of the film causes only small position errors, compared with the noise."""
-        if self.result is None or len(self) < FEW:
+        if self.result is None or len(self) < FEW_PRESSES:
             return False
         noise_mm = self.result.sensitivity.noise_error.position_mm
         return self.result.error_left.position_mm <= self._until * noise_mm

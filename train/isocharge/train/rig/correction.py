@@ -169,7 +169,7 @@ def fit_correction(residuals: Residuals) -> Correction:
     most_probable_size = mixture.best.discrepancy
     if most_probable_size == 0.0:
         return Correction(domain, coefficients=np.zeros((n_term, n_electrode)), effective_count=0.0)
-    coefficients = mixture.mean.reshape(n_term, n_electrode)
+    coefficients = mixture.mean_change.reshape(n_term, n_electrode)
     # The residuals determine some of the coefficients, and the prior determines the others. The effective number of
     # coefficients that the residuals determine is the trace of the posterior covariance times the normal matrix.
     effective_count = float(np.trace(mixture.covariance @ model.normal))
@@ -226,7 +226,7 @@ def _linear_model(residuals: Residuals, domain: Domain) -> LinearModel:
     n_coefficient = term_count() * residuals.log_ratio.shape[1]
     design = derivatives.reshape(-1, n_coefficient)
     deviation_from_prior_mean = np.zeros(n_coefficient)  # the prior mean of the coefficients is c = 0
-    return LinearModel.of(design, uncorrected_residuals.ravel(), deviation_from_prior_mean)
+    return LinearModel.from_residuals(design, uncorrected_residuals.ravel(), deviation_from_prior_mean)
 
 
 def _log_ratio(ratio: Array) -> Array:
