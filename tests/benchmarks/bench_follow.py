@@ -55,6 +55,9 @@ WARM_FINGER_s = 150.0
 COLD_TOUCHES = 10
 PRESSES = 20
 RATE_Hz = 200.0
+SEQ_MODULUS = 65536
+"""Number of values of the counter of a binary frame."""
+
 TARE_FRAMES = 110
 TOUCH_FRAMES = 20
 REST_FRAMES = 20
@@ -186,7 +189,8 @@ class Board:
         """Send frames with the same charges, shape (n_electrode,), pC, and with noise of 1 pC."""
         for _ in range(count):
             noisy_charge = charge + self._rng.standard_normal(charge.size)
-            frame = Frame(self._count, int(1e6 * self._count / RATE_Hz), tuple(noisy_charge.tolist()))
+            counter = self._count % SEQ_MODULUS  # a fast machine sends more frames than the counter has values
+            frame = Frame(counter, int(1e6 * self._count / RATE_Hz), tuple(noisy_charge.tolist()))
             chunk = Chunk(encode_frame(frame), 1.7e9 + self._count / RATE_Hz, 0)
             self._count += 1
             for _record in self.stream.feed(chunk):
