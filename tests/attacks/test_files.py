@@ -363,7 +363,7 @@ def test_companion_files_with_faults(name, tmp_path, attack):
             log_changes = directions.log_changes(np.array([[0.0, 0.0, 0.5], [30.0, -20.0, 100.0]]))
             assert np.isfinite(np.exp(log_changes)).all()
         elif name == "film_charges.npz":
-            charges = read_film_charges(tmp_path, 4).at(np.array([0.7]))
+            charges = read_film_charges(tmp_path, 4).interpolated(np.array([0.7]))
             unit_contact = charges.unit_contact(np.array([[0.0, 0.0, 0.5], [30.0, -20.0, 100.0]]))
             assert np.isfinite(charges.charges(unit_contact[None])[0]).all()
         else:

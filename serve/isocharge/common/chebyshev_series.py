@@ -16,11 +16,13 @@ CHUNK_SIZE = 4096
 class Series:
     """Sum of products of Chebyshev polynomials in three coordinates: x, y and the logarithm of the force.
 
-    Each coordinate is scaled to the range from -1 to 1.
+    Each coordinate is scaled to the range from -1 to 1. The sum has one value for each electrode. Products whose total
+    degree in x and y exceeds `degree` are omitted.
 
     Attributes:
         coefficients: Coefficients of the products, shape (degree + 1, degree + 1, force_degree + 1, n_electrode). The
-            first three axes are the degrees of the polynomials in x, in y and in the logarithm of the force.
+            indices of the first three axes are the degrees of the polynomials in x, in y and in the logarithm of the
+            force.
     """
 
     coefficients: Array
@@ -40,7 +42,7 @@ class Series:
         """
         n_x, _n_y, n_force, n_electrode = self.coefficients.shape  # numbers of polynomials, and of electrodes
         degree = n_x - 1  # the same in x and in y
-        n_chunk = len(coordinates) // CHUNK_SIZE + 1  # at least one chunk, even for no points
+        n_chunk = len(coordinates) // CHUNK_SIZE + 1  # at least one chunk, even if there are no points
         evaluated_chunks = []
         for chunk in np.array_split(coordinates, n_chunk):
             position_terms, force_terms = chebyshev_terms(chunk, degree, force_degree=n_force - 1)
@@ -48,8 +50,8 @@ class Series:
             # Sum over the products of polynomials in x and y: (points, n_term) @ (n_term, n_force * 4 * n_electrode).
             # The factor 4 stands for the value and its three derivatives. For each point, the sums are the coefficients
             # of series in the logarithm of the force.
-            force_coefficients = position_terms @ self._term_coefficients
-            force_coefficients = force_coefficients.reshape(len(chunk), n_force, 4 * n_electrode)
+            position_sums = position_terms @ self._term_coefficients
+            force_coefficients = position_sums.reshape(len(chunk), n_force, 4 * n_electrode)
 
             # Sum over the polynomials in the logarithm of the force:
             # (points, 1, n_force) @ (points, n_force, 4 * n_electrode).
@@ -96,15 +98,15 @@ class SeriesStack:
             Values and derivatives, shape (n_series, m, 4, n_electrode), as `Series.values_and_derivatives` returns
             them.
         """
-        n_series, _, n_y, n_force, n_electrode = self.coefficients.shape
+        n_series, n_x, _n_y, n_force, n_electrode = self.coefficients.shape
         n_point = coordinates.shape[1]
         all_coordinates = coordinates.reshape(n_series * n_point, 3)
-        position_terms, force_terms = chebyshev_terms(all_coordinates, degree=n_y - 1, force_degree=n_force - 1)
+        position_terms, force_terms = chebyshev_terms(all_coordinates, degree=n_x - 1, force_degree=n_force - 1)
 
         # The two sums are those of `Series.values_and_derivatives`, for all series at the same time.
         n_term = position_terms.shape[1]
-        force_coefficients = position_terms.reshape(n_series, n_point, n_term) @ self._term_coefficients
-        force_coefficients = force_coefficients.reshape(n_series * n_point, n_force, 4 * n_electrode)
+        position_sums = position_terms.reshape(n_series, n_point, n_term) @ self._term_coefficients
+        force_coefficients = position_sums.reshape(n_series * n_point, n_force, 4 * n_electrode)
         values = force_terms[:, None, :] @ force_coefficients
         return values.reshape(n_series, n_point, 4, n_electrode)
 

@@ -223,7 +223,7 @@ def test_film_charges_are_read_as_they_were_written(tmp_path):
 def test_film_charges_are_those_of_the_chebyshev_series(tmp_path):
     """The logarithms of the charges in the small file are linear in x, y, the scaled ln F and the pretension."""
     write_npz(tmp_path, "film_charges.npz", film_charge_arrays())
-    charges = read_film_charges(tmp_path, 4).at(np.array([0.6, 1.5]))
+    charges = read_film_charges(tmp_path, 4).interpolated(np.array([0.6, 1.5]))
     contact = np.array([[4.0, -2.0, 2.0], [0.0, 0.0, np.sqrt(0.05 * 2.0)]])
     unit_contact = np.broadcast_to(charges.unit_contact(contact), (2, 2, 3))
     charge_pC, slopes_pC = charges.charges(unit_contact)

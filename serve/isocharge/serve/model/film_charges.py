@@ -38,7 +38,7 @@ MAX_DEGREE = 30
 """Largest degree of the series in a file."""
 
 MAX_LOG_CHARGE = 100.0
-"""Largest magnitude of ln Q. The charges of calibrated films are between 0.01 and 1e5 pC."""
+"""Largest magnitude of ln Q, where Q is a charge in pC. The charges of calibrated films are between 0.01 and 1e5 pC."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class FilmChargeSeries:
         """Series of ln Q, one for each node."""
         return SeriesStack(self.coefficients)
 
-    def at(self, pretension_MPa: Array) -> "FilmChargeSeries":
-        """Return series that are interpolated to other pretensions.
+    def interpolated(self, pretension_MPa: Array) -> "FilmChargeSeries":
+        """Return the charges with series that are interpolated to other pretensions, which become the nodes.
 
         Args:
             pretension_MPa: The other pretensions, shape (n,), MPa, in ascending order.
@@ -73,9 +73,9 @@ class FilmChargeSeries:
         coefficients = np.tensordot(weights, self.coefficients, axes=1)
         return replace(self, node_MPa=pretension_MPa, coefficients=coefficients)
 
-    def unit_contact(self, contact: Array) -> Array:
+    def unit_contact(self, contacts: Array) -> Array:
         """Convert contacts (x, y, F), shape (n, 3), to coordinates of the series; see `clipped_unit_contact`."""
-        return clipped_unit_contact(contact, self.radius_mm, self.force_N)
+        return clipped_unit_contact(contacts, self.radius_mm, self.force_N)
 
     def charges(self, unit_contact: Array) -> tuple[Array, Array]:
         """Compute the charges of contacts, and their derivatives with respect to the coordinates of the series.
@@ -152,10 +152,11 @@ def _film_charges(arrays: Mapping[str, np.ndarray], n_electrode: int) -> FilmCha
             f"{coefficients.shape}"
         )
 
-    # A Chebyshev polynomial is at most 1, so a series is at most the sum of the magnitudes of its coefficients.
+    # The magnitude of a Chebyshev polynomial is at most 1. The magnitude of a series is therefore at most the sum of
+    # the magnitudes of its coefficients.
     max_log_charges = np.abs(coefficients).sum(axis=(1, 2, 3))  # shape (n_node, n_electrode)
-    largest = float(max_log_charges.max())
-    if largest > MAX_LOG_CHARGE:
-        raise ValueError(f"series: expected values of ln Q up to {MAX_LOG_CHARGE:g}, got up to {largest:g}")
+    largest_log_charge = float(max_log_charges.max())
+    if largest_log_charge > MAX_LOG_CHARGE:
+        raise ValueError(f"series: expected values of ln Q up to {MAX_LOG_CHARGE:g}, got up to {largest_log_charge:g}")
     radius_mm, force_N = read_contact_range(arrays)
     return FilmChargeSeries(node_MPa, coefficients, radius_mm, force_N)

@@ -58,8 +58,8 @@ class FilmDirections:
     """Uncertain linear combinations of the unknowns of a film, called directions, and their effects on the charges.
 
     Attributes:
-        coefficients: Coefficients of the series, shape (degree + 1, degree + 1, force_degree + 1, n_direction,
-            n_electrode).
+        coefficients: Coefficients of the Chebyshev series of the changes of ln Q, the logarithm of each charge, by one
+            unit of each direction, shape (degree + 1, degree + 1, force_degree + 1, n_direction, n_electrode).
         radius_mm: Largest distance of a contact from the centre, mm.
         force_N: Smallest and largest force, N.
         by_pretension: Derivative of the mean of each direction with respect to the pretension, shape (n_direction,),
@@ -78,6 +78,7 @@ class FilmDirections:
         A model that was calibrated by an earlier version of isocharge has no directions.
         """
         no_coefficients = np.zeros((1, 1, 1, 0, n_electrode))
+        # There are no series, so the radius and the forces have no effect.
         return cls(no_coefficients, radius_mm=1.0, force_N=(1.0, 2.0), by_pretension=np.zeros(0))
 
     @property
@@ -90,7 +91,7 @@ class FilmDirections:
         """Chebyshev series of every direction and electrode. Directions and electrodes share one axis."""
         return Series(self.coefficients.reshape(*self.coefficients.shape[:3], -1))
 
-    def log_changes(self, contact: Array) -> Array:
+    def log_changes(self, contacts: Array) -> Array:
         """Compute the change of ln Q, the logarithm of each charge, that one unit of each direction causes.
 
         A direction is a linear combination of the unknowns of the film. One unit of a direction is one standard
@@ -98,22 +99,22 @@ class FilmDirections:
         within these limits.
 
         Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            contacts: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
             Changes, shape (n, n_direction, n_electrode), dimensionless.
         """
         *_coefficient_counts, n_direction, n_electrode = self.coefficients.shape
         if n_direction == 0:
-            return np.zeros((len(contact), 0, n_electrode))
+            return np.zeros((len(contacts), 0, n_electrode))
 
-        # The first entry of axis 1 is the value of the series. Its derivatives follow in this axis.
-        unit_contact = clipped_unit_contact(contact, self.radius_mm, self.force_N)
-        log_changes = self._series.values_and_derivatives(unit_contact)[:, 0]
-        return np.asarray(log_changes.reshape(len(contact), n_direction, n_electrode))
+        # The first entry of axis 1 is the value of the series. Its derivatives follow in this axis and are not used.
+        unit_contact = clipped_unit_contact(contacts, self.radius_mm, self.force_N)
+        log_changes = self._series.values_and_derivatives(unit_contact)[:, 0]  # shape (n, n_direction * n_electrode)
+        return np.asarray(log_changes.reshape(len(contacts), n_direction, n_electrode))
 
     def to_bytes(self) -> bytes:
-        """Return the content of the file."""
+        """Return the content of the file `film_directions.npz`."""
         arrays: dict[str, Any] = {
             "series": self.coefficients.astype(np.float32),
             "radius_mm": np.array(self.radius_mm),

@@ -33,7 +33,7 @@ def interpolation_weights(node_MPa: Array, pretension_MPa: Array) -> Array:
     node_difference_MPa = node_MPa[:, None] - node_MPa  # p_i - p_j, shape (k, k)
     difference_MPa = pretension_MPa[:, None, None] - node_MPa  # p - p_j, shape (n, 1, k)
 
-    # The factors with i equal to j are no part of the product. Their denominator is replaced, because it is 0.
+    # The factors with i equal to j do not belong to the product. Their denominator is 0, and is replaced by 1.
     denominator_MPa = np.where(is_other_node, node_difference_MPa, 1.0)
     factors = difference_MPa / denominator_MPa  # shape (n, k nodes i, k nodes j)
     return np.asarray(np.prod(factors, axis=2, where=is_other_node))
@@ -56,7 +56,7 @@ def neighbour_weights(node_MPa: Array, pretension_MPa: Array) -> Array:
 
 
 def check_nodes(node_MPa: Array, required_MPa: float | None = None) -> None:
-    """Check the nodes of a file.
+    """Check that the nodes of a file, which are pretensions in ascending order, are valid.
 
     Args:
         node_MPa: Pretensions of the nodes, shape (k,), MPa.

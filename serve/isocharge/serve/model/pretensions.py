@@ -71,8 +71,9 @@ class Pretensions:
         limits_pC: Smallest and largest charge, pC. Charges outside this range are clipped.
         typical_pC: Charge by which each charge is divided before the logarithm, shape (n_electrode,), pC.
         weights: Arrays of the layers by the names of the constants in the graph, float32, in this order: weight, shape
-            (k, n_input, n_output), and bias, shape (k, n_output), of each hidden layer; weight of the skip layer,
-            shape (k, n_electrode, n_answer); bias and weight of the output layer.
+            (k, n_input, n_neuron), and bias, shape (k, n_neuron), of each hidden layer; weight of the skip layer,
+            shape (k, n_electrode, n_output); bias, shape (k, n_output), and weight, shape (k, n_neuron, n_output), of
+            the output layer. The skip layer connects the inputs directly with the outputs.
         activation: Name of the activation function of the hidden layers.
     """
 
@@ -127,7 +128,7 @@ class Pretensions:
         output_layer = Layer(output_weight, output_bias[:, None])
         return Perceptron(tuple(hidden_layers), output_layer, skip_weight, ACTIVATIONS[self.activation])
 
-    def at(self, pretension_MPa: Array) -> "Pretensions":
+    def interpolated(self, pretension_MPa: Array) -> "Pretensions":
         """Return the same network with weights that are interpolated to other pretensions.
 
         In the result, the other pretensions replace the pretensions `node_MPa`.
@@ -148,7 +149,7 @@ class Pretensions:
         Args:
             pretension_MPa: The pretension, MPa, within `range_MPa`.
         """
-        single_network = self.at(np.array([pretension_MPa]))
+        single_network = self.interpolated(np.array([pretension_MPa]))
         return {name: node_weights[0] for name, node_weights in single_network.weights.items()}
 
     def misfits(self, charge_pC: Array, pretension_MPa: Array) -> Array:
@@ -161,17 +162,17 @@ class Pretensions:
         Returns:
             Misfits, shape (n,), in standard deviations of the noise.
         """
-        charge_rows_pC = charge_pC[None]  # shape (1, n_electrode), because `vectors` expects several presses
-        (misfit_vectors,) = self.vectors(charge_rows_pC, pretension_MPa)  # one array of shape (n, n_electrode)
+        charge_rows_pC = charge_pC[None]  # shape (1, n_electrode), because `misfit_vectors` expects several presses
+        (misfit_vectors,) = self.misfit_vectors(charge_rows_pC, pretension_MPa)  # one array of shape (n, n_electrode)
         return np.asarray(np.linalg.norm(misfit_vectors, axis=1))
 
-    def vectors(self, charge_pC: Array, pretension_MPa: Array) -> Array:
+    def misfit_vectors(self, charge_pC: Array, pretension_MPa: Array) -> Array:
         """Compute the misfit vectors of presses at several pretensions. The length of a misfit vector is the misfit.
 
         The network computes a vector u at each pretension of `node_MPa`. At other pretensions, u is interpolated
         linearly between the two nearest pretensions of `node_MPa`. The pretensions of `node_MPa` must therefore be
-        close to each other, as in a network that the method `at` returns. The misfit vector has the direction of u and
-        the length misfit_unit * sinh(|u|).
+        close to each other. The method `interpolated` can return such a network. The misfit vector has the direction of
+        u and the length misfit_unit * sinh(|u|).
 
         Args:
             charge_pC: Charges of m presses, shape (m, n_electrode), pC.
@@ -187,7 +188,8 @@ class Pretensions:
         n_electrode = inputs.shape[1]
         node_vectors = outputs[..., -n_electrode:]  # shape (k, m, n_electrode)
 
-        # Find the two neighbouring pretensions of `node_MPa`. The fraction is 0 at the lower and 1 at the upper one.
+        # Find the two pretensions of `node_MPa` between which each pretension lies. The fraction is 0 at the lower of
+        # these two pretensions, and 1 at the upper.
         upper = np.clip(np.searchsorted(self.node_MPa, pretension_MPa), 1, self.node_MPa.size - 1)
         lower = upper - 1
         gap_MPa = self.node_MPa[upper] - self.node_MPa[lower]
@@ -265,7 +267,7 @@ def _pretensions_from_arrays(arrays: Mapping[str, np.ndarray]) -> Pretensions:
             f"{low_pC:g} to {high_pC:g} pC"
         )
     numbers = {name: getattr(about, name) for name in _NUMBERS}
-    weight_names = _checked_weights(arrays, about, node_MPa.size)
+    weight_names = _checked_weight_names(arrays, about, node_MPa.size)
     weights = {name: arrays[name].astype(np.float32) for name in weight_names}
     pretensions = Pretensions(node_MPa=node_MPa, typical_pC=typical_pC, weights=weights, **numbers)
     _check_misfits(pretensions)
@@ -282,13 +284,13 @@ def _check_misfits(pretensions: Pretensions) -> None:
     checked_MPa = np.linspace(min_MPa, max_MPa, CHECKED_PRETENSIONS)
     charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)  # a weak, a typical and a strong press
     with np.errstate(over="ignore", invalid="ignore"):  # results that overflow are reported below
-        interpolated_network = pretensions.at(checked_MPa)
-        misfit_vectors = interpolated_network.vectors(charges_pC, checked_MPa)
+        interpolated_network = pretensions.interpolated(checked_MPa)
+        misfit_vectors = interpolated_network.misfit_vectors(charges_pC, checked_MPa)
     if not np.isfinite(misfit_vectors).all():
         raise ValueError("the weights give misfits that are not finite")
 
 
-def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: int) -> list[str]:
+def _checked_weight_names(arrays: Mapping[str, np.ndarray], about: _About, n_node: int) -> list[str]:
     """Check the arrays that contain the weights, and return their names in the order of the layers.
 
     The list `about.constants` contains the names. The list begins with two names for each hidden layer, which are the

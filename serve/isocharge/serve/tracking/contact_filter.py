@@ -66,8 +66,7 @@ class ContactFilter:
 
     def reset(self) -> None:
         """Discard the tracked contact."""
-        # `step` starts both filters again at the next contact, so the filters that are created here are never used.
-        # A position is a complex number x + iy.
+        # Placeholders, because `step` replaces both filters at the next contact. A position is a complex number x + iy.
         self._position_filter = TwoModeFilter.start(0j, 1.0, POSITION_MOTION)
         self._force_filter = TwoModeFilter.start(0.0, 1.0, FORCE_MOTION)
         self._tracked: TrackedContact | None = None
@@ -77,10 +76,11 @@ class ContactFilter:
     def step(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> TrackedContact:
         """Process the next frame, and smooth its position and the logarithm of its force with two filters.
 
-        Both filters are restarted after a gap in time, and also when the position filter rejects the measured position.
-        If only the force filter rejects its measured value, only the force filter is restarted. A rejected position is
-        an outlier if the contact would have to move at `MAX_SPEED_mm_per_s` or faster to reach this position. Up to
-        `MAX_OUTLIERS` outliers in succession are ignored.
+        A filter rejects a measured value that is far from its prediction. If the force filter rejects its value, only
+        the force filter is restarted. If the position filter rejects the position, the position may be an outlier,
+        which means that no contact moves fast enough to reach the position. Up to `MAX_OUTLIERS` outliers in
+        succession are ignored. After any other rejected position, both filters are restarted. They are also restarted
+        if the time since the latest frame is longer than `MAX_GAP_s`, or if the clock was set back.
 
         The filters use only the variance of the noise that changes from frame to frame. Smoothing does not reduce
         errors that are the same in all frames.
@@ -99,7 +99,7 @@ class ContactFilter:
         smoothed_position = None
         smoothed_log_force = None
 
-        # Continue the filters. A filter returns None if it rejects a measured value far from its prediction.
+        # Continue the filters. A filter returns None if it rejects its measured value.
         dt_s = t_s - self._latest_time_s  # since the latest frame that was not ignored
         previous = self._tracked
         if previous is not None and 0.0 < dt_s <= MAX_GAP_s:
@@ -111,7 +111,8 @@ class ContactFilter:
                 return previous
         self._outlier_count = 0
 
-        # Start each filter that was not continued. Its first smoothed value is the measured value.
+        # Start each filter that was not continued. Its first smoothed value is the measured value. If the position was
+        # rejected, the force filter was not continued either.
         if smoothed_position is None:
             self._position_filter = TwoModeFilter.start(measured.position, position_variance, POSITION_MOTION)
             smoothed_position = Estimate(measured.position, position_variance)
@@ -156,8 +157,7 @@ class ContactFilter:
         """Return the smoothed contact with standard deviations that include the constant errors of the model.
 
         The filters smooth only the errors that change from frame to frame. The variance of the constant errors is a
-        fixed fraction of the variance that the model states. The variance of the constant errors is added to the
-        variance of the smoothed values.
+        fixed fraction of the variance that the model states, and is added to the variance of the smoothed values.
 
         Args:
             contact: Contact predicted by the model.

@@ -153,8 +153,8 @@ class ContactMixture:
         self._hypotheses: list[ContactHypothesis] = []
         self._step_frames: list[tuple[Array, float]] = []  # charges and time of each frame of the present step
         self._step_begin_s = -math.inf
-        self._previous_step_s = -math.inf  # mean time of the frames of the previous step
-        self._next_search_s = -math.inf  # time before which the whole film is not searched again
+        self._mixture_time_s = -math.inf  # time of the latest update, which is the mean time of its frames
+        self._next_search_s = -math.inf  # earliest time of the next search over the whole film
 
     def update(self, charge_pC: Array, t_s: float) -> list[ContactHypothesis]:
         """Process the next frame, and return the contacts that explain the charges.
@@ -171,11 +171,12 @@ class ContactMixture:
             contact explains the charges.
         """
         self._step_frames.append((charge_pC, t_s))
-        # A time before the beginning of the step also ends the step, because the clock was then set back.
-        is_within_step = 0.0 <= t_s - self._step_begin_s < STEP_s - CLOCK_TOLERANCE_s
+        # A negative time since the beginning of the step means that the clock was set back. This also ends the step.
+        time_in_step_s = t_s - self._step_begin_s
+        is_within_step = 0.0 <= time_in_step_s < STEP_s - CLOCK_TOLERANCE_s
         if not is_within_step:
             self._process_step(t_s)
-        return [hypothesis.extrapolated(t_s - self._previous_step_s) for hypothesis in self._hypotheses]
+        return [hypothesis.extrapolated(t_s - self._mixture_time_s) for hypothesis in self._hypotheses]
 
     def _process_step(self, t_s: float) -> None:
         """Update the mixture with the mean charges of the frames in a step, and begin the next step.
@@ -185,10 +186,10 @@ class ContactMixture:
         """
         charges_of_frames, times_s = zip(*self._step_frames, strict=True)
         mean_time_s = sum(times_s) / len(times_s)
-        dt_s = mean_time_s - self._previous_step_s  # since the mean time of the previous step
+        dt_s = mean_time_s - self._mixture_time_s  # time since the previous update
         self._step_frames = []
         self._step_begin_s = t_s
-        self._previous_step_s = mean_time_s
+        self._mixture_time_s = mean_time_s
 
         # Follow the contact of the previous step. If there was no contact, or the charges no longer fit it, search the
         # whole film. The search takes milliseconds, so it is not repeated in every step.
@@ -200,7 +201,7 @@ class ContactMixture:
             self._next_search_s = t_s + SEARCH_INTERVAL_s
             components = self._search(measurement)
         self._components = components
-        self._hypotheses = [] if components is None else self._group(components)
+        self._hypotheses = [] if components is None else self._combine_by_contact(components)
 
     def _mean_measurement(self, charges_of_frames: Sequence[Array]) -> Measurement:
         """Average the charges over the frames in a step, and compute the variances of the mean charges.
@@ -219,15 +220,15 @@ class ContactMixture:
     def _search(self, measurement: Measurement) -> Components | None:
         """Search the whole film for contacts that explain the charges.
 
-        Components with large variances are placed on a spiral that covers the film. The charges update these
-        components. The state of a component consists of x, y and the logarithm of the force, the rates of change of
-        these three values, and the logarithm of the gain of each electrode.
+        Components with large variances are placed on a spiral that covers the film, and are then updated with the
+        charges. The state of a component consists of x, y and the logarithm of the force, the rates of change of these
+        three values, and the logarithm of the gain of each electrode.
 
         Args:
             measurement: Charges of this step.
 
         Returns:
-            The updated components that explain the charges; None if no component explains them.
+            The updated components; None if the most probable component does not explain the charges.
         """
         n_electrode = measurement.charge_pC.size
         mean = np.zeros((N_INITIAL_COMPONENTS, N_MOTION + n_electrode))  # rates and logarithms of gains remain 0
@@ -260,7 +261,7 @@ class ContactMixture:
             dt_s: Time since the previous step, s.
 
         Returns:
-            The updated components; None if no component explains the charges.
+            The updated components; None if the most probable component does not explain the charges.
         """
         predicted = predict_components(components, dt_s)
 
@@ -273,7 +274,9 @@ class ContactMixture:
 
         has_large_innovation = self._squared_innovation(predicted, measurement) > SQUARED_GATE
         is_fast = np.hypot(added_mean[X_RATE], added_mean[Y_RATE]) > SPEED_STD
-        if has_large_innovation:  # the velocity may have changed to an unknown value
+        if has_large_innovation:
+            # The rates may have changed to unknown values at any time since the previous step. The position and the
+            # force may therefore have changed, too.
             rate_variance = np.array([NEW_SPEED_STD, NEW_SPEED_STD, FORCE_RATE_STD]) ** 2
             added_covariance[RATES, RATES] += np.diag(rate_variance)
             added_covariance[CONTACT, CONTACT] += np.diag(rate_variance * dt_s**2)
@@ -288,7 +291,7 @@ class ContactMixture:
         """Compute the squared Mahalanobis distance of the innovation of the most probable component.
 
         The innovation v is the difference between the measured and the predicted charges. The covariance of the
-        innovation is S = J P J^T + R. Here P is the covariance of the state, J is the derivative of the charges with
+        innovation is S = J P J^T + R. Here P is the covariance of the state, J is the Jacobian of the charges with
         respect to the state, and R is the covariance of the noise. The result is v^T S^-1 v.
 
         Args:
@@ -296,10 +299,11 @@ class ContactMixture:
             measurement: Charges of this step.
         """
         most_probable = components.best
-        charge_pC, jacobian = charges_and_jacobian(self.charges, components.mean)
-        charge_covariance = jacobian @ components.covariance @ jacobian.swapaxes(1, 2)
-        innovation_covariance = charge_covariance[most_probable] + np.diag(measurement.variance)
-        innovation = measurement.charge_pC - charge_pC[most_probable]
+        charges_pC, jacobians = charges_and_jacobian(self.charges, components.mean)  # of all components
+        jacobian = jacobians[most_probable]  # shape (n_electrode, n_state)
+        charge_covariance = jacobian @ components.covariance[most_probable] @ jacobian.T
+        innovation_covariance = charge_covariance + np.diag(measurement.variance)
+        innovation = measurement.charge_pC - charges_pC[most_probable]
         return float(innovation @ np.linalg.solve(innovation_covariance, innovation))
 
     def _most_probable_states(
@@ -307,9 +311,9 @@ class ContactMixture:
     ) -> tuple[Array, LinearisedUpdate]:
         """For each component, find the most probable state for the measured charges.
 
-        Each iteration linearises the charges about the present state, and computes the Kalman update of the prior mean
-        with the linearised charges. Each iteration moves the state towards the updated mean. The change of the state in
-        one iteration is limited, because the linearisation is only accurate near the present state.
+        Each iteration linearises the charges about the present state, computes the Kalman update of the prior mean with
+        the linearised charges, and moves the state towards the updated mean. The change of the state in one iteration
+        is limited, because the linearisation is only accurate near the present state.
 
         Args:
             prior: Predicted components.
@@ -324,16 +328,16 @@ class ContactMixture:
         for _ in range(iterations):
             state_charge_covariance = linearised.cross_covariance.swapaxes(1, 2)  # (n_component, n_state, n_electrode)
             change_from_prior = (state_charge_covariance @ linearised.weighted_innovation)[:, :, 0]
-            steps = prior.mean + change_from_prior - states
-            states = states + limit_iteration_steps(steps)
+            updated_mean = prior.mean + change_from_prior
+            states = states + limit_iteration_steps(updated_mean - states)
             linearised = linearise_update(self.charges, states, prior, measurement)
         return states, linearised
 
     def _update(self, prior: Components, measurement: Measurement, iterations: int) -> Components | None:
         """Update the components with the charges, remove improbable components, and split a component at a fold.
 
-        The weight of each component is multiplied by the likelihood of the component. Components outside the film are
-        removed. If the most probable component does not explain the charges, the result is None.
+        The weight of each component is multiplied by the likelihood of the component. Components that are clearly
+        outside the film, beyond `MAX_RELATIVE_RADIUS`, are removed.
 
         Args:
             prior: Predicted components.
@@ -355,7 +359,8 @@ class ContactMixture:
         is_outside_film = np.hypot(states[:, X], states[:, Y]) > MAX_RELATIVE_RADIUS * self.charges.radius_mm
         log_weight[is_outside_film] = -np.inf
         best = int(log_weight.argmax())  # the most probable component
-        is_explained = squared_distance[best] < MAX_SQUARED_DISTANCE and np.isfinite(log_weight[best])
+        is_any_inside = np.isfinite(log_weight[best])
+        is_explained = is_any_inside and squared_distance[best] < MAX_SQUARED_DISTANCE
         if not is_explained:
             return None
 
@@ -381,14 +386,14 @@ class ContactMixture:
         best = components.best
         mean = components.mean[best]
         covariance = components.covariance[best]
-        has_space_for_two = len(components.mean) <= MAX_COMPONENTS - 2
 
         # Standard deviation of the position along the longest axis of the covariance ellipse.
         variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])
         longest = variances.size - 1  # `eigh` returns the variances in ascending order
         std_mm = math.sqrt(max(variances[longest], 0.0))  # rounding errors may make the variance negative
-        is_narrow = std_mm < MIN_SPLIT_STD_mm
-        if is_narrow or not has_space_for_two:
+        is_wide = std_mm >= MIN_SPLIT_STD_mm
+        has_space_for_two = len(components.mean) <= MAX_COMPONENTS - 2
+        if not (is_wide and has_space_for_two):
             return components
 
         # Expected change of the whole state if the position changes by one standard deviation along the longest axis.
@@ -400,7 +405,8 @@ class ContactMixture:
         if not self._is_across_fold(mean, states_on_both_sides).any():
             return components
 
-        # Each added component is narrower along the longest axis than the most probable component.
+        # Each added component is narrower along the longest axis than the most probable component. The ratio of the
+        # variances is the square of the ratio of the standard deviations.
         removed_share = 1.0 - SPLIT_STD_RATIO**2
         narrow_covariance = covariance - removed_share * np.outer(change_per_std, change_per_std)
 
@@ -437,7 +443,7 @@ class ContactMixture:
         relative_orientation = np.linalg.det(state_jacobian.T @ other_jacobians)
         return np.asarray(relative_orientation < 0.0)
 
-    def _group(self, components: Components) -> list[ContactHypothesis]:
+    def _combine_by_contact(self, components: Components) -> list[ContactHypothesis]:
         """For each contact, combine all components that describe the contact into one hypothesis.
 
         The most probable component and all components that describe the same contact form the first group. The
@@ -459,6 +465,8 @@ class ContactMixture:
             hypothesis = combine_components(components.select(group), probability[group])
             hypotheses.append(hypothesis)
             remaining = remaining[~is_same]
+
+        # A later group may have a larger total probability than an earlier group.
         return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)
 
     def _is_same_contact(self, components: Components, rows: Integers) -> Booleans:

@@ -64,7 +64,7 @@ OFFSET_TIME_CONSTANT_s = 600.0
 RELATIVE_LEVELS = (0.0, 0.15, 0.33, 1.0, 3.3)
 """Standard deviation of the mean offset at each level, relative to the largest standard deviation that is tolerated.
 
-Offsets of the last level are too large.
+The last level represents offsets that are too large to be tolerated.
 """
 
 RELATIVE_SCATTER = (0.0, 0.03, 0.1, 0.3, 1.0)
@@ -74,7 +74,7 @@ The values are relative to the largest standard deviation of the mean offset tha
 """
 
 MAX_RELATIVE_OFFSET = 2.0
-"""Mean offset above which offsets are too large, relative to the largest standard deviation that is tolerated."""
+"""Magnitude of the mean offset, relative to the largest tolerated standard deviation, above which it is too large."""
 
 NO_OFFSET_PROBABILITY = 0.9
 """Probability before the first touch that touches have no offset. The other levels have equal probabilities."""
@@ -200,13 +200,15 @@ class FilmFilter:
         """Whether the offsets are probably larger than the largest offsets that the filter tolerates.
 
         An offset is a charge that is added to all electrodes during a touch. The offset levels are hypotheses about the
-        size of the offsets. The last level is the hypothesis that the offsets are too large.
+        size of the offsets. The offsets are too large if the last level is the most likely level, or if the magnitude
+        of the mean offset exceeds `MAX_RELATIVE_OFFSET` times the largest tolerated standard deviation.
         """
         level_count = self._level_std_pC.size
         if level_count == 1:  # touches are assumed to have no offsets
             return False
-        is_at_last_level = self._likeliest_level == level_count - 1
-        return is_at_last_level or abs(self._mean_offset_pC) > MAX_RELATIVE_OFFSET * self._largest_offset_pC
+        is_last_level_likeliest = self._likeliest_level == level_count - 1
+        is_mean_too_large = abs(self._mean_offset_pC) > MAX_RELATIVE_OFFSET * self._largest_offset_pC
+        return is_last_level_likeliest or is_mean_too_large
 
     @property
     def offset_pC(self) -> Array:
@@ -480,7 +482,8 @@ class FilmFilter:
         misfit = linearised.vectors[0]  # shape (n_pretension, n_electrode)
         misfit_without_offset = linearised.vectors[1:]  # shape (n_level, n_pretension, n_electrode)
 
-        # The derivatives with respect to gains and directions are the same at every level.
+        # The derivatives with respect to gains and directions are the same at every level. Each change of the charges
+        # is caused by one unit of a gain or of a direction, so the changes of the misfit vectors are the derivatives.
         jacobian = np.empty((*self._joint_probability.shape, layout.electrodes, layout.size))
         jacobian[..., layout.offset] = (misfit - misfit_without_offset) / offset_step_pC[:, None, None]
         jacobian[..., layout.gains] = linearised.changes[..., : layout.electrodes]

@@ -42,7 +42,7 @@ from isocharge.serve.tracking.pretension_grid import odds_of_no_change
 from isocharge.serve.tracking.touch_misfits import touch_misfits
 
 HARMLESS_FLAGS = frozenset({STRESS, GAP, REPEAT})
-"""Flags of a frame with which its touch remains usable. GAP and REPEAT only mean that frames were lost."""
+"""Flags that do not make the touch of a frame unusable. GAP and REPEAT only mean that frames were lost."""
 
 HARMLESS_FLAGS_OUTSIDE = HARMLESS_FLAGS | {OUTSIDE, BEYOND, MISFIT}
 """Flags with which a touch remains usable if the same frame also has the flag OUTSIDE.
@@ -80,7 +80,7 @@ The reduction is the smallest sum for any pretension minus the smallest sum for 
 OFFSET_CORRECTION_ERROR = 0.5
 """Standard deviation of the correction of the pretension for offsets, in units of the correction."""
 
-UNCHANGED_PROBABILITY = 0.3
+UNCHANGED_PROBABILITY = 0.2
 """Probability before the first touch that the pretension has not changed since the calibration."""
 
 SENSITIVITY_STEP_MPa = 0.05
@@ -173,15 +173,15 @@ class FilmFollower:
                 (n_electrode,), or one number for all electrodes.
 
         Raises:
-            ModelError: If the model has three electrodes, or has no file of pretensions, or the file of pretensions
-                belongs to another model.
+            ModelError: If the model has fewer than four electrodes, or has no file of pretensions, or the file of
+                pretensions belongs to another model.
         """
         self._calibrated_predictor = predictor
         self._pretensions = followable_pretensions(predictor)
         electrodes = self._pretensions.typical_pC.size
         self._directions = read_film_directions(predictor.folder, electrodes)
         self._misfits = touch_misfits(predictor, self._pretensions)
-        self._calibrated_misfits = self._misfits.at(self._pretensions.calibrated_MPa)
+        self._calibrated_misfits = self._misfits.at_pretension(self._pretensions.calibrated_MPa)
         rule = rule or FollowRule()
         self._filter = FilmFilter(
             self._pretensions,
@@ -214,9 +214,9 @@ class FilmFollower:
         self._neighbouring_model: Predictor | None = None
         self._neighbouring_step_MPa = SENSITIVITY_STEP_MPa
 
-        # Charge factors for both models, and the contact for which the factors were computed; see `_charge_factors`.
-        self._factors: tuple[Array, Array] | None = None
-        self._factors_contact: Contact | None = None
+        # Charge ratios for both models, and the contact for which the ratios were computed; see `_charge_ratios`.
+        self._stored_ratios: tuple[Array, Array] | None = None
+        self._stored_ratios_contact: Contact | None = None
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
         self._touch_count = 0
         self._recent_misfits: deque[SquaredMisfits] = deque(maxlen=RECENT_TOUCHES)
@@ -256,7 +256,7 @@ class FilmFollower:
             if not harmless_flags.issuperset(flags):
                 self._is_touch_usable = False
         elif self._peak is None or contact.force_N > self._peak.contact.force_N:  # the largest force so far
-            assert charge_pC is not None
+            assert charge_pC is not None  # a frame with a contact has charges
             self._peak = PeakFrame(contact, charge_pC)
 
     def _end_touch(self, clock_s: float) -> None:
@@ -289,36 +289,37 @@ class FilmFollower:
         corrected_contact = contact
         corrected_pC = charge_pC
         neighbouring_pC = charge_pC  # charges for the model at the neighbouring pretension
-        if self._directions.count > 0:
-            factor, neighbouring_factor = self._charge_factors(contact)
-            neighbouring_pC = charge_pC / neighbouring_factor
-            corrected_pC = charge_pC / factor
+        if self._directions.count > 0:  # without directions, all ratios are 1
+            ratio, neighbouring_ratio = self._charge_ratios(contact)
+            neighbouring_pC = charge_pC / neighbouring_ratio
+            corrected_pC = charge_pC / ratio
             corrected_contact = self.predictor.predict(corrected_pC)
         predict_neighbouring = partial(self._neighbouring_model.predict, neighbouring_pC)
         shift = self._sensitivity.shift(corrected_contact, self._applied_estimate.std_MPa, predict_neighbouring)
         return FollowedContact(corrected_contact.widened(shift), corrected_pC)
 
-    def _charge_factors(self, contact: Contact) -> tuple[Array, Array]:
-        """Return the factors by which charges are divided before a model computes a contact from them.
+    def _charge_ratios(self, contact: Contact) -> tuple[Array, Array]:
+        """Return the ratios by which charges are divided before a model computes a contact from them.
 
-        The factors depend on the contact and on the estimate of the film. The factors are only computed again if the
-        contact has moved or the estimate of the film has changed.
+        A ratio is a charge of the present film, divided by the charge of the film that the model describes. The ratios
+        depend on the contact and on the estimate of the film. The ratios are therefore stored, and computed again only
+        if the contact has moved or the estimate of the film has changed.
 
         Args:
-            contact: Contact for which the factors are needed.
+            contact: Contact for which the ratios are needed.
 
         Returns:
-            Factors for the model with the estimated pretension, and factors for the model with the neighbouring
+            Ratios for the model with the estimated pretension, and ratios for the model with the neighbouring
             pretension, each of shape (n_electrode,).
         """
-        if self._factors is None or not is_close(contact, self._factors_contact):
+        if self._stored_ratios is None or not is_close(contact, self._stored_ratios_contact):
             contacts = np.array([contact[:3]])  # one contact (x, y, force), shape (1, 3)
             log_changes = self._directions.log_changes(contacts)[0]
-            factor = self._applied_estimate.charge_factor(log_changes)
-            neighbouring_factor = self._applied_estimate.charge_factor(log_changes, self._neighbouring_step_MPa)
-            self._factors = factor, neighbouring_factor
-            self._factors_contact = contact
-        return self._factors
+            ratio = self._applied_estimate.charge_ratio(log_changes)
+            neighbouring_ratio = self._applied_estimate.charge_ratio(log_changes, self._neighbouring_step_MPa)
+            self._stored_ratios = ratio, neighbouring_ratio
+            self._stored_ratios_contact = contact
+        return self._stored_ratios
 
     def observe_touch(self, peak: PeakFrame, clock_s: float) -> None:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
@@ -369,17 +370,17 @@ class FilmFollower:
                 an uncertain combination of film parameters.
             residuals: Squared misfits that the filter computed for the touch.
         """
-        with_gains = np.minimum(residuals.with_gains, LARGEST_SQUARE)  # shape (n_pretension,)
+        squares_with_gains = np.minimum(residuals.with_gains, LARGEST_SQUARE)  # shape (n_pretension,)
 
-        # Remove the estimated offset, and the estimated changes of the film along the directions.
+        # Correct the charges for the estimated offset, and for the estimated changes of the film along the directions.
         direction_means = self._filter.direction_means(self._filter.mean_MPa)
         corrected_pC = (peak.charge_pC - self._filter.offset_pC) * np.exp(-direction_means @ log_changes)
-        wrong_gain = self._squared_misfits_of_wrong_gains(corrected_pC, peak.contact, residuals.offset_variance)
+        wrong_gain_squares = self._squared_misfits_of_wrong_gains(corrected_pC, peak.contact, residuals.offset_variance)
         return SquaredMisfits(
-            with_gains=with_gains,
-            at_touch_estimate=float(with_gains[self._filter.nearest_index]),
+            with_gains=squares_with_gains,
+            at_touch_estimate=float(squares_with_gains[self._filter.nearest_index]),
             without_gains=np.minimum(residuals.without_gains, LARGEST_SQUARE),
-            wrong_gain=np.minimum(wrong_gain, LARGEST_SQUARE),
+            wrong_gain=np.minimum(wrong_gain_squares, LARGEST_SQUARE),
         )
 
     def _squared_misfits_of_wrong_gains(self, corrected_pC: Array, contact: Contact, offset_variance: float) -> Array:
@@ -395,13 +396,16 @@ class FilmFollower:
             Squared misfits, first at the calibrated pretension and then at the estimated pretension, shape
             (2 * n_wrong_gain * n_electrode,). They are relative to the mean squared misfit of good touches.
         """
-        charges_with_wrong_gain_pC = corrected_pC * self._wrong_gains  # one row for each wrong gain
-        start = np.array(contact[:3])
-        no_changes = np.empty((0, corrected_pC.size))
+        charges_with_wrong_gain_pC = corrected_pC * self._wrong_gains  # shape (n_wrong_gain * n_electrode, n_electrode)
+        start = np.array(contact[:3])  # x, y and force
+        no_changes = np.empty((0, corrected_pC.size))  # only the misfit vectors are needed, not their changes
         squares = []
-        for misfits in (self._calibrated_misfits, self._applied_misfits):
+        for misfits in (self._calibrated_misfits, self._applied_misfits):  # each has a single pretension
             linearised = misfits.linearise(charges_with_wrong_gain_pC, start, no_changes)
-            squares.append((linearised.vectors[:, 0] ** 2).sum(axis=1))  # there is only one pretension
+            misfit_vectors = linearised.vectors[:, 0]  # shape (n_wrong_gain * n_electrode, n_electrode)
+            squares.append((misfit_vectors**2).sum(axis=1))
+
+        # The random offset of this touch adds to the variance 1 of a good touch.
         return np.concatenate(squares) / (1.0 + offset_variance)
 
     def _is_unexplained(self) -> bool:
@@ -464,10 +468,11 @@ class FilmFollower:
         """Return the probability that the pretension has changed since the calibration."""
         pretensions = self._pretensions
         change_MPa = self._filter.grid_MPa - pretensions.calibrated_MPa
-        likelihood_ratio = odds_of_no_change(
+        odds_for_equal_priors = odds_of_no_change(
             change_MPa, self._filter.pretension_probability, pretensions.std_MPa, self._additional_variance()
         )
-        unchanged_odds = likelihood_ratio * UNCHANGED_PROBABILITY / (1.0 - UNCHANGED_PROBABILITY)
+        # The odds are multiplied by the actual prior odds of the hypothesis that the pretension has not changed.
+        unchanged_odds = odds_for_equal_priors * UNCHANGED_PROBABILITY / (1.0 - UNCHANGED_PROBABILITY)
         return 1.0 / (1.0 + unchanged_odds)
 
     def _apply_estimate(self, estimate: FilmStateEstimate) -> None:
@@ -476,7 +481,7 @@ class FilmFollower:
         If the pretension has changed by less than `SMALLEST_CHANGE_MPa`, the present pretension and the present models
         are kept. The other values of the new estimate are used in any case.
         """
-        self._factors = None  # the factors of the charges belong to the previous estimate
+        self._stored_ratios = None  # the stored ratios of the charges belong to the previous estimate
         present_MPa = self._applied_estimate.pretension_MPa
         is_same_pretension = abs(estimate.pretension_MPa - present_MPa) < SMALLEST_CHANGE_MPa
         if is_same_pretension:
@@ -484,7 +489,7 @@ class FilmFollower:
         else:
             self._applied_estimate = estimate
             self.predictor = self._model_with_pretension(estimate.pretension_MPa)
-            self._applied_misfits = self._misfits.at(estimate.pretension_MPa)
+            self._applied_misfits = self._misfits.at_pretension(estimate.pretension_MPa)
 
         # The first estimate needs the neighbouring model even if the pretension has not changed.
         if not is_same_pretension or self._neighbouring_model is None:
@@ -505,7 +510,9 @@ class FilmFollower:
             step_MPa = -step_MPa
         self._neighbouring_step_MPa = step_MPa
         self._neighbouring_model = self._model_with_pretension(pretension_MPa + step_MPa)
-        self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)  # the sign of the step does not affect variances
+
+        # The stored sensitivity belongs to the previous models. The sign of the step does not affect variances.
+        self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
 
     def _model_with_pretension(self, pretension_MPa: float) -> Predictor:
         """Return the model of the calibrated film at the pretension `pretension_MPa`."""

@@ -23,17 +23,18 @@ class FilmStateEstimate(NamedTuple):
     directions: Array
     directions_per_MPa: Array
 
-    def charge_factor(self, log_changes: Array, step_MPa: float = 0.0) -> Array:
+    def charge_ratio(self, log_changes: Array, change_MPa: float = 0.0) -> Array:
         """Compute the ratio of the charges of the estimated film to the charges of the calibrated film.
 
-        Both films are assumed to have the same pretension.
+        The ratio contains only the effect of the changes along the directions, because both films are assumed to have
+        the same pretension.
 
         Args:
             log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode).
-            step_MPa: Pretension for which the ratio is computed, minus the estimated pretension, MPa.
+            change_MPa: Pretension for which the ratio is computed, minus the estimated pretension, MPa.
 
         Returns:
             Ratios, shape (n_electrode,), dimensionless.
         """
-        directions = self.directions + step_MPa * self.directions_per_MPa
+        directions = self.directions + change_MPa * self.directions_per_MPa
         return np.asarray(np.exp(directions @ log_changes))

@@ -20,8 +20,8 @@ def followable_pretensions(predictor: Predictor) -> Pretensions:
         The weights of the network at any pretension.
 
     Raises:
-        ModelError: If the model has three electrodes, or has no file of pretensions, or the file of pretensions belongs
-            to another model.
+        ModelError: If the model has fewer than four electrodes, or has no file of pretensions, or the file of
+            pretensions belongs to another model.
     """
     electrodes = predictor.metadata.electrodes
     if len(electrodes) <= 3:  # three charges have no misfit
@@ -48,6 +48,7 @@ def _check_same_model(predictor: Predictor, pretensions: Pretensions) -> None:
     Raises:
         ModelError: If the weights belong to another model.
     """
+    # The other pretension is an end of the range that differs from the calibrated pretension.
     lowest_MPa, highest_MPa = pretensions.range_MPa
     other_MPa = highest_MPa if pretensions.calibrated_MPa == lowest_MPa else lowest_MPa
     charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)  # a weak, a typical and a strong press

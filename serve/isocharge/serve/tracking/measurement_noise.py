@@ -107,7 +107,9 @@ class NoiseEstimate(NamedTuple):
 
     @classmethod
     def start(cls, measured: complex) -> "NoiseEstimate":
-        """Return the noise estimate after the first measured value, which is the variance stated by the model.
+        """Return the estimate after the first measured value.
+
+        The estimated variance of the noise is then the variance that the model states.
 
         Args:
             measured: The measured value: a position x + iy, mm, or the logarithm of a force.
@@ -120,9 +122,9 @@ class NoiseEstimate(NamedTuple):
         """Return the estimate after the next measured value.
 
         The measured value is compared with the linear extrapolation of the two previous values. The relative square of
-        a frame is the squared error of the extrapolation, divided by its mean for noise with the stated variance. The
-        estimated relative variance is the mean of the relative squares of the latest frames. The relative square of a
-        single frame is limited, because a sudden movement is not noise.
+        a frame is the squared error of the extrapolation, divided by the mean of this square for noise with the stated
+        variance. The estimated relative variance is the mean of the relative squares of the latest frames. The relative
+        square of a single frame is limited, because a sudden movement is not noise.
 
         Args:
             measured: The measured value: a position x + iy, mm, or the logarithm of a force.

@@ -178,7 +178,10 @@ class Components(NamedTuple):
 
 
 def predict_components(components: Components, dt_s: float) -> Components:
-    """Predict the components at the next step. A white acceleration disturbs their constant velocities.
+    """Predict the components at the next step.
+
+    The rates of x, y and the logarithm of the force are assumed to be constant, except for a random white acceleration
+    that increases the covariance.
 
     Args:
         components: Components after the update of the previous step.
@@ -203,20 +206,22 @@ def predict_components(components: Components, dt_s: float) -> Components:
     return components._replace(mean=mean, covariance=covariance)
 
 
-def _add_process_noise(covariance: Array, value: int, rate: int, density: Array | float, dt_s: float) -> None:
+def _add_process_noise(
+    covariance: Array, value_index: int, rate_index: int, density: Array | float, dt_s: float
+) -> None:
     """Add the process noise of a white acceleration to covariances (Bar-Shalom, Li and Kirubarajan 2001, 6.2.2).
 
     Args:
         covariance: Covariances of the state, shape (n, 6 + n_electrode, 6 + n_electrode). They are changed in place.
-        value: Index of x, y or ln F in the state.
-        rate: Index of the rate of the same quantity in the state.
+        value_index: Index of x, y or ln F in the state.
+        rate_index: Index of the rate of the same quantity in the state.
         density: Spectral density of the acceleration, shape (n,) or a number, in squared units of the value per s^3.
         dt_s: Time over which the acceleration acts, s.
     """
-    covariance[:, value, value] += density * dt_s**3 / 3.0
-    covariance[:, value, rate] += density * dt_s**2 / 2.0
-    covariance[:, rate, value] += density * dt_s**2 / 2.0
-    covariance[:, rate, rate] += density * dt_s
+    covariance[:, value_index, value_index] += density * dt_s**3 / 3.0
+    covariance[:, value_index, rate_index] += density * dt_s**2 / 2.0
+    covariance[:, rate_index, value_index] += density * dt_s**2 / 2.0
+    covariance[:, rate_index, rate_index] += density * dt_s
 
 
 def prune_components(components: Components) -> Components:

@@ -80,7 +80,7 @@ def smooth_moments(moments: Array, std_MPa: float) -> Array:
     Returns:
         The smoothed moments, of the same shape.
     """
-    # The kernel is the normal distribution on the grid, cut off at four standard deviations.
+    # The kernel is the normal distribution on the grid, cut off at four standard deviations or at the grid size.
     grid_size = moments.shape[1]
     kernel_reach = min(round(4.0 * std_MPa / GRID_STEP_MPa), grid_size)  # number of grid steps on each side
     deviation_MPa = GRID_STEP_MPa * np.arange(-kernel_reach, kernel_reach + 1.0)

@@ -60,7 +60,7 @@ class TouchEvents:
                 self._latest_event = "slide"
                 return "slide"
         elif tracked.moving < REST_PROBABILITY:
-            if is_away:  # the contact begins to rest at another position
+            if is_away:  # the contact rests at another position than before
                 self._rest_position = position
                 self._rest_begin_s = t_s
             elif self._latest_event != "hold" and t_s - self._rest_begin_s >= HOLD_TIME_s:

@@ -38,6 +38,12 @@ A last step, which is linear, follows in the computation of the misfit vector.
 OTHER_ROWS_STEPS = 2
 """Number of Gauss-Newton steps for further rows of charges, whose search begins at the contact of the first row."""
 
+TYPICAL_MISFIT = 1.15
+"""Root mean square misfit of good touches, in standard deviations of the noise, if it is computed from the series.
+
+It exceeds 1, because a calibration does not describe the imperfections of a film completely.
+"""
+
 DAMPING = 1e-4
 """Damping of the Gauss-Newton steps, relative to the mean of the diagonal of the normal matrix."""
 
@@ -66,11 +72,11 @@ class LinearisedMisfits(NamedTuple):
 class TouchMisfits(Protocol):
     """Method that computes the misfit vectors of a touch at several pretensions."""
 
-    def at(self, pretension_MPa: float) -> "TouchMisfits":
+    def at_pretension(self, pretension_MPa: float) -> "TouchMisfits":
         """Return the same method for a single pretension, MPa."""
 
     def linearise(self, charge_pC: Array, contact: Array, log_changes: Array, /) -> LinearisedMisfits:
-        """Compute the misfit vectors of a touch, and how small changes of its charges change them.
+        """Compute the misfit vectors of a touch, and their changes that small changes of the charges cause.
 
         Args:
             charge_pC: Charges of the touch in the first row, and similar charges in further rows, shape (m,
@@ -96,7 +102,7 @@ def touch_misfits(predictor: Predictor, pretensions: Pretensions) -> TouchMisfit
     grid_MPa = pretension_grid(pretensions)
     film_charges = read_film_charges(predictor.folder, pretensions.typical_pC.size)
     if film_charges is None:
-        return NetworkMisfits(pretensions.at(node_MPa), grid_MPa)
+        return NetworkMisfits(pretensions.interpolated(node_MPa), grid_MPa)
     return SeriesMisfits(film_charges, predictor.metadata.noise, node_MPa, grid_MPa)
 
 
@@ -112,15 +118,16 @@ class NetworkMisfits:
     network: Pretensions
     pretension_MPa: Array
 
-    def at(self, pretension_MPa: float) -> "NetworkMisfits":
+    def at_pretension(self, pretension_MPa: float) -> "NetworkMisfits":
         """Return the same method for a single pretension, MPa."""
         return NetworkMisfits(self.network, np.array([pretension_MPa]))
 
     def linearise(self, charge_pC: Array, _contact: Array, log_changes: Array) -> LinearisedMisfits:
         """Compute the misfit vectors and their changes, which are finite differences; see `TouchMisfits`."""
-        changed_charge_pC = charge_pC[0] * np.exp(log_changes)
+        # One call evaluates the network for the m given rows of charges and for the changed charges of the first row.
+        changed_charge_pC = charge_pC[0] * np.exp(log_changes)  # shape (n_change, n_electrode)
         all_charge_pC = np.vstack([charge_pC, changed_charge_pC])
-        all_vectors = self.network.vectors(all_charge_pC, self.pretension_MPa) / self.network.misfit_rms
+        all_vectors = self.network.misfit_vectors(all_charge_pC, self.pretension_MPa) / self.network.misfit_rms
         vectors = all_vectors[: len(charge_pC)]
         changes = all_vectors[len(charge_pC) :] - vectors[0]  # shape (n_change, n_pretension, n_electrode)
         return LinearisedMisfits(vectors, np.moveaxis(changes, 0, 2))
@@ -130,8 +137,7 @@ class NetworkMisfits:
 class SeriesMisfits:
     """Misfit vectors that are computed from the nearest contact.
 
-    The root mean square misfit of good touches is about 1, because the charges of the series are more accurate than the
-    measurement.
+    The misfit vectors are divided by `TYPICAL_MISFIT`, which is the root mean square misfit of good touches.
 
     Attributes:
         film: Charges of the film at any pretension.
@@ -145,7 +151,7 @@ class SeriesMisfits:
     node_MPa: Array
     pretension_MPa: Array
 
-    def at(self, pretension_MPa: float) -> "SeriesMisfits":
+    def at_pretension(self, pretension_MPa: float) -> "SeriesMisfits":
         """Return the same method for a single pretension, MPa."""
         only_pretension_MPa = np.array([pretension_MPa])
         return SeriesMisfits(self.film, self.noise, only_pretension_MPa, only_pretension_MPa)
@@ -153,7 +159,7 @@ class SeriesMisfits:
     @cached_property
     def _node_film(self) -> FilmChargeSeries:
         """Charges of the film at the pretensions `node_MPa`."""
-        return self.film.at(self.node_MPa)
+        return self.film.interpolated(self.node_MPa)
 
     @cached_property
     def _neighbour_weights(self) -> Array:
@@ -163,18 +169,22 @@ class SeriesMisfits:
     def linearise(self, charge_pC: Array, contact: Array, log_changes: Array) -> LinearisedMisfits:
         """Compute the misfit vectors and their changes from the nearest contacts; see `TouchMisfits`."""
         noise_std_pC = np.sqrt(self.noise.variance(charge_pC))  # shape (m, n_electrode)
-        node_vectors, unexplained = self._nearest(charge_pC, noise_std_pC, contact)
+        node_vectors, projections = self._misfits_and_projections(charge_pC, noise_std_pC, contact)
 
         # A change d of the logarithms changes the charges by Q d / sigma in units of the noise. The part that no change
         # of the contact explains is added to the misfit vector.
         scaled_changes = (log_changes * charge_pC[0] / noise_std_pC[0]).T  # shape (n_electrode, n_change)
-        node_changes = unexplained[:, 0] @ scaled_changes  # shape (n_node, n_electrode, n_change)
+        first_row_projections = projections[:, 0]  # shape (n_node, n_electrode, n_electrode)
+        node_changes = first_row_projections @ scaled_changes  # shape (n_node, n_electrode, n_change)
         vectors = np.tensordot(self._neighbour_weights, node_vectors, axes=1)  # shape (n_pretension, m, n_electrode)
         changes = np.tensordot(self._neighbour_weights, node_changes, axes=1)
-        return LinearisedMisfits(vectors.swapaxes(0, 1), changes)
+        return LinearisedMisfits(vectors.swapaxes(0, 1) / TYPICAL_MISFIT, changes / TYPICAL_MISFIT)
 
-    def _nearest(self, charge_pC: Array, noise_std_pC: Array, contact: Array) -> tuple[Array, Array]:
-        """Search for the contacts whose charges are nearest to measured charges, at the pretension of each node.
+    def _misfits_and_projections(self, charge_pC: Array, noise_std_pC: Array, contact: Array) -> tuple[Array, Array]:
+        """Compute the misfit vectors of measured charges at the pretension of each node.
+
+        For each row of charges, the method searches for the contact whose charges are nearest to the row. The misfit
+        vector is the remaining difference of the charges, in units of the noise.
 
         Args:
             charge_pC: Measured charges, shape (m, n_electrode), pC.
@@ -187,21 +197,23 @@ class SeriesMisfits:
         """
         n_node = self.node_MPa.size
         start = np.broadcast_to(self.film.unit_contact(contact[None]), (n_node, 1, 3))
-        first_contact = self._search(charge_pC[:1], noise_std_pC[:1], start, FIRST_ROW_STEPS)
+        first_contact = self._nearest_contacts(charge_pC[:1], noise_std_pC[:1], start, FIRST_ROW_STEPS)
 
         # The charges of the other rows are similar. Their search begins at the contact of the first row.
         others_start = np.broadcast_to(first_contact, (n_node, len(charge_pC) - 1, 3))
-        other_contacts = self._search(charge_pC[1:], noise_std_pC[1:], others_start, OTHER_ROWS_STEPS)
+        other_contacts = self._nearest_contacts(charge_pC[1:], noise_std_pC[1:], others_start, OTHER_ROWS_STEPS)
         unit_contact = np.concatenate([first_contact, other_contacts], axis=1)
 
-        # A last linear step, which may leave the range of the series, removes the part that the contact explains.
+        # The contacts are not exactly the nearest contacts. A last linear step, which may leave the range of the
+        # series, removes the part of the residuals that a change of the contact explains.
         residual, slopes = self._residuals(charge_pC, noise_std_pC, unit_contact)
-        explained = slopes @ _damped_solution(slopes, slopes.swapaxes(-1, -2), LAST_DAMPING)
-        unexplained = np.eye(charge_pC.shape[1]) - explained
-        return (unexplained @ residual[..., None])[..., 0], unexplained
+        explained_projections = slopes @ _damped_solution(slopes, slopes.swapaxes(-1, -2), LAST_DAMPING)
+        projections = np.eye(charge_pC.shape[1]) - explained_projections
+        misfit_vectors = (projections @ residual[..., None])[..., 0]
+        return misfit_vectors, projections
 
-    def _search(self, charge_pC: Array, noise_std_pC: Array, unit_contact: Array, step_count: int) -> Array:
-        """Move contacts towards those whose charges are nearest to measured charges, by damped Gauss-Newton steps.
+    def _nearest_contacts(self, charge_pC: Array, noise_std_pC: Array, unit_contact: Array, step_count: int) -> Array:
+        """Search for the contacts whose charges are nearest to measured charges, by damped Gauss-Newton steps.
 
         Args:
             charge_pC: Measured charges, shape (m, n_electrode), pC.
@@ -214,8 +226,8 @@ class SeriesMisfits:
         """
         for _ in range(step_count):
             residual, slopes = self._residuals(charge_pC, noise_std_pC, unit_contact)
-            step = _damped_solution(slopes, slopes.swapaxes(-1, -2) @ residual[..., None], DAMPING)
-            unit_contact = _into_unit_range(unit_contact + step[..., 0])
+            contact_change = _damped_solution(slopes, slopes.swapaxes(-1, -2) @ residual[..., None], DAMPING)
+            unit_contact = _into_unit_range(unit_contact + contact_change[..., 0])
         return unit_contact
 
     def _residuals(self, charge_pC: Array, noise_std_pC: Array, unit_contact: Array) -> tuple[Array, Array]:
@@ -250,7 +262,8 @@ def _damped_solution(slopes: Array, right_side: Array, damping: float) -> Array:
     """
     normal_matrix = slopes.swapaxes(-1, -2) @ slopes
     trace = np.trace(normal_matrix, axis1=-2, axis2=-1) + SMALLEST_TRACE
-    damped_matrix = normal_matrix + (damping / 3.0 * trace)[..., None, None] * np.eye(3)
+    added_to_diagonal = damping / 3.0 * trace  # the mean of the three diagonal elements is a third of the trace
+    damped_matrix = normal_matrix + added_to_diagonal[..., None, None] * np.eye(3)
     return np.asarray(np.linalg.solve(damped_matrix, right_side))
 
 

@@ -70,8 +70,10 @@ class Tracker:
     ) -> tuple[TrackedContact | None, str | None]:
         """Process the next frame, and return the tracked contact and the event that begins with this frame.
 
-        Without a mixture, a filter smooths the contact that the model predicted. With a mixture, the tracked contact is
-        the most probable of the contacts that the mixture estimates from the charges.
+        Without a mixture or without charges, a filter smooths the contact that the model predicted. With a mixture, the
+        tracked contact is the most probable of the contacts that the mixture estimates from the charges. The previous
+        tracked contact is returned again if the frame is invalid, if its charges are saturated, or if no contact
+        explains them.
 
         Args:
             contact: Contact predicted by the model; None if nothing touches the film, or if the frame is invalid.
@@ -81,12 +83,12 @@ class Tracker:
 
         Returns:
             The tracked contact, and the event that begins with this frame. The contact is None if nothing touches the
-            film, or if no contact has explained the charges since the touch began. The event is `press`, `hold`,
-            `slide`, `tap` or `release`; None if no event begins.
+            film, or if the touch has not yet had a tracked contact. The event is `press`, `hold`, `slide`, `tap` or
+            `release`; None if no event begins.
         """
         self.mixture_contact = None
         if contact is None:
-            if INVALID in flags:  # an invalid frame does not end a touch
+            if INVALID in flags:  # an invalid frame does not show whether the touch has ended
                 return self._tracked, None
             return None, self._end_touch(t_s)
 
