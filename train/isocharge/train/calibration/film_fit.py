@@ -107,17 +107,19 @@ class FilmPosterior(FilmEstimate):
             if any(hypothesis.has(effect) for effect in effects)
         )
 
-    def scaled(self, factor: float) -> "FilmPosterior":
+    def scaled(self, variance_factor: float) -> "FilmPosterior":
         """Return a copy of the estimate in which all variances are multiplied by a factor.
 
         Args:
-            factor: Factor on all variances and covariances.
+            variance_factor: Factor on all variances and covariances.
         """
         warming = self.warming
         if warming is not None:
-            std = warming.std * float(np.sqrt(factor))
-            warming = warming._replace(std=std, covariance=warming.covariance * factor)
-        return replace(self, covariance=self.covariance * factor, joint=self.joint * factor, warming=warming)
+            std = warming.std * float(np.sqrt(variance_factor))
+            warming = warming._replace(std=std, covariance=warming.covariance * variance_factor)
+        return replace(
+            self, covariance=self.covariance * variance_factor, joint=self.joint * variance_factor, warming=warming
+        )
 
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> FilmEstimate:
         """Return the estimate of the film for a later time; see `FilmEstimate.drifted`.
@@ -135,7 +137,7 @@ class FilmPosterior(FilmEstimate):
         # Remove the coefficients of imperfections and discrepancy. The parameters are the first unknowns.
         warming = self.warming
         if warming is not None:
-            warming = warming.with_unknowns(len(self.parameters))
+            warming = warming.with_unknowns(len(self.parameters))  # keeps the covariances with the parameters only
         parameters_only = FilmEstimate(self.parameters, self.covariance, warming=warming)
         return parameters_only.drifted(prior, knows_temperature=knows_temperature)
 
@@ -159,8 +161,8 @@ def fit_film(
         charge_model: Model of the charges of all films.
         data: The measured presses.
         initial: Estimate of the film before the presses.
-        at_C: Temperature for which the initial estimate and the result hold, degrees Celsius; None if temperatures were
-            not measured.
+        at_C: Temperature of the film in the initial estimate and in the result, degrees Celsius; None if temperatures
+            were not measured.
         friction: Expected coefficient of friction of the presses; 0 for presses without friction.
     """
     problem = FitProblem.from_estimate(charge_model, initial, knows_temperature=at_C is not None, friction=friction)
@@ -191,9 +193,9 @@ def _refit_if_all_good(
 ) -> SettledFit:
     """Fit a film to all presses if all presses are probably good; otherwise, return the given fit.
 
-    Two explanations of the presses that were left out are compared: they were recorded wrongly, or all presses are good
-    and the film has imperfections. The evidence of an explanation is the probability density of all presses according
-    to the explanation, including the prior probability of the mistakes.
+    Some presses were left out of the given fit. Two explanations of these presses are compared: they were recorded
+    wrongly, or all presses are good and the film has imperfections. The evidence of an explanation is the probability
+    density of all presses if the explanation is true, times the prior probability of the mistakes.
 
     Args:
         problem: The least-squares problem.
@@ -231,7 +233,7 @@ def refit_film(
         data: The presses. No press is left out.
         initial: Estimate of the film before the presses.
         previous: Previous estimate of the film, from similar presses.
-        at_C: Temperature for which all these estimates hold, degrees Celsius; None if temperatures were not measured.
+        at_C: Temperature of the film in all these estimates, degrees Celsius; None if temperatures were not measured.
         friction: Expected coefficient of friction of the presses; 0 for presses without friction.
     """
     problem = FitProblem.from_estimate(charge_model, initial, knows_temperature=at_C is not None, friction=friction)
@@ -247,7 +249,8 @@ def refit_film(
     most_probable = max(previous.probabilities, key=lambda hypothesis: previous.probabilities[hypothesis])
     solved = problem.solve(data, np.ones(len(data)), start, most_probable)
 
-    # With the hypothesis without effects, `settle` uses the solved film for its first round instead of another fit.
+    # If `settle` is given a hypothesis with effects, it begins with another fit. This fit was made above already.
+    # Therefore, `settle` is given the hypothesis without effects, and begins at the solved film.
     every_press = np.ones(len(data), dtype=bool)
     degrees_of_freedom = _degrees_of_freedom(data)
     settled = problem.settle(data, every_press, degrees_of_freedom, solved, Hypothesis())
@@ -287,7 +290,8 @@ def _agreeing_presses(
     """Find a film with which most presses agree, and find the presses that agree with it.
 
     The film is fitted repeatedly. Before each fit, presses with large residuals get smaller weights, as for errors with
-    Student's t distribution.
+    Student's t distribution (Lange et al., 1989). The fits end if the weights hardly change, or after `MAX_WEIGHTINGS`
+    fits.
 
     Args:
         problem: The least-squares problem.
@@ -301,20 +305,21 @@ def _agreeing_presses(
     weight = np.ones(len(data))
     for _ in range(MAX_WEIGHTINGS):
         previous_weight = weight
+        # A press with the expected residuals (chi2 equal to its degrees of freedom) has the weight 1.
         weight = (STUDENT_T_DEGREES + degrees_of_freedom) / (STUDENT_T_DEGREES + solved.contacts.chi2)
         if np.abs(weight / previous_weight - 1.0).max() < WEIGHT_TOLERANCE:
             break
         solved = problem.solve(data, weight, solved.unknowns, Hypothesis())
-    return _is_good(solved.contacts.chi2, degrees_of_freedom), solved.unknowns
+    return _agrees_with_film(solved.contacts.chi2, degrees_of_freedom), solved.unknowns
 
 
-def _is_good(chi2: Array, degrees_of_freedom: Array) -> Booleans:
+def _agrees_with_film(chi2: Array, degrees_of_freedom: Array) -> Booleans:
     """Return whether each press agrees with a film, shape (n,).
 
     A press agrees if the sum of its squared residuals does not exceed a limit. The probability that a good press
     exceeds the limit is `BAD_PROBABILITY` divided by the number of presses (Bonferroni correction). The limit is
-    increased if the residuals of all presses are larger than expected. If more than `MAX_BAD_SHARE` of the presses
-    exceed the limit, all presses count as good.
+    increased if most presses have larger residuals than expected. If more than `MAX_BAD_SHARE` of the presses exceed
+    the limit, the function returns True for all presses.
 
     Args:
         chi2: Sum of squared residuals of each press, shape (n,).
@@ -324,19 +329,20 @@ def _is_good(chi2: Array, degrees_of_freedom: Array) -> Booleans:
     positive_degrees = np.maximum(degrees_of_freedom, 1.0)
     limit = chi_square.value_exceeded_with(BAD_PROBABILITY / len(chi2), positive_degrees)
 
-    # If the residuals of all presses are larger than expected, the limit is increased by the median of their ratios.
-    expected_median = np.maximum(chi_square.value_exceeded_with(0.5, positive_degrees), 0.1)
+    # If most presses have larger residuals than expected, for example because the noise is larger than stated, the
+    # limits of all presses are multiplied by the typical ratio of measured to expected sums.
+    expected_median = chi_square.value_exceeded_with(0.5, positive_degrees)
     typical_ratio = max(1.0, float(np.median(chi2 / expected_median)))
-    is_good = chi2 <= limit * typical_ratio
-    if np.mean(~is_good) > MAX_BAD_SHARE:  # it is uncertain which presses are wrong, so none is left out
-        return np.ones_like(is_good)
-    return np.asarray(is_good)
+    agrees = chi2 <= limit * typical_ratio
+    if np.mean(~agrees) > MAX_BAD_SHARE:  # it is uncertain which presses are wrong, so none is left out
+        return np.ones_like(agrees)
+    return np.asarray(agrees)
 
 
 def _log_density_of_mistakes(data: PressData, is_mistake: Booleans) -> float:
     """Return the logarithm of the probability density of presses that were recorded wrongly.
 
-    The density also contains the prior probability of these mistakes.
+    The density is multiplied by the prior probability that these presses are recorded wrongly.
 
     Args:
         data: All presses.
@@ -362,7 +368,7 @@ def _posterior(
     """
     layout = problem.layout
     # A hypothesis is a combination of effects besides the parameters. The mixture is the average of the estimates under
-    # all hypotheses. Its mean is the change of the unknowns from their mean before the presses.
+    # all hypotheses. The sum is clipped, because rounding may lead slightly beyond the bounds.
     mixture = settled.mixture
     unknowns = np.clip(problem.mean + mixture.mean_change, *problem.bounds)
 
@@ -372,7 +378,8 @@ def _posterior(
     )
     force_scatter = float(np.sqrt(scatter_variance))
 
-    # The contacts of the fit can be used as a start only if no press was left out of the fit.
+    # The contacts of all presses are adjusted to the estimated film. The search can begin at the contacts of the last
+    # fit only if no press was left out of this fit.
     start = settled.solved.contacts.contact if settled.is_kept.all() else None
     contacts = problem.adjusted_contacts(unknowns, data.with_force_scatter(mixture.best.force_scatter), start)
 

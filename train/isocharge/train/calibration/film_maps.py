@@ -54,8 +54,9 @@ class FilmMaps:
     def domain(self) -> Domain:
         """Range of contacts in which the charges of every film of the prior can be computed.
 
-        The range is small enough to leave a margin for finite differences. The stiffest film determines the smallest
-        force, and the softest film determines the largest force.
+        The range is small enough to leave a margin for finite differences. It is a disk with a range of forces. The
+        smallest load of the family requires the largest force on the stiffest film, which therefore determines the
+        smallest force of the range. Correspondingly, the softest film determines the largest force.
         """
         film = self.prior.sensor.film
         young = self.prior.index("young")
@@ -66,7 +67,9 @@ class FilmMaps:
         min_stiffness = stiffness * np.exp(lower[young] + lower[thickness])
         max_stiffness = stiffness * np.exp(upper[young] + upper[thickness])
 
-        # The family is limited in the distance from the centre divided by the radius a, and in the load F / (E h a).
+        # The family of simulated films is limited in two dimensionless variables: the distance from the centre divided
+        # by the radius a of the film, and the load F / (E h a). The factors with `EDGE` keep rounding errors from
+        # leading outside these limits. The step and `FORCE_MARGIN` leave room for finite differences.
         _, max_distance = self.family.limits["distance"]
         min_load, max_load = self.family.limits["load"]
         position_step, _, _ = CONTACT_STEPS
@@ -145,8 +148,9 @@ class FilmMaps:
     def finite_difference(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
         """Compute the derivative of the charges with respect to one parameter by a finite difference.
 
-        If the parameter is the thickness h, the force F changes in proportion to h. The load F / h is then constant,
-        and the derivative contains only the effect of bending.
+        The derivative is computed at constant contacts, except if the parameter is the thickness h. In this case, the
+        force F changes in proportion to h. The load F / h is then constant, and the derivative contains only the effect
+        of bending.
 
         Args:
             name: Name of the parameter.

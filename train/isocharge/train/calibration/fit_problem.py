@@ -1,4 +1,4 @@
-"""Least-squares problem of a calibration, which is solved by the film that explains the presses best.
+"""Least-squares problem whose solution is the film that explains the presses of a calibration best.
 
 The solution is the vector of unknowns p that minimises the sum of two parts. The first part is the sum of the squared
 residuals of all presses. Each measured charge and each coordinate that the rig measured has one residual. The second
@@ -91,7 +91,7 @@ class SolvedFilm(NamedTuple):
 
 
 class SettledFit(NamedTuple):
-    """Result of the repeated fits of a film by `FitProblem.settle`.
+    """Film and selection of presses that `FitProblem.settle` finds by repeated fits.
 
     Attributes:
         is_kept: Whether each press was used in the last fit, shape (n,). The other presses were left out as bad.
@@ -123,7 +123,7 @@ class FitProblem:
     def from_estimate(
         cls, charge_model: FilmCharges, initial: FilmEstimate, *, knows_temperature: bool, friction: float = 0.0
     ) -> "FitProblem":
-        """From an estimate of the film before the presses, create the problem.
+        """Create the problem from the estimate of a film before the presses.
 
         An unknown whose prior variance is zero keeps its mean in a fit, unless the hypothesis of the fit adds a
         variance.
@@ -148,6 +148,7 @@ class FitProblem:
             mean[layout.coefficients] = initial.coefficients
         covariance[film_unknowns, film_unknowns] = initial.unknown_covariance
 
+        # The last unknowns are the nuisances of the session. Most of them get a variance only by a hypothesis.
         if knows_temperature:
             for nuisance in NUISANCES:
                 index = layout.nuisance(nuisance.name)
@@ -196,10 +197,12 @@ class FitProblem:
                 mean.
 
         Returns:
-            The film that explains the presses best.
+            The film that explains the presses best. If the fit does not end within `MAX_STEPS` steps, the film of the
+            last step is returned.
         """
         fit = _FilmFit(self, data, weight, hypothesis)
         lower, upper = (bound[fit.active] for bound in self.bounds)
+        # SciPy requires a start strictly inside the bounds.
         start_inside = np.clip(start[fit.active], lower + BOUND_MARGIN, upper - BOUND_MARGIN)
         result = least_squares(
             fit.residual,
@@ -244,8 +247,8 @@ class FitProblem:
             solved = self._solve_kept(data, is_kept, solved.unknowns, hypothesis)
         for round_index in range(MAX_ROUNDS):
             mixture = self.mixture(data[is_kept], solved)
-            # The mixture is computed with derivatives at the solved film. It is accurate only if the step from the
-            # solved film to the estimate of the mixture is small.
+            # The mixture is computed with derivatives at the solved film. Therefore, it is accurate only if the step
+            # from the solved film to the average of the mixture is small.
             step = self.mean + mixture.mean_change - solved.unknowns
             is_step_small = np.abs(step[self.layout.parameters]).max() < MAX_LINEAR_STEP
 
@@ -305,22 +308,23 @@ class FitProblem:
         # r' S^-1 r of each press. The residuals are passed to NumPy as matrices with one column.
         weighted_residual = np.linalg.solve(covariance, residual[:, :, None])[:, :, 0]
         chi2 = (residual * weighted_residual).sum(axis=1)
-        limit = chi_square.value_exceeded_with(BAD_PROBABILITY / len(data), np.maximum(degrees_of_freedom, 1.0))
+        positive_degrees = np.maximum(degrees_of_freedom, 1.0)  # the distribution is not defined for zero degrees
+        limit = chi_square.value_exceeded_with(BAD_PROBABILITY / len(data), positive_degrees)
         return np.asarray(chi2 <= limit)
 
     def mixture(self, data: PressData, solved: SolvedFilm) -> Mixture:
         """Estimate the unknowns from presses by averaging over all hypotheses.
 
-        The residuals of the presses are approximated by linear functions of the unknowns near a solved film. The
-        average is kept within the bounds of the unknowns.
+        A hypothesis is a combination of effects that the parameters of the film do not describe. The residuals of the
+        presses are approximated by linear functions of the unknowns near a solved film. The average is kept within the
+        bounds of the unknowns.
 
         Args:
             data: The measured presses.
             solved: The film that explains the presses best, with the contacts of the presses on this film.
 
         Returns:
-            The average of the estimates under all hypotheses. Its mean is the difference from the mean before the
-            presses.
+            The average of the estimates under all hypotheses.
         """
         # The fit may have assumed a scatter of the forces. The contacts are adjusted again without this assumption.
         unknowns = solved.unknowns
@@ -339,9 +343,9 @@ class FitProblem:
     ) -> dict[float, LinearModel]:
         """Create a linear model of the residuals for each value in `FORCE_SCATTERS`.
 
-        If the forces scatter at random, the vector of the residuals of a press gets additional noise. This noise
-        changes the vector only along its derivative with respect to the logarithm of the stated force. The standard
-        deviation of the noise is the scatter times the length of this derivative.
+        The value is an assumed random scatter of the stated forces, which adds noise to the vector of the residuals of
+        each press. The noise changes the vector only along its derivative with respect to the logarithm of the stated
+        force. The standard deviation of the noise is the scatter times the length of this derivative.
 
         Args:
             solved: The film about which the residuals are linearised, and the contacts of the presses on this film.
@@ -406,7 +410,9 @@ class FitProblem:
         film_unknowns = layout.film if with_coefficients else layout.parameters
         contact = from_log_contact(solved.contacts.contact)
 
-        # Derivatives of the charges on films with several pretensions, between which the presses are interpolated
+        # Derivatives of the charges with respect to the contacts (`contact_slopes`) and to the unknowns of the film
+        # (`unknown_slopes`). The pretension may differ between the presses. Therefore, the derivatives are computed for
+        # films with several pretensions, and are interpolated for each press.
         films, film_weights = self._neighbouring_films(solved.unknowns, data)
         contact_slopes_of_films = [self.charge_model.contact_slopes(film, contact) for film in films]
         unknown_slopes_of_films = [
@@ -431,10 +437,10 @@ class FitProblem:
         return derivatives_with_adjusted_contacts(jacobian, residual_contact_slopes)
 
     def gain_covariance(self, nuisances: dict[str, NuisanceEstimate], force_scatter: float) -> Array:
-        """Return the covariance that is added to the unknowns of the film for its use after the session.
+        """Return the additional covariance of the unknowns of the film for its use after the session.
 
-        If the charges drift or the forces scatter during the session, later presses may be affected differently.
-        Therefore, the mean of all gains remains uncertain. The additional error is the same for all gains.
+        If the charges drift or the forces scatter during the session, later contacts may be affected differently.
+        Therefore, the mean of all gains remains uncertain. The additional relative error is the same for all gains.
 
         Args:
             nuisances: Estimates of the nuisances of the session by name.
@@ -447,7 +453,9 @@ class FitProblem:
         gain_std = 0.0
         for nuisance in NUISANCES:
             gain_std = float(np.hypot(gain_std, nuisance.gain_std(nuisances[nuisance.name])))
-        gain_std = float(np.hypot(gain_std, MEAN_OVER_STD * force_scatter))
+        # If the cause of the scatter only lowers charges, its unknown mean has the effect of an error of all gains.
+        mean_effect = MEAN_OVER_STD * force_scatter
+        gain_std = float(np.hypot(gain_std, mean_effect))
 
         common_error = np.zeros(self.layout.film_count)
         common_error[self.charge_model.prior.gains] = gain_std / self.charge_model.prior.spread.gain
@@ -493,6 +501,7 @@ class FitProblem:
         """
         contact = from_log_contact(contacts.contact)
         films, film_weights = self._neighbouring_films(unknowns, data)
+        # Derivatives with respect to the contacts, interpolated between films with several pretensions
         contact_slopes_of_films = [self.charge_model.contact_slopes(film, contact) for film in films]
         residual_contact_slopes = data.residual_slopes(weighted_sum(contact_slopes_of_films, film_weights))
         # The stated force is treated as the only unknown. Therefore, an axis of length 1 is added, and then removed.
@@ -512,7 +521,7 @@ class _FilmFit:
     """
 
     def __init__(self, problem: FitProblem, data: PressData, weight: Array, hypothesis: Hypothesis) -> None:
-        """Compute all values that do not change during the fit.
+        """Prepare a fit: compute all values that do not change from step to step.
 
         Args:
             problem: The least-squares problem.
@@ -524,6 +533,7 @@ class _FilmFit:
         self._data = data.with_force_scatter(hypothesis.force_scatter)
         self._root_weight = np.sqrt(weight)  # factor on the residuals, whose squares then have the given weight
 
+        # The fit changes only the active unknowns, which are those with a variance under the hypothesis.
         covariance = problem.prior_covariance(hypothesis)
         self.active = np.diag(covariance) > 0.0
         self._has_coefficients = bool(self.active[problem.layout.coefficients].any())
@@ -541,7 +551,7 @@ class _FilmFit:
         Args:
             active_unknowns: Values of the active unknowns, shape (n_active,).
         """
-        start_contacts_of_search = None
+        start_contacts_of_search = None  # without a latest film, each search has several starts
         if self._latest is not None:
             latest_unknowns, latest_film = self._latest
             if np.array_equal(latest_unknowns, active_unknowns):

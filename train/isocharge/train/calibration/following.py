@@ -1,8 +1,8 @@
 """Content of the file `pretensions.npz`. A service needs this file to follow the pretension of a calibrated film.
 
-The file contains the weights of several networks. Each network belongs to the film with another pretension. All other
-parameters are those of the calibrated film. Each network is adapted to the discrepancy and to the remaining uncertainty
-of the film, as is the network of the model.
+The file contains the weights of several networks. Each network belongs to the calibrated film at a different
+pretension; all other parameters of the film are as calibrated. Like the network of the model, each of these networks is
+adapted to the discrepancy and to the remaining uncertainty of the film.
 """
 
 from dataclasses import replace
@@ -68,12 +68,13 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
     arrays_of_networks = [_weight_arrays(node_network) for node_network in _networks_at(nodes, result, network)]
     stacked_weights = [np.stack(arrays) for arrays in zip(*arrays_of_networks, strict=True)]
 
+    # When a stream begins, the film may have drifted since the calibration.
     drifted_std = np.sqrt(np.diag(posterior.drifted(prior).covariance)) * prior.std
     pretensions = Pretensions(
         node_MPa=nodes,
         calibrated_MPa=calibrated_MPa,
         std_MPa=float(drifted_std[pretension]),
-        floor_MPa=_lasting_std_MPa(result),
+        floor_MPa=_remaining_std_MPa(result),
         misfit_rms=1.0,
         misfit_unit=MISFIT_UNIT,
         limits_pC=(LOWEST_CHARGE, HIGHEST_CHARGE),
@@ -121,7 +122,7 @@ def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> floa
     problem = result.problem
     rng = np.random.default_rng(SEED)
     touches = draw_contacts(rng, problem.domain, N_TOUCHES)
-    # Charges of the calibrated film: those of its parameters times the factor of its coefficients and of friction
+    # Charges of the calibrated film: those of its parameters, multiplied by a factor for its coefficients and friction
     film = problem.charges.forward_map(result.posterior.parameters)
     exact_charge = film.charges(touches) * result.charge_factor(result.posterior.unknowns, touches)
     charge = problem.noise.add(exact_charge, rng)
@@ -133,8 +134,9 @@ def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> floa
 def _pretension_nodes(calibrated_MPa: float, lower_MPa: float, upper_MPa: float) -> Array:
     """Return Chebyshev nodes around the calibrated pretension, shape (N_NODES,), MPa.
 
-    The nodes are stretched, so that the first and the last node lie at the ends of their range. The node closest to the
-    calibrated pretension is replaced by this pretension.
+    The nodes are stretched, so that the first and the last node lie at the ends of the range. On both sides of the
+    calibrated pretension, this range is limited to `MAX_PRETENSION_CHANGE_MPa`. The node closest to the calibrated
+    pretension is replaced by this pretension.
 
     Args:
         calibrated_MPa: The calibrated pretension, MPa.
@@ -178,8 +180,8 @@ def _with_correlations_of(model_network: FoldedNetwork, film_network: FoldedNetw
 def _weight_arrays(network: FoldedNetwork) -> list[np.ndarray]:
     """Return the weights of a network as single-precision arrays, in the order that `Pretensions` expects.
 
-    The weight and the bias of each hidden layer come first. The skip layer, the bias of the last layer, and the weight
-    of the last layer follow.
+    The weight and the bias of each hidden layer come first. Then follow the weight of the skip connection, the bias of
+    the last layer, and the weight of the last layer.
 
     Args:
         network: The network.
@@ -205,18 +207,18 @@ def _weight_names(network: FoldedNetwork) -> list[str]:
 
     names = []
     for array in _weight_arrays(network):
-        equal_names = [name for name, values in constants.items() if np.array_equal(values, array)]
-        names.append(equal_names[0])
+        matching_names = [name for name, values in constants.items() if np.array_equal(values, array)]
+        names.append(matching_names[0])
     return names
 
 
-def _lasting_std_MPa(result: CalibrationResult) -> float:
-    """Compute the standard deviation, in MPa, that the pretension estimated by a service has even after many touches.
+def _remaining_std_MPa(result: CalibrationResult) -> float:
+    """Compute the standard deviation, in MPa, that remains in the estimate of the pretension even after many touches.
 
-    The service estimates the pretension by least squares from the misfits of touches. A misfit is the part of the
-    charges that no contact explains. The service does not estimate the other unknowns of the film again. Errors of
-    their calibrated values therefore cause an error of the estimated pretension, which further touches do not reduce.
-    An error of the calibrated pretension is added to the error of the estimate without any change.
+    A service estimates the pretension by least squares from the misfits of touches. A misfit is the part of the charges
+    that no contact explains. The service does not estimate the other unknowns of the film again. Errors of their
+    calibrated values therefore cause an error of the estimated pretension, which further touches do not reduce. An
+    error of the calibrated pretension contributes with the factor 1.
 
     Args:
         result: Result of the calibration.

@@ -131,6 +131,7 @@ def hypotheses() -> Iterator[Hypothesis]:
             prior_probability=math.prod(probabilities),  # the effects are independent
         )
 
+    # Hypotheses with traces. Modes and traces have the size 1, which is the size in typical films.
     for discrepancy, probability in DISCREPANCY_SIZES.items():
         if discrepancy > 0.0:
             yield Hypothesis(
@@ -179,8 +180,8 @@ class LinearModel(NamedTuple):
     ) -> "LinearModel":
         """Return a model whose residuals have additional noise along several orthogonal directions.
 
-        The squared residual along each direction has the weight 1. If noise with the variance v is added along the
-        direction, this weight decreases to 1 / (1 + v).
+        Before the noise is added, the squared residual along each direction has the weight 1. If noise with the
+        variance v is added along the direction, this weight decreases to 1 / (1 + v).
 
         Args:
             jacobian: Derivatives of the components of the residuals along the directions, shape (n_direction,
@@ -217,7 +218,7 @@ class LinearModel(NamedTuple):
         return float(-0.5 * (self.square - explained_square) - half_log_determinant)
 
     def posterior(self, prior_covariance: Array) -> tuple[Array, Array]:
-        """Return the mean and the covariance of the unknowns after the presses.
+        """Return the change of the mean of the unknowns by the presses, and the covariance after the presses.
 
         Args:
             prior_covariance: Covariance of the unknowns before the presses, shape (n_unknown, n_unknown).
@@ -315,7 +316,8 @@ def mix_hypotheses(
 ) -> Mixture:
     """Compute the probability of each hypothesis, and average the estimates of the unknowns over the hypotheses.
 
-    Hypotheses with a probability of at most `NEGLIGIBLE_PROBABILITY` are ignored in the average.
+    Hypotheses with a probability of at most `NEGLIGIBLE_PROBABILITY` are omitted from the average. The probabilities of
+    the other hypotheses are not increased, although their sum is slightly below 1.
 
     Args:
         models: Linear model of the residuals for each value of `Hypothesis.force_scatter`.
@@ -333,18 +335,18 @@ def mix_hypotheses(
 
     # Estimates under the hypotheses that are not negligible
     relevant_rows = np.flatnonzero(probabilities > NEGLIGIBLE_PROBABILITY)
-    means = []
+    mean_changes = []
     covariances = []
     for index in relevant_rows:
         hypothesis = all_hypotheses[index]
         model = models[hypothesis.force_scatter]
-        hypothesis_mean, hypothesis_covariance = model.posterior(prior_covariance_of(hypothesis))
-        means.append(hypothesis_mean)
-        covariances.append(hypothesis_covariance)
+        mean_change_of_hypothesis, covariance_of_hypothesis = model.posterior(prior_covariance_of(hypothesis))
+        mean_changes.append(mean_change_of_hypothesis)
+        covariances.append(covariance_of_hypothesis)
 
-    mean, covariance = _mixture_moments(probabilities[relevant_rows], means, covariances)
+    mean_change, covariance = _mixture_moments(probabilities[relevant_rows], mean_changes, covariances)
     probability_of_hypothesis = dict(zip(all_hypotheses, probabilities.tolist(), strict=True))
-    return Mixture(mean, covariance, probability_of_hypothesis, log_evidence)
+    return Mixture(mean_change, covariance, probability_of_hypothesis, log_evidence)
 
 
 def _mixture_moments(probabilities: Array, means: Sequence[Array], covariances: Sequence[Array]) -> tuple[Array, Array]:

@@ -45,8 +45,8 @@ class ModeCharges(NamedTuple):
         contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
         mode_jacobian: Derivatives of the charges with respect to the coefficients of the modes, shape (n, n_electrode,
             n_mode), pC.
-        unevenness_derivative: Derivative of ln Q with respect to the unevenness of the tension, shape (n,
-            n_electrode); see `tension_unevenness`.
+        unevenness_derivative: Derivative of ln Q, where Q is the charge, with respect to the unevenness of the tension,
+            shape (n, n_electrode); see `tension_unevenness`.
     """
 
     modes: ModeMap | None
@@ -105,15 +105,17 @@ def trace_charges(forward_map: ForwardMap, lines: Array, contact: Array) -> Arra
     points = ReadoutPoints.along(forward_map.sensor, lines)
     charge_per_mm = forward_map.field_charges(contact, EVEN_FIELD, points)
 
-    # In the product, the axes are the contact, the electrode that receives the charge, the electrode of the line, and
-    # the line, shape (n, n_electrode, n_electrode, n_line). Both electrodes must be equal, otherwise the charge is 0.
-    # The charges of the lines are multiplied by the identity matrix, which is symmetric in the two electrodes.
-    line_charge = TRACE_STD_MM * charge_per_mm.reshape(n_contact, n_electrode, 1, -1)
-    is_own_electrode = np.eye(n_electrode)[:, :, None]
-    charge_by_line = line_charge * is_own_electrode
+    line_charge = TRACE_STD_MM * charge_per_mm.reshape(n_contact, n_electrode, -1)
+
+    # The axes are the contact, the electrode that receives the charge, the electrode of the line, and the line. The
+    # charge is zero unless both electrodes are the same.
+    n_line = line_charge.shape[2]
+    charge_by_line = np.zeros((n_contact, n_electrode, n_electrode, n_line))
+    for electrode in range(n_electrode):
+        charge_by_line[:, electrode, electrode] = line_charge[:, electrode]
 
     # Join the last two axes, because the returned last axis counts the lines of all electrodes.
-    return np.asarray(charge_by_line.reshape(n_contact, n_electrode, -1))
+    return charge_by_line.reshape(n_contact, n_electrode, -1)
 
 
 def trace_widths(coefficients: Array, covariance: Array) -> tuple[Array, Array]:
@@ -139,7 +141,8 @@ def tension_unevenness(pretension: float, tension_stds: Array, coefficients: Arr
     """Compute the unevenness of the tension, 1 - sqrt(1 - (e / T)^2), and its derivatives.
 
     Here T is the mean tension, and e is the uneven part of the tension. A membrane with the tensions T + e and T - e
-    along two perpendicular axes deflects like a membrane with the uniform tension sqrt(T^2 - e^2).
+    along two perpendicular axes deflects like a membrane with the uniform tension sqrt(T^2 - e^2). The squared ratio
+    (e / T)^2 is limited to `LARGEST_SQUARED_RATIO`, and T is at least `MIN_TENSION`.
 
     Args:
         pretension: Mean tension T, MPa.
@@ -149,7 +152,8 @@ def tension_unevenness(pretension: float, tension_stds: Array, coefficients: Arr
 
     Returns:
         Unevenness, dimensionless, and its derivatives with respect to the coefficients, shape (n_mode,). The derivative
-        with respect to a coefficient c with the standard deviation s is (s / T)^2 c / sqrt(1 - (e / T)^2).
+        with respect to a coefficient c with the standard deviation s is (s / T)^2 c / sqrt(1 - (e / T)^2). It is zero
+        if the squared ratio is at its limit.
     """
     relative_stds = tension_stds / max(pretension, MIN_TENSION)
     squared_ratio = float(((relative_stds * coefficients) ** 2).sum())  # (e / T)^2, the sum over all modes

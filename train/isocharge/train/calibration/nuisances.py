@@ -95,7 +95,7 @@ class Nuisance:
 
 
 class PretensionPerKelvin(Nuisance):
-    """Change of the pretension with temperature, because film and ring expand differently."""
+    """Change of the pretension with temperature, which occurs because film and ring expand differently."""
 
     def tension_change(self, data: PressData, value: float) -> Array:
         """Return the pretension during each press minus the pretension at the mean temperature, shape (n,), MPa."""

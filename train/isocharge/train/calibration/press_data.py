@@ -59,15 +59,15 @@ class PressData:
     def from_presses(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
         """Convert measured presses into data for a fit.
 
-        A missing charge gets the weight 0. A missing coordinate of a contact is replaced by its value at the centre of
-        the domain. The standard deviation of this coordinate is as large as the domain.
+        A missing charge gets the weight 0. A missing x, y or ln F is replaced by its value at the centre of the domain.
+        Its standard deviation is then the radius of the domain, or `UNKNOWN_FORCE_STD` for ln F.
 
         Args:
             presses: The measured presses.
             noise: Noise of the charges.
             domain: Range of contacts for which the charges of the films are known.
         """
-        # Charges and contacts, with a note of what was measured
+        # Missing values are NaN.
         has_charge = ~np.isnan(presses.charge_pC)
         charge = np.where(has_charge, presses.charge_pC, 0.0)
         log_contact = np.column_stack([presses.contact[:, :2], np.log(presses.contact[:, 2])])
@@ -138,9 +138,9 @@ class PressData:
     def pretension_nodes(self, pretension: float, bounds: tuple[float, float]) -> tuple[Array, Array]:
         """Return pretensions at which charges are computed, and weights for the interpolation at each press.
 
-        The returned pretensions are Chebyshev nodes between the smallest and the largest pretension of the presses. The
-        weights are those of Lagrange's interpolation. If all presses have the same pretension, this pretension is the
-        only node.
+        The pretension during a press is that of the film plus the `tension_change` of the press. The returned
+        pretensions are Chebyshev nodes between the smallest and the largest pretension of the presses. The weights are
+        those of Lagrange's interpolation. If all presses have the same pretension, this pretension is the only node.
 
         Args:
             pretension: Pretension of the film, MPa.
@@ -149,8 +149,9 @@ class PressData:
         Returns:
             Nodes, shape (k,), MPa, and the weight of each node for each press, shape (n, k).
         """
+        # Without presses, the limits are infinite (`low` is inf, `high` is -inf), and the node does not matter.
         press_pretensions = np.clip(pretension + self.tension_change, *bounds)  # shape (n,)
-        low = float(press_pretensions.min(initial=np.inf))  # infinite if there are no presses
+        low = float(press_pretensions.min(initial=np.inf))
         high = float(press_pretensions.max(initial=-np.inf))
         if high <= low:  # all presses have the same pretension, or there are no presses
             return np.array([low]), np.ones((len(self), 1))

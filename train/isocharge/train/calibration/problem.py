@@ -286,8 +286,8 @@ class CalibrationProblem:
     ) -> Fitted:
         """Return a network for one film, which is derived from the network for all films.
 
-        The network for all films knows only the parameters of a film. The real charges may differ from the charges that
-        this network expects, for two reasons. First, effects such as imperfections multiply the charges by given
+        The network for all films is given only the parameters of a film. The real charges may differ from the charges
+        that this network expects, for two reasons. First, effects such as imperfections multiply the charges by given
         factors. Second, the sensor may have other electrodes than the sensor of the network for all films. Therefore,
         the network is adapted to the ratio of real to expected charges.
 
@@ -422,16 +422,16 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
 def _with_electrodes(prior: FilmPrior, sensor: Sensor) -> FilmPrior:
     """If a prior and a sensor have the same pads, replace the electrodes of the prior by those of the sensor.
 
-    The electrodes of the sensor may have traces and patterned backs. If the pads differ, or if all electrodes are
-    equal, the function returns the given prior itself.
+    The electrodes of the sensor may have traces and patterned backs. If the pads differ, or if the prior has the
+    electrodes of the sensor already, the function returns the given prior itself.
 
     Args:
         prior: Distribution of the films for which a network was trained.
         sensor: Sensor whose electrodes are used.
     """
     has_other_pads = _pad_corners(prior.sensor) != _pad_corners(sensor)
-    has_equal_electrodes = prior.sensor.electrodes == sensor.electrodes
-    if has_other_pads or has_equal_electrodes:
+    has_same_electrodes = prior.sensor.electrodes == sensor.electrodes
+    if has_other_pads or has_same_electrodes:
         return prior
     return replace(prior, sensor=replace(prior.sensor, electrodes=sensor.electrodes))
 

@@ -99,7 +99,8 @@ def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
             definition.meaning,
             value=float(definition.offset + definition.weights @ film.parameters),
             std=float(np.sqrt(scaled_weights @ film.covariance @ scaled_weights)),
-            before_std=float(np.sqrt(scaled_weights @ scaled_weights)),  # the prior covariance is the identity matrix
+            # In units of the prior standard deviations, the covariance before the presses is the identity matrix.
+            before_std=float(np.sqrt(scaled_weights @ scaled_weights)),
             weights=scaled_weights,
         )
     return quantity_of_name
@@ -114,27 +115,28 @@ def _definitions(prior: FilmPrior) -> dict[str, _Definition]:
     Args:
         prior: Distribution of the films, with the names of the parameters and electrodes.
     """
-    # A quantity is defined by the weights of the parameters. The weights of a single parameter are a unit vector.
+    # A quantity is defined by the weights of the parameters. The weights of a quantity that is a single parameter are
+    # the unit vector of this parameter.
     unit = dict(zip(prior.names, np.eye(len(prior.names)), strict=True))
     gains = {name: unit[f"gain {name}"] for name in prior.sensor.electrode_names}
     mean_gain = sum(gains.values(), np.zeros(len(unit))) / len(gains)
     piezo_times_gain = 0.5 * (unit["d31"] + unit["d32"]) + mean_gain  # sqrt(d31 d32) times the mean gain
     # Without pretension, the charge of a press is proportional to E^(1/3) h^(-2/3) sqrt(d31 d32) and to the gain.
     slack_response = (unit["young"] - 2.0 * unit["thickness"]) / 3.0 + piezo_times_gain
-    # The parameters of shift and rotation are differences from those in the sensor file.
+    # The parameters of shift and rotation are differences from the sensor file, so the values in the file are added.
     file_calibration = prior.sensor.calibration
     x_shift_mm, y_shift_mm = file_calibration.shift
     degrees_per_rad = float(np.rad2deg(1.0))
     definitions = {
         "pretension_MPa": _Definition("pretension", unit["pretension"]),
-        "response_percent": _relative(
+        "response_percent": _percent_definition(
             "charge of a press on the slack film, E^(1/3) h^(-2/3) sqrt(d31 d32) gain", slack_response
         ),
-        "charge_scale_percent": _relative(
+        "charge_scale_percent": _percent_definition(
             "product of Young's modulus, sqrt(d31 d32) and mean gain", unit["young"] + piezo_times_gain
         ),
-        "stiffness_percent": _relative("Young's modulus times thickness", unit["young"] + unit["thickness"]),
-        "anisotropy_percent": _relative("ratio of d31 to d32", unit["d31"] - unit["d32"]),
+        "stiffness_percent": _percent_definition("Young's modulus times thickness", unit["young"] + unit["thickness"]),
+        "anisotropy_percent": _percent_definition("ratio of d31 to d32", unit["d31"] - unit["d32"]),
         "shift_x_mm": _Definition("shift of the electrodes along x", unit["shift_x"], x_shift_mm),
         "shift_y_mm": _Definition("shift of the electrodes along y", unit["shift_y"], y_shift_mm),
         "rotation_deg": _Definition(
@@ -147,15 +149,15 @@ def _definitions(prior: FilmPrior) -> dict[str, _Definition]:
     for name, gain in gains.items():
         meaning = f"gain of {name} relative to the mean of all gains, %"
         definitions[f"gain_{name}_percent"] = _Definition(meaning, 100.0 * (gain - mean_gain))
-    definitions["young_percent"] = _relative("Young's modulus alone", unit["young"])
-    definitions["thickness_percent"] = _relative("thickness alone", unit["thickness"])
-    definitions["d31_percent"] = _relative("d31 alone", unit["d31"])
-    definitions["d32_percent"] = _relative("d32 alone", unit["d32"])
-    definitions["mean_gain_percent"] = _relative("mean gain alone", mean_gain)
+    definitions["young_percent"] = _percent_definition("Young's modulus alone", unit["young"])
+    definitions["thickness_percent"] = _percent_definition("thickness alone", unit["thickness"])
+    definitions["d31_percent"] = _percent_definition("d31 alone", unit["d31"])
+    definitions["d32_percent"] = _percent_definition("d32 alone", unit["d32"])
+    definitions["mean_gain_percent"] = _percent_definition("mean gain alone", mean_gain)
     return definitions
 
 
-def _relative(meaning: str, log_weights: Array) -> _Definition:
+def _percent_definition(meaning: str, log_weights: Array) -> _Definition:
     """Define a quantity in percent, as the difference from its value in the sensor file.
 
     Args:

@@ -73,7 +73,7 @@ class CalibrationResult:
 
     @cached_property
     def error_left_before(self) -> ContactError:
-        """Contact errors that were caused by the uncertainty of the film before the calibration.
+        """Contact errors that the uncertainty of the film caused before the calibration.
 
         If the film was moved to another temperature, these are the errors before the move.
         """
@@ -116,7 +116,7 @@ class CalibrationResult:
         at_C = None if warming is None else warming.at_C
 
         def network_of(film: FilmPosterior) -> Fitted:
-            """Return a network for a film that was fitted to a part of the presses."""
+            """Return a network for a film that was fitted to some of the presses."""
             return self._network_of(film.unknowns, film.joint)
 
         # If a side force is declared only for later contacts, the presses themselves have no friction.
@@ -323,7 +323,7 @@ class CalibrationResult:
 
 
 def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved: str) -> CalibrationResult:
-    """From an estimate of a film, create a calibration result that has no presses.
+    """Create a calibration result without presses from an estimate of a film.
 
     Args:
         problem: The calibration problem.

@@ -73,18 +73,18 @@ def read_answer(text: str) -> Answer:
     Raises:
         PressError: If the text has none of these forms.
     """
-    word = text.strip().lower()
-    if word in REPLIES:
-        return Answer(REPLIES[word])
-    undo_match = UNDO.fullmatch(word)
+    normalised_text = text.strip().lower()
+    if normalised_text in REPLIES:
+        return Answer(REPLIES[normalised_text])
+    undo_match = UNDO.fullmatch(normalised_text)
     if undo_match is not None:
         digits = undo_match[1]
         return Answer("undo", number=int(digits) if digits else "last")
-    if word == "?":  # a press with an unknown place and an unknown force
+    if normalised_text == "?":  # a press with an unknown place and an unknown force
         return Answer("take", np.full(len(CONTACT), np.nan))
 
     try:
-        contact = _typed_contact(word)
+        contact = _typed_contact(normalised_text)
     except ValueError:
         # The message repeats at most 60 characters of the text.
         raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}") from None
@@ -166,7 +166,7 @@ class PressSession:
 
         Args:
             problem: The calibration problem.
-            save: Function that stores the presses. It is called with all presses after each change of the presses,
+            save: Function that stores the presses. After each change of the presses, it is called with all presses,
                 before the film is fitted.
             presses: Presses of an earlier session that is continued; None to begin without presses.
             position_std_mm: Standard deviation of the positions of further presses, mm.

@@ -77,16 +77,19 @@ def with_friction(
 ) -> PressData:
     """Return a copy of the presses, with the effect of friction on their charges as `friction_charge`.
 
+    The effect is divided by the coefficient of friction at which it was computed. This coefficient is at least
+    `MIN_REFERENCE`.
+
     Args:
         data: The measured presses.
         charges: Model of the charges of all films, with their domain.
         side_force_map: Effect of side forces on the charges of the estimated film.
         contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
-        coefficient: Estimated coefficient of friction, at which the effect is computed.
+        coefficient: Estimated coefficient of friction, at which the effect is computed if it is not too small.
     """
     reference_coefficient = float(np.clip(coefficient, MIN_REFERENCE, MAX_FRICTION))
     charge_at_reference = side_force_map.friction_charges(charges.into_domain(contact), reference_coefficient)
-    return replace(data, friction_charge=charge_at_reference / reference_coefficient)  # per unit of the coefficient
+    return replace(data, friction_charge=charge_at_reference / reference_coefficient)
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,8 @@ class SideForces:
 
     def charge_factor(self, contact: Array) -> Array:
         """Compute the factors by which half of the friction of the presses multiplies the charges.
+
+        All factors are 1 if the estimated coefficient of friction is zero.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.

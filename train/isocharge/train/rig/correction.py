@@ -169,6 +169,7 @@ def fit_correction(residuals: Residuals) -> Correction:
     most_probable_size = mixture.best.discrepancy
     if most_probable_size == 0.0:
         return Correction(domain, coefficients=np.zeros((n_term, n_electrode)), effective_count=0.0)
+    # The mean before the presses is zero, so the change of the mean is the estimate.
     coefficients = mixture.mean_change.reshape(n_term, n_electrode)
     # The residuals determine some of the coefficients, and the prior determines the others. The effective number of
     # coefficients that the residuals determine is the trace of the posterior covariance times the normal matrix.
