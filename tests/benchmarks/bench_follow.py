@@ -1,11 +1,11 @@
 """How well a film is followed: films that changed, and unchanged films that warm fingers touch.
 
     python tests/benchmarks/bench_follow.py [--sensor four-25um-biaxial] [--films 6] [--sessions 1] [--seed 0]
-        [--seconds 10] [--offsets none,constant,varying,decaying] [--json]
+        [--frames 10] [--seconds 10] [--offsets none,constant,varying,decaying] [--json]
 
 Each film is drawn from the prior, with a pretension of 1 MPa, and calibrated by 20 presses. A session is 60 or 120
-touches of unknown place and force, 5 s apart; the follower gets the hardest frame of each that does not make the film
-yield.
+touches of unknown place and force, 5 s apart. No touch makes the film yield. During the given number of frames, the
+force of a touch is constant, and each frame has its own noise.
 
 Changed films: root-mean-square errors of the contacts after 60 touches, the share of forces within two reported
 standard deviations, the errors by the calibrated model, and the share of touches with the flag `film`.
@@ -74,9 +74,20 @@ class Film(NamedTuple):
 
     def touches(self, change_MPa: float, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw contacts below the yield force, shape (n, 3), and their noisy charges, shape (n, n_electrode), pC."""
+        contact, frames = self.touch_frames(change_MPa, count, 1, rng)
+        return contact, frames[:, 0]
+
+    def touch_frames(
+        self, change_MPa: float, count: int, frame_count: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Draw contacts below the yield force, and the noisy charges of several frames of each contact.
+
+        Returns:
+            Contacts, shape (n, 3), and charges, shape (n, n_frame, n_electrode), pC.
+        """
         contact = draw_contacts(rng, self.problem.domain, count)
         contact[:, 2] = np.minimum(contact[:, 2], 0.95 * self.predictor.validity.yield_force_N)
-        return contact, self.problem.noise.add(self.maps[change_MPa].charges(contact), rng)
+        return contact, noisy_frames(self.problem, self.maps[change_MPa].charges(contact), frame_count, rng)
 
 
 def calibrated_film(sensor: str, seed: int, folder: Path) -> Film:
@@ -95,6 +106,23 @@ def calibrated_film(sensor: str, seed: int, folder: Path) -> Film:
     return Film(problem, Predictor(folder / "mine"), maps)
 
 
+def noisy_frames(
+    problem: CalibrationProblem, charge: np.ndarray, frame_count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Return frames of touches with constant charges, each frame with its own noise.
+
+    Args:
+        problem: The films, which state the noise.
+        charge: Charges of the touches without noise, shape (n, n_electrode), pC.
+        frame_count: Number of frames of each touch.
+        rng: Generator of the noise.
+
+    Returns:
+        Charges with noise, shape (n, n_frame, n_electrode), pC.
+    """
+    return problem.noise.add(np.repeat(charge[:, None], frame_count, axis=1), rng)
+
+
 def session_offsets(kind: str, size_pC: float, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return the offset of each touch of a session, shape (count,), pC."""
     if kind == "varying":
@@ -104,20 +132,28 @@ def session_offsets(kind: str, size_pC: float, count: int, rng: np.random.Genera
     return np.full(count, size_pC)
 
 
-def observe(follower: FilmFollower, charges: np.ndarray) -> tuple[float, list[float]]:
-    """Let a follower observe touches; return the share with the flag `film`, and the time of each touch, s."""
+def observe(follower: FilmFollower, touches: np.ndarray) -> tuple[float, list[float]]:
+    """Let a follower observe touches.
+
+    Args:
+        follower: The follower.
+        touches: Charges of the frames of each touch, shape (n, n_frame, n_electrode), pC.
+
+    Returns:
+        Share of the touches with the flag `film`, and the time of the update after each touch, s.
+    """
     flagged = 0
     times = []
-    for number, charge in enumerate(charges):
-        contact = follower.predictor.predict(charge)
-        flags = follower.predictor.flags(contact)
+    for number, frames in enumerate(touches):
         clock_s = TOUCH_INTERVAL_s * number
-        follower.observe_frame(charge, contact, flags, clock_s)
+        for charge in frames:
+            contact = follower.predictor.predict(charge)
+            follower.observe_frame(charge, contact, follower.predictor.flags(contact), clock_s)
         begin = time.perf_counter()
         follower.observe_frame(None, None, (), clock_s + 1.0)
         times.append(time.perf_counter() - begin)
         flagged += follower.is_lost
-    return flagged / len(charges), times
+    return flagged / len(touches), times
 
 
 def answers(follower: FilmFollower, charges: np.ndarray) -> list[Contact]:
@@ -125,12 +161,12 @@ def answers(follower: FilmFollower, charges: np.ndarray) -> list[Contact]:
     return [follower.follow_contact(follower.predictor.predict(charge), charge).contact for charge in charges]
 
 
-def changed_film(film: Film, change_MPa: float, seed: list[int]) -> dict[str, float]:
+def changed_film(film: Film, change_MPa: float, frame_count: int, seed: list[int]) -> dict[str, float]:
     """Errors after 60 touches of a film whose pretension changed."""
     rng = np.random.default_rng(seed)
     follower = FilmFollower(film.predictor)
-    _, charge = film.touches(change_MPa, 60, rng)
-    flagged, times = observe(follower, charge)
+    _, frames = film.touch_frames(change_MPa, 60, frame_count, rng)
+    flagged, times = observe(follower, frames)
     contact, charge = film.touches(change_MPa, CONTACTS, rng)
     calibrated_contact = np.array(film.predictor.predict_batch(charge))[:, :3]
     answer = answers(follower, charge)
@@ -147,22 +183,24 @@ def changed_film(film: Film, change_MPa: float, seed: list[int]) -> dict[str, fl
     }
 
 
-def warm_session(film: Film, kind: str, size_pC: float, count: int, seed: list[int]) -> dict[str, float]:
+def warm_session(
+    film: Film, kind: str, size_pC: float, count: int, frame_count: int, seed: list[int]
+) -> dict[str, float]:
     """What an offset of the charges does to an unchanged film."""
     rng = np.random.default_rng(seed)
     follower = FilmFollower(film.predictor)
     calibrated_MPa = follower.film.pretension_MPa
-    contact, charge = film.touches(0.0, count + COLD_TOUCHES, rng)
-    observe(follower, charge[:count] + session_offsets(kind, size_pC, count, rng)[:, None])
+    contact, frames = film.touch_frames(0.0, count + COLD_TOUCHES, frame_count, rng)
+    observe(follower, frames[:count] + session_offsets(kind, size_pC, count, rng)[:, None, None])
     change_MPa = abs(follower.film.pretension_MPa - calibrated_MPa)
     is_flagged = follower.is_lost
     wrong = 0
-    for truth, row in zip(contact[count:], charge[count:], strict=True):
-        (answer,) = answers(follower, row[None])
+    for truth, touch in zip(contact[count:], frames[count:], strict=True):
+        (answer,) = answers(follower, touch[:1])  # the contact of the first frame of the touch
         std = np.array([answer.x_std_mm, answer.y_std_mm, answer.force_std_N])
         is_wrong = bool((np.abs(np.array(answer[:3]) - truth) > 4.0 * std).any())
         wrong += is_wrong and not follower.is_lost and not follower.predictor.flags(answer)
-        observe(follower, row[None])
+        observe(follower, touch[None])
     return {
         "held": float(is_flagged or change_MPa < 2.0 * follower.film.pretension_std_MPa),
         "flagged": float(is_flagged),
@@ -228,6 +266,7 @@ def main() -> None:
         films=6,
         sessions=1,
         seed=0,
+        frames=10,
         seconds=10.0,
         offsets="none,constant,varying,decaying",
         json=False,
@@ -246,11 +285,11 @@ def main() -> None:
             if kind == "none":
                 results["frame of a held contact"] = frame_times(films[0], asked.seconds)
                 for change_MPa in CHANGES_MPa:
-                    rows = [changed_film(film, change_MPa, seed) for film, seed in seeds]
+                    rows = [changed_film(film, change_MPa, asked.frames, seed) for film, seed in seeds]
                     add(f"changed by {change_MPa:+g} MPa", rows)
             for size_pC in (0.0,) if kind == "none" else OFFSETS_pC:
                 for count in (60, 120):
-                    rows = [warm_session(film, kind, size_pC, count, seed) for film, seed in seeds]
+                    rows = [warm_session(film, kind, size_pC, count, asked.frames, seed) for film, seed in seeds]
                     add(f"{kind} {size_pC:+g} pC, {count} touches", rows)
     print_results("follow", asked, results)
 

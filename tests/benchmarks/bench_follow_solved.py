@@ -1,16 +1,18 @@
 """How well films with imperfections are followed, whose presses are solved one by one.
 
     python tests/benchmarks/bench_follow_solved.py [--sensor four-25um-biaxial] [--seeds 0,1,2,3,4,6,7,8,9,10]
-        [--change 0.3] [--orders 4] [--workers 2] [--folder build/solved_films] [--json]
+        [--change 0.3] [--frames 10] [--orders 4] [--workers 2] [--folder build/solved_films] [--json]
 
 The films are those of `solved_films.py`: orthotropic, unevenly stretched, with an oval clamp and wrong gains. Every
 third film has ink on its electrodes. Each film is calibrated by 20 presses. Its pretension then changes, and 60 touches
-of unknown place and force follow. The benchmark gives root-mean-square errors of 60 further contacts, and the shares of
-the positions and of the forces within two reported standard deviations:
+of unknown place and force follow. The force of a touch is constant for the given number of frames, each with its own
+noise. The benchmark gives root-mean-square errors of 60 further contacts, each computed from one frame, and the shares
+of the positions and of the forces within two reported standard deviations:
 
 - calibrated: by the calibrated model;
 - followed: by the model that `serve stream --follow` uses after the touches;
-- calibrated again: by a second calibration from the same touches, as `train calibrate --from` does;
+- calibrated again: by a second calibration from the average charges of the same touches, as `train calibrate --from`
+  does;
 - followed, other touches: as followed, for other random orders of the presses, so that other presses are the touches.
 
 A change of -0.45 MPa is the change of a film that is 1 K warmer than its ring. Solved charges are stored in the folder.
@@ -26,7 +28,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from bench_follow import answers, mean, observe
+from bench_follow import answers, mean, noisy_frames, observe
 from measured_films import contact_errors, measured_presses, with_rig_errors
 from shared import arguments, print_results, report_progress
 from solved_films import SolvedFilm, solved_film
@@ -49,28 +51,31 @@ def errors(answer: list[Contact], truth: np.ndarray) -> dict[str, float]:
     return contact_errors(contact, std, truth)
 
 
-def follow(predictor: Predictor, film: SolvedFilm, charge: np.ndarray, order: np.ndarray) -> dict[str, float]:
+def follow(predictor: Predictor, film: SolvedFilm, frames: np.ndarray, order: np.ndarray) -> dict[str, float]:
     """Follow a film through its first presses after the change, and return the errors for the other presses.
 
     Args:
         predictor: The calibrated model.
         film: The film.
-        charge: Charges of the later presses with noise, shape (n, n_electrode), pC.
+        frames: Charges of the frames of the later presses with noise, shape (n, n_frame, n_electrode), pC.
         order: Order of the later presses, shape (n,). The first `TOUCHES` presses are the touches.
     """
     follower = FilmFollower(predictor)
     touches, others = np.split(order, [TOUCHES])
-    observe(follower, charge[touches])
-    return errors(answers(follower, charge[others]), film.later_contact[others])
+    observe(follower, frames[touches])
+    return errors(answers(follower, frames[others, 0]), film.later_contact[others])
 
 
-def followed_film(problem: CalibrationProblem, film: SolvedFilm, seed: int, orders: int) -> dict[str, dict[str, float]]:
+def followed_film(
+    problem: CalibrationProblem, film: SolvedFilm, seed: int, frame_count: int, orders: int
+) -> dict[str, dict[str, float]]:
     """Calibrate a film, let it change, and return the errors of each method."""
     rng = np.random.default_rng([seed, 51])
     contact = with_rig_errors(film.contact, rng)
     presses = measured_presses(problem, contact, problem.noise.add(film.charge, rng))
-    later_charge = problem.noise.add(film.later_charge, rng)
-    touch_charge, charge = np.split(later_charge, [TOUCHES])
+    later_frames = noisy_frames(problem, film.later_charge, frame_count, rng)
+    touch_charge = later_frames[:TOUCHES].mean(axis=1)
+    charge = later_frames[TOUCHES:, 0]
     truth = film.later_contact[TOUCHES:]
 
     calibration = calibrate(presses, problem)
@@ -84,10 +89,10 @@ def followed_film(problem: CalibrationProblem, film: SolvedFilm, seed: int, orde
         write_calibration(again, again_folder)
         predictor = Predictor(calibrated_folder)
         again_predictor = Predictor(again_folder)
-        given_order = np.arange(len(later_charge))
-        followed = follow(predictor, film, later_charge, given_order)
+        given_order = np.arange(len(later_frames))
+        followed = follow(predictor, film, later_frames, given_order)
         random_orders = [rng.permutation(given_order) for _ in range(orders)]
-        other_touches = [follow(predictor, film, later_charge, order) for order in random_orders]
+        other_touches = [follow(predictor, film, later_frames, order) for order in random_orders]
         return {
             "calibrated": errors([predictor.predict(row) for row in charge], truth),
             "followed": followed,
@@ -102,6 +107,7 @@ def main() -> None:
         sensor="four-25um-biaxial",
         seeds="0,1,2,3,4,6,7,8,9,10",
         change=0.3,
+        frames=10,
         orders=4,
         workers=2,
         folder=Path("build/solved_films"),
@@ -114,7 +120,7 @@ def main() -> None:
         for seed in asked.seeds.split(","):
             solved = solved_film(problem, int(seed), asked.change, counts, asked.folder, pool)
             try:
-                film = followed_film(problem, solved, int(seed), asked.orders)
+                film = followed_film(problem, solved, int(seed), asked.frames, asked.orders)
             except ModelError as error:  # the calibration has written no file for following
                 print(f"film {seed}: cannot be followed ({error})", file=sys.stderr)
                 continue

@@ -307,16 +307,53 @@ def test_between_its_pretensions_it_is_the_network_for_all_films(mine, problem):
     np.testing.assert_allclose(misfits, followed, atol=0.05)
 
 
+@pytest.fixture
+def touch_charge(problem, film, mine):
+    """Charges of one touch of the calibrated film, shape (4,), pC."""
+    _, charge = touch_charges(problem, film, Predictor(mine), 1.0, 1, seed=8)
+    return charge[0]
+
+
 @pytest.mark.parametrize(
-    ("flags", "counted"), [((), 1), (("stress",), 1), (("saturated",), 0), (("misfit",), 0), (("thermal",), 0)]
+    ("flags", "counted"),
+    [((), 1), (("stress",), 1), (("misfit",), 1), (("saturated",), 0), (("thermal",), 0), (("outside", "thermal"), 0)],
 )
-def test_touches_that_do_not_count(mine, flags, counted):
-    follower, charge = FilmFollower(Predictor(mine)), np.array([500.0, 480.0, 520.0, 510.0])
-    contact = follower.predictor.predict(charge)
-    for frame in (("outside", "misfit"), (), flags):
-        follower.observe_frame(charge, contact, frame, 0.0)
-    follower.observe_frame(charge, None, (), 0.1)
+def test_flag_of_a_frame_decides_whether_its_touch_counts(mine, touch_charge, flags, counted):
+    follower = FilmFollower(Predictor(mine))
+    contact = follower.predictor.predict(touch_charge)
+    for frame_flags in (("outside", "misfit"), (), flags):
+        follower.observe_frame(touch_charge, contact, frame_flags, 0.0)
+    follower.observe_frame(touch_charge, None, (), 0.1)
     assert follower.film.touches == counted
+
+
+def test_touch_does_not_count_if_no_contact_explains_its_average_charges(mine, film):
+    follower = FilmFollower(Predictor(mine))
+    wrong_charge = film(1.0).charges(np.array([[0.0, 0.0, 0.5]]))[0] * [1.2, 0.8, 1.2, 0.8]
+    contact = follower.predictor.predict(wrong_charge)
+    for _ in range(10):
+        follower.observe_frame(wrong_charge, contact, follower.predictor.flags(contact), 0.0)
+    follower.observe_frame(wrong_charge, None, (), 0.1)
+    assert "misfit" in follower.predictor.flags(contact)
+    assert follower.film.touches == 0
+
+
+def test_touches_with_many_noisy_frames_count(mine, problem, film):
+    """Without the average, a single frame with a large misfit would exclude most of these touches."""
+    follower = FilmFollower(Predictor(mine))
+    contact, _ = touch_charges(problem, film, follower.predictor, 1.0, 10, seed=8)
+    rng = np.random.default_rng(3)
+    touches_with_misfit = 0
+    for charge in film(1.0).charges(contact):
+        frames = charge + 2.5 * problem.noise.sigma(charge) * rng.standard_normal((64, charge.size))
+        frame_contacts = [follower.predictor.predict(frame) for frame in frames]
+        frame_flags = [follower.predictor.flags(frame_contact) for frame_contact in frame_contacts]
+        touches_with_misfit += any("misfit" in flags for flags in frame_flags)
+        for frame, frame_contact, flags in zip(frames, frame_contacts, frame_flags, strict=True):
+            follower.observe_frame(frame, frame_contact, flags, 0.0)
+        follower.observe_frame(None, None, (), 0.1)
+    assert touches_with_misfit > 5
+    assert follower.film.touches == 10
 
 
 @pytest.mark.parametrize("change", ["gone", "damaged", "another model", "another model without checksums"])

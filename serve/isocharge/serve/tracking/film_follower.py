@@ -5,10 +5,11 @@ between the measured charges and the nearest charges that a contact can produce.
 for example because the room becomes warmer by 1 K, the misfits of all touches increase. The estimated pretension is the
 pretension for which the misfits of the touches are smallest.
 
-The module `isocharge.serve.tracking.film_filter` estimates the pretension. The estimate uses one frame of each touch,
-namely the frame with the largest force. The filter also estimates the gains, a common offset, and the changes of the
-film along directions that remained uncertain after the calibration (`FilmDirections`). Contacts are corrected for the
-estimated pretension and for the estimated changes along the directions.
+The module `isocharge.serve.tracking.film_filter` estimates the pretension. The estimate uses one set of charges of each
+touch, namely the average charges of the frames with about the largest force. The filter also estimates the gains, a
+common offset, and the changes of the film along directions that remained uncertain after the calibration
+(`FilmDirections`). Contacts are corrected for the estimated pretension and for the estimated changes along the
+directions.
 
 If no pretension explains a touch, for example a touch with two contacts, the touch hardly changes the estimate. The
 film is considered lost in three cases.
@@ -40,14 +41,19 @@ from isocharge.serve.tracking.film_update import TouchResiduals
 from isocharge.serve.tracking.followable_pretensions import followable_pretensions
 from isocharge.serve.tracking.pretension_grid import odds_of_no_change
 from isocharge.serve.tracking.touch_misfits import touch_misfits
+from isocharge.serve.tracking.touch_peak import TouchPeak
 
-HARMLESS_FLAGS = frozenset({STRESS, GAP, REPEAT})
-"""Flags that do not make the touch of a frame unusable. GAP and REPEAT only mean that frames were lost."""
+UNUSED_FRAME_FLAGS = frozenset({OUTSIDE, BEYOND, STRESS, GAP, REPEAT})
+"""Flags of frames that are not used, although the other frames of the same touch may be used.
 
-HARMLESS_FLAGS_OUTSIDE = HARMLESS_FLAGS | {OUTSIDE, BEYOND, MISFIT}
-"""Flags with which a touch remains usable if the same frame also has the flag OUTSIDE.
+The first and the last frames of every touch have the flag OUTSIDE. GAP and REPEAT only mean that frames were lost.
+"""
 
-The first frames of every touch have the flag OUTSIDE.
+HARMLESS_FLAGS = UNUSED_FRAME_FLAGS | {MISFIT}
+"""Flags that do not make the touch of a frame unusable.
+
+The noise of a single frame may cause the flag MISFIT. Therefore the misfit of the average charges of the touch decides
+whether the touch is used.
 """
 
 RECENT_TOUCHES = 40
@@ -119,12 +125,12 @@ class FollowedContact(NamedTuple):
     charge_pC: Array
 
 
-class PeakFrame(NamedTuple):
-    """The frame with the largest force of a touch.
+class Touch(NamedTuple):
+    """A touch, described by its charges near the largest force.
 
     Attributes:
-        contact: Contact that the model computed for the frame.
-        charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
+        contact: Contact that the model computed from the charges.
+        charge_pC: Touch charges, averaged over the frames with about the largest force, shape (n_electrode,), pC.
     """
 
     contact: Contact
@@ -225,7 +231,7 @@ class FilmFollower:
 
     def discard_touch(self) -> None:
         """Discard the frames of the present touch, for example after an outage or a new tare."""
-        self._peak: PeakFrame | None = None
+        self._peak: TouchPeak | None = None
         self._is_touch_usable = True
 
     @property
@@ -239,8 +245,9 @@ class FilmFollower:
     ) -> None:
         """Process the next frame, and update the estimate of the film when a touch ends.
 
-        The estimate is updated with one frame of the touch, namely the frame without flags that has the largest force.
-        A touch is not used if one of its frames has a flag that is not harmless.
+        The estimate is updated with the average charges of the frames with about the largest force. Frames with a flag
+        in `UNUSED_FRAME_FLAGS` are not averaged. A touch is not used if one of its frames has a flag that is not
+        harmless.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC; None if nothing touches the film.
@@ -250,25 +257,33 @@ class FilmFollower:
         """
         if contact is None:
             self._end_touch(clock_s)
-        elif flags:
-            # The first frames of every touch have the flag `outside`. More flags are harmless in such a frame.
-            harmless_flags = HARMLESS_FLAGS_OUTSIDE if OUTSIDE in flags else HARMLESS_FLAGS
-            if not harmless_flags.issuperset(flags):
-                self._is_touch_usable = False
-        elif self._peak is None or contact.force_N > self._peak.contact.force_N:  # the largest force so far
-            assert charge_pC is not None  # a frame with a contact has charges
-            self._peak = PeakFrame(contact, charge_pC)
+            return
+        if not HARMLESS_FLAGS.issuperset(flags):
+            self._is_touch_usable = False
+            return
+        if not UNUSED_FRAME_FLAGS.isdisjoint(flags):
+            return
+
+        assert charge_pC is not None  # a frame with a contact has charges
+        if self._peak is None:
+            self._peak = TouchPeak(contact, charge_pC)
+        else:
+            self._peak.add_frame(contact, charge_pC)
 
     def _end_touch(self, clock_s: float) -> None:
         """Update the estimate with the touch that has just ended, unless the touch is unusable.
 
-        A touch is unusable if a frame has a flag that is not harmless, or if all frames have flags.
+        A touch is unusable if one of its frames has a flag that is not harmless, if no frame was averaged, or if no
+        contact explains the average charges.
 
         Args:
             clock_s: Time of the first frame without contact on a clock that does not jump, s.
         """
         if self._peak is not None and self._is_touch_usable:
-            self.observe_touch(self._peak, clock_s)
+            charge_pC = self._peak.mean_charge_pC
+            contact = self.predictor.predict(charge_pC)
+            if MISFIT not in self.predictor.flags(contact):
+                self.observe_touch(Touch(contact, charge_pC), clock_s)
         self.discard_touch()
 
     def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
@@ -321,7 +336,7 @@ class FilmFollower:
             self._stored_ratios_contact = contact
         return self._stored_ratios
 
-    def observe_touch(self, peak: PeakFrame, clock_s: float) -> None:
+    def observe_touch(self, touch: Touch, clock_s: float) -> None:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
 
         The film is lost if no pretension explains the latest touches, if the gain of an electrode seems to be wrong, or
@@ -329,15 +344,15 @@ class FilmFollower:
         is restored. No estimate is used before `FEWEST_TOUCHES` touches were observed.
 
         Args:
-            peak: Frame with the largest force of the touch.
+            touch: The touch.
             clock_s: Time of the touch on a clock that does not jump, s.
         """
-        contacts = np.array([peak.contact[:3]])  # one contact (x, y, force), shape (1, 3)
+        contacts = np.array([touch.contact[:3]])  # one contact (x, y, force), shape (1, 3)
         log_changes = self._directions.log_changes(contacts)[0]
         self._filter.predict(clock_s)
-        residuals = self._filter.update(peak.charge_pC, contacts[0], log_changes)
+        residuals = self._filter.update(touch.charge_pC, contacts[0], log_changes)
         self._touch_count += 1
-        self._recent_misfits.append(self._squared_misfits(peak, log_changes, residuals))
+        self._recent_misfits.append(self._squared_misfits(touch, log_changes, residuals))
         if len(self._recent_misfits) < FEWEST_TOUCHES:
             return
 
@@ -359,13 +374,13 @@ class FilmFollower:
         is_long_enough = len(self._recent_estimates) == RECENT_TOUCHES
         return self._recent_estimates[0] if is_long_enough else self._calibrated_estimate
 
-    def _squared_misfits(self, peak: PeakFrame, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
+    def _squared_misfits(self, touch: Touch, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
         """Compute the squared misfits of a touch, which are needed to decide whether the film is lost.
 
         Each squared misfit is limited to `LARGEST_SQUARE`, so that a single touch has little influence.
 
         Args:
-            peak: The frame with the largest force, with the touch charges Q.
+            touch: The touch, with the charges Q.
             log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode). A direction is
                 an uncertain combination of film parameters.
             residuals: Squared misfits that the filter computed for the touch.
@@ -374,8 +389,10 @@ class FilmFollower:
 
         # Correct the charges for the estimated offset, and for the estimated changes of the film along the directions.
         direction_means = self._filter.direction_means(self._filter.mean_MPa)
-        corrected_pC = (peak.charge_pC - self._filter.offset_pC) * np.exp(-direction_means @ log_changes)
-        wrong_gain_squares = self._squared_misfits_of_wrong_gains(corrected_pC, peak.contact, residuals.offset_variance)
+        corrected_pC = (touch.charge_pC - self._filter.offset_pC) * np.exp(-direction_means @ log_changes)
+        wrong_gain_squares = self._squared_misfits_of_wrong_gains(
+            corrected_pC, touch.contact, residuals.offset_variance
+        )
         return SquaredMisfits(
             with_gains=squares_with_gains,
             at_touch_estimate=float(squares_with_gains[self._filter.nearest_index]),

@@ -1,0 +1,61 @@
+"""Tests of the average charges of a touch near its largest force."""
+
+import numpy as np
+import pytest
+
+from isocharge.serve.prediction.contact import Contact
+from isocharge.serve.tracking.touch_peak import MAX_AVERAGED_FRAMES, TouchPeak
+
+
+def contact(force_N, x_mm=1.0):
+    """Return a contact with a force and a position; the other values do not matter."""
+    return Contact(x_mm, 0.0, force_N, x_std_mm=0.1, y_std_mm=0.1, force_std_N=0.01, misfit=0.5)
+
+
+def peak_of(contacts, charges):
+    """Return the peak of a touch with these contacts and charges of its frames."""
+    peak = TouchPeak(contacts[0], np.array(charges[0]))
+    for frame_contact, charge in zip(contacts[1:], charges[1:], strict=True):
+        peak.add_frame(frame_contact, np.array(charge))
+    return peak
+
+
+def test_only_the_frames_near_the_largest_force_are_averaged():
+    forces_N = [0.2, 0.6, 1.0, 1.02, 0.98, 0.6, 0.2]
+    charges = [[100.0 * force_N, 50.0 * force_N] for force_N in forces_N]
+    peak = peak_of([contact(force_N) for force_N in forces_N], charges)
+    np.testing.assert_allclose(peak.mean_charge_pC, [100.0, 50.0])
+
+
+def test_frame_at_another_position_is_not_averaged():
+    peak = peak_of([contact(1.0), contact(0.99, x_mm=3.0)], [[100.0], [400.0]])
+    np.testing.assert_allclose(peak.mean_charge_pC, [100.0])
+
+
+def test_larger_force_at_another_position_starts_a_new_average():
+    peak = peak_of([contact(1.0), contact(1.01, x_mm=3.0)], [[100.0], [400.0]])
+    np.testing.assert_allclose(peak.mean_charge_pC, [400.0])
+
+
+def test_long_touch_is_averaged_over_the_first_frames_only():
+    steady = [[100.0]] * MAX_AVERAGED_FRAMES
+    changed = [[200.0]] * 10
+    charges = steady + changed
+    peak = peak_of([contact(1.0)] * len(charges), charges)
+    np.testing.assert_allclose(peak.mean_charge_pC, [100.0])
+
+
+def test_average_reduces_independent_noise_by_the_square_root_of_the_number_of_frames():
+    rng = np.random.default_rng(7)
+    means = []
+    for _ in range(400):
+        noisy_charges = 500.0 + rng.standard_normal((16, 4))
+        means.append(peak_of([contact(1.0)] * 16, noisy_charges).mean_charge_pC)
+    assert np.std(means) == pytest.approx(1.0 / 4.0, rel=0.1)
+
+
+def test_given_charges_are_not_changed():
+    charge = np.array([100.0])
+    peak = TouchPeak(contact(1.0), charge)
+    peak.add_frame(contact(1.0), np.array([200.0]))
+    assert charge[0] == 100.0
