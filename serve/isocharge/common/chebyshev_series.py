@@ -166,6 +166,9 @@ def _derivative(coefficients: Array, axis: int) -> Array:
     Returns:
         Coefficients of the derivative, padded with zeros to the shape of `coefficients`.
     """
+    derivative = chebyshev.chebder(coefficients, axis=axis)
+    # The derivative of a constant has as many coefficients as the constant. Otherwise, it has one coefficient less.
+    missing_count = coefficients.shape[axis] - derivative.shape[axis]
     padding = [(0, 0)] * coefficients.ndim
-    padding[axis] = (0, 1)  # one zero at the end, because the derivative has one coefficient less
-    return np.pad(chebyshev.chebder(coefficients, axis=axis), padding)
+    padding[axis] = (0, missing_count)
+    return np.pad(derivative, padding)

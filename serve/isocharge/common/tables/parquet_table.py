@@ -137,11 +137,11 @@ class ParquetTable(NumberTable):
         row_count = 0  # number of rows that are decoded so far
         all_groups = list(range(self._metadata.num_row_groups))
         for batch in self._parquet.reader.iter_batches(ROWS_PER_BATCH, all_groups, [leaf_index], use_threads=False):
-            batch_end = row_count + batch.num_rows
-            if batch_end > declared_row_count:  # the column has more rows than the metadata declare
+            first_row = row_count
+            row_count += batch.num_rows
+            if row_count > declared_row_count:  # the column has more rows than the metadata declare
                 break
-            numbers[row_count:batch_end] = _as_float64(batch.column(0))  # the only column of the batch
-            row_count = batch_end
+            numbers[first_row:row_count] = _as_float64(batch.column(0))  # the only column of the batch
         if row_count != declared_row_count:
             raise self.error_class(
                 f"{self.where}, column {shown(name)}: expected {declared_row_count:,} rows as in the metadata of the "

@@ -462,14 +462,16 @@ def _drift_reason(press: SteadyPress, mean_magnitudes: Sequence[tuple[float, flo
     """Return the probable reason for a drift of the charges, as a part of a sentence.
 
     If only the force changes, all charges change in proportion, and their relative slopes are equal. If the relative
-    slopes differ, the position of the press changes. The charges are assumed to be positive.
+    slopes differ, the position of the press changes. A charge rises if its magnitude becomes larger, so that charges of
+    both signs can be compared.
 
     Args:
         press: Charges and drift in a window of the press. The drift is the change of each charge over the window.
         mean_magnitudes: Time since the touch, s, and mean magnitude of the charges, pC, of each calm window so far.
     """
     magnitude_pC = np.maximum(np.abs(press.charge_pC), MIN_CHARGE_pC)  # avoids a division by 0
-    relative_slope = press.drift_pC / magnitude_pC / press.window_s  # shape (n_electrode,), 1/s
+    magnitude_change_pC = np.sign(press.charge_pC) * press.drift_pC
+    relative_slope = magnitude_change_pC / magnitude_pC / press.window_s  # shape (n_electrode,), 1/s
     mean_slope = float(relative_slope.mean())
     largest_difference = np.abs(relative_slope - mean_slope).max()
     if largest_difference > MAX_SLOPE_DIFFERENCE * abs(mean_slope):

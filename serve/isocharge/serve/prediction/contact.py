@@ -115,11 +115,11 @@ class Contact(NamedTuple):
 NO_CORRELATION = dict.fromkeys(Contact._fields[N_WITHOUT_CORRELATION:])
 """Correlations of a contact in a record, all None, for a model that computes no correlations."""
 
-REUSE_DISTANCE_mm = 0.3
-"""Largest change of x or of y after which a sensitivity is still used again, mm."""
+CLOSE_DISTANCE_mm = 0.3
+"""Largest difference of x or of y between two close contacts, mm."""
 
-REUSE_FORCE_RATIO = 0.05
-"""Largest relative change of the force after which a sensitivity is still used again, dimensionless."""
+CLOSE_FORCE_RATIO = 0.05
+"""Largest difference of the force between two close contacts, relative to the force of the reference contact."""
 
 
 class Sensitivity:
@@ -170,20 +170,20 @@ class Sensitivity:
 
 
 def is_close(contact: Contact, reference: Contact | None) -> bool:
-    """Return whether the sensitivity that was computed for a reference contact may also be used for another contact.
+    """Return whether a contact has nearly the same position and force as a reference contact.
 
-    A sensitivity describes how a contact changes with a parameter of the film. Two contacts have nearly the same
-    sensitivity if their positions and forces are close to each other.
+    A sensitivity describes how a contact changes with a parameter of the film. The sensitivity that was computed for
+    the reference may also be used for a contact that is close to the reference.
 
     Args:
         contact: The contact that is compared with the reference.
-        reference: The contact for which a sensitivity was computed. If it is None, the result is False.
+        reference: The reference contact. If it is None, the result is False.
     """
     if reference is None:
         return False
-    is_x_close = abs(contact.x_mm - reference.x_mm) <= REUSE_DISTANCE_mm
-    is_y_close = abs(contact.y_mm - reference.y_mm) <= REUSE_DISTANCE_mm
-    is_force_close = abs(contact.force_N - reference.force_N) <= REUSE_FORCE_RATIO * reference.force_N
+    is_x_close = abs(contact.x_mm - reference.x_mm) <= CLOSE_DISTANCE_mm
+    is_y_close = abs(contact.y_mm - reference.y_mm) <= CLOSE_DISTANCE_mm
+    is_force_close = abs(contact.force_N - reference.force_N) <= CLOSE_FORCE_RATIO * reference.force_N
     return is_x_close and is_y_close and is_force_close
 
 

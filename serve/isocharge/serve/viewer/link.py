@@ -136,15 +136,16 @@ class PageEnd(LinkEnd):
         Args:
             size: Size of a sample, bytes. The bytes of an incomplete sample are kept for the next call.
         """
-        data = self._incomplete
+        received = b""
         try:
-            data += os.read(self.samples.fileno(), PIPE_BYTES)
+            received = os.read(self.samples.fileno(), PIPE_BYTES)
         except BlockingIOError:  # no samples have arrived
             pass
         except OSError:
             self.is_open = False
         else:
-            self.is_open = bool(data)  # reading returns no bytes if the reader has closed its end
+            self.is_open = bool(received)  # reading returns no bytes if the reader has closed its end
+        data = self._incomplete + received
         complete_bytes = len(data) - len(data) % size
         self._incomplete = data[complete_bytes:]
         return data[:complete_bytes]

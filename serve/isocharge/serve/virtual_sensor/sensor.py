@@ -278,11 +278,13 @@ class VirtualSensor:
     def truth(self, seq: int) -> Truth:
         """Return the true press in the latest frame that has the given frame counter.
 
+        The sensor must send all frames, and its counter must wrap at `SEQ_MODULUS`, as is the default.
+
         Args:
             seq: The frame counter: number of the frame since the start, modulo `SEQ_MODULUS`.
 
         Raises:
-            SceneError: If no frame with this counter has been played.
+            SceneError: If no frame with this counter has been played, or if the frame belongs to an earlier script.
         """
         # Several frames may have this counter, because the counter wraps. Find the latest of these frames.
         latest_number = self._frame_count - 1
@@ -290,6 +292,11 @@ class VirtualSensor:
         frame_number = latest_number - later_frame_count
         if frame_number < 0 or not 0 <= seq < SEQ_MODULUS:
             raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest_number, SEQ_MODULUS - 1)}")
+        if frame_number < self._first_frame_of_script:
+            raise SceneError(
+                f"frame {seq} was played before the script was replaced; expected a frame of the present script, which "
+                f"began with frame {self._first_frame_of_script % SEQ_MODULUS}"
+            )
         script = self._script
         row = (frame_number - self._first_frame_of_script) % len(script)  # the script is repeated without end
         return Truth(

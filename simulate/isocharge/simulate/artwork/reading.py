@@ -1,11 +1,12 @@
 """Reader of electrodes from a DXF drawing."""
 
-from itertools import chain
+from itertools import chain, combinations
 from pathlib import Path
 from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from isocharge.common.errors import SensorError, cut
 from isocharge.common.extras import require
@@ -84,21 +85,15 @@ def _touching_groups(polygons: list[Electrode]) -> list[list[Electrode]]:
     Returns:
         The groups, in the order of their first polygons.
     """
-    groups: list[list[Electrode]] = []
-    for polygon in polygons:
-        # Find the groups that the polygon touches. The polygon connects them, so they become one group.
-        touched_groups = []
-        separate_groups = []
-        for group in groups:
-            if any(polygon.overlaps(other, TOUCHING_DISTANCE) for other in group):
-                touched_groups.append(group)
-            else:
-                separate_groups.append(group)
-        joined_group = [*chain(*touched_groups), polygon]
-        groups = [*separate_groups, joined_group]
+    touches = np.zeros((len(polygons), len(polygons)), dtype=bool)
+    for (row, polygon), (column, other) in combinations(enumerate(polygons), 2):
+        touches[row, column] = polygon.overlaps(other, TOUCHING_DISTANCE)
+    _, group_of_polygon = connected_components(touches, directed=False)
 
-    # The joined groups were appended at the end. Sort all groups by the index of their first polygon.
-    return sorted(groups, key=lambda group: polygons.index(group[0]))
+    groups: dict[int, list[Electrode]] = {}  # a new group is added when its first polygon is reached
+    for polygon, group in zip(polygons, group_of_polygon.tolist(), strict=True):
+        groups.setdefault(group, []).append(polygon)
+    return list(groups.values())
 
 
 def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list[Electrode]:

@@ -256,6 +256,19 @@ def slow_load(store, monkeypatch):
     go_on.set()
 
 
+@pytest.mark.parametrize("requests_before", [[], [infer()], [LOAD, infer()]])
+def test_malformed_request_is_refused_after_the_answer_to_an_earlier_load(server, slow_load, requests_before):
+    """The malformed request arrives in one piece with the load, whose answer is computed in another thread."""
+    began, go_on = slow_load
+    with connect(server) as connection:
+        connection.sendall(b"".join([LOAD, *requests_before, b"NONSENSE\r\n\r\n"]))
+        assert began.wait(30)
+        go_on.set()
+        answers = everything(connection)
+    assert statuses(answers) == [200] * (1 + len(requests_before)) + [400]
+    assert b"connection: close" in answers
+
+
 def test_loading_a_model_delays_no_other_request(server, slow_load):
     began, go_on = slow_load
     with connect(server) as connection:

@@ -106,6 +106,7 @@ class Connection(asyncio.Protocol):
 
         self._is_stopping = False  # whether the server is being stopped
         self._is_refused = False  # whether a request was refused; no further requests are read then
+        self._postponed_refusal: Response | None = None  # refusal that is sent after the answers to earlier requests
         self._is_half_closed = False  # whether the client sends no more data but still reads responses
         self._is_blocked = False  # whether nothing is parsed, because the client does not read its responses
 
@@ -210,11 +211,11 @@ class Connection(asyncio.Protocol):
         """Close the connection, because the server is being stopped.
 
         If a request is incomplete, or if its answer is being computed, the connection is closed only after the response
-        was sent. After a refusal, the connection is ended at once.
+        was sent. After a refusal was sent, the connection is ended at once.
         """
         self._is_stopping = True  # the next response closes the connection
         has_open_request = self._phase is not Phase.IDLE or self._answering is not None
-        if self._is_refused:  # the connection is only open so that the client can read the refusal
+        if self._is_refusal_sent:  # the connection is only open so that the client can read the refusal
             self._transport.abort()
         elif not has_open_request:
             self._transport.close()
@@ -232,6 +233,11 @@ class Connection(asyncio.Protocol):
     def abort(self) -> None:
         """End the connection at once."""
         self._transport.abort()
+
+    @property
+    def _is_refusal_sent(self) -> bool:
+        """Whether a refusal was sent, after which no other response may follow."""
+        return self._is_refused and self._postponed_refusal is None
 
     def _parse_stored_data(self) -> None:
         """Parse slices of the stored data for at most `TURN_SECONDS`.
@@ -435,7 +441,8 @@ class Connection(asyncio.Protocol):
     async def _answer_in_order(self, head: Head, body: bytes) -> None:
         """Answer a request in another thread, and then answer the requests that have arrived in the meantime.
 
-        If one of the later requests also needs another thread, all requests after it wait for its answer.
+        If one of the later requests also needs another thread, all requests after it wait for its answer. If a request
+        after all of these requests was refused, the refusal is sent last.
 
         Args:
             head: Request line and headers of the request.
@@ -452,6 +459,10 @@ class Connection(asyncio.Protocol):
                 self._answer_in_thread(next_head, next_body)
             else:
                 self._answer(next_head, next_body)
+        if self._postponed_refusal is not None and self._answering is None:
+            refusal_response = self._postponed_refusal
+            self._postponed_refusal = None
+            self._send_refusal(refusal_response)
         self._parse_stored_data()
 
     def _remember(self, data: bytes) -> None:
@@ -479,7 +490,7 @@ class Connection(asyncio.Protocol):
             response: The response.
             head: Head of the request. Its attribute `is_last` states whether the client wants to close the connection.
         """
-        if self._is_refused or self._transport.is_closing():
+        if self._is_refusal_sent or self._transport.is_closing():
             return
         is_last = self._is_stopping or head.is_last
         is_head_request = head.method == "HEAD"
@@ -515,16 +526,32 @@ class Connection(asyncio.Protocol):
         self._refuse(refusal(431, f"the request line and headers are longer than {limit} bytes"))
 
     def _refuse(self, response: Response) -> None:
-        """Send a response that refuses the present request, and read no more requests.
+        """Refuse the present request, and read no more requests.
 
-        The connection remains open until the client closes it, but not longer than `LINGER_SECONDS`. With TLS, the
-        connection is closed as soon as the response was sent.
+        The refusal is sent at once. If the answer to an earlier request is still being computed, the refusal is sent
+        after that answer.
+
+        Args:
+            response: Response that states why the request is refused.
         """
         if self._is_refused or self._transport.is_closing():
             return
         self._is_refused = True
         self._unparsed.clear()
         self._handler.count_refusal(response, self._client)
+        if self._answering is None:
+            self._send_refusal(response)
+        else:
+            self._postponed_refusal = response
+
+    def _send_refusal(self, response: Response) -> None:
+        """Send a refusal as the last response of the connection.
+
+        The connection remains open until the client closes it, but not longer than `LINGER_SECONDS`. With TLS, the
+        connection is closed as soon as the response was sent.
+        """
+        if self._transport.is_closing():
+            return
         self._transport.write(response_bytes(response, is_last=True))
         if self._transport.can_write_eof():  # false with TLS, in which both directions can only be closed together
             self._transport.write_eof()
