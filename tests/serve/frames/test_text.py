@@ -176,6 +176,20 @@ def test_unrecognised_lines_use_bounded_memory():
     assert feed("1,2,3", "1,2,3", "1,2,3", parser=parser)[-1].values == (1.0, 2.0, 3.0)
 
 
+@pytest.mark.parametrize(
+    ("first_line", "frame_count", "malformed_count"),
+    [("", 9, 1), ("A,B\n", 10, 0), ("# board\n", 10, 0), ("\n", 10, 0)],
+)
+def test_first_line_of_a_pipe_or_file_is_malformed_only_without_a_header_comment_or_blank_line(
+    first_line, frame_count, malformed_count
+):
+    """Without such a line, the first numbers may be the rest of a line whose beginning is missing."""
+    parser = AutoParser()
+    frames = parser.feed((first_line + "801.2,799.5\n" * 10).encode())
+    assert len(frames) == frame_count
+    assert parser.counts.malformed == malformed_count
+
+
 def test_first_line_without_its_beginning_is_dropped():
     parser = TextParser()
     frames = parser.feed(b"01.2,799,803\n801.2,799,803\n801.2,799,803\n801.2,799,803\n")

@@ -14,7 +14,7 @@ from attacks.companions import (
     linear_series,
     pretension_arrays,
 )
-from isocharge.common.chebyshev_series import Series
+from isocharge.common.chebyshev_series import Series, position_degrees
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import load_model, write_model
@@ -179,6 +179,31 @@ def test_film_directions_change_the_charges_as_the_chebyshev_series_says(tmp_pat
     expected = np.array([0.02, -0.02, 0.01, 0.0])
     np.testing.assert_allclose(log_changes[0, 1], 0.5 * expected, rtol=1e-5)
     np.testing.assert_allclose(log_changes[1, 1], expected, rtol=1e-5)
+
+
+def test_film_directions_of_degree_zero_change_all_charges_equally(tmp_path):
+    series = np.full((1, 1, 1, 2, 4), 0.01)
+    write_npz(tmp_path, "film_directions.npz", direction_arrays() | {"series": series})
+    log_changes = read_film_directions(tmp_path, 4).log_changes(np.array([[4.0, 1.0, 0.3], [0.0, 0.0, 1.0]]))
+    np.testing.assert_allclose(log_changes, np.full((2, 2, 4), 0.01), rtol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1, 2), (1, 1, 3, 2), (3, 3, 1, 2), (2, 2, 2, 2), (4, 4, 3, 2)])
+def test_derivatives_of_a_chebyshev_series_are_its_finite_differences_also_for_degree_zero(shape):
+    rng = np.random.default_rng(0)
+    coefficients = np.zeros(shape)
+    terms = position_degrees(shape[0] - 1)
+    coefficients[terms] = rng.standard_normal(coefficients[terms].shape)
+    series = Series(coefficients)
+    coordinates = rng.uniform(-0.9, 0.9, (5, 3))
+    derivatives = series.values_and_derivatives(coordinates)[:, 1:]
+    step = 1e-5
+    for axis in range(3):
+        change = step * np.eye(3)[axis]
+        values_above = series.values_and_derivatives(coordinates + change)[:, 0]
+        values_below = series.values_and_derivatives(coordinates - change)[:, 0]
+        expected = (values_above - values_below) / (2.0 * step)
+        np.testing.assert_allclose(derivatives[:, axis], expected, atol=1e-8)
 
 
 def test_model_without_film_directions_has_none(tmp_path):

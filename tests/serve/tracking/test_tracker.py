@@ -232,6 +232,29 @@ def test_event_tap_of_a_short_press_and_event_release_of_a_short_slide():
     assert tracker.update(None, 2.1) == (None, "release")
 
 
+def test_touch_continues_if_the_clock_is_set_back():
+    """The clock is set back by 50 s after a touch of 0.1 s. The events hold and release do not wait for 50 s."""
+    tracker = Tracker()
+    before = update_all(tracker, noisy_contacts(np.zeros(100)), begin_s=100.0)
+    after = update_all(tracker, noisy_contacts(np.zeros(200)), begin_s=50.0)
+    assert events_of(before) == ["press"]
+    hold_frames = [number for number, (_, event) in enumerate(after) if event == "hold"]
+    assert hold_frames == pytest.approx([100], abs=30)
+    assert tracker.update(None, 50.2) == (None, "release")
+
+
+@pytest.mark.parametrize("set_back_s", [0.0, 0.002, 0.1, 50.0])
+def test_tracked_contact_is_correct_directly_after_the_clock_was_set_back(set_back_s):
+    """The filter begins again, so that the first tracked contact is the contact of the frame."""
+    tracker = Tracker()
+    update_all(tracker, noisy_contacts(slide(50.0)[0][:450]), begin_s=100.0)
+    contact, *_ = noisy_contacts([2.0 + 1.0j])
+    tracked, _ = tracker.update(contact, 100.449 - set_back_s)
+    assert (tracked.x_mm, tracked.y_mm) == pytest.approx((contact.x_mm, contact.y_mm), abs=1e-9)
+    assert (tracked.x_std_mm, tracked.y_std_mm) == pytest.approx((STD, STD), rel=1e-6)
+    assert all(math.isfinite(value) for value in structs.astuple(tracked))
+
+
 def test_saturated_frames_have_a_small_weight():
     tracker = Tracker()
     update_all(tracker, noisy_contacts(np.zeros(100)), begin_s=0.0)

@@ -91,6 +91,18 @@ def test_link_delivers_complete_samples_in_order():
     page.close_here()
 
 
+def test_link_is_closed_if_the_reader_ends_in_the_middle_of_a_sample():
+    """The bytes of the incomplete sample are not mistaken for data of a reader that is still there."""
+    reader, page = make_link()
+    reader.send_sample(SAMPLE + SAMPLE[:40])
+    assert page.receive_samples(64) == SAMPLE
+    assert page.is_open
+    reader.close()
+    assert page.receive_samples(64) == b""
+    assert not page.is_open
+    page.close_here()
+
+
 def test_reader_does_not_wait_for_a_page_that_reads_nothing():
     reader, page = make_link()
     begin_s = time.perf_counter()

@@ -139,6 +139,37 @@ def test_frames_are_sent_on_time_with_their_truth(film):
     assert late_s[-300:].min() - late_s[:300].min() < 0.02  # 0.05 if it slept for the time between two frames
 
 
+def test_truth_of_a_frame_that_was_sent_before_the_script_was_replaced_is_refused(film):
+    with VirtualSensor(film.charges, steady(rate_Hz=1000.0, force_N=1.0)) as sensor:
+        early_frames, _ = read(sensor.url, 10)
+        sensor.use(film.charges, steady(rate_Hz=1000.0, force_N=2.0))
+        late_frames, _ = read(sensor.url, 1000)  # a new script begins within 500 frames
+        assert sensor.truth(late_frames[-1].seq).force_N == 2.0
+        with pytest.raises(SceneError, match="was played before the script was replaced"):
+            sensor.truth(early_frames[-1].seq)
+
+
+def test_truth_of_a_board_with_a_narrow_counter(film):
+    """The force is different in every frame. The counter wraps at 256."""
+    script = Script(np.zeros(1000), np.zeros(1000), np.linspace(0.1, 1.0, 1000), 200.0)
+    with VirtualSensor(film.charges, script, offset_pC=[0.0] * 3, seq_modulus=256) as sensor:
+        frames, _ = read(sensor.url, 300)
+        latest_frames = frames[-20:]
+        truths = [sensor.truth(frame.seq) for frame in latest_frames]
+        with pytest.raises(SceneError, match="no frame 256 was played; expected 0 to 255"):
+            sensor.truth(256)
+    for frame, truth in zip(latest_frames, truths, strict=True):
+        np.testing.assert_allclose(frame.values, truth.charge_pC, rtol=1e-6)
+    sent_s = [truth.sent_s for truth in truths]
+    assert sent_s == sorted(sent_s)
+
+
+def test_truth_of_a_board_that_sends_frames_only_on_request_is_refused(film):
+    sensor = VirtualSensor(film.charges, steady(), request=b"?")
+    with sensor, pytest.raises(SceneError, match="only on request"):
+        sensor.truth(0)
+
+
 def test_frames_after_a_stall_of_the_process_are_postponed_and_not_sent_in_a_burst(film):
     """The stall is as long as 200 frames. Without a pause, these frames would be sent within a few milliseconds."""
 

@@ -12,7 +12,10 @@ from isocharge.common.json_values import plain_values
 from isocharge.serve import Predictor, check_presses, read_presses, write_presses
 from isocharge.simulate import Circle, load_sensor, press, touch_charge
 from isocharge.train import calibrate, read_earlier, write_calibration
+from isocharge.train.calibration.calibrate import _with_undetected_mistakes
+from isocharge.train.calibration.film_fit import MISTAKE_PROBABILITY
 from isocharge.train.calibration.folder import read_moved, result_table
+from isocharge.train.calibration.nuisances import PRETENSION_PER_KELVIN
 from isocharge.train.calibration.press_data import temperatures
 from isocharge.train.calibration.problem import CREEP, DRIFT
 from isocharge.train.data.presses import draw_contacts
@@ -201,3 +204,24 @@ def test_presses_at_another_temperature_fit_the_moved_model_only(calibration, pr
     cold_presses = replace(presses_at_temperatures(problem, 7, np.full(10, 20.5)), temperature_C=None)
     assert not check_presses(Predictor(tmp_path / "day"), cold_presses).fits
     assert check_presses(Predictor(tmp_path / "cold"), cold_presses).fits
+
+
+@pytest.mark.parametrize("has_earlier_change", [False, True])
+def test_undetected_mistakes_increase_the_std_of_the_pretension_per_kelvin(calibration, problem, has_earlier_change):
+    """With half of the presses left out, the variance is the mean of the variances after and before the presses."""
+    posterior = calibration.posterior
+    is_left_out = np.zeros(4, dtype=bool)
+    is_left_out[:2] = True  # 2 of 4 presses: the probability of a mistake is 0.5, and 0.02 for the two used presses
+    before = problem.before
+    std_before = PRETENSION_PER_KELVIN.std_with_temperatures
+    if has_earlier_change:
+        std_before = 3.0 * posterior.warming.std
+        before = replace(before, warming=posterior.warming._replace(std=std_before))
+    uncertain = _with_undetected_mistakes(replace(posterior, bad=is_left_out), before)
+    probability = 0.5 + 2 * MISTAKE_PROBABILITY
+    variance = (1.0 - probability) * posterior.warming.std**2 + probability * std_before**2
+    assert uncertain.warming.std == pytest.approx(np.sqrt(variance))
+    # The covariance of all unknowns together with the change per kelvin has no negative eigenvalues.
+    covariance = uncertain.warming.covariance[:, None]
+    joint = np.block([[uncertain.joint, covariance], [covariance.T, uncertain.warming.std**2]])
+    assert np.linalg.eigvalsh(joint).min() > -1e-9 * np.linalg.eigvalsh(joint).max()

@@ -8,7 +8,9 @@ Reading may start in the middle of a cycle. The lines of a cycle are therefore s
 and the clock before the channels. A cycle begins with the line whose name comes first in the sorted order.
 
 Reading may also start in the middle of a line. If the first line contains numbers without names, it is therefore
-dropped.
+dropped and counted as malformed. This also applies to files and pipes, because their bytes usually come from a port,
+for example from `cat /dev/ttyACM0`. A program that begins with a complete line can send a header, a comment or a blank
+line first. No frame is then dropped.
 
 Text has no checksum, except for sentences in the style of NMEA 0183. The parser therefore cannot detect a damaged digit
 in an otherwise intact line. If the same line occurs repeatedly but cannot be parsed, for example because it is the echo

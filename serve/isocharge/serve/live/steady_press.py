@@ -44,9 +44,11 @@ A larger scatter means that the probe has moved suddenly.
 """
 
 MAX_SLOPE_DIFFERENCE = 0.3
-"""Largest difference between the relative slope of a charge and the mean relative slope, divided by the latter.
+"""Largest difference between the slope of a charge and a proportional change of all charges, dimensionless.
 
-If no difference is larger, all charges change in proportion, and the press does not move.
+The difference is relative to the magnitude of the charge or to the mean magnitude, whichever is larger, and to the
+relative slope of the mean magnitude. If no difference is larger, all charges change in proportion, and the press does
+not move.
 """
 
 MIN_CHARGE_pC = 1e-9
@@ -461,20 +463,24 @@ def unsteadiness(
 def _drift_reason(press: SteadyPress, mean_magnitudes: Sequence[tuple[float, float]]) -> str:
     """Return the probable reason for a drift of the charges, as a part of a sentence.
 
-    If only the force changes, all charges change in proportion, and their relative slopes are equal. If the relative
-    slopes differ, the position of the press changes. A charge rises if its magnitude becomes larger, so that charges of
-    both signs can be compared.
+    If only the force changes, all charges change in proportion. If they change otherwise, the position of the press
+    changes. A charge rises if its magnitude becomes larger, so that charges of both signs can be compared.
 
     Args:
         press: Charges and drift in a window of the press. The drift is the change of each charge over the window.
         mean_magnitudes: Time since the touch, s, and mean magnitude of the charges, pC, of each calm window so far.
     """
-    magnitude_pC = np.maximum(np.abs(press.charge_pC), MIN_CHARGE_pC)  # avoids a division by 0
-    magnitude_change_pC = np.sign(press.charge_pC) * press.drift_pC
-    relative_slope = magnitude_change_pC / magnitude_pC / press.window_s  # shape (n_electrode,), 1/s
-    mean_slope = float(relative_slope.mean())
-    largest_difference = np.abs(relative_slope - mean_slope).max()
-    if largest_difference > MAX_SLOPE_DIFFERENCE * abs(mean_slope):
+    magnitude_pC = np.abs(press.charge_pC)
+    mean_magnitude_pC = max(float(magnitude_pC.mean()), MIN_CHARGE_pC)  # avoids a division by 0
+    magnitude_slope_pC_per_s = np.sign(press.charge_pC) * press.drift_pC / press.window_s
+    mean_slope = float(magnitude_slope_pC_per_s.mean()) / mean_magnitude_pC  # relative, 1/s
+
+    # A charge that is smaller than the mean magnitude is compared with the mean magnitude. Otherwise, the noise of a
+    # charge near zero would look like a movement.
+    reference_pC = np.maximum(magnitude_pC, mean_magnitude_pC)
+    proportional_slope_pC_per_s = mean_slope * magnitude_pC
+    slope_difference = (magnitude_slope_pC_per_s - proportional_slope_pC_per_s) / reference_pC  # shape (n_electrode,)
+    if np.abs(slope_difference).max() > MAX_SLOPE_DIFFERENCE * abs(mean_slope):
         return "the press moves: the ratios of the charges change"
     if mean_slope > 0.0:
         return f"the charges rise by {100.0 * mean_slope:.2g} % per second: hold the force"

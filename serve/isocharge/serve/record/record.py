@@ -78,15 +78,15 @@ class Tracking(Struct, frozen=True):
 
     tracked: Annotated[
         TrackedContact | None,
-        Meaning("The contact by all frames up to now, where contacts are followed."),
+        Meaning("Contact that was estimated from all frames of the touch up to now; null out of contact."),
     ] = None
     event: Annotated[
         str | None,
-        Meaning("What begins with this record: press, hold, slide, tap or release."),
+        Meaning("Event that begins with this record: press, hold, slide, tap or release; null if none begins."),
     ] = None
     other: Annotated[
         OtherContact | None,
-        Meaning("Another contact with the same charges, if the film folds and it is unknown which of them is real."),
+        Meaning("Second possible contact with the same charges, on a film with folds; null if there is none."),
     ] = None
 
 
@@ -118,7 +118,10 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     force_std_N: Annotated[float | None, Meaning("Standard deviation of the force, N.", "N", is_shown_live=True)]
     misfit: Annotated[
         float | None,
-        Meaning("Distance from the nearest single contact, in standard deviations.", is_shown_live=True),
+        Meaning(
+            "Distance of the charges from the nearest single contact, in standard deviations of the noise.",
+            is_shown_live=True,
+        ),
     ]
     xy_correlation: Annotated[
         float | None,
@@ -135,23 +138,25 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     ]
     charge_raw_pC: Annotated[
         Charges | None,
-        Meaning("Charges by electrode as the device sent them, pC.", "pC"),
+        Meaning("Readings of the board by electrode, converted to pC by `[gain]` and not processed further.", "pC"),
     ]
     tare_pC: Annotated[
         Charges | None,
         Meaning("Charges at rest that were subtracted, by electrode, pC.", "pC"),
     ]
-    flags: Annotated[tuple[str, ...], Meaning("Words, each one a reason for care.")]
+    flags: Annotated[
+        tuple[str, ...], Meaning("Words that name events or reasons not to trust the contact; see the page Flags.")
+    ]
     latency_us: Annotated[
         float | None,
-        Meaning("From the last byte of the reading to this record, us.", "us", is_shown_live=True),
+        Meaning("Time from the last byte of the reading to this record, us.", "us", is_shown_live=True),
     ]
     model: Annotated[str, Meaning("The model, name/version.")]
     frame_id: Annotated[str, Meaning("Name of the sensor, the frame of x and y.")]
     tracking: Annotated[Tracking | None, Meaning("", is_flattened=True)] = None
     film: Annotated[
         FollowedFilm | None,
-        Meaning("The film for which the model answered, where it is followed."),
+        Meaning("Estimated film for which the model answered."),
     ] = None
 
     @property

@@ -151,6 +151,7 @@ class ContactMixture:
         """Discard the contact and all received frames."""
         self._components: Components | None = None
         self._hypotheses: list[ContactHypothesis] = []
+        self._latest_frame_s = -math.inf
         self._step_frames: list[tuple[Array, float]] = []  # charges and time of each frame of the present step
         self._step_begin_s = -math.inf
         self._mixture_time_s = -math.inf  # time of the latest update, which is the mean time of its frames
@@ -162,6 +163,9 @@ class ContactMixture:
         The mixture is updated only once in each step, which is a time interval of length `STEP_s`. Between two updates,
         the contacts are extrapolated with constant velocities to the time of the frame.
 
+        If the clock was set back, the contact and all earlier frames are discarded, because the time since these frames
+        is unknown. The whole film is then searched at once.
+
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
             t_s: Time of the frame on any clock, s.
@@ -170,10 +174,12 @@ class ContactMixture:
             The contacts that explain the charges, in descending order of their probability. The list is empty if no
             contact explains the charges.
         """
+        was_clock_set_back = t_s < self._latest_frame_s
+        if was_clock_set_back:
+            self.reset()
+        self._latest_frame_s = t_s
         self._step_frames.append((charge_pC, t_s))
-        # A negative time since the beginning of the step means that the clock was set back. This also ends the step.
-        time_in_step_s = t_s - self._step_begin_s
-        is_within_step = 0.0 <= time_in_step_s < STEP_s - CLOCK_TOLERANCE_s
+        is_within_step = t_s - self._step_begin_s < STEP_s - CLOCK_TOLERANCE_s
         if not is_within_step:
             self._process_step(t_s)
         return [hypothesis.extrapolated(t_s - self._mixture_time_s) for hypothesis in self._hypotheses]
@@ -195,7 +201,7 @@ class ContactMixture:
         # whole film. The search takes milliseconds, so it is not repeated in every step.
         measurement = self._mean_measurement(charges_of_frames)
         components = None
-        if self._components is not None and 0.0 < dt_s < MAX_GAP_s:
+        if self._components is not None and dt_s < MAX_GAP_s:
             components = self._advance(self._components, measurement, dt_s)
         if components is None and t_s >= self._next_search_s:
             self._next_search_s = t_s + SEARCH_INTERVAL_s

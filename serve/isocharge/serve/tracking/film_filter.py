@@ -253,8 +253,10 @@ class FilmFilter:
     def predict(self, clock_s: float) -> None:
         """Predict the probability distribution of the unknowns at the time of the next touch.
 
+        If the clock was set back since the previous touch, the elapsed time is assumed to be zero.
+
         Args:
-            clock_s: Time of the touch on a clock that does not jump, s.
+            clock_s: Time of the touch, s.
         """
         elapsed_s = 0.0 if self._last_touch_s is None else max(clock_s - self._last_touch_s, 0.0)
         self._last_touch_s = clock_s
@@ -395,7 +397,7 @@ class FilmFilter:
         self._mean = normalised_moments[..., mean_columns]
         self._covariance = normalised_moments[..., covariance_columns].reshape(level_count, grid_size, size, size)
 
-    def update(self, charge_pC: Array, contact: Array, log_changes: Array) -> TouchResiduals:
+    def update(self, charge_pC: Array, contact: Array, log_changes: Array, misfit_std: float) -> TouchResiduals:
         """Update the probability distribution of the unknowns with a touch.
 
         With a small probability, the touch is an outlier. The changes that the Kalman update computes are therefore
@@ -408,11 +410,15 @@ class FilmFilter:
             contact: Contact (x, y, F) that the network computed from the charges, shape (3,), mm and N.
             log_changes: Changes of the logarithms of the charges by one unit of each direction at the contact, shape
                 (n_direction, n_electrode).
+            misfit_std: Root mean square misfit of good touches with as little noise as this touch, relative to the root
+                mean square misfit of single frames of good touches.
 
         Returns:
             The squared misfits that remain after the update.
         """
-        misfit, jacobian = self._linearise(charge_pC, contact, log_changes)
+        frame_misfit, frame_jacobian = self._linearise(charge_pC, contact, log_changes)
+        misfit = frame_misfit / misfit_std
+        jacobian = frame_jacobian / misfit_std
         noise_covariance = self._noise_covariance(jacobian)
         kalman = kalman_update(misfit, jacobian, noise_covariance, self._mean, self._covariance)
 
@@ -468,7 +474,8 @@ class FilmFilter:
 
         Returns:
             Misfit vectors, shape (n_pretension, n_electrode). Jacobian of the misfit vectors, shape (n_level,
-            n_pretension, n_electrode, n_unknown). Both are relative to the root mean square misfit of good touches.
+            n_pretension, n_electrode, n_unknown). Both are relative to the root mean square misfit of single frames of
+            good touches.
         """
         layout = self._layout
         gain_changes = GAIN_STD * np.eye(layout.electrodes)  # changes of the logarithms; one row for each gain

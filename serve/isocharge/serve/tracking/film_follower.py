@@ -40,7 +40,7 @@ from isocharge.serve.tracking.film_state import FilmStateEstimate
 from isocharge.serve.tracking.film_update import TouchResiduals
 from isocharge.serve.tracking.followable_pretensions import followable_pretensions
 from isocharge.serve.tracking.pretension_grid import odds_of_no_change
-from isocharge.serve.tracking.touch_misfits import touch_misfits
+from isocharge.serve.tracking.touch_misfits import relative_misfit_std, touch_misfits
 from isocharge.serve.tracking.touch_peak import TouchPeak
 
 UNUSED_FRAME_FLAGS = frozenset({OUTSIDE, BEYOND, STRESS, GAP, REPEAT})
@@ -131,10 +131,13 @@ class Touch(NamedTuple):
     Attributes:
         contact: Contact that the model computed from the charges.
         charge_pC: Touch charges, averaged over the frames with about the largest force, shape (n_electrode,), pC.
+        misfit_std: Root mean square misfit of good touches with as little noise as this touch, relative to the root
+            mean square misfit of single frames of good touches.
     """
 
     contact: Contact
     charge_pC: Array
+    misfit_std: float = 1.0
 
 
 class SquaredMisfits(NamedTuple):
@@ -283,7 +286,9 @@ class FilmFollower:
             charge_pC = self._peak.mean_charge_pC
             contact = self.predictor.predict(charge_pC)
             if MISFIT not in self.predictor.flags(contact):
-                self.observe_touch(Touch(contact, charge_pC), clock_s)
+                frame_variance_pC2 = self.predictor.metadata.noise.variance(charge_pC)
+                misfit_std = relative_misfit_std(self._peak.relative_noise_variance(frame_variance_pC2))
+                self.observe_touch(Touch(contact, charge_pC, misfit_std), clock_s)
         self.discard_touch()
 
     def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
@@ -350,7 +355,7 @@ class FilmFollower:
         contacts = np.array([touch.contact[:3]])  # one contact (x, y, force), shape (1, 3)
         log_changes = self._directions.log_changes(contacts)[0]
         self._filter.predict(clock_s)
-        residuals = self._filter.update(touch.charge_pC, contacts[0], log_changes)
+        residuals = self._filter.update(touch.charge_pC, contacts[0], log_changes, touch.misfit_std)
         self._touch_count += 1
         self._recent_misfits.append(self._squared_misfits(touch, log_changes, residuals))
         if len(self._recent_misfits) < FEWEST_TOUCHES:
@@ -391,7 +396,7 @@ class FilmFollower:
         direction_means = self._filter.direction_means(self._filter.mean_MPa)
         corrected_pC = (touch.charge_pC - self._filter.offset_pC) * np.exp(-direction_means @ log_changes)
         wrong_gain_squares = self._squared_misfits_of_wrong_gains(
-            corrected_pC, touch.contact, residuals.offset_variance
+            touch._replace(charge_pC=corrected_pC), residuals.offset_variance
         )
         return SquaredMisfits(
             with_gains=squares_with_gains,
@@ -400,12 +405,11 @@ class FilmFollower:
             wrong_gain=np.minimum(wrong_gain_squares, LARGEST_SQUARE),
         )
 
-    def _squared_misfits_of_wrong_gains(self, corrected_pC: Array, contact: Contact, offset_variance: float) -> Array:
+    def _squared_misfits_of_wrong_gains(self, corrected_touch: Touch, offset_variance: float) -> Array:
         """Compute the squared misfit of a touch for each hypothesis that the gain of one electrode is wrong.
 
         Args:
-            corrected_pC: Charges after a correction for the offset and the directions, shape (n_electrode,), pC.
-            contact: Contact that the model computed for the touch.
+            corrected_touch: The touch, with charges that are corrected for the offset and the directions.
             offset_variance: Variance of the misfit that is caused by the deviation of the offset of this touch from
                 the mean offset, relative to the mean squared misfit of good touches.
 
@@ -413,13 +417,15 @@ class FilmFollower:
             Squared misfits, first at the calibrated pretension and then at the estimated pretension, shape
             (2 * n_wrong_gain * n_electrode,). They are relative to the mean squared misfit of good touches.
         """
+        corrected_pC = corrected_touch.charge_pC
         charges_with_wrong_gain_pC = corrected_pC * self._wrong_gains  # shape (n_wrong_gain * n_electrode, n_electrode)
-        start = np.array(contact[:3])  # x, y and force
+        start = np.array(corrected_touch.contact[:3])  # x, y and force
         no_changes = np.empty((0, corrected_pC.size))  # only the misfit vectors are needed, not their changes
         squares = []
         for misfits in (self._calibrated_misfits, self._applied_misfits):  # each has a single pretension
             linearised = misfits.linearise(charges_with_wrong_gain_pC, start, no_changes)
-            misfit_vectors = linearised.vectors[:, 0]  # shape (n_wrong_gain * n_electrode, n_electrode)
+            # The shape of the misfit vectors is (n_wrong_gain * n_electrode, n_electrode).
+            misfit_vectors = linearised.vectors[:, 0] / corrected_touch.misfit_std
             squares.append((misfit_vectors**2).sum(axis=1))
 
         # The random offset of this touch adds to the variance 1 of a good touch.

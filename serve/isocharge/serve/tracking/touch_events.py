@@ -19,7 +19,11 @@ REST_PROBABILITY = 0.5
 
 
 class TouchEvents:
-    """Detector that derives the events of a touch from the tracked contacts of its frames."""
+    """Detector that derives the events of a touch from the tracked contacts of its frames.
+
+    The durations of a touch and of a rest are measured with the times of the frames. If the clock is set back during a
+    touch, the time between the two frames is unknown and is not counted.
+    """
 
     def __init__(self) -> None:
         """Start without a touch."""
@@ -27,6 +31,7 @@ class TouchEvents:
         self._press_s = 0.0  # time at which the touch began
         self._rest_position = 0j  # position x + iy at which the contact last rested, mm
         self._rest_begin_s = 0.0  # time at which the contact began to rest at this position
+        self._latest_frame_s = 0.0
         self._latest_event = ""
 
     def begin(self, tracked: TrackedContact, t_s: float) -> str:
@@ -39,6 +44,7 @@ class TouchEvents:
         self._press_s = t_s
         self._rest_position = complex(tracked.x_mm, tracked.y_mm)
         self._rest_begin_s = t_s
+        self._latest_frame_s = t_s
         self._latest_event = "press"
         return "press"
 
@@ -53,6 +59,7 @@ class TouchEvents:
             tracked: Tracked contact of the frame. Its attribute `moving` is the probability that the contact moves.
             t_s: Time of the frame, s.
         """
+        self._correct_for_clock(t_s)
         position = complex(tracked.x_mm, tracked.y_mm)
         is_away = abs(position - self._rest_position) > SLIDE_DISTANCE_mm
         if tracked.moving > SLIDE_PROBABILITY:
@@ -76,7 +83,19 @@ class TouchEvents:
         Args:
             t_s: Time of the first frame without a contact, s.
         """
+        self._correct_for_clock(t_s)
         is_short = t_s - self._press_s <= MAX_TAP_TIME_s
         if self._latest_event == "press" and is_short:
             return "tap"
         return "release"
+
+    def _correct_for_clock(self, t_s: float) -> None:
+        """Store the time of the next frame. If the clock was set back, set the stored times back by the same amount.
+
+        Args:
+            t_s: Time of the frame, s.
+        """
+        set_back_s = max(self._latest_frame_s - t_s, 0.0)
+        self._press_s -= set_back_s
+        self._rest_begin_s -= set_back_s
+        self._latest_frame_s = t_s

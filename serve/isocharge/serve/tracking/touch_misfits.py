@@ -9,6 +9,7 @@ ways to compute it.
   an earlier version of isocharge have no series.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -39,9 +40,17 @@ OTHER_ROWS_STEPS = 2
 """Number of Gauss-Newton steps for further rows of charges, whose search begins at the contact of the first row."""
 
 TYPICAL_MISFIT = 1.15
-"""Root mean square misfit of good touches, in standard deviations of the noise, if it is computed from the series.
+"""Root mean square misfit of single frames of good touches, in standard deviations of the noise.
 
-It exceeds 1, because a calibration does not describe the imperfections of a film completely.
+The misfit is computed from the series. It exceeds 1, because a calibration does not describe the imperfections of a
+film completely.
+"""
+
+CONSTANT_MISFIT_VARIANCE = 1.0
+"""Variance of the part of the misfit that is equal in all frames of a touch, in units of the noise of a single frame.
+
+This part is caused by errors of the model of the film. On films that have not changed since the calibration, it is
+about `TYPICAL_MISFIT`^2 - 1. On changed films it is larger, because some of their changes are linearised or omitted.
 """
 
 DAMPING = 1e-4
@@ -67,6 +76,19 @@ class LinearisedMisfits(NamedTuple):
 
     vectors: Array
     changes: Array
+
+
+def relative_misfit_std(relative_noise_variance: float) -> float:
+    """Return the typical misfit of averages over several frames, relative to the typical misfit of single frames.
+
+    An average reduces the part of the misfit that noise causes, but not the part that errors of the model cause.
+
+    Args:
+        relative_noise_variance: Variance of the noise of the average, relative to the variance for a single frame.
+    """
+    average_variance = relative_noise_variance + CONSTANT_MISFIT_VARIANCE
+    single_frame_variance = 1.0 + CONSTANT_MISFIT_VARIANCE
+    return math.sqrt(average_variance / single_frame_variance)
 
 
 class TouchMisfits(Protocol):

@@ -2,6 +2,9 @@
 
 A film is followed with one set of charges of each touch. A single frame has the noise of one reading. Therefore the
 charges of several frames are averaged, namely of frames whose contact is close to the contact with the largest force.
+
+The average has less noise than a frame only if the noise differs from frame to frame. The frames themselves show how
+much of the noise does: if a board filters its signals, for example, successive frames are nearly equal.
 """
 
 import numpy as np
@@ -43,7 +46,10 @@ class TouchPeak:
         """
         if is_close(contact, self._reference_contact):
             if self._frame_count < MAX_AVERAGED_FRAMES:
+                difference_pC = charge_pC - self._latest_charge_pC
+                self._squared_difference_sum_pC2 = self._squared_difference_sum_pC2 + difference_pC**2
                 self._charge_sum_pC = self._charge_sum_pC + charge_pC
+                self._latest_charge_pC = charge_pC
                 self._frame_count += 1
         elif contact.force_N > self._reference_contact.force_N:
             self._start_average(contact, charge_pC)
@@ -53,8 +59,30 @@ class TouchPeak:
         """Average of the touch charges, shape (n_electrode,), pC."""
         return np.asarray(self._charge_sum_pC / self._frame_count)
 
+    def relative_noise_variance(self, frame_variance_pC2: Array) -> float:
+        """Estimate the variance of the noise of the average charges, relative to the variance for a single frame.
+
+        One part of the noise of a frame is independent of the other frames, and the average of n frames has a variance
+        of 1/n of this part. The other part is equal in all frames, and the average does not reduce it. The variance of
+        the independent part is half the mean squared difference of successive frames (von Neumann 1941).
+
+        Args:
+            frame_variance_pC2: Variance of the noise of a single frame, shape (n_electrode,), pC^2.
+
+        Returns:
+            Ratio of the variances, averaged over the electrodes, from 1/n to 1.
+        """
+        difference_count = self._frame_count - 1
+        if difference_count == 0:
+            return 1.0
+        independent_variance_pC2 = self._squared_difference_sum_pC2 / (2.0 * difference_count)
+        independent_share = min(float(np.mean(independent_variance_pC2 / frame_variance_pC2)), 1.0)
+        return 1.0 - independent_share + independent_share / self._frame_count
+
     def _start_average(self, contact: Contact, charge_pC: Array) -> None:
         """Make a frame the reference and the only frame of the average."""
         self._reference_contact = contact
+        self._latest_charge_pC = charge_pC
         self._charge_sum_pC = charge_pC
+        self._squared_difference_sum_pC2 = np.zeros_like(charge_pC)  # of successive frames of the average
         self._frame_count = 1

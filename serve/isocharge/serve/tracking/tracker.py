@@ -75,6 +75,9 @@ class Tracker:
         tracked contact is returned again if the frame is invalid, if its charges are saturated, or if no contact
         explains them.
 
+        If the clock was set back, the filter or the mixture begins again with the frame, but the touch continues. The
+        time between the two frames is then not counted for the events.
+
         Args:
             contact: Contact predicted by the model; None if nothing touches the film, or if the frame is invalid.
             t_s: Time of the frame on any clock, s.

@@ -52,6 +52,9 @@ After a larger delay, all later frames are postponed by the delay.
 BLOCK_S = 0.5
 """Length of the blocks that the amplifier processes, s."""
 
+STORED_FRAME_COUNT = 1 << 16
+"""Number of the latest frames for which the time of sending is stored."""
+
 MAX_RANDOM_OFFSET_pC = 20.0
 """Largest absolute value of a random constant charge, pC."""
 
@@ -160,7 +163,7 @@ class VirtualSensor:
         self.paused_s = 0.0
         self._frame_count = 0
         self._first_frame_of_script = 0  # number of the frame with which the script began
-        self._sent_s = np.full(SEQ_MODULUS, np.nan)  # time at which the latest frame with each counter was sent
+        self._sent_s = np.full(STORED_FRAME_COUNT, np.nan)  # times at which the latest frames were sent, as a ring
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
         self._port: PseudoPort | None = None
@@ -278,24 +281,29 @@ class VirtualSensor:
     def truth(self, seq: int) -> Truth:
         """Return the true press in the latest frame that has the given frame counter.
 
-        The sensor must send all frames, and its counter must wrap at `SEQ_MODULUS`, as is the default.
-
         Args:
-            seq: The frame counter: number of the frame since the start, modulo `SEQ_MODULUS`.
+            seq: The frame counter: number of the frame since the start, modulo the `seq_modulus` of the sensor.
 
         Raises:
-            SceneError: If no frame with this counter has been played, or if the frame belongs to an earlier script.
+            SceneError: If no frame with this counter has been played, if the frame belongs to an earlier script, or if
+                more than `STORED_FRAME_COUNT` frames were played since. The error is also raised if the sensor sends
+                frames only on request, because its counter is then not the number of the frame.
         """
+        if self._request is not None:
+            raise SceneError("a sensor that sends frames only on request has no truth, because it counts its answers")
+
         # Several frames may have this counter, because the counter wraps. Find the latest of these frames.
         latest_number = self._frame_count - 1
-        later_frame_count = (latest_number - seq) % SEQ_MODULUS  # number of frames after the frame with this counter
+        later_frame_count = (latest_number - seq) % self._seq_modulus  # frames after the frame with this counter
         frame_number = latest_number - later_frame_count
-        if frame_number < 0 or not 0 <= seq < SEQ_MODULUS:
-            raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest_number, SEQ_MODULUS - 1)}")
+        if frame_number < 0 or not 0 <= seq < self._seq_modulus:
+            raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest_number, self._seq_modulus - 1)}")
+        if later_frame_count >= STORED_FRAME_COUNT:
+            raise SceneError(f"frame {seq} is too old; expected one of the latest {STORED_FRAME_COUNT} frames")
         if frame_number < self._first_frame_of_script:
             raise SceneError(
                 f"frame {seq} was played before the script was replaced; expected a frame of the present script, which "
-                f"began with frame {self._first_frame_of_script % SEQ_MODULUS}"
+                f"began with frame {self._first_frame_of_script % self._seq_modulus}"
             )
         script = self._script
         row = (frame_number - self._first_frame_of_script) % len(script)  # the script is repeated without end
@@ -304,7 +312,7 @@ class VirtualSensor:
             y_mm=float(script.y_mm[row]),
             force_N=float(script.force_N[row]),
             charge_pC=self._clean_pC[row],
-            sent_s=float(self._sent_s[seq]),
+            sent_s=float(self._sent_s[frame_number % STORED_FRAME_COUNT]),
         )
 
     def __enter__(self) -> Self:
@@ -358,7 +366,7 @@ class VirtualSensor:
                 self.paused_s += lateness_s
 
             # Count the frame before it is written, because a reader may ask for its truth as soon as it has the frame.
-            self._sent_s[frame_number % SEQ_MODULUS] = time.perf_counter()
+            self._sent_s[frame_number % STORED_FRAME_COUNT] = time.perf_counter()
             self._frame_count = frame_number + 1
 
             self._plug_or_unplug(frame_number)

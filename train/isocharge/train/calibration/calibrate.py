@@ -24,9 +24,9 @@ from isocharge.train.calibration.diagnosis import (
     unexplained_error,
 )
 from isocharge.train.calibration.film_fit import MISTAKE_PROBABILITY, PROBABLE, FilmPosterior, fit_film
-from isocharge.train.calibration.nuisances import FRICTION, NUISANCES
+from isocharge.train.calibration.nuisances import FRICTION, NUISANCES, PRETENSION_PER_KELVIN
 from isocharge.train.calibration.press_data import PressData, temperatures
-from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
+from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate, Warming
 from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.calibration.side_forces import solve_side_forces, with_friction
 
@@ -313,7 +313,8 @@ def _with_undetected_mistakes(posterior: FilmPosterior, before: FilmEstimate) ->
 
     If one of the used presses was recorded wrongly, all presses are assumed to contain no information. The returned
     covariance is therefore a weighted mean of the covariances before and after the presses. The weight of the
-    covariance before the presses is the probability of such an undetected mistake.
+    covariance before the presses is the probability of such an undetected mistake. The same applies to the warming,
+    which is the change of the pretension with temperature.
 
     Args:
         posterior: The estimate after the presses. Its unknowns are the parameters of the film, followed by the
@@ -331,13 +332,37 @@ def _with_undetected_mistakes(posterior: FilmPosterior, before: FilmEstimate) ->
     parameters = slice(0, len(before.parameters))
     parameter_covariance = joint_covariance[parameters, parameters]
 
-    # The warming is the change of the pretension with temperature. Its covariances with the unknowns become weighted
-    # means, too. Before the presses, the warming is assumed not to be correlated with the unknowns, so these
-    # covariances are zero. The variance of the warming is not changed.
     warming = posterior.warming
     if warming is not None:
-        warming = warming._replace(covariance=correct_probability * warming.covariance)
+        warming = _warming_with_undetected_mistakes(warming, before.warming, mistake_probability)
     return replace(posterior, joint=joint_covariance, covariance=parameter_covariance, warming=warming)
+
+
+def _warming_with_undetected_mistakes(
+    warming: Warming, warming_before: Warming | None, mistake_probability: float
+) -> Warming:
+    """Increase the variance of the warming, because one of the used presses may have been recorded wrongly.
+
+    The warming is the change of the pretension with temperature. As in `_with_undetected_mistakes`, its variance and
+    its covariances with the unknowns become weighted means of the values before and after the presses.
+
+    Args:
+        warming: The estimate after the presses.
+        warming_before: The estimate of an earlier calibration; None if there is no such estimate. The warming is then
+            assumed to have its prior variance, and not to be correlated with the unknowns.
+        mistake_probability: Probability of an undetected mistake.
+    """
+    unknown_count = warming.covariance.size
+    if warming_before is None:
+        std_before = PRETENSION_PER_KELVIN.std_with_temperatures
+        covariance_before = np.zeros(unknown_count)
+    else:
+        std_before = warming_before.std
+        covariance_before = warming_before.with_unknowns(unknown_count).covariance
+    correct_probability = 1.0 - mistake_probability
+    variance = correct_probability * warming.std**2 + mistake_probability * std_before**2
+    covariance = correct_probability * warming.covariance + mistake_probability * covariance_before
+    return warming._replace(std=float(np.sqrt(variance)), covariance=covariance)
 
 
 def _mistake_probability(is_left_out: Booleans) -> float:
