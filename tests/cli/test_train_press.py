@@ -21,7 +21,14 @@ from isocharge.cli.train.press_dialogue import Dialogue, Screen
 from isocharge.cli.train.press_events import PressEvents, SessionEnd
 from isocharge.common.errors import OutputExists, PortLost, PressError
 from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_frame, read_presses
-from isocharge.serve.live.steady_press import PORT_LOST, Phase, SteadyPress, WatchResult
+from isocharge.serve.live.steady_press import (
+    PORT_LOST,
+    Phase,
+    SteadyPress,
+    SteadyRule,
+    WatchResult,
+    unsteadiness,
+)
 from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration.press_file import open_press_file
@@ -144,6 +151,21 @@ def test_a_press_that_is_refused_is_asked_for_again(capsys):
     assert "not taken: it moves; press again" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("charge_pC", "drift_pC", "reason"),
+    [
+        ((800.0, 400.0, -300.0, -500.0), (-40.0, -20.0, 15.0, 25.0), "the charges fall by 10 % per second"),
+        ((-800.0, -400.0, -300.0, -500.0), (-40.0, -20.0, -15.0, -25.0), "the charges rise by 10 % per second"),
+        ((800.0, 400.0, -300.0, -500.0), (-40.0, 20.0, 15.0, -25.0), "the press moves"),
+        ((800.0, 400.0, -0.5, -300.0), (-40.0, -20.0, -0.5, 15.0), "the charges fall by 9.9 % per second"),
+    ],
+    ids=["both signs fall", "negative charges rise", "moves", "a charge near zero is noisy"],
+)
+def test_reason_of_a_drift_holds_for_negative_charges(charge_pC, drift_pC, reason):
+    press = SteadyPress(np.array(charge_pC), np.ones(4), np.array(drift_pC), 2.0, 0.5, 100, ())
+    assert unsteadiness(SteadyRule(), press, np.ones(4), NAMES, [(0.5, 500.0), (2.0, 430.0)]).startswith(reason)
+
+
 def test_nothing_is_asked_with_yes():
     assert dialogue(STEADY, STEADY, STEADY, asks=False)[0].taken == [FIRST, SECOND, THIRD]
 
@@ -258,7 +280,7 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk
     np.testing.assert_array_equal(presses.contact, places)
 
     table = json.loads(command("train", "calibrate", "presses.csv", *PRESS[2:4], "--json")[1])
-    assert table["error_left"] == lines[0]["error_left"]
+    assert table["film_error"] == lines[0]["film_error"]
 
 
 @pytest.mark.slow  # in `make test`, a session continues after the end of its port, and its open file is read

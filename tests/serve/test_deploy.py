@@ -243,6 +243,23 @@ def test_every_image_is_pinned():
         assert re.fullmatch(r"[\w./-]+:[\w.-]+@sha256:[0-9a-f]{64}", image), image
 
 
+def test_the_manifests_with_and_without_kserve_run_the_same_container():
+    """And the Service and the PodDisruptionBudget without KServe select the pods of the Deployment."""
+    kserve = yaml.safe_load((DEPLOY / "kserve/inference_service.yaml").read_text())["spec"]["predictor"]
+    deployment, service, budget = yaml.safe_load_all((DEPLOY / "kubernetes/isocharge.yaml").read_text())
+    pod = deployment["spec"]["template"]["spec"]
+    (container,) = pod["containers"]
+    (kserve_container,) = kserve["containers"]
+    assert container | {"name": "kserve-container"} == kserve_container
+    assert pod["securityContext"] == kserve["securityContext"]
+    labels = deployment["spec"]["template"]["metadata"]["labels"]
+    assert labels == deployment["spec"]["selector"]["matchLabels"]
+    assert labels == service["spec"]["selector"]
+    assert labels == budget["spec"]["selector"]["matchLabels"]
+    assert service["spec"]["ports"][0]["targetPort"] == container["ports"][0]["containerPort"]
+    assert budget["spec"]["minAvailable"] < deployment["spec"]["replicas"]
+
+
 def test_grafana_has_no_default_password():
     services = yaml.safe_load((DEPLOY / "monitoring/compose.yaml").read_text())["services"]
     environment = services["grafana"]["environment"]
@@ -286,9 +303,8 @@ def test_the_ros2_package_has_the_version_of_isocharge():
 
 def test_the_page_copies_every_file_that_the_units_read(tmp_path):
     """The commands of the page, with folders below a temporary one in place of /etc, and without systemctl."""
-    page = (ROOT / "serve/docs/secure_service.md").read_text("utf-8")
-    section = page.partition("## 5. ")[2].partition("\n## ")[0]
-    commands = [line for block in re.findall(r"```text\n(.*?)```", section, re.DOTALL) for line in block.splitlines()]
+    page = (ROOT / "serve/docs/systemd.md").read_text("utf-8")
+    commands = [line for block in re.findall(r"```text\n(.*?)```", page, re.DOTALL) for line in block.splitlines()]
     installs = [line.replace(" /etc/", f" {tmp_path}/etc/") for line in commands if line.startswith("install ")]
     assert len(installs) == len([line for line in commands if "systemctl" not in line])
     (tmp_path / "etc/systemd/system").mkdir(parents=True)

@@ -29,7 +29,7 @@ from isocharge.serve.tracking.tracker import TrackRule
 SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
 
-SLOW = {"mcap.md", "recordings.md", "virtual_sensor.md", "live_page.md"}
+SLOW = {"mcap.md", "recordings.md", "virtual_sensor.md", "live_page.md", "live_samples.md"}
 """Pages whose commands simulate a film each time; those of the tutorial, which do the same, run always."""
 
 
@@ -73,7 +73,9 @@ def test_examples_of_the_pages_run(page_example, desks, installed, start_http, r
 
 def check_commands(example, folder, printed):
     """What the commands of some examples must have printed."""
-    if "/infer" in example:
+    if "client.py" in example:
+        assert printed.endswith("['stress']\n")
+    elif "/infer" in example:
         outputs = json.loads(printed[printed.index("{") :])["outputs"]
         assert outputs[0]["data"] == pytest.approx([3.0, -2.0, 1.0], abs=0.02)
     if "/session.json" in example and "curl" in example:

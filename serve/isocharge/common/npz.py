@@ -136,7 +136,7 @@ def _has_shape(array: np.ndarray, shape: tuple[int | None, ...]) -> bool:
 
 
 def finite_number(arrays: Mapping[str, np.ndarray], name: str) -> float:
-    """Return the number in an array without dimensions.
+    """Return the value of an array that contains a single number and has no dimensions.
 
     Args:
         arrays: Arrays of the file, by name.
@@ -149,7 +149,7 @@ def finite_number(arrays: Mapping[str, np.ndarray], name: str) -> float:
 
 
 def text_item(arrays: Mapping[str, np.ndarray], name: str) -> str:
-    """Return the text in an array without dimensions.
+    """Return the value of an array that contains a single text and has no dimensions.
 
     Args:
         arrays: Arrays of the file, by name.

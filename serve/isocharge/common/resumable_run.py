@@ -272,11 +272,11 @@ def draft_of(target: Path) -> Path:
     return path_with_name.parent / f"{path_with_name.name}.part"
 
 
-def refuse_finished(target: Path) -> None:
-    """Check that the target of a run does not exist, and remove the rest of a draft that is not needed any more.
+def check_target_is_new(target: Path) -> None:
+    """Check that the target of a run does not exist, and remove the draft of a run that has already ended.
 
     The draft is a folder that stores the finished parts of the run. At the end of the run, its folder `data` is renamed
-    to the target. If a process was killed directly after this renaming, the rest of the draft remains.
+    to the target, and the draft is removed. If the process was killed between these two steps, the draft remains.
 
     Args:
         target: File or folder that the run writes.
@@ -337,7 +337,7 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
         OutputExists: If the target exists, or the draft belongs to a run with other settings or is in use.
         OutputError: If a file cannot be written.
     """
-    refuse_finished(target)
+    check_target_is_new(target)
     draft = ResumableRun(target)
     missing_parents = [parent for parent in target.parents if not parent.exists()]
     try:

@@ -100,6 +100,17 @@ def test_read_artwork_of_a_drawing_without_names_and_unit(tmp_path):
     assert other.area == pytest.approx(4.0 * np.pi, rel=0.01)
 
 
+def test_pads_that_a_later_trace_joins_keep_the_order_of_the_drawing(tmp_path):
+    """The first trace touches only the first pad. The second trace then joins the first pad and the third pad."""
+    pads = [[(x, 0.0), (x, 4.0), (x + 4.0, 4.0), (x + 4.0, 0.0)] for x in (0.0, 20.0, 40.0)]
+    traces = [[(2.0, -5.0), (2.0, 2.0)], [(2.0, 2.0), (2.0, 9.0), (20.0, 9.0), (42.0, 9.0), (42.0, 2.0)]]
+    first, second = read_artwork(drawn(tmp_path / "mine.dxf", *((line, 0.5) for line in (*pads, *traces))), "METAL")
+    assert first.centre == pytest.approx((2.0, 2.0))
+    assert [box(corners)[0] for corners in first.more] == pytest.approx([40.0, 1.75, 1.75])
+    assert second.centre == pytest.approx((22.0, 2.0))
+    assert second.more == ()
+
+
 SQUARE = [(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)]
 
 

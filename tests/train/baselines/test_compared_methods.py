@@ -1,6 +1,7 @@
 """The compared methods on a map with a known inverse, Gauss-Newton against SciPy, and parts of whole networks."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from isocharge.simulate import Domain, FunctionMap, noise_model
 from isocharge.train.baselines.compared_methods import compared_methods, polynomial_ridge
 from isocharge.train.baselines.gauss_newton import GaussNewton
 from isocharge.train.baselines.learned import Logarithms
-from isocharge.train.baselines.networks import OnnxContact, ReleasedModel
+from isocharge.train.baselines.networks import OnnxContact, StoredModel
 from isocharge.train.baselines.paper import Triangulate
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.model_release.onnx_graph import write_contact_graph
@@ -82,6 +83,19 @@ def test_the_parameters_are_chosen_by_validation():
     band = next(method for method in compared_methods(task) if method.name == "linear band").fit(task)
     assert "best of 3 by validation" in band.choice
     assert band.regressor.degree in (6, 10, 14)
+
+
+def test_the_choice_calls_presses_clean_noisy_or_measured():
+    task = KnownMap(3).task()
+    measured_presses = replace(task.train, measured=True)
+    measured_task = replace(task, train=measured_presses, validation=replace(task.validation, measured=True))
+    linear_band = next(method for method in compared_methods(task) if method.name == "linear band")
+    assert linear_band.copies == 0
+    assert "3000 clean presses" in linear_band.fit(task).choice
+    assert "3000 noisy presses" in replace(linear_band, copies=1).fit(task).choice
+    for copies in (0, 1):
+        choice = replace(linear_band, copies=copies).fit(measured_task).choice
+        assert "3000 measured presses" in choice
 
 
 def test_a_linear_band_without_presses_is_refused(task):
@@ -188,6 +202,6 @@ def test_the_contact_graph_gives_the_contact_of_the_network(network):
 
 
 def test_the_part_of_a_released_model_that_computes_the_contact():
-    released = ReleasedModel(find_model("three-25um-biaxial"))
+    released = StoredModel(find_model("three-25um-biaxial"))
     check_contact(released.contact_only(), released.predict(CHARGE))
     assert len(released.contact_only().graph) < len(released.graph)

@@ -8,6 +8,7 @@ import pytest
 from isocharge.simulate import press, touch_charge
 from isocharge.simulate.forward.film_modes import MODES
 from isocharge.simulate.sensor.film_prior import SHARED
+from isocharge.train.calibration.problem import COEFFICIENT_DRIFT_STD
 from isocharge.train.data.presses import draw_contacts
 
 STEP = 0.01
@@ -61,6 +62,28 @@ def test_derivatives_include_the_effect_of_parameters_on_modes_and_traces(proble
         charge_below = charges.charges(unknowns - step, contact)
         difference = (charge_above - charge_below) / (2.0 * STEP)
         np.testing.assert_allclose(derivative[:, :, index] / charge, difference / charge, atol=1e-3, err_msg=name)
+
+
+@pytest.mark.parametrize("kind", ["modes", "traces"])
+def test_derivatives_hold_for_coefficients_as_small_as_the_drift_since_an_earlier_calibration(problem, kind):
+    """A calibration that is continued (`--from`) changes the coefficients by about `COEFFICIENT_DRIFT_STD`."""
+    charges = problem.charges
+    contact = draw_contacts(np.random.default_rng(6), problem.domain.within(7.0), 6)
+    unknowns = np.zeros(charges.layout.film_count)
+    unknowns[charges.layout.parameters] = problem.before.parameters
+    charge = charges.charges(unknowns, contact)
+    derivative = charges.unknown_slopes(unknowns, contact, charges.contact_slopes(unknowns, contact))
+
+    small_coefficient = 0.25 * COEFFICIENT_DRIFT_STD
+    first = getattr(charges.layout, kind).start
+    for index in range(first, first + 3):
+        step = np.zeros_like(unknowns)
+        step[index] = small_coefficient
+        charge_above = charges.charges(unknowns + step, contact)
+        charge_below = charges.charges(unknowns - step, contact)
+        difference = (charge_above - charge_below) / (2.0 * small_coefficient)
+        assert np.abs(difference / charge).max() > 0.005
+        np.testing.assert_allclose(derivative[:, :, index] / charge, difference / charge, atol=1e-4)
 
 
 @pytest.mark.parametrize(("pretension", "force"), [(0.8, 0.2), (1.6, 0.1)])

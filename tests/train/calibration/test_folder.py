@@ -45,7 +45,7 @@ def test_calibrated_model_has_the_expected_errors_on_the_film(film, problem):
         answer = Predictor(model).predict_batch(charge)
         return rms(np.hypot(answer.x_mm - contact[:, 0], answer.y_mm - contact[:, 1]))
 
-    expected_mm = np.hypot(result.error_left.position_mm, result.sensitivity.noise_error.position_mm)
+    expected_mm = np.hypot(result.film_error.position_mm, result.sensitivity.noise_error.position_mm)
     assert rms_error_mm(folder) < 1.5 * expected_mm
     assert rms_error_mm("four-25um-biaxial") > 3.0 * rms_error_mm(folder)
 
@@ -53,7 +53,7 @@ def test_calibrated_model_has_the_expected_errors_on_the_film(film, problem):
 def test_all_files_are_written_and_read_back(film, problem):
     _, result, folder = film
     table = json.loads((folder / "calibration.json").read_text("utf-8"))
-    assert table["error_left"]["position_mm"] == pytest.approx(result.error_left.position_mm)
+    assert table["film_error"]["position_mm"] == pytest.approx(result.film_error.position_mm)
     assert table["parameters"]["pretension"]["value"] == pytest.approx(1e6 * result.posterior.parameters[0])  # Pa
     assert np.shape(table["correlations"]) == (13, 13)
     parameters = problem.prior.parameters_of(load_sensor(folder / "sensor.toml"), result.film[1])

@@ -21,6 +21,7 @@ from isocharge.serve.flags import FILM
 from isocharge.serve.live import recorded_stream
 from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.tracking.film_follower import FilmFollower, Touch
+from isocharge.train.calibration.following import _pretension_difference_std_MPa
 from isocharge.train.data.presses import draw_contacts
 
 pytestmark = pytest.mark.usefixtures("no_closed_backs")
@@ -124,6 +125,23 @@ def reset_film_before(number):
 def reset_film_before_each(stream, _):
     """Reset the film, for `follow`, so that the calibrated model is used for every touch."""
     stream.reset_film()
+
+
+def test_floor_of_the_std_is_the_scatter_of_the_followed_pretension_about_the_calibrated_pretension(
+    film_with_discrepancy,
+):
+    """The unknowns are drawn from the calibration, and the pretension is fitted to the misfits of the same film."""
+    _, result = film_with_discrepancy
+    prior = result.problem.prior
+    pretension = prior.index("pretension")
+    jacobian = result.sensitivity.misfit_jacobian
+    flat_jacobian = jacobian.reshape(-1, jacobian.shape[-1])
+    joint = result.posterior.joint
+    unknown_errors = np.random.default_rng(8).multivariate_normal(np.zeros(len(joint)), joint, 4000)
+
+    misfits = flat_jacobian @ unknown_errors.T  # of the calibrated film, shape (n_misfit, 4000)
+    (change,), *_ = np.linalg.lstsq(flat_jacobian[:, [pretension]], -misfits, rcond=None)
+    assert _pretension_difference_std_MPa(result) == pytest.approx(change.std() * prior.std[pretension], rel=0.05)
 
 
 @pytest.fixture(scope="module")

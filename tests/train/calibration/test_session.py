@@ -72,7 +72,7 @@ def test_three_presses_determine_the_film_as_well_as_planned(problem, plan):
     rig = SimulatedRig(problem, plan)
     rig.press(3)
     result = rig.session.result
-    assert result.error_left.position_mm < 2.0 * plan[2].position_mm
+    assert result.film_error.position_mm < 2.0 * plan[2].position_mm
     deviation = (result.posterior.parameters - rig.parameters) / problem.prior.std
     squared_distance = deviation @ np.linalg.solve(result.posterior.covariance, deviation)
     assert squared_distance < 40.0  # chi-squared of 13 parameters; one film in 4000 has a larger value
@@ -82,7 +82,7 @@ def test_session_reports_its_errors_and_continues_with_saved_presses(problem, pl
     rig = SimulatedRig(problem, plan)
     rig.press(3)
     session = rig.session
-    error = session.result.error_left
+    error = session.result.film_error
     assert f"errors of {error.position_mm:.2g} mm and {error.force_percent:.2g} %;" in session.summary[0]
     assert [presses.lines for presses in rig.saved] == [(1,), (1, 2), (1, 2, 3)]
     assert not session.enough

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import yaml
 from msgspec import structs
 from scipy.stats import chi2, halfnorm
 
-from isocharge.common.errors import DatasetError, ModelError
+from isocharge.common.errors import ConfigError, DatasetError, ModelError
+from isocharge.common.structs import convert
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.model_folder import model_names
@@ -26,6 +28,7 @@ from isocharge.train import (
     TrainingConfig,
     evaluate,
     fit,
+    load_config,
     release,
     student_data,
 )
@@ -89,6 +92,32 @@ def _slow_if_solved(name):
 def predictor(request):
     """Each released model."""
     return Predictor(find_model(MODELS / request.param))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "three-25um-biaxial",
+        "four-25um-biaxial",
+        "four-25um-biaxial-15mm",
+        "eight-25um-biaxial",
+        "six-25um-biaxial-30mm",
+        "eight-25um-biaxial-36mm",
+    ],
+)
+def test_command_of_a_card_trains_with_the_settings_of_its_model(name):
+    """The other models were trained by an earlier version, whose settings do not exist any more."""
+    model = find_model(MODELS / name)
+    card = (model / "card.md").read_text("utf-8")
+    words = shlex.split(re.search(r"```bash\n(.*)\n```", card)[1])
+    config = FitConfig()
+    if "--config" in words:
+        config = load_config(MODELS.parent / words[words.index("--config") + 1])
+
+    metadata = Predictor(model).metadata
+    n_electrode = len(metadata.electrodes)
+    recorded_config = convert(metadata.made_with["config"], FitConfig, "", ConfigError)
+    assert config.for_electrodes(n_electrode) == recorded_config.for_electrodes(n_electrode)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from isocharge.train.report.case import EvaluationCase
 from isocharge.train.report.measures import (
     ContactErrors,
     MethodRecord,
-    compare_with_released,
+    compare_with_evaluated_model,
     interval_coverage,
     pareto_front,
 )
@@ -119,10 +119,10 @@ def method_record(name, kind, error_mm, latency_us, *, given_force=False, answer
 )
 def test_comparison_names_faster_and_more_accurate_methods(other, faster_and_more_accurate, sentence):
     """Methods that are given the force or do not answer all presses are left out of the comparison."""
-    released = method_record("released", "network", 0.2, 10.0)
+    evaluated = method_record("evaluated", "network", 0.2, 10.0)
     with_force = method_record("with force", "paper", 0.1, 1.0, given_force=True)
     incomplete = method_record("incomplete", "paper", 0.1, 1.0, answered=0.9)
-    comparison = compare_with_released([released, with_force, incomplete, method_record(*other)])
+    comparison = compare_with_evaluated_model([evaluated, with_force, incomplete, method_record(*other)])
     assert comparison["both"]["latency"] == faster_and_more_accurate
     assert re.search(sentence, comparison["sentences"][0])
 

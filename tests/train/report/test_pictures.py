@@ -104,7 +104,7 @@ def stub_record(name, error_mm, cost, cost_value, *, is_on_front):
 def test_cost_plot_draws_methods_pareto_front_and_limits(cost):
     """The two best methods are on the front, and the limit that is larger than all errors is left out."""
     records = [
-        stub_record(pictures.RELEASED, 0.1, cost, 8.0, is_on_front=True),
+        stub_record(pictures.EVALUATED_MODEL, 0.1, cost, 8.0, is_on_front=True),
         stub_record("small", 0.3, cost, 2.0, is_on_front=True),
         stub_record("large", 0.5, cost, 9.0, is_on_front=False),
     ]

@@ -37,7 +37,7 @@ from isocharge.simulate import (
 
 
 class FrameFormat(StrEnum):
-    """Format of the frames, unless a device file describes the frames."""
+    """Format of the frames that is used if no device file describes the frames."""
 
     binary = "binary"
     csv = "csv"

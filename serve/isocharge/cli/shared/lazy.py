@@ -53,7 +53,7 @@ def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer
                 self.add_command(placeholder)
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-            """Import the command that the arguments name, and return the command in place of its placeholder."""
+            """Import the command that the arguments name. Return this command instead of its placeholder."""
             name, command, remaining_args = super().resolve_command(ctx, args)
             if name is not None and name in commands:
                 command = load_command(commands[name])

@@ -412,8 +412,8 @@ class Warming(Stage):
         self._rule = rule
         self._misfit = misfit
         self._offset_stage = offset_stage
-        self._ratios = ratios
-        self._warmth_s = warmth_s
+        self._electrode_ratios = ratios
+        self._warmth_time_constant_s = warmth_s
         self._drift = NO_DRIFT
 
     def step(self, frame: ChainFrame) -> None:
@@ -432,16 +432,22 @@ class Warming(Stage):
             return
         previous_pC = self._drift.charge_pC
         drift = track_thermal_drift(
-            self._rule, self._drift, frame.charge_pC, self._misfit, frame.dt_s, self._ratios, self._warmth_s
+            self._rule,
+            self._drift,
+            frame.charge_pC,
+            self._misfit,
+            frame.dt_s,
+            self._electrode_ratios,
+            self._warmth_time_constant_s,
         )
         self._drift = drift
 
         # After a touch with a large warming, the stage of the film's memory must not learn the properties of the film.
         is_large = abs(drift.charge_pC) >= self._rule.tell_pC
         if drift.charge_pC != previous_pC:  # most frames do not change the estimate
-            change_pC = (drift.charge_pC - previous_pC) * self._ratios
+            change_pC = (drift.charge_pC - previous_pC) * self._electrode_ratios
             frame.charge_pC = frame.charge_pC - change_pC
-            rate_pC_per_s = drift.rate_pC_per_s * self._ratios
+            rate_pC_per_s = drift.rate_pC_per_s * self._electrode_ratios
             self._offset_stage.add_warming(WarmingChange(change_pC, rate_pC_per_s, is_learned=not is_large))
         if is_large:
             frame.flags.append(THERMAL)

@@ -76,9 +76,9 @@ class ContactFilter:
     def step(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> TrackedContact:
         """Process the next frame, and smooth its position and the logarithm of its force with two filters.
 
-        A filter rejects a measured value that is far from its prediction. If the force filter rejects its value, only
-        the force filter is restarted. If the position filter rejects the position, the position may be an outlier,
-        which means that no contact moves fast enough to reach the position. Up to `MAX_OUTLIERS` outliers in
+        A filter rejects a measured value that is far from its prediction. If the force filter rejects the measured
+        force, only the force filter is restarted. If the position filter rejects the position, the position may be an
+        outlier, which means that no contact moves fast enough to reach the position. Up to `MAX_OUTLIERS` outliers in
         succession are ignored. After any other rejected position, both filters are restarted. They are also restarted
         if the time since the latest frame is longer than `MAX_GAP_s`, or if the clock was set back.
 

@@ -186,7 +186,10 @@ class FilmFilter:
 
     @property
     def offset_correction_MPa(self) -> float:
-        """Mean pretension minus the mean pretension at the level without offsets, MPa."""
+        """Change of the estimated mean pretension that the consideration of offsets causes, MPa.
+
+        The mean over all offset levels is compared with the mean at the level at which touches have no offsets.
+        """
         probability_without_offset = self._joint_probability[0] / self._joint_probability[0].sum()
         return self.mean_MPa - float(probability_without_offset @ self.grid_MPa)
 

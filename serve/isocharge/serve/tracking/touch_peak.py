@@ -35,7 +35,8 @@ class TouchPeak:
             contact: Contact that the model computed for the frame.
             charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
         """
-        self._start_average(contact, charge_pC)
+        self._reference_contact = contact
+        self._averaged_charges_pC = [charge_pC]
 
     def add_frame(self, contact: Contact, charge_pC: Array) -> None:
         """Process another frame of the touch.
@@ -45,19 +46,16 @@ class TouchPeak:
             charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
         """
         if is_close(contact, self._reference_contact):
-            if self._frame_count < MAX_AVERAGED_FRAMES:
-                difference_pC = charge_pC - self._latest_charge_pC
-                self._squared_difference_sum_pC2 = self._squared_difference_sum_pC2 + difference_pC**2
-                self._charge_sum_pC = self._charge_sum_pC + charge_pC
-                self._latest_charge_pC = charge_pC
-                self._frame_count += 1
+            if len(self._averaged_charges_pC) < MAX_AVERAGED_FRAMES:
+                self._averaged_charges_pC.append(charge_pC)
         elif contact.force_N > self._reference_contact.force_N:
-            self._start_average(contact, charge_pC)
+            self._reference_contact = contact
+            self._averaged_charges_pC = [charge_pC]
 
     @property
     def mean_charge_pC(self) -> Array:
         """Average of the touch charges, shape (n_electrode,), pC."""
-        return np.asarray(self._charge_sum_pC / self._frame_count)
+        return np.mean(self._averaged_charges_pC, axis=0)
 
     def relative_noise_variance(self, frame_variance_pC2: Array) -> float:
         """Estimate the variance of the noise of the average charges, relative to the variance for a single frame.
@@ -72,17 +70,10 @@ class TouchPeak:
         Returns:
             Ratio of the variances, averaged over the electrodes, from 1/n to 1.
         """
-        difference_count = self._frame_count - 1
-        if difference_count == 0:
+        frame_count = len(self._averaged_charges_pC)
+        if frame_count == 1:
             return 1.0
-        independent_variance_pC2 = self._squared_difference_sum_pC2 / (2.0 * difference_count)
-        independent_share = min(float(np.mean(independent_variance_pC2 / frame_variance_pC2)), 1.0)
-        return 1.0 - independent_share + independent_share / self._frame_count
-
-    def _start_average(self, contact: Contact, charge_pC: Array) -> None:
-        """Make a frame the reference and the only frame of the average."""
-        self._reference_contact = contact
-        self._latest_charge_pC = charge_pC
-        self._charge_sum_pC = charge_pC
-        self._squared_difference_sum_pC2 = np.zeros_like(charge_pC)  # of successive frames of the average
-        self._frame_count = 1
+        difference_pC = np.diff(self._averaged_charges_pC, axis=0)  # of successive frames, shape (n - 1, n_electrode)
+        independent_variance_pC2 = 0.5 * (difference_pC**2).mean(axis=0)
+        independent_share = min(float((independent_variance_pC2 / frame_variance_pC2).mean()), 1.0)
+        return 1.0 - independent_share + independent_share / frame_count

@@ -199,12 +199,12 @@ class ComparedMethod:
                 parameter_sets[best_index],
                 n_compared=len(parameter_sets),
                 validation_error_mm=errors_mm[best_index],
-                n_presses=len(presses),
+                presses=presses,
             )
         return replace(self, regressor=fitted_regressors[best_index], choice=choice)
 
     def _describe_choice(
-        self, parameters: Mapping[str, Any], *, n_compared: int, validation_error_mm: float, n_presses: int
+        self, parameters: Mapping[str, Any], *, n_compared: int, validation_error_mm: float, presses: LabelledPresses
     ) -> str:
         """Return a text about the chosen parameters and the presses of the fit.
 
@@ -212,11 +212,16 @@ class ComparedMethod:
             parameters: The chosen parameters, by name.
             n_compared: Number of sets of parameters that were compared.
             validation_error_mm: Root mean square of the position errors with the chosen parameters, mm.
-            n_presses: Number of presses to which the method was fitted.
+            presses: Presses to which the method was fitted, including all copies.
         """
+        if presses.measured:
+            kind_of_presses = "measured"
+        elif self.copies:
+            kind_of_presses = "noisy"
+        else:
+            kind_of_presses = "clean"
         descriptions = [describe_parameter(name, value) for name, value in parameters.items()]
-        noise_word = "noisy" if self.copies else "clean"
-        descriptions.append(f"{n_presses} {noise_word} presses")
+        descriptions.append(f"{len(presses)} {kind_of_presses} presses")
         if n_compared > 1:
             descriptions.append(f"best of {n_compared} by validation ({validation_error_mm:.3f} mm rms)")
         return ", ".join(descriptions)

@@ -1,4 +1,4 @@
-"""Networks for the comparison of methods: the released model, and newly trained networks of several sizes.
+"""Networks for the comparison of methods: the evaluated model, and newly trained networks of several sizes.
 
 The other methods of the comparison only estimate the contact. The networks are therefore also compared without their
 outputs for standard deviations and misfit.
@@ -27,8 +27,8 @@ from isocharge.train.training.fit import train_network
 from isocharge.train.training.network import fold_contact_mean
 from isocharge.train.training.source import TrainingData
 
-RELEASED = "released network"
-"""Name of the released model in the comparison."""
+EVALUATED_MODEL = "evaluated model"
+"""Name of the evaluated model in the comparison."""
 
 SMALL_MISFIT_WIDTH = 8
 """Width of the hidden layers of a misfit perceptron whose output is not used."""
@@ -132,8 +132,8 @@ class TrainedNetwork(OnnxContact):
         return self
 
 
-class ReleasedModel(GivenMethod):
-    """Released model, which `Predictor` evaluates.
+class StoredModel(GivenMethod):
+    """Model in a folder, which `Predictor` evaluates.
 
     Args:
         folder: Version folder of the model.

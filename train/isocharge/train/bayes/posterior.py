@@ -423,10 +423,11 @@ class Posterior:
         deviation = (charge - expected) / sigma
         chi2 = (deviation**2).sum(axis=1)
 
-        # No term is steeper than the largest slope. The slope of an expected charge is therefore at most about the
-        # largest slope times the sum of the weights, most of which are positive. The square root of chi-squared is the
-        # norm of the deviations of all electrodes, so its slope is at most the norm of their slopes.
-        deviation_slope = largest_slope * force_weights.sum(axis=1)[:, None] / sigma
+        # No term is steeper than the largest slope. The slope of an expected charge is therefore at most the largest
+        # slope times the sum of the magnitudes of the weights, some of which are negative. The square root of
+        # chi-squared is the norm of the deviations of all electrodes, so its slope is at most the norm of their slopes.
+        weight_sum = np.abs(force_weights).sum(axis=1)
+        deviation_slope = largest_slope * weight_sum[:, None] / sigma
         return chi2, np.linalg.norm(deviation_slope, axis=1)
 
     def _inverse_std(self, cells: Cells, terms: Array, log_force: Array) -> Array:

@@ -17,10 +17,10 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError, SceneError, SolveError
 from isocharge.common.measured_presses import MeasuredPresses
 from isocharge.simulate import SolveSettings, press, touch_charge
-from isocharge.train.calibration.diagnosis import CLEARER, PRETENSIONS, charge_misfit, expected_charges
+from isocharge.train.calibration.diagnosis import BETTER_MISFIT_RATIO, PRETENSIONS, charge_misfit, expected_charges
 from isocharge.train.calibration.film_charges import FilmCharges
 
-MIN_VENTED_MISFIT = 0.5
+MAX_EXPLAINED_MISFIT = 0.5
 """Misfit of films with a vented back, as `charge_misfit` returns it, up to which a closed back is not considered."""
 
 CAVITY_DEPTH_mm = 20.0
@@ -65,7 +65,7 @@ def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
     # The charges are computed for the pretensions in `PRETENSIONS`, and interpolated for pretensions between them.
     vented_charges = _interpolate_pretensions(expected_charges(charges, examined.contact))
     vented_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, vented_charges)
-    is_explained = vented_misfit <= MIN_VENTED_MISFIT
+    is_explained = vented_misfit <= MAX_EXPLAINED_MISFIT
     is_comparable = vented_misfit < np.inf  # the misfit is infinite if many presses lie outside the domain
     if is_explained or not is_comparable:
         return False
@@ -77,7 +77,7 @@ def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
         return False  # a film with a closed back cannot be simulated, so there is no evidence for a closed back
     closed_charges = _interpolate_pretensions(solved_charges)
     closed_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, closed_charges)
-    return closed_misfit < CLEARER * vented_misfit
+    return closed_misfit < BETTER_MISFIT_RATIO * vented_misfit
 
 
 def refuse_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> None:

@@ -88,7 +88,7 @@ MAX_SQUARED_DEVIATION = 4.0
 MAX_OUTSIDE_FRACTION = 0.2
 """Largest fraction of presses outside the domain for which a misfit is computed."""
 
-CLEARER = 0.25
+BETTER_MISFIT_RATIO = 0.25
 """Ratio of two misfits below which one explanation of the presses counts as clearly better than another.
 
 For example, the correction of a mistake must reduce the misfit to less than this fraction."""
@@ -257,9 +257,9 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     """Find the mistakes whose correction makes the presses agree far better with a film.
 
-    A mistake is returned if its correction reduces the misfit to less than `CLEARER` times the misfit without
-    corrections. The misfit after the correction must also be at most `MAX_MISFIT_RATIO` times the misfit after the best
-    correction.
+    A mistake is returned if its correction reduces the misfit to less than `BETTER_MISFIT_RATIO` times the misfit
+    without corrections. The misfit after the correction must also be at most `MAX_MISFIT_RATIO` times the misfit after
+    the best correction.
 
     Args:
         presses: The measured presses. A press whose place or force is unknown is not used.
@@ -285,7 +285,7 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
         )
 
     # A correction must improve the misfit clearly, and must be nearly as good as the best correction.
-    improvement_limit = CLEARER * misfit(presses, charges)
+    improvement_limit = BETTER_MISFIT_RATIO * misfit(presses, charges)
     similarity_limit = MAX_MISFIT_RATIO * min(corrected_misfits.values())
     sentences_best_first = sorted(corrected_misfits, key=lambda sentence: corrected_misfits[sentence])
     return [

@@ -33,11 +33,6 @@ from isocharge.train.calibration.unknowns import UnknownLayout
 LOAD_PARAMETERS = ("pretension", "young", "thickness")
 """Parameters that change the stress of the film under a load."""
 
-NEGLIGIBLE = 1e-3
-"""Size of the coefficients of modes and traces up to which their effects are not computed.
-
-Modes and traces with smaller coefficients change the charges by less than 1e-4 of their value."""
-
 LARGEST_LOCAL_COEFFICIENT = 0.1
 """Largest coefficient of modes and traces for which their factor is assumed not to depend on the parameters.
 
@@ -124,7 +119,7 @@ class FilmCharges(FilmMaps):
         Modes are imperfections of the film, such as an uneven tension. Traces are metal lines that lead to the
         electrodes and also collect charge. The discrepancy multiplies each charge by a factor whose logarithm is a
         polynomial of the contact. The computation of the effects of modes and traces is slow. Therefore, these effects
-        are omitted if all coefficients of modes and traces are negligible.
+        are only computed if at least one coefficient of modes and traces is not zero.
 
         Args:
             unknowns: Parameters and coefficients of the film, as in `film`.
@@ -137,7 +132,7 @@ class FilmCharges(FilmMaps):
         """
         layout = self.layout
         factor = np.ones((len(contact), len(self.prior.sensor.electrodes)))
-        if np.abs(unknowns[layout.imperfections]).max(initial=0.0) > NEGLIGIBLE:
+        if unknowns[layout.imperfections].any():
             if charge is None:
                 charge = self.forward_map(unknowns[layout.parameters]).charges(contact)
             factor = self._imperfection_factor(unknowns, contact, charge)
@@ -174,11 +169,11 @@ class FilmCharges(FilmMaps):
 
         # First order: the added charges are proportional to the coefficients. A Jacobian contains the charges that are
         # added per unit of each coefficient, shape (n, n_electrode, n_coefficient).
-        if np.abs(trace_coefficients).max() > NEGLIGIBLE:
+        if trace_coefficients.any():
             forward_map = self.forward_map(parameters)
             trace_jacobian = trace_charges(forward_map, self._trace_lines, contact)
             factor += trace_jacobian @ trace_coefficients / charge
-        if np.abs(mode_coefficients).max(initial=0.0) > NEGLIGIBLE:
+        if mode_coefficients.any():
             mode_charges = self._mode_charges(parameters, contact, charge)
             factor += mode_charges.mode_jacobian @ mode_coefficients / charge
 

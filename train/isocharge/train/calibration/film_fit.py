@@ -54,6 +54,12 @@ The charge may then be wrong by up to twenty standard deviations.
 PROBABLE = 0.5
 """Probability above which an effect is reported."""
 
+NEGLIGIBLE_COEFFICIENT = 1e-3
+"""Largest magnitude of the coefficients of modes or of traces that is rounded to zero in the estimate of a film.
+
+Modes and traces with smaller coefficients change the charges by less than 1e-4 of their value. If the coefficients are
+zero, the slow computation of the effects of modes and traces is not needed."""
+
 
 @dataclass(frozen=True)
 class FilmPosterior(FilmEstimate):
@@ -370,7 +376,8 @@ def _posterior(
     # A hypothesis is a combination of effects besides the parameters. The mixture is the average of the estimates under
     # all hypotheses. The sum is clipped, because rounding may lead slightly beyond the bounds.
     mixture = settled.mixture
-    unknowns = np.clip(problem.mean + mixture.mean_change, *problem.bounds)
+    mean_unknowns = np.clip(problem.mean + mixture.mean_change, *problem.bounds)
+    unknowns = _without_negligible_coefficients(layout, mean_unknowns)
 
     # Root-mean-square scatter of the forces over all hypotheses, weighted by their probabilities
     scatter_variance = sum(
@@ -409,6 +416,25 @@ def _posterior(
         force_scatter=force_scatter,
         probabilities=mixture.probabilities,
     )
+
+
+def _without_negligible_coefficients(layout: UnknownLayout, unknowns: Array) -> Array:
+    """Return a copy of estimated unknowns in which negligible coefficients of modes and traces are zero.
+
+    The average over the hypotheses is almost never exactly zero, because each hypothesis with modes or traces has a
+    small probability. The coefficients of modes are replaced by zeros only if no magnitude of them exceeds
+    `NEGLIGIBLE_COEFFICIENT`. The coefficients of traces are treated in the same way.
+
+    Args:
+        layout: Layout of the unknowns.
+        unknowns: Estimated unknowns, shape (n_unknown,).
+    """
+    rounded_unknowns = unknowns.copy()
+    for coefficients in (layout.modes, layout.traces):
+        largest_magnitude = np.abs(unknowns[coefficients]).max(initial=0.0)
+        if largest_magnitude <= NEGLIGIBLE_COEFFICIENT:
+            rounded_unknowns[coefficients] = 0.0
+    return rounded_unknowns
 
 
 def _nuisance_estimates(layout: UnknownLayout, unknowns: Array, covariance: Array) -> dict[str, NuisanceEstimate]:

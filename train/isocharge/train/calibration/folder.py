@@ -192,7 +192,7 @@ def _write_version(result: CalibrationResult, folder: Path, command: str) -> Pat
         SENSOR: sensor_to_toml(sensor).encode(),
         PICTURE: picture_bytes(calibration_picture(result)),
     }
-    if not result.moved:
+    if not result.move_description:
         files[PRESSES] = presses_text(result.presses).encode()
 
     # Files with which a service follows the pretension of the film
@@ -228,8 +228,8 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
         "friction": friction_table(result),
         "side_force": result.problem.side_force,
         "reduced_chi2": result.reduced_chi2,
-        "error_left": error_table(result.error_left),
-        "error_left_before": error_table(result.error_left_before),
+        "film_error": error_table(result.film_error),
+        "film_error_before": error_table(result.film_error_before),
         "error_of_noise": error_table(result.sensitivity.noise_error),
         "held_out": held_out_table(result),
         "quantities": {name: quantity.to_dict() for name, quantity in result.quantities.items()},
@@ -332,7 +332,9 @@ def _card(result: CalibrationResult, about: ModelMetadata) -> str:
     """
     sensor, probe = result.film
     min_force, max_force = about.force_range_N
-    origin = f"{result.moved}," if result.moved else f"calibrated on {len(result.presses)} presses"
+    origin = (
+        f"{result.move_description}," if result.move_description else f"calibrated on {len(result.presses)} presses"
+    )
     summary_list = "\n".join(f"- {sentence}" for sentence in result.summary)
     quantity_rows = "\n".join(
         f"| `{quantity.name}` | {quantity.meaning} | {quantity.value:.4g} | {quantity.std:.2g} | "

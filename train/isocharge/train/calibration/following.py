@@ -74,7 +74,7 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
         node_MPa=nodes,
         calibrated_MPa=calibrated_MPa,
         std_MPa=float(drifted_std[pretension]),
-        floor_MPa=_remaining_std_MPa(result),
+        floor_MPa=_pretension_difference_std_MPa(result),
         misfit_rms=1.0,
         misfit_unit=MISFIT_UNIT,
         limits_pC=(LOWEST_CHARGE, HIGHEST_CHARGE),
@@ -212,13 +212,20 @@ def _weight_names(network: FoldedNetwork) -> list[str]:
     return names
 
 
-def _remaining_std_MPa(result: CalibrationResult) -> float:
-    """Compute the standard deviation, in MPa, that remains in the estimate of the pretension even after many touches.
+def _pretension_difference_std_MPa(result: CalibrationResult) -> float:
+    """Compute how much the pretension that is estimated from many touches differs from the calibrated pretension.
+
+    The result is the standard deviation of this difference, MPa, for a film that has not changed since the calibration.
+    Further touches do not reduce the difference.
 
     A service estimates the pretension by least squares from the misfits of touches. A misfit is the part of the charges
-    that no contact explains. The service does not estimate the other unknowns of the film again. Errors of their
-    calibrated values therefore cause an error of the estimated pretension, which further touches do not reduce. An
-    error of the calibrated pretension contributes with the factor 1.
+    that no contact explains. The service uses the calibrated values of the other unknowns of the film. Their errors
+    therefore change the estimated pretension. An error of the calibrated pretension does not change the estimate, but
+    the difference from the calibrated pretension. It contributes with the factor 1.
+
+    The difference from the calibrated pretension is computed, and not the error of the estimate, because the errors of
+    the calibrated unknowns are correlated. The calibrated pretension partly compensates for the errors of the other
+    unknowns. A film with the true pretension and with these errors would usually answer worse than the calibrated film.
 
     Args:
         result: Result of the calibration.
@@ -228,11 +235,11 @@ def _remaining_std_MPa(result: CalibrationResult) -> float:
     misfit_jacobian = result.sensitivity.misfit_jacobian
     pretension_jacobian = misfit_jacobian[:, :, pretension]  # shape (n_touch, n_misfit)
 
-    # Error of the least-squares estimate of the pretension if the calibrated value of the unknown p has the error 1.
-    # The sums extend over the touches n and the misfits k of each touch.
+    # Calibrated pretension minus the least-squares estimate of the pretension if the calibrated value of the unknown p
+    # has the error 1. The sums extend over the touches n and the misfits k of each touch.
     projection = np.einsum("nk,nkp->p", pretension_jacobian, misfit_jacobian)
-    error_per_unknown = projection / (pretension_jacobian**2).sum()
+    difference_per_unknown = projection / (pretension_jacobian**2).sum()
 
-    # Parameters are in units of their prior standard deviations, and so is the error of the pretension.
-    scaled_variance = error_per_unknown @ result.posterior.joint @ error_per_unknown
+    # Parameters are in units of their prior standard deviations, and so is the difference of the pretensions.
+    scaled_variance = difference_per_unknown @ result.posterior.joint @ difference_per_unknown
     return float(np.sqrt(scaled_variance) * prior.std[pretension])

@@ -109,9 +109,10 @@ class PretensionPerFilmExcess(Nuisance):
     """
 
     def tension_change(self, data: PressData, value: float) -> Array:
-        """Return the pretension during each press minus the pretension at the mean excess, shape (n,), MPa.
+        """Return how much the pretension during each press differs from the mean pretension, shape (n,), MPa.
 
-        The excess is the temperature of the film minus the temperature of its ring.
+        The pretension changes with the excess, which is the temperature of the film minus the temperature of its ring.
+        The mean pretension is the pretension for the mean excess of all presses.
         """
         return value * data.film_excess_K
 
@@ -233,8 +234,8 @@ def without_nuisances(data: PressData, values: Sequence[float] | Array) -> Press
 def nuisance_derivatives(data: PressData, pretension_derivative: Array) -> Array:
     """Compute the derivatives of the residuals with respect to the nuisances.
 
-    A nuisance adds charge or changes the pretension in proportion to its value. Therefore, the derivatives are the
-    effects of the value 1.
+    The added charge, or the change of the pretension, is proportional to the value of the nuisance. Therefore, the
+    derivatives are the effects of the value 1.
 
     Args:
         data: The presses as they were measured.

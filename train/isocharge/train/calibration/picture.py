@@ -46,14 +46,14 @@ def calibration_picture(result: CalibrationResult) -> Figure:
     """
     figure = new_figure(11.0, 8.8)
     (before_axes, after_axes), (quantity_axes, residual_axes) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
-    if result.moved:
+    if result.move_description:
         before_title = "before it was moved"
         after_title = "moved to another temperature"
     else:
         before_title = "before the presses"
         after_title = f"after {len(result.presses)} presses"
-    _draw_error(before_axes, result, result.error_left_before, before_title)
-    error_areas = _draw_error(after_axes, result, result.error_left, after_title)
+    _draw_error(before_axes, result, result.film_error_before, before_title)
+    error_areas = _draw_error(after_axes, result, result.film_error, after_title)
     _draw_presses(after_axes, result)
     label = "position error by the film (rms), mm"
     figure.colorbar(

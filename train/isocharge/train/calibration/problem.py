@@ -77,7 +77,7 @@ class Warming(NamedTuple):
 
     @property
     def identified(self) -> bool:
-        """Whether presses have reduced the standard deviation of the change per kelvin by at least half."""
+        """Whether the presses have reduced the standard deviation of the change per kelvin to half or less."""
         return self.std <= MAX_IDENTIFIED_STD_RATIO * PRETENSION_PER_KELVIN.std_with_temperatures
 
     def with_unknowns(self, count: int) -> "Warming":

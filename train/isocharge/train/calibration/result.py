@@ -38,8 +38,8 @@ class CalibrationResult:
         presses: The presses of the calibration, including those that were left out as bad.
         posterior: Estimate of the film from the presses.
         cautions: Warnings for the user, each as one string.
-        moved: Words that describe how an earlier calibration was moved to another temperature without presses; empty
-            for a calibration by presses.
+        move_description: Words that describe how an earlier calibration was moved to another temperature without
+            presses; empty for a calibration by presses.
         side_force_map: Effect of side forces on the charges of the film. None if the presses have no friction and no
             side force of later contacts was declared.
     """
@@ -48,7 +48,7 @@ class CalibrationResult:
     presses: MeasuredPresses
     posterior: FilmPosterior
     cautions: tuple[str, ...] = ()
-    moved: str = ""
+    move_description: str = ""
     side_force_map: SideForceMap | None = None
 
     @cached_property
@@ -67,12 +67,12 @@ class CalibrationResult:
         return ContactSensitivity.for_film(self.problem, self.posterior.unknowns)
 
     @cached_property
-    def error_left(self) -> ContactError:
+    def film_error(self) -> ContactError:
         """Contact errors that are caused by the remaining uncertainty of the film."""
         return self.sensitivity.contact_error(self.posterior.joint)
 
     @cached_property
-    def error_left_before(self) -> ContactError:
+    def film_error_before(self) -> ContactError:
         """Contact errors that the uncertainty of the film caused before the calibration.
 
         If the film was moved to another temperature, these are the errors before the move.
@@ -83,7 +83,7 @@ class CalibrationResult:
         estimated = slice(0, len(before.unknowns))
         covariance = np.zeros((unknown_count, unknown_count))
         covariance[estimated, estimated] = before.unknown_covariance
-        if not self.moved:
+        if not self.move_description:
             return self.sensitivity.contact_error(covariance)
 
         # The sensitivity of the film before the move differs from that of the moved film, so it is computed again.
@@ -110,7 +110,7 @@ class CalibrationResult:
         The value is None if there are too few presses, or if the film was moved to another temperature without presses.
         The contacts are computed at the first access. This computation takes about as long as the calibration.
         """
-        if self.moved:
+        if self.move_description:
             return None
         warming = self.posterior.warming
         at_C = None if warming is None else warming.at_C
@@ -210,12 +210,12 @@ class CalibrationResult:
 
         The sentences are computed only once, because the planning of further presses is slow.
         """
-        error_after = self.error_left
-        error_before = self.error_left_before
+        error_after = self.film_error
+        error_before = self.film_error_before
         noise_error = self.sensitivity.noise_error
 
         # The errors are compared with those before the presses, or before the film was moved to another temperature.
-        event = "it was moved" if self.moved else "these presses"
+        event = "it was moved" if self.move_description else "these presses"
         film_errors = (
             f"The uncertainty of the film causes errors of {error_after.position_mm:.2g} mm and "
             f"{error_after.force_percent:.2g} % "
@@ -224,8 +224,8 @@ class CalibrationResult:
             f"{noise_error.position_mm:.2g} mm and {noise_error.force_percent:.2g} %."
         )
         film_quantities = summarise(self.quantities)
-        if self.moved:
-            film_quantities = (f"The film was {self.moved}, without presses.",)
+        if self.move_description:
+            film_quantities = (f"The film was {self.move_description}, without presses.",)
         rig_errors = (
             "Errors of the load cell, and of the origin and the axes of the stage, affect every answer in addition to "
             "these errors."
@@ -306,7 +306,7 @@ class CalibrationResult:
         places = ", ".join(f"{press.force_N:.2f} N at ({press.x_mm:g}, {press.y_mm:g}) mm" for press in plan[:3])
         yield (
             f"The charges of this film differ from those of its parameters by {discrepancy_percent:.2g} % (root mean "
-            f"square), smoothly over the film. The remaining error is {self.error_left.position_mm:.2g} mm. "
+            f"square), smoothly over the film. The remaining error is {self.film_error.position_mm:.2g} mm. "
             f"{PLANNED_PRESSES} more presses would reduce it to {error_after_plan_mm:.2g} mm. The first of them are "
             f"{places}; --next lists more."
         )
@@ -322,13 +322,13 @@ class CalibrationResult:
             )
 
 
-def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved: str) -> CalibrationResult:
+def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, move_description: str) -> CalibrationResult:
     """Create a calibration result without presses from an estimate of a film.
 
     Args:
         problem: The calibration problem.
         film: The estimate of the film.
-        moved: Words that describe how an earlier calibration was moved to another temperature.
+        move_description: Words that describe how an earlier calibration was moved to another temperature.
     """
     layout = problem.charges.layout
     # The estimate may have only the first of the unknowns. The other unknowns are zero, with a variance of zero.
@@ -359,4 +359,6 @@ def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved:
     if problem.side_force > 0.0:
         side_force_map = solve_side_forces(problem.charges, film.parameters)
     empty_presses = no_presses(problem.electrodes)
-    return CalibrationResult(problem, empty_presses, posterior, moved=moved, side_force_map=side_force_map)
+    return CalibrationResult(
+        problem, empty_presses, posterior, move_description=move_description, side_force_map=side_force_map
+    )

@@ -216,7 +216,7 @@ class PressSession:
         if self.result is None or len(self) < FEW_PRESSES:
             return False
         noise_mm = self.result.sensitivity.noise_error.position_mm
-        return self.result.error_left.position_mm <= self._until * noise_mm
+        return self.result.film_error.position_mm <= self._until * noise_mm
 
     def take(self, charge: Array, contact: Array) -> None:
         """Add a press, save all presses, and fit the film to them.
@@ -321,7 +321,7 @@ class PressSession:
             return (f"No film explains these presses: {self.refusal}",)
         if self.result is None or len(self) < MIN_PRESSES:
             return ()
-        film_error = self.result.error_left
+        film_error = self.result.film_error
         noise_error = self.result.sensitivity.noise_error
         error_sentence = (
             f"The uncertainty of the film causes errors of {film_error.position_mm:.2g} mm and "

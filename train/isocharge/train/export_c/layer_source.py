@@ -105,8 +105,8 @@ def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Bloc
     other layers have a single block, which is the whole matrix.
 
     The layers are examined from the last to the first. When a layer is examined, the number of its outputs that belong
-    to the first perceptron is known. The weights then show which of its inputs belong to the first perceptron. These
-    inputs are the outputs of the layer before.
+    to the first perceptron is known. The weights of the layer then show which inputs of the layer belong to the first
+    perceptron. These inputs are the outputs of the layer before.
 
     Args:
         weights: Weights of each layer except the first layer, whose inputs both perceptrons share.

@@ -480,7 +480,8 @@ class _MisfitTraining:
         """Return the loss on validation examples and good presses, and a text that states both parts of the loss.
 
         The good presses are those of the training, but their noise is not that of the training. The noise is the same
-        in every call.
+        in every call. The loss on good presses is therefore smaller than on new films. It is only used to compare the
+        steps of one training, and is not stored. The misfits that a released model states are measured on new presses.
         """
         validation = slice(self.n_train, None)
         misfit_vector = self.network(self.example_inputs[validation], self.example_context[validation])

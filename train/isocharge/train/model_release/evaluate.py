@@ -77,7 +77,7 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
 
 
 def _good_press_misfits(fitted: Fitted, seed: int) -> dict[str, float]:
-    """Compute the misfits that only a few good presses exceed, for a network that is tested on measured presses.
+    """Compute the misfits that only a few good presses exceed.
 
     Good presses are presses without faults. There are three cases:
 
@@ -152,7 +152,7 @@ def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]
 
 
 def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int) -> dict[str, float]:
-    """Compute the misfits that only a few good presses exceed, and the fraction of faults that cause an alarm.
+    """Compute the thresholds of the misfit, and the fraction of faults that cause an alarm.
 
     Args:
         predict: Function that computes the answers of the network.

@@ -1,7 +1,7 @@
 """Report that compares methods by speed and error. All methods are tested on the same presses.
 
 Example:
-    The function `write_report` needs datasets, each with the folder of the released model of its sensor.
+    The function `write_report` needs datasets, each with the folder of the model that is evaluated on it.
 
     from isocharge.train.report import write_report
 

@@ -44,7 +44,7 @@ def write_report(
 
     Args:
         folder: Folder to write; it must not exist.
-        subjects: Datasets, each with the version folder of the released model that is evaluated on it.
+        subjects: Datasets, each with the version folder of the model that is evaluated on it.
         settings: Settings of the report; None for the settings of a full report.
         students: Version folders of small models. Each of them is compared on the datasets of its sensor.
         command: Command that repeats the report, for the page; empty if there is none.

@@ -54,7 +54,7 @@ class Settings:
             for the same duration.
         batch: Number of presses in a batch.
         draws: Number of times that noise is drawn for the test presses, for the error maps and the coverage of the
-            released model.
+            evaluated model.
         limited: Number of test presses for which the Bayes limit is computed.
         accuracy: Relative accuracy of the charges in the solves of the film.
         shapes: Probes for which the models were not trained, in the notation of `parse_probe`.

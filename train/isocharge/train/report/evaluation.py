@@ -1,4 +1,4 @@
-"""Evaluation of a released model and of all other methods on one dataset."""
+"""Evaluation of a model and of all other methods on one dataset."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -24,18 +24,18 @@ from isocharge.train.baselines.compared_methods import (
     FittingTask,
     compared_methods,
 )
-from isocharge.train.baselines.networks import RELEASED, ReleasedModel, TrainedNetwork
+from isocharge.train.baselines.networks import EVALUATED_MODEL, StoredModel, TrainedNetwork
 from isocharge.train.data.presses import LabelledPresses, held_out, is_measured, presses_of, split_by_position
 from isocharge.train.model_release.evaluate import alarm_threshold
 from isocharge.train.report import pictures, studies
 from isocharge.train.report.case import BAYES, ErrorLimits, EvaluationCase, Settings, simulate_presses
-from isocharge.train.report.measures import compare_with_released, round_significant
+from isocharge.train.report.measures import compare_with_evaluated_model, round_significant
 from isocharge.train.report.methods import FittedMethod, fit_all, measure_methods
 from isocharge.train.report.press_selection import measured_presses_for, select_presses, simulated_presses_for
 from isocharge.train.training.source import TrainingData
 
 STUDIED_METHODS = (GAUSS_NEWTON, POLYNOMIAL, TABLE, BOOSTING, LINEAR_BAND)
-"""Names of the methods that are studied in more detail, in addition to the released model."""
+"""Names of the methods that are studied in more detail, in addition to the evaluated model."""
 
 TEST_NOISE_SEED = 4242
 """Seed of the noise on the test presses, relative to the seed of the case."""
@@ -85,11 +85,11 @@ class Section:
 
 @dataclass(frozen=True)
 class DatasetEvaluation:
-    """Prepared evaluation of a released model and of all other methods on one dataset.
+    """Prepared evaluation of a model and of all other methods on one dataset.
 
     Attributes:
         dataset: The presses for fitting and validation.
-        released: The released model.
+        evaluated_model: The model that is evaluated. It may be a released model or a model of the user.
         students: Version folders of the small models of the same sensor.
         task: The presses and conditions to which the methods are fitted.
         case: The conditions of the test.
@@ -98,7 +98,7 @@ class DatasetEvaluation:
     """
 
     dataset: Dataset
-    released: ReleasedModel
+    evaluated_model: StoredModel
     students: tuple[Path, ...]
     task: FittingTask
     case: EvaluationCase
@@ -109,7 +109,7 @@ class DatasetEvaluation:
     def prepare(
         cls, dataset: Dataset, model_folder: Path, students: Sequence[Path], settings: Settings
     ) -> "DatasetEvaluation":
-        """Select the presses on which the released model can be evaluated, and split them for fits and tests.
+        """Select the presses on which the model can be evaluated, and split them for fits and tests.
 
         Measured presses are split into three groups: for training, for the choice of parameters (validation), and for
         the test (held out). Simulated presses are only split into the first two groups, because the test presses are
@@ -117,7 +117,7 @@ class DatasetEvaluation:
 
         Args:
             dataset: The dataset.
-            model_folder: Version folder of the released model.
+            model_folder: Version folder of the model.
             students: Version folders of small models; models of other sensors are ignored.
             settings: Settings of the report.
 
@@ -129,7 +129,7 @@ class DatasetEvaluation:
             ModelError: If the model is for another sensor or for a smaller range of forces than the dataset.
             PressError: If there are too few measured presses.
         """
-        # Read the released model, and find the small models of the same sensor.
+        # Read the evaluated model, and find the small models of the same sensor.
         model = Predictor(model_folder).metadata
         unique_students = dict.fromkeys(students)  # without repetitions, in the given order
         own_students = tuple(path for path in unique_students if Predictor(path).metadata.sensor == model.sensor)
@@ -156,14 +156,14 @@ class DatasetEvaluation:
         task = FittingTask(
             train, validation, domain=case.domain, noise=case.noise, seed=settings.seed, quick=settings.quick
         )
-        return cls(fitting_dataset, ReleasedModel(model_folder), own_students, task, case, settings, held_out_presses)
+        return cls(fitting_dataset, StoredModel(model_folder), own_students, task, case, settings, held_out_presses)
 
     def identity(self) -> dict[str, Any]:
         """Return the checksum of the dataset and the folders of the models.
 
         A stopped report is continued only if these values are the same.
         """
-        folders = [self.released.folder, *self.students]
+        folders = [self.evaluated_model.folder, *self.students]
         return {"dataset_sha256": self.dataset.sha256, "models": [str(folder) for folder in folders]}
 
     def measure(self, executor: Executor) -> Section:
@@ -191,7 +191,7 @@ class DatasetEvaluation:
         """Simulate test presses, evaluate all methods on them, and return the section of a simulated dataset.
 
         The test presses are simulated first, and the theoretical limits of the error are computed for these presses.
-        All methods are then fitted and measured. Finally, the released model is studied for several draws of the noise
+        All methods are then fitted and measured. Finally, the evaluated model is studied for several draws of the noise
         and for mismatches, which are conditions that differ from the assumptions of the model.
 
         Args:
@@ -214,19 +214,19 @@ class DatasetEvaluation:
 
         # Fit and measure the methods. On simulated presses, a method that cannot be fitted raises an error, so there
         # are no failures to report.
-        methods = [*self._released_models(), *compared_methods(self.task, charge_map), *self._new_networks()]
+        methods = [*self._stored_models(), *compared_methods(self.task, charge_map), *self._new_networks()]
         fitted_methods, _ = fit_all(methods, self.task, test_presses)
         fitted_by_name = {fitted.method.name: fitted for fitted in fitted_methods}
         records = measure_methods(fitted_methods, test_presses, settings, limits.posterior_mean)
 
-        # Study the released model for several draws of the noise, and all studied methods for mismatches.
-        noise_draws = studies.NoiseDraws.draw(self.released, clean_presses, case, settings.draws)
+        # Study the evaluated model for several draws of the noise, and all studied methods for mismatches.
+        noise_draws = studies.NoiseDraws.draw(self.evaluated_model, clean_presses, case, settings.draws)
         threshold = alarm_threshold(noise_draws.misfit)
         content = {
             **self._description(len(test_presses)),
             "limits": limits.to_dict(test_presses.contact),
             "methods": records,
-            "verdict": compare_with_released(records),
+            "verdict": compare_with_evaluated_model(records),
             "by_force": self._errors_by_force(fitted_by_name, limits, test_presses),
             "calibration": studies.coverage_by_level(noise_draws),
             "alarm_threshold": round_significant(threshold),
@@ -253,7 +253,7 @@ class DatasetEvaluation:
     ) -> dict[str, Any]:
         """Compute the position error of some methods and of the theoretical limits in each bin of the force.
 
-        The methods are the released model and the methods of `STUDIED_METHODS`. The Bayes limit is left out if it was
+        The methods are the evaluated model and the methods of `STUDIED_METHODS`. The Bayes limit is left out if it was
         not computed.
 
         Args:
@@ -267,7 +267,7 @@ class DatasetEvaluation:
         estimates = {}
         if limits.posterior_mean is not None:
             estimates[BAYES] = limits.posterior_mean
-        for name in (RELEASED, *STUDIED_METHODS):
+        for name in (EVALUATED_MODEL, *STUDIED_METHODS):
             estimates[name] = fitted_by_name[name].estimate
         return studies.errors_by_force(self.case.domain, test.contact, estimates, limits.cramer_rao.position)
 
@@ -278,14 +278,14 @@ class DatasetEvaluation:
         threshold: float,
         executor: Executor,
     ) -> list[dict[str, Any]]:
-        """Measure the errors of the released model and of the studied methods for all mismatches.
+        """Measure the errors of the evaluated model and of the studied methods for all mismatches.
 
         A mismatch is a condition that differs from the assumptions of the models, such as another probe.
 
         Args:
             fitted_by_name: Fitted methods by name.
             clean_presses: The test presses without noise.
-            threshold: Misfit above which the released model gives an alarm, in standard deviations of the noise.
+            threshold: Misfit above which the evaluated model gives an alarm, in standard deviations of the noise.
             executor: Executor of the simulations of the film.
 
         Returns:
@@ -293,7 +293,7 @@ class DatasetEvaluation:
         """
         methods = [fitted_by_name[name].method for name in STUDIED_METHODS]
         return [
-            studies.measure_mismatch(mismatch, RELEASED, self.released, methods, threshold)
+            studies.measure_mismatch(mismatch, EVALUATED_MODEL, self.evaluated_model, methods, threshold)
             for mismatch in studies.mismatches(self.case, clean_presses, self.settings, executor)
         ]
 
@@ -305,38 +305,38 @@ class DatasetEvaluation:
         Args:
             test: The held-out presses.
         """
-        methods = [*self._released_models(), *compared_methods(self.task), *self._new_networks()]
+        methods = [*self._stored_models(), *compared_methods(self.task), *self._new_networks()]
         fitted_methods, failure_reasons = fit_all(methods, self.task, test)
         records = measure_methods(fitted_methods, test, self.settings)
         content = {
             **self._description(len(test)),
             "limits": {"bayes": None, "cramer_rao": None},
             "methods": records,
-            "verdict": compare_with_released(records),
+            "verdict": compare_with_evaluated_model(records),
             "left_out": failure_reasons,
         }
         return Section(content, {})
 
-    def _released_models(self) -> list[ComparedMethod]:
-        """Return the released model and its students, which are small models of the same sensor.
+    def _stored_models(self) -> list[ComparedMethod]:
+        """Return the evaluated model and its students, which are small models of the same sensor.
 
-        Each model is listed twice: with all outputs, and with the contact as its only output. The released model with
+        Each model is listed twice: with all outputs, and with the contact as its only output. The evaluated model with
         all outputs comes first.
         """
-        models = {RELEASED: self.released}
+        models = {EVALUATED_MODEL: self.evaluated_model}
         for path in self.students:
             student_name = Predictor(path).metadata.name
-            models[student_name] = ReleasedModel(path)
+            models[student_name] = StoredModel(path)
 
         methods = []
         for name, model in models.items():
-            full_model = ComparedMethod(name, "network", "Predictor", model, choice="as released")
+            full_model = ComparedMethod(name, "network", "Predictor", model, choice="not fitted again")
             contact_model = ComparedMethod(
                 f"{name}, contact only",
                 "network",
                 "ONNX Runtime, bound",
                 model.contact_only(),
-                choice="as released, only the contact",
+                choice="not fitted again, only the contact",
             )
             methods += [full_model, contact_model]
         return methods
@@ -367,7 +367,7 @@ class DatasetEvaluation:
             test_count: Number of test presses.
         """
         case = self.case
-        model = self.released.predictor.metadata
+        model = self.evaluated_model.predictor.metadata
         return {
             "sensor": case.sensor.name,
             "measured": self.held_out_presses is not None,
@@ -405,12 +405,12 @@ def _study_drawings(
     Args:
         content: Section of the report of a simulated dataset.
         case: The conditions of the test.
-        draws: Estimates of the released model under several noise draws.
+        draws: Estimates of the evaluated model under several noise draws.
     """
     by_force = content["by_force"]
     mismatch_results = content["cases"]
-    released_record = content["methods"][0]  # the released model is always listed first
-    nominal_error_mm = released_record.errors.position_rms_mm
+    evaluated_record = content["methods"][0]  # the evaluated model is always listed first
+    nominal_error_mm = evaluated_record.errors.position_rms_mm
 
     noise_results = [result for result in mismatch_results if result["group"] == "noise"]
     method_names = noise_results[0]["errors"].keys()

@@ -1,4 +1,4 @@
-"""Figures of merit of the compared methods: errors, costs, Pareto fronts, and a comparison with the released model.
+"""Figures of merit of the compared methods: errors, costs, Pareto fronts, and a comparison with the evaluated model.
 
 Each method has one error, which is the root-mean-square position error. Each method has three costs: the time of one
 prediction, the throughput of batches, and the memory. A method is on the Pareto front of a cost unless another method
@@ -238,24 +238,24 @@ SPEED_NAMES: dict[Cost, str] = {"latency": "single predictions", "throughput": "
 """Names of the two costs that are speeds in the sentences of the report, by the cost."""
 
 
-def compare_with_released(records: Sequence[MethodRecord]) -> dict[str, Any]:
-    """Compare all comparable methods with the released model in speed and error.
+def compare_with_evaluated_model(records: Sequence[MethodRecord]) -> dict[str, Any]:
+    """Compare all comparable methods with the evaluated model in speed and error.
 
     Args:
-        records: Records of all methods; the first one is the record of the released model.
+        records: Records of all methods; the first one is the record of the evaluated model.
 
     Returns:
         The value of "verdict" in `report.json`, which has two entries. The entry "sentences" is a list of sentences
-        about the methods and the networks other than the released model. The entry "both" contains a list of labels for
-        "latency" and a list of labels for "throughput". Each list contains the methods that are both faster and more
-        accurate than the released model.
+        about the methods and the networks other than the evaluated model. The entry "both" contains a list of labels
+        for "latency" and a list of labels for "throughput". Each list contains the methods that are both faster and
+        more accurate than the evaluated model.
     """
-    released = records[0]
+    evaluated_record = records[0]
     comparable = [record for record in records[1:] if record.is_comparable]
     faster_and_more_accurate = {}
     for cost in SPEED_NAMES:
-        faster = _faster_records(comparable, released, cost)
-        labels = [record.label for record in faster if record.error_mm < released.error_mm]
+        faster = _faster_records(comparable, evaluated_record, cost)
+        labels = [record.label for record in faster if record.error_mm < evaluated_record.error_mm]
         faster_and_more_accurate[cost] = labels
 
     other_methods = [record for record in comparable if record.method.kind != "network"]
@@ -263,54 +263,56 @@ def compare_with_released(records: Sequence[MethodRecord]) -> dict[str, Any]:
     sentences = []
     for group_name, group in (("other methods", other_methods), ("other networks", networks)):
         if group:
-            sentences += [_comparison_sentence(cost, released, group, group_name) for cost in SPEED_NAMES]
+            sentences += [_comparison_sentence(cost, evaluated_record, group, group_name) for cost in SPEED_NAMES]
     return {"both": faster_and_more_accurate, "sentences": sentences}
 
 
-def _speed_ratio(record: MethodRecord, released: MethodRecord, cost: Cost) -> float:
-    """Return the speed of a method divided by the speed of the released model.
+def _speed_ratio(record: MethodRecord, evaluated_record: MethodRecord, cost: Cost) -> float:
+    """Return the speed of a method divided by the speed of the evaluated model.
 
     Args:
         record: Record of the method.
-        released: Record of the released model.
+        evaluated_record: Record of the evaluated model.
         cost: Kind of speed: "latency" or "throughput".
     """
-    cost_ratio = released.cost(cost) / record.cost(cost)
+    cost_ratio = evaluated_record.cost(cost) / record.cost(cost)
     # A latency is a duration, so its inverse is the speed. The throughput is a speed itself. Its sign of -1 inverts the
     # ratio.
     return float(cost_ratio ** COST_SIGNS[cost])
 
 
-def _faster_records(records: Sequence[MethodRecord], released: MethodRecord, cost: Cost) -> list[MethodRecord]:
-    """Return the records of the methods that are faster than the released model."""
-    return [record for record in records if _speed_ratio(record, released, cost) > 1.0]
+def _faster_records(records: Sequence[MethodRecord], evaluated_record: MethodRecord, cost: Cost) -> list[MethodRecord]:
+    """Return the records of the methods that are faster than the evaluated model."""
+    return [record for record in records if _speed_ratio(record, evaluated_record, cost) > 1.0]
 
 
-def _comparison_sentence(cost: Cost, released: MethodRecord, group: Sequence[MethodRecord], group_name: str) -> str:
-    """Return sentences that compare the methods of a group with the released model.
+def _comparison_sentence(
+    cost: Cost, evaluated_record: MethodRecord, group: Sequence[MethodRecord], group_name: str
+) -> str:
+    """Return sentences that compare the methods of a group with the evaluated model.
 
-    The first sentence states how many methods are both faster and more accurate than the released model. The second
+    The first sentence states how many methods are both faster and more accurate than the evaluated model. The second
     sentence describes the most accurate of the faster methods. If no method is faster, a single sentence states this.
 
     Args:
         cost: The kind of speed: "latency" or "throughput".
-        released: Record of the released model.
+        evaluated_record: Record of the evaluated model.
         group: Records of the methods of the group; at least one.
         group_name: Name of the group in the sentence, in the plural.
     """
-    faster = _faster_records(group, released, cost)
+    faster = _faster_records(group, evaluated_record, cost)
     if not faster:
-        return f"In {SPEED_NAMES[cost]}, none of {len(group)} {group_name} is faster than the released model."
-    n_more_accurate = sum(record.error_mm < released.error_mm for record in faster)
+        return f"In {SPEED_NAMES[cost]}, none of {len(group)} {group_name} is faster than the evaluated model."
+    n_more_accurate = sum(record.error_mm < evaluated_record.error_mm for record in faster)
     verb = "are" if n_more_accurate > 1 else "is"
 
     most_accurate = min(faster, key=lambda record: record.error_mm)
-    speed_ratio = _speed_ratio(most_accurate, released, cost)
-    error_change_percent = 100.0 * (most_accurate.error_mm / released.error_mm - 1.0)
+    speed_ratio = _speed_ratio(most_accurate, evaluated_record, cost)
+    error_change_percent = 100.0 * (most_accurate.error_mm / evaluated_record.error_mm - 1.0)
     comparative = "less" if error_change_percent < 0.0 else "more"
     return (
         f"In {SPEED_NAMES[cost]}, {n_more_accurate or 'none'} of {len(group)} {group_name} {verb} both faster and "
-        f"more accurate than the released model. The most accurate of the faster ones is {most_accurate.label}: it is "
-        f"{speed_ratio:.3g} times as fast as the released model, with {abs(error_change_percent):.2g} % {comparative} "
+        f"more accurate than the evaluated model. The most accurate of the faster ones is {most_accurate.label}: it is "
+        f"{speed_ratio:.3g} times as fast as the evaluated model, with {abs(error_change_percent):.2g} % {comparative} "
         "error."
     )

@@ -14,7 +14,7 @@ from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.common.progress import track
 from isocharge.serve.benchmark import Contender, Timing, take_turns
 from isocharge.train.baselines.compared_methods import ComparedMethod, FittingTask
-from isocharge.train.baselines.networks import OnnxContact, ReleasedModel
+from isocharge.train.baselines.networks import OnnxContact, StoredModel
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.report.case import Settings
 from isocharge.train.report.measures import ContactErrors, MethodRecord, round_significant, with_pareto_fronts
@@ -140,7 +140,7 @@ def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callabl
     inputs = _test_inputs(method, test)[:SINGLE_PRESSES]
     regressor = method.regressor
     calls: list[Callable[[], object]]
-    if isinstance(regressor, OnnxContact | ReleasedModel):
+    if isinstance(regressor, OnnxContact | StoredModel):
         calls = [regressor.single_press_function(press_input) for press_input in inputs]
     else:
         # `predict` expects a batch, so each press becomes a batch of one press, shape (1, n_input).
@@ -227,6 +227,6 @@ def bayes_ratio(estimate: Array, posterior_mean: Array, truth: Array) -> float |
 def _serialised_bytes(method: ComparedMethod) -> int:
     """Return the size of the ONNX file of a network, or the size of the pickle of another regressor, in bytes."""
     regressor = method.regressor
-    if isinstance(regressor, OnnxContact | ReleasedModel):
+    if isinstance(regressor, OnnxContact | StoredModel):
         return len(regressor.graph)
     return len(pickle.dumps(regressor, protocol=pickle.HIGHEST_PROTOCOL))

@@ -34,27 +34,27 @@ def report_page(record: Mapping[str, Any]) -> str:
 
 
 def _summary_lines(section: SectionContent) -> Iterator[str]:
-    """Yield the lines of the summary: the errors of the released model, and its comparison with the other methods.
+    """Yield the lines of the summary: the errors of the evaluated model, and its comparison with the other methods.
 
     The line about the Bayes limit is left out if this limit was not computed.
 
     Args:
         section: Content of the section.
     """
-    released: MethodRecord = section["methods"][0]  # the released model is always listed first
-    errors = released.errors
-    yield f"**{section['sensor']}**, released model `{section['model']['label']}`:\n"
+    evaluated_record: MethodRecord = section["methods"][0]  # the evaluated model is always listed first
+    errors = evaluated_record.errors
+    yield f"**{section['sensor']}**, evaluated model `{section['model']['label']}`:\n"
     yield (
         f"- The position error is {errors.position_rms_mm:.3g} mm rms ({errors.position_median_mm:.3g} mm median), the "
         f"force error is {errors.force_rms_percent:.3g} % rms, and the prediction of one press takes "
-        f"{released.single_timing.p50_us:.3g} us."
+        f"{evaluated_record.single_timing.p50_us:.3g} us."
     )
-    if released.bayes_ratio:
+    if evaluated_record.bayes_ratio:
         bayes = section["limits"]["bayes"]
         yield (
-            f"- The position error is {released.bayes_ratio:.3f} times the Bayes limit. The Bayes limit on the same "
-            f"charges is {bayes['position_rms_mm']:.3g} mm and {bayes['force_rms_percent']:.3g} % of the force. No "
-            "method has a smaller mean squared error."
+            f"- The position error is {evaluated_record.bayes_ratio:.3f} times the Bayes limit. The Bayes limit on the "
+            f"same charges is {bayes['position_rms_mm']:.3g} mm and {bayes['force_rms_percent']:.3g} % of the force. "
+            "No method has a smaller mean squared error."
         )
     for sentence in section["verdict"]["sentences"]:
         yield f"- {sentence}"
@@ -226,7 +226,7 @@ def _mismatch_effects(section: SectionContent) -> Iterator[str]:
     yield _picture(section, "noise")
     yield _picture(section, "effects")
     yield (
-        "The table shows the root-mean-square position errors in mm, and the alarms of the released model (misfit "
+        "The table shows the root-mean-square position errors in mm, and the alarms of the evaluated model (misfit "
         f"above {_number_text(section['alarm_threshold'])} standard deviations of the noise)."
     )
     method_names = list(section["cases"][0]["errors"])
@@ -236,7 +236,7 @@ def _mismatch_effects(section: SectionContent) -> Iterator[str]:
     yield (
         f"Wrong gains have independent errors of {100 * GAIN_STD:g} % rms for every electrode and every press. The "
         f"other pretension is {PRETENSION_ERROR_MPa:g} MPa larger than the models assume. The force errors and the "
-        "coverage are those of the released model."
+        "coverage are those of the evaluated model."
     )
 
 
@@ -245,14 +245,14 @@ def _mismatch_row(result: Mapping[str, Any], method_names: Sequence[str]) -> lis
 
     Args:
         result: Result of `studies.measure_mismatch`.
-        method_names: Names of the methods in the order of the columns; the first one is the released model.
+        method_names: Names of the methods in the order of the columns; the first one is the evaluated model.
     """
     errors = result["errors"]
-    released_errors = errors[method_names[0]]
+    evaluated_errors = errors[method_names[0]]
     return [
         f"{result['group']}: {result['case']}",
         *(_number_text(errors[name]["position_rms_mm"]) for name in method_names),
-        _number_text(released_errors["force_rms_percent"]),
+        _number_text(evaluated_errors["force_rms_percent"]),
         f"{100 * result['coverage_68']:.1f}",
         _number_text(result["alarms_percent"]),
     ]
@@ -293,10 +293,10 @@ CAPTIONS = {
     "throughput": "Position error (rms, mm) against the predictions per second in batches. The axis is reversed, so "
     "that faster methods are on the left.",
     "memory": "Position error (rms, mm) against the size of the serialised method (bytes).",
-    "maps": "Root-mean-square errors of the released model over the film, for all forces and several draws of the "
+    "maps": "Root-mean-square errors of the evaluated model over the film, for all forces and several draws of the "
     "noise. Squares: electrodes. Dotted line: edge of the working area.",
     "force": "Position error (rms, mm) against the force (N).",
-    "calibration": "Coverage of the central intervals of the released model (fraction of the true values inside an "
+    "calibration": "Coverage of the central intervals of the evaluated model (fraction of the true values inside an "
     "interval) minus the nominal level. Shaded area: 2 percentage points.",
     "noise": "Position error (rms, mm) against the noise, relative to the noise for which the methods were fitted.",
     "effects": "Left: position error (rms, mm) if the probe, the pretension or the gains differ from what the methods "

@@ -15,7 +15,7 @@ from isocharge.common.statistics import rms
 from isocharge.simulate import Domain, Sensor
 from isocharge.simulate.plots.figure import FELT, INK, new_axes, new_figure
 from isocharge.simulate.plots.film import draw_layout
-from isocharge.train.baselines.networks import RELEASED
+from isocharge.train.baselines.networks import EVALUATED_MODEL
 from isocharge.train.model_release.evaluate import FALSE_ALARM_RATE
 from isocharge.train.report.case import BAYES, CRAMER_RAO
 from isocharge.train.report.measures import Cost, MethodRecord
@@ -31,11 +31,11 @@ MARKERS = "osv^DPX<>h"
 """Markers that the methods of one kind use in turn."""
 
 LINE_STYLES: dict[str, dict[str, Any]] = {
-    RELEASED: {"color": FELT, "marker": "*", "ms": 10, "lw": 2.0, "zorder": 3},
+    EVALUATED_MODEL: {"color": FELT, "marker": "*", "ms": 10, "lw": 2.0, "zorder": 3},
     BAYES: {"color": INK, "marker": "", "ls": "-", "lw": 2.0},
     CRAMER_RAO: {"color": INK, "marker": "", "ls": ":", "lw": 2.0},
 }
-"""Matplotlib styles of the released model and of the limits, by name.
+"""Matplotlib styles of the evaluated model and of the limits, by name.
 
 Other methods have the style `DEFAULT_LINE_STYLE`.
 """
@@ -95,7 +95,7 @@ def _draw_methods(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> No
     """Draw one point for each method.
 
     The colour shows the kind of the method. Methods of one kind have different markers. If a method uses the true force
-    or has no estimate for some presses, its point is hollow. The released model is a star.
+    or has no estimate for some presses, its point is hollow. The evaluated model is a star.
 
     Args:
         axes: Axes of matplotlib.
@@ -109,7 +109,7 @@ def _draw_methods(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> No
         fill_colour = colour if record.is_comparable else "white"
         marker = next(markers_by_kind[kind])
         style: dict[str, Any] = {"color": colour, "mfc": fill_colour, "marker": marker, "ms": 7}
-        if record.method.name == RELEASED:
+        if record.method.name == EVALUATED_MODEL:
             style = {"color": FELT, "marker": "*", "ms": 14}
         label = f"{record.method.name}, {record.error_mm:.3g} mm"
         axes.plot(record.cost(cost), record.error_mm, ls="", label=label, **style)
@@ -155,14 +155,14 @@ def _set_logarithmic_axes(axes: Axes, x_label: str, y_label: str) -> None:
 
 
 def error_maps(sensor: Sensor, domain: Domain, draws: NoiseDraws) -> Figure:
-    """Draw maps of the root-mean-square errors of the released model over the film.
+    """Draw maps of the root-mean-square errors of the evaluated model over the film.
 
     The left map shows the position error in mm, and the right map shows the relative error of the force in %.
 
     Args:
         sensor: The sensor, whose electrodes are drawn.
         domain: The working area, whose edge is drawn.
-        draws: Estimates of the released model under several noise draws.
+        draws: Estimates of the evaluated model under several noise draws.
 
     Returns:
         Figure with both maps.
@@ -215,7 +215,7 @@ def _line_style(name: str) -> dict[str, Any]:
 
 
 def coverage_plot(record: Mapping[str, Any]) -> Figure:
-    """Draw the coverage of the intervals of the released model minus the nominal level, in percentage points.
+    """Draw the coverage of the intervals of the evaluated model minus the nominal level, in percentage points.
 
     A shaded band shows the tolerance. If a point is above zero, the intervals contain more true values than their
     nominal level states.
@@ -246,7 +246,7 @@ def mismatch_plot(results: Sequence[Mapping[str, Any]], nominal_error_mm: float 
 
     Args:
         results: Results of `studies.measure_mismatch`.
-        nominal_error_mm: Position error of the released model without a mismatch, mm; None if it is unknown.
+        nominal_error_mm: Position error of the evaluated model without a mismatch, mm; None if it is unknown.
 
     Returns:
         Figure with the errors on the left and the alarms on the right.

@@ -1,4 +1,4 @@
-"""Selection of the presses of a dataset on which a released model can be evaluated.
+"""Selection of the presses of a dataset on which a model can be evaluated.
 
 A model can only be evaluated on presses of its own sensor, within the working area and the forces of its training.
 """

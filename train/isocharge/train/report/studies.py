@@ -1,4 +1,4 @@
-"""Studies of the errors of the released model in addition to its mean error.
+"""Studies of the errors of the evaluated model in addition to its mean error.
 
 One study computes the errors as a function of the place and of the force. Another study computes the coverage of the
 reported standard deviations. A third study computes the errors under conditions that differ from the training: other
@@ -17,7 +17,7 @@ from isocharge.common.contact_errors import position_error
 from isocharge.common.statistics import rms
 from isocharge.simulate import Domain, NoiseModel, parse_probe
 from isocharge.train.baselines.compared_methods import ComparedMethod
-from isocharge.train.baselines.networks import ReleasedModel
+from isocharge.train.baselines.networks import StoredModel
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.report.case import CRAMER_RAO, EvaluationCase, Settings, simulate_presses
 from isocharge.train.report.measures import ContactErrors, interval_coverage, round_significant
@@ -37,7 +37,7 @@ COORDINATES = ("x", "y", "force")
 
 @dataclass(frozen=True)
 class NoiseDraws:
-    """Estimates of the released model for all test presses under several draws of the noise.
+    """Estimates of the evaluated model for all test presses under several draws of the noise.
 
     Attributes:
         truth: True contacts (x, y, F), repeated for each draw, shape (n_press * n_draw, 3), mm and N.
@@ -53,12 +53,12 @@ class NoiseDraws:
 
     @classmethod
     def draw(
-        cls, released: ReleasedModel, clean_presses: LabelledPresses, case: EvaluationCase, draw_count: int
+        cls, evaluated_model: StoredModel, clean_presses: LabelledPresses, case: EvaluationCase, draw_count: int
     ) -> "NoiseDraws":
         """Draw the noise of the test presses several times, and estimate all contacts each time.
 
         Args:
-            released: The released model.
+            evaluated_model: The evaluated model.
             clean_presses: The test presses without noise.
             case: The case, with noise and seed.
             draw_count: Number of noise draws for each press.
@@ -69,7 +69,7 @@ class NoiseDraws:
         first_seed = case.seed + NOISE_DRAWS_SEED
         charges_by_draw = [clean_presses.noisy(case.noise, first_seed + draw) for draw in range(draw_count)]
         all_charges = np.concatenate(charges_by_draw)  # shape (draw_count * n_press, n_electrode)
-        estimate, std, misfit = released.answer(all_charges)
+        estimate, std, misfit = evaluated_model.answer(all_charges)
         truth = np.tile(clean_presses.contact, (draw_count, 1))
         return cls(truth, estimate, std, misfit[:, 0])
 
@@ -134,7 +134,7 @@ def coverage_by_level(draws: NoiseDraws) -> dict[str, Any]:
     """Compute the coverage of the central intervals at many nominal levels.
 
     Args:
-        draws: Estimates of the released model under several draws of the noise, with their standard deviations.
+        draws: Estimates of the evaluated model under several draws of the noise, with their standard deviations.
 
     Returns:
         The nominal levels ("levels"), and for x, y and the force the fractions of true values inside the intervals
@@ -287,30 +287,30 @@ def _dead_electrodes(
 
 def measure_mismatch(
     mismatch: Mismatch,
-    released_name: str,
-    released: ReleasedModel,
+    evaluated_name: str,
+    evaluated_model: StoredModel,
     other_methods: Sequence[ComparedMethod],
     alarm_threshold: float,
 ) -> dict[str, Any]:
-    """Measure the errors of the released model and of other methods under a mismatch.
+    """Measure the errors of the evaluated model and of other methods under a mismatch.
 
     The estimates of the other methods are clipped to the range from -`CLIP_LIMIT` to `CLIP_LIMIT`, because polynomials
     diverge for charges outside their training range.
 
     Args:
         mismatch: The presses with their charges.
-        released_name: Name of the released model in the results.
-        released: The released model.
+        evaluated_name: Name of the evaluated model in the results.
+        evaluated_model: The evaluated model.
         other_methods: Other fitted methods.
-        alarm_threshold: Misfit above which the released model gives an alarm, in standard deviations of the noise.
+        alarm_threshold: Misfit above which the evaluated model gives an alarm, in standard deviations of the noise.
 
     Returns:
-        One entry of "cases" in `report.json`. It contains the errors of each method. For the released model, it also
+        One entry of "cases" in `report.json`. It contains the errors of each method. For the evaluated model, it also
         contains the percentage of presses with an alarm, and the fraction of the true values within one standard
         deviation of the estimate ("coverage_68").
     """
-    estimate, std, misfit = released.answer(mismatch.charge)
-    errors = {released_name: asdict(ContactErrors.compute(estimate, mismatch.truth))}
+    estimate, std, misfit = evaluated_model.answer(mismatch.charge)
+    errors = {evaluated_name: asdict(ContactErrors.compute(estimate, mismatch.truth))}
     for method in other_methods:
         with np.errstate(over="ignore"):  # a diverging polynomial may overflow
             method_estimate = method.regressor.predict(mismatch.charge)
