@@ -55,7 +55,7 @@ class TouchPeak:
     @property
     def mean_charge_pC(self) -> Array:
         """Average of the touch charges, shape (n_electrode,), pC."""
-        return np.mean(self._averaged_charges_pC, axis=0)
+        return np.asarray(np.mean(self._averaged_charges_pC, axis=0))
 
     def relative_noise_variance(self, frame_variance_pC2: Array) -> float:
         """Estimate the variance of the noise of the average charges, relative to the variance for a single frame.
