@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import socket
+import tomllib
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -46,6 +47,14 @@ def test_frame_of_the_documentation_is_read():
     )
     assert encode_frame(Frame(1, 5000, (850.0, 840.5, 846.25))) == after
     assert cobs_decode(after[:-1]) == before
+
+
+def test_described_frames_of_the_documentation_are_read():
+    table = tomllib.loads(re.search(r"```toml\n(.*?)```", PAGES["own_frames.md"], re.DOTALL)[1])
+    layout = device_from_table(table, "board.toml").frames
+    parser = device_from_table(table, "board.toml").parser()
+    frame = Frame(7, None, (100.0, -200.0, 300.0), names=("A", "B", "C"))
+    assert parser.feed(layout.encode(frame)) == [frame]
 
 
 @pytest.fixture(scope="module")
