@@ -108,14 +108,19 @@ def calibrated_files(sensor: str, seed: int) -> dict[str, bytes]:
         return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
 
 
+def write_files(folder, files):
+    """Write the files of a model folder, which are given as bytes by their paths, and return the folder."""
+    for name, data in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+    return folder
+
+
 @pytest.fixture(scope="module")
 def mine(tmp_path_factory) -> Path:
     """The folder of the calibrated film."""
     folder = tmp_path_factory.mktemp("films") / "mine"
-    for name, data in kept(calibrated_files, "four-25um-biaxial", 5).items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(data)
-    return folder
+    return write_files(folder, kept(calibrated_files, "four-25um-biaxial", 5))
 
 
 @pytest.fixture(scope="module")

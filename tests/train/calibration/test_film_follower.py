@@ -8,7 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from tests.train.calibration.conftest import DEGREE_MPa, film_of, follow_touches, rms_errors, touch_charges
+from tests.train.calibration.conftest import (
+    DEGREE_MPa,
+    calibrated_files,
+    film_of,
+    follow_touches,
+    rms_errors,
+    touch_charges,
+    write_files,
+)
 
 from isocharge.common.errors import ModelError
 from isocharge.common.statistics import rms
@@ -25,13 +33,14 @@ from isocharge.serve.model.pretensions import read_pretensions
 from isocharge.serve.signal_chain.thermal import TRIED_PC, ThermalRule
 from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule
 from isocharge.serve.tracking.touch_misfits import TYPICAL_MISFIT, SeriesMisfits
-from isocharge.simulate import load_sensor
-from isocharge.train import write_calibration
+from isocharge.simulate import Circle, load_sensor
+from isocharge.train import CalibrationProblem, write_calibration
 from isocharge.train.calibration.film_charge_series import film_charge_series
 from isocharge.train.calibration.film_directions import film_directions
 from isocharge.train.calibration.problem import FilmEstimate
 from isocharge.train.calibration.result import film_without_presses
 from isocharge.train.data.presses import draw_contacts
+from kept import kept
 
 pytestmark = pytest.mark.usefixtures("no_closed_backs")
 
@@ -354,6 +363,36 @@ def test_touches_with_many_noisy_frames_count(mine, problem, film):
         follower.observe_frame(None, None, (), 0.1)
     assert touches_with_misfit > 5
     assert follower.film.touches == 10
+
+
+@pytest.mark.parametrize("misfit_count", [6, 7, 12])
+def test_touches_with_a_misfit_count_if_most_touches_have_one(mine, film, touch_charge, misfit_count):
+    """Of twelve touches, the last ones have a misfit. They count from the seventh touch with a misfit on."""
+    follower = FilmFollower(Predictor(mine))
+    misfit_charge = film(1.0).charges(np.array([[0.0, 0.0, 0.5]]))[0] * [1.2, 0.8, 1.2, 0.8]
+    good_count = 12 - misfit_count
+    follow_touches(follower, np.array([touch_charge] * good_count + [misfit_charge] * misfit_count))
+    used_misfits = max(misfit_count - 6, 0)
+    assert follower.film.touches == good_count + used_misfits
+
+
+@pytest.mark.parametrize("change_MPa", [-DEGREE_MPa, DEGREE_MPa])
+def test_uniaxial_film_is_followed_although_most_touches_have_a_misfit(tmp_path, change_MPa):
+    """The calibrated model has errors of the force of 13 to 17 %."""
+    problem = CalibrationProblem.of(load_sensor("four-25um-uniaxial"), Circle(1.0))
+    model = Predictor(write_files(tmp_path / "uniaxial", kept(calibrated_files, "four-25um-uniaxial", 5)))
+    changed_film = problem.charges.forward_map(np.append(1.0 + change_MPa, film_of(problem)[1:]))
+    contact, charge = touch_charges(problem, lambda _: changed_film, model, 1.0 + change_MPa, 120, seed=8)
+    touches = slice(0, 60)
+    later = slice(60, 120)
+    touches_with_misfit = ["misfit" in model.flags(model.predict(row)) for row in charge[touches]]
+    assert np.mean(touches_with_misfit) > 0.5
+
+    follower = FilmFollower(model)
+    follow_touches(follower, charge[touches])
+    answers = [follower.follow_contact(follower.predictor.predict(row), row).contact for row in charge[later]]
+    force_N = np.array([answer.force_N for answer in answers])
+    assert rms(force_N / contact[later, 2] - 1.0) < 0.02
 
 
 @pytest.mark.parametrize("change", ["gone", "damaged", "another model", "another model without checksums"])

@@ -56,6 +56,13 @@ The noise of a single frame may cause the flag MISFIT. Therefore the misfit of t
 whether the touch is used.
 """
 
+MISFIT_WINDOW = 12
+"""Number of the latest touches from which the follower decides whether touches with the flag MISFIT are used.
+
+If a few touches have the flag, they are probably faulty, for example because two fingers touched the film. If more than
+half of the touches have the flag, the film has probably changed, and the touches show how.
+"""
+
 RECENT_TOUCHES = 40
 """Number of the latest touches from which the follower decides whether the film is lost."""
 
@@ -228,6 +235,7 @@ class FilmFollower:
         self._stored_ratios_contact: Contact | None = None
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
         self._touch_count = 0
+        self._recent_misfit_flags: deque[bool] = deque(maxlen=MISFIT_WINDOW)  # of all touches, used or not
         self._recent_misfits: deque[SquaredMisfits] = deque(maxlen=RECENT_TOUCHES)
         self._recent_estimates: deque[FilmStateEstimate] = deque(maxlen=RECENT_TOUCHES)
         self.discard_touch()
@@ -276,8 +284,8 @@ class FilmFollower:
     def _end_touch(self, clock_s: float) -> None:
         """Update the estimate with the touch that has just ended, unless the touch is unusable.
 
-        A touch is unusable if one of its frames has a flag that is not harmless, if no frame was averaged, or if no
-        contact explains the average charges.
+        A touch is unusable if one of its frames has a flag that is not harmless, or if no frame was averaged. A touch
+        whose average charges no contact explains is only used if this applies to most of the latest touches.
 
         Args:
             clock_s: Time of the first frame without contact on a clock that does not jump, s.
@@ -285,7 +293,10 @@ class FilmFollower:
         if self._peak is not None and self._is_touch_usable:
             charge_pC = self._peak.mean_charge_pC
             contact = self.predictor.predict(charge_pC)
-            if MISFIT not in self.predictor.flags(contact):
+            has_misfit = MISFIT in self.predictor.flags(contact)
+            self._recent_misfit_flags.append(has_misfit)
+            is_misfit_common = sum(self._recent_misfit_flags) > MISFIT_WINDOW // 2
+            if is_misfit_common or not has_misfit:
                 frame_variance_pC2 = self.predictor.metadata.noise.variance(charge_pC)
                 misfit_std = relative_misfit_std(self._peak.relative_noise_variance(frame_variance_pC2))
                 self.observe_touch(Touch(contact, charge_pC, misfit_std), clock_s)
