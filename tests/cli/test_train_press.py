@@ -280,7 +280,7 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk
     np.testing.assert_array_equal(presses.contact, places)
 
     table = json.loads(command("train", "calibrate", "presses.csv", *PRESS[2:4], "--json")[1])
-    assert table["film_error"] == lines[0]["film_error"]
+    assert table["error_left"] == lines[0]["error_left"]
 
 
 @pytest.mark.slow  # in `make test`, a session continues after the end of its port, and its open file is read

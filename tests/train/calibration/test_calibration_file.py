@@ -91,8 +91,8 @@ def test_calibrate_continues_from_a_film_with_a_discrepancy(imperfect, problem, 
     later = json.loads(out)
     expected = imperfect.posterior.drifted(problem.prior)
     expected_error = imperfect.sensitivity.contact_error(expected.joint)
-    assert later["film_error_before"]["position_mm"] == pytest.approx(expected_error.position_mm, rel=0.02)
-    assert later["film_error"]["position_mm"] < later["film_error_before"]["position_mm"]
+    assert later["error_left_before"]["position_mm"] == pytest.approx(expected_error.position_mm, rel=0.02)
+    assert later["error_left"]["position_mm"] < later["error_left_before"]["position_mm"]
     earlier = read_earlier(tmp_path / "mine", problem)
     np.testing.assert_allclose(earlier.joint, expected.joint, atol=1e-5)
 

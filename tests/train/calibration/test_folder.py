@@ -53,7 +53,7 @@ def test_calibrated_model_has_the_expected_errors_on_the_film(film, problem):
 def test_all_files_are_written_and_read_back(film, problem):
     _, result, folder = film
     table = json.loads((folder / "calibration.json").read_text("utf-8"))
-    assert table["film_error"]["position_mm"] == pytest.approx(result.film_error.position_mm)
+    assert table["error_left"]["position_mm"] == pytest.approx(result.film_error.position_mm)
     assert table["parameters"]["pretension"]["value"] == pytest.approx(1e6 * result.posterior.parameters[0])  # Pa
     assert np.shape(table["correlations"]) == (13, 13)
     parameters = problem.prior.parameters_of(load_sensor(folder / "sensor.toml"), result.film[1])

@@ -133,7 +133,7 @@ def test_calibrate_moves_a_film_to_another_temperature(calibration, tmp_path, co
     assert change_MPa == pytest.approx(-warming.MPa_per_K * (warming.at_C - 20.5))
     assert table["temperature"]["at_C"] == 20.5
     # The change per kelvin is uncertain, so the error is larger at another temperature.
-    assert table["film_error"]["force_percent"] > calibration.film_error.force_percent
+    assert table["error_left"]["force_percent"] > calibration.film_error.force_percent
     assert table["words"][1].startswith("The film was moved from 21.5 C")
 
 

@@ -291,7 +291,7 @@ def _press_table(session: PressSession, press: SteadyPress) -> dict[str, object]
         "held_s": press.held_s,
         "frames": press.frames,
         "flags": list(press.flags),
-        "film_error": None if result is None else error_table(result.film_error),
+        "error_left": None if result is None else error_table(result.film_error),
         "left_out": [] if result is None else list(result.bad_lines),
         "problem": session.refusal or None,
         "enough": session.enough,
