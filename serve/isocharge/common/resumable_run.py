@@ -272,11 +272,12 @@ def draft_of(target: Path) -> Path:
     return path_with_name.parent / f"{path_with_name.name}.part"
 
 
-def check_target_is_new(target: Path) -> None:
-    """Check that the target of a run does not exist, and remove the draft of a run that has already ended.
+def prepare_target(target: Path) -> None:
+    """Remove a draft that an ended run has left behind, and check that the target of a new run does not exist.
 
-    The draft is a folder that stores the finished parts of the run. At the end of the run, its folder `data` is renamed
-    to the target, and the draft is removed. If the process was killed between these two steps, the draft remains.
+    A draft is a folder that stores the finished parts of a run. At the end of the run, the folder `data` of the draft
+    is renamed to the target, and the draft is removed. If the process is killed between these two steps, the draft
+    remains.
 
     Args:
         target: File or folder that the run writes.
@@ -285,7 +286,7 @@ def check_target_is_new(target: Path) -> None:
         OutputExists: If the target exists.
     """
     draft = ResumableRun(target)
-    is_draft = (draft.folder / "run.json").is_file()  # any other folder is never removed
+    is_draft = (draft.folder / "run.json").is_file()  # a folder that is no draft is never removed
     is_data_renamed = target.exists() and not draft.data.exists()
     if is_draft and is_data_renamed:
         draft.remove()
@@ -337,7 +338,7 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
         OutputExists: If the target exists, or the draft belongs to a run with other settings or is in use.
         OutputError: If a file cannot be written.
     """
-    check_target_is_new(target)
+    prepare_target(target)
     draft = ResumableRun(target)
     missing_parents = [parent for parent in target.parents if not parent.exists()]
     try:

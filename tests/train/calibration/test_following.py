@@ -20,7 +20,8 @@ from isocharge.serve import (
 from isocharge.serve.flags import FILM
 from isocharge.serve.live import recorded_stream
 from isocharge.serve.live.recorded_stream import RecordedStream
-from isocharge.serve.tracking.film_follower import FilmFollower, Touch
+from isocharge.serve.tracking.film_follower import FilmFollower
+from isocharge.serve.tracking.touch_collector import ObservedTouch
 from isocharge.train.calibration.following import _pretension_difference_std_MPa
 from isocharge.train.data.presses import draw_contacts
 
@@ -269,7 +270,7 @@ def test_gain_that_changes_late_is_not_taken_for_a_change_of_pretension(mine, pr
     stds_MPa = []
     calibrated_MPa = follower.film.pretension_MPa
     for number, row in enumerate(charge):
-        follower.observe_touch(Touch(follower.predictor.predict(row), row), 5.0 * number)
+        follower.observe_touch(ObservedTouch(follower.predictor.predict(row), row), 5.0 * number)
         changes_MPa.append(follower.film.pretension_MPa - calibrated_MPa)
         stds_MPa.append(follower.film.pretension_std_MPa)
     assert np.ptp(changes_MPa[299:]) < 0.25

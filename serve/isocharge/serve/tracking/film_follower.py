@@ -29,7 +29,6 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.flags import BEYOND, GAP, MISFIT, OUTSIDE, REPEAT, STRESS
 from isocharge.serve.model.film_directions import read_film_directions
 from isocharge.serve.prediction.contact import Contact, Sensitivity, is_close
 from isocharge.serve.prediction.predictor import Predictor
@@ -40,28 +39,8 @@ from isocharge.serve.tracking.film_state import FilmStateEstimate
 from isocharge.serve.tracking.film_update import TouchResiduals
 from isocharge.serve.tracking.followable_pretensions import followable_pretensions
 from isocharge.serve.tracking.pretension_grid import odds_of_no_change
-from isocharge.serve.tracking.touch_misfits import relative_misfit_std, touch_misfits
-from isocharge.serve.tracking.touch_peak import TouchPeak
-
-UNUSED_FRAME_FLAGS = frozenset({OUTSIDE, BEYOND, STRESS, GAP, REPEAT})
-"""Flags of frames that are not used, although the other frames of the same touch may be used.
-
-The first and the last frames of every touch have the flag OUTSIDE. GAP and REPEAT only mean that frames were lost.
-"""
-
-HARMLESS_FLAGS = UNUSED_FRAME_FLAGS | {MISFIT}
-"""Flags that do not make the touch of a frame unusable.
-
-The noise of a single frame may cause the flag MISFIT. Therefore the misfit of the average charges of the touch decides
-whether the touch is used.
-"""
-
-MISFIT_WINDOW = 12
-"""Number of the latest touches from which the follower decides whether touches with the flag MISFIT are used.
-
-If a few touches have the flag, they are probably faulty, for example because two fingers touched the film. If more than
-half of the touches have the flag, the film has probably changed, and the touches show how.
-"""
+from isocharge.serve.tracking.touch_collector import ObservedTouch, TouchCollector
+from isocharge.serve.tracking.touch_misfits import touch_misfits
 
 RECENT_TOUCHES = 40
 """Number of the latest touches from which the follower decides whether the film is lost."""
@@ -130,21 +109,6 @@ class FollowedContact(NamedTuple):
 
     contact: Contact
     charge_pC: Array
-
-
-class Touch(NamedTuple):
-    """A touch, described by its charges near the largest force.
-
-    Attributes:
-        contact: Contact that the model computed from the charges.
-        charge_pC: Touch charges, averaged over the frames with about the largest force, shape (n_electrode,), pC.
-        misfit_std: Root mean square misfit of good touches with as little noise as this touch, relative to the root
-            mean square misfit of single frames of good touches.
-    """
-
-    contact: Contact
-    charge_pC: Array
-    misfit_std: float = 1.0
 
 
 class SquaredMisfits(NamedTuple):
@@ -216,6 +180,7 @@ class FilmFollower:
         # Each row contains a wrong gain for one electrode, and the gain 1 for all other electrodes. The shape is
         # (n_wrong_gain * n_electrode, n_electrode).
         self._wrong_gains = 1.0 + np.kron(np.eye(electrodes), WRONG_GAINS[:, None])
+        self._touch_collector = TouchCollector()
         self.reset()
 
     def reset(self) -> None:
@@ -235,15 +200,13 @@ class FilmFollower:
         self._stored_ratios_contact: Contact | None = None
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
         self._touch_count = 0
-        self._recent_misfit_flags: deque[bool] = deque(maxlen=MISFIT_WINDOW)  # of all touches, used or not
         self._recent_misfits: deque[SquaredMisfits] = deque(maxlen=RECENT_TOUCHES)
         self._recent_estimates: deque[FilmStateEstimate] = deque(maxlen=RECENT_TOUCHES)
-        self.discard_touch()
+        self._touch_collector.reset()
 
     def discard_touch(self) -> None:
         """Discard the frames of the present touch, for example after an outage or a new tare."""
-        self._peak: TouchPeak | None = None
-        self._is_touch_usable = True
+        self._touch_collector.discard_touch()
 
     @property
     def film(self) -> FollowedFilm:
@@ -256,9 +219,8 @@ class FilmFollower:
     ) -> None:
         """Process the next frame, and update the estimate of the film when a touch ends.
 
-        The estimate is updated with the average charges of the frames with about the largest force. Frames with a flag
-        in `UNUSED_FRAME_FLAGS` are not averaged. A touch is not used if one of its frames has a flag that is not
-        harmless.
+        The estimate is updated with the average charges of the frames with about the largest force, unless the touch is
+        unusable; see `TouchCollector`.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC; None if nothing touches the film.
@@ -266,41 +228,13 @@ class FilmFollower:
             flags: Flags of the frame.
             clock_s: Time of the frame on a clock that does not jump, s.
         """
-        if contact is None:
-            self._end_touch(clock_s)
+        if contact is not None:
+            assert charge_pC is not None  # a frame with a contact has charges
+            self._touch_collector.add_frame(contact, charge_pC, flags)
             return
-        if not HARMLESS_FLAGS.issuperset(flags):
-            self._is_touch_usable = False
-            return
-        if not UNUSED_FRAME_FLAGS.isdisjoint(flags):
-            return
-
-        assert charge_pC is not None  # a frame with a contact has charges
-        if self._peak is None:
-            self._peak = TouchPeak(contact, charge_pC)
-        else:
-            self._peak.add_frame(contact, charge_pC)
-
-    def _end_touch(self, clock_s: float) -> None:
-        """Update the estimate with the touch that has just ended, unless the touch is unusable.
-
-        A touch is unusable if one of its frames has a flag that is not harmless, or if no frame was averaged. A touch
-        whose average charges no contact explains is only used if this applies to most of the latest touches.
-
-        Args:
-            clock_s: Time of the first frame without contact on a clock that does not jump, s.
-        """
-        if self._peak is not None and self._is_touch_usable:
-            charge_pC = self._peak.mean_charge_pC
-            contact = self.predictor.predict(charge_pC)
-            has_misfit = MISFIT in self.predictor.flags(contact)
-            self._recent_misfit_flags.append(has_misfit)
-            is_misfit_common = sum(self._recent_misfit_flags) > MISFIT_WINDOW // 2
-            if is_misfit_common or not has_misfit:
-                frame_variance_pC2 = self.predictor.metadata.noise.variance(charge_pC)
-                misfit_std = relative_misfit_std(self._peak.relative_noise_variance(frame_variance_pC2))
-                self.observe_touch(Touch(contact, charge_pC, misfit_std), clock_s)
-        self.discard_touch()
+        touch = self._touch_collector.end_touch(self.predictor)
+        if touch is not None:
+            self.observe_touch(touch, clock_s)
 
     def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
         """Correct a contact for the estimated changes of the film.
@@ -352,7 +286,7 @@ class FilmFollower:
             self._stored_ratios_contact = contact
         return self._stored_ratios
 
-    def observe_touch(self, touch: Touch, clock_s: float) -> None:
+    def observe_touch(self, touch: ObservedTouch, clock_s: float) -> None:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
 
         The film is lost if no pretension explains the latest touches, if the gain of an electrode seems to be wrong, or
@@ -390,7 +324,7 @@ class FilmFollower:
         is_long_enough = len(self._recent_estimates) == RECENT_TOUCHES
         return self._recent_estimates[0] if is_long_enough else self._calibrated_estimate
 
-    def _squared_misfits(self, touch: Touch, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
+    def _squared_misfits(self, touch: ObservedTouch, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
         """Compute the squared misfits of a touch, which are needed to decide whether the film is lost.
 
         Each squared misfit is limited to `LARGEST_SQUARE`, so that a single touch has little influence.
@@ -416,7 +350,7 @@ class FilmFollower:
             wrong_gain=np.minimum(wrong_gain_squares, LARGEST_SQUARE),
         )
 
-    def _squared_misfits_of_wrong_gains(self, corrected_touch: Touch, offset_variance: float) -> Array:
+    def _squared_misfits_of_wrong_gains(self, corrected_touch: ObservedTouch, offset_variance: float) -> Array:
         """Compute the squared misfit of a touch for each hypothesis that the gain of one electrode is wrong.
 
         Args:

@@ -18,7 +18,7 @@ from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
-from isocharge.common.resumable_run import check_target_is_new, resume_parts
+from isocharge.common.resumable_run import prepare_target, resume_parts
 from isocharge.simulate import Circle, load_sensor, noise_model, parse_probe
 from isocharge.simulate.artwork.design_folder import write_design, write_guard_design
 from isocharge.simulate.artwork.leads import straight_leads
@@ -100,7 +100,7 @@ def design_command(
     Example: isocharge simulate design four-25um-biaxial --guard --radius 8 -o guarded
     """
     # Check the options, and describe the search.
-    check_target_is_new(output)
+    prepare_target(output)
     footprint = parse_probe(probe)
     if not isinstance(footprint, Circle):
         raise InputError(f"--probe: expected circle:RADIUS, for which layouts are designed, got {probe}")

@@ -24,7 +24,7 @@ from isocharge.common.errors import InputError, OutputExists
 from isocharge.common.extras import require
 from isocharge.common.files import refuse_existing
 from isocharge.common.measured_presses import MAX_ROWS
-from isocharge.common.resumable_run import check_target_is_new
+from isocharge.common.resumable_run import prepare_target
 from isocharge.serve import MeasuredPresses, write_presses
 from isocharge.simulate import Dataset, Sweep, load_sensor, parse_probe, read_dataset, run_sweep
 from isocharge.simulate.sensor.probe import PROBE_HELP
@@ -110,7 +110,7 @@ def sweep_command(
         folder = output.with_suffix("")
         has_one_orientation = len(probes) == 1 and orientation is Orientation.fixed
         _check_table(table, folder, samples, has_one_orientation=has_one_orientation)
-    check_target_is_new(folder)
+    prepare_target(folder)
 
     _, max_force = force
     warn_of_stress(film_sensor.film, probes, max_force, stress_limit)

@@ -85,14 +85,16 @@ def _touching_groups(polygons: list[Electrode]) -> list[list[Electrode]]:
     Returns:
         The groups, in the order of their first polygons.
     """
-    touches = np.zeros((len(polygons), len(polygons)), dtype=bool)
+    # Compare each pair of polygons once, and number the groups of connected polygons.
+    is_connected = np.zeros((len(polygons), len(polygons)), dtype=bool)
     for (row, polygon), (column, other) in combinations(enumerate(polygons), 2):
-        touches[row, column] = polygon.overlaps(other, TOUCHING_DISTANCE)
-    _, group_of_polygon = connected_components(touches, directed=False)
+        is_connected[row, column] = polygon.overlaps(other, TOUCHING_DISTANCE)
+    _group_count, group_numbers = connected_components(is_connected, directed=False)
 
-    groups: dict[int, list[Electrode]] = {}  # a new group is added when its first polygon is reached
-    for polygon, group in zip(polygons, group_of_polygon.tolist(), strict=True):
-        groups.setdefault(group, []).append(polygon)
+    # A dictionary keeps the order in which its keys are added, which is the order of the first polygons.
+    groups: dict[int, list[Electrode]] = {}
+    for polygon, group_number in zip(polygons, group_numbers.tolist(), strict=True):
+        groups.setdefault(group_number, []).append(polygon)
     return list(groups.values())
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.progress import report
-from isocharge.common.resumable_run import ResumableRun, check_target_is_new, output_errors, resume_folder
+from isocharge.common.resumable_run import ResumableRun, output_errors, prepare_target, resume_folder
 from isocharge.simulate.dataset.sampling import SAMPLING_DESCRIPTIONS, Sweep, SweepPresses
 from isocharge.simulate.dataset.shards import (
     Samples,
@@ -85,7 +85,7 @@ def run_sweep(
     """
     folder = Path(folder)
     probes = tuple(probes)
-    check_target_is_new(folder)
+    prepare_target(folder)
 
     # The presses are computed before files are written, because SciPy ignores an interrupt during this computation.
     presses = sweep.over(probes)

@@ -11,7 +11,7 @@ from isocharge.cli.shared.options import FreshOption, JsonOption, NewFolderOptio
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.errors import InputError, ModelError
-from isocharge.common.resumable_run import check_target_is_new
+from isocharge.common.resumable_run import prepare_target
 from isocharge.serve import find_model
 from isocharge.simulate import Dataset, load_sensor, parse_probe, read_dataset
 from isocharge.train.data.presses import dataset_of
@@ -75,7 +75,7 @@ def report_command(
     Example: isocharge train report presses -o report
     """
     # Find the datasets and, for each of them, the model to compare.
-    check_target_is_new(output)
+    prepare_target(output)
     if model and len(model) != len(datasets):
         raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
     loaded_datasets = [_read_dataset(path, sensor, probe) for path in datasets]

@@ -441,8 +441,8 @@ class Connection(asyncio.Protocol):
     async def _answer_in_order(self, head: Head, body: bytes) -> None:
         """Answer a request in another thread, and then answer the requests that have arrived in the meantime.
 
-        If one of the later requests also needs another thread, all requests after it wait for its answer. If a request
-        after all of these requests was refused, the refusal is sent last.
+        If one of the later requests also needs another thread, all requests after it wait for its answer. A refusal
+        that was postponed is sent after the last answer.
 
         Args:
             head: Request line and headers of the request.
@@ -459,10 +459,8 @@ class Connection(asyncio.Protocol):
                 self._answer_in_thread(next_head, next_body)
             else:
                 self._answer(next_head, next_body)
-        if self._postponed_refusal is not None and self._answering is None:
-            refusal_response = self._postponed_refusal
-            self._postponed_refusal = None
-            self._send_refusal(refusal_response)
+        if self._answering is None:
+            self._send_postponed_refusal()
         self._parse_stored_data()
 
     def _remember(self, data: bytes) -> None:
@@ -543,6 +541,13 @@ class Connection(asyncio.Protocol):
             self._send_refusal(response)
         else:
             self._postponed_refusal = response
+
+    def _send_postponed_refusal(self) -> None:
+        """Send the refusal that had to wait for answers to earlier requests, if there is one."""
+        response = self._postponed_refusal
+        if response is not None:
+            self._postponed_refusal = None
+            self._send_refusal(response)
 
     def _send_refusal(self, response: Response) -> None:
         """Send a refusal as the last response of the connection.
