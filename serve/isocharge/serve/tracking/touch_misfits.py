@@ -50,7 +50,8 @@ CONSTANT_MISFIT_VARIANCE = 1.0
 """Variance of the part of the misfit that is equal in all frames of a touch, in units of the noise of a single frame.
 
 This part is caused by errors of the model of the film. On films that have not changed since the calibration, it is
-about `TYPICAL_MISFIT`^2 - 1. On changed films it is larger, because some of their changes are linearised or omitted.
+about the square of `TYPICAL_MISFIT` minus 1. On changed films it is larger, because some of their changes are
+linearised or omitted.
 """
 
 DAMPING = 1e-4
