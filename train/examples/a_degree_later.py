@@ -62,8 +62,11 @@ def update(presses: MeasuredPresses) -> CalibrationResult:
     return calibrate(presses, replace(problem, earlier=calibration.posterior.drifted(problem.prior)))
 
 
-def show_errors(label: str, result: CalibrationResult, forward_map: ForwardMap) -> None:
-    """Print the errors of a calibrated model for 1000 new touches of a film, and plot the position errors."""
+def show_errors(label: str, result: CalibrationResult, forward_map: ForwardMap, line: str) -> None:
+    """Print the errors of a calibrated model for 1000 new touches of a film, and plot the position errors.
+
+    The line has a colour for each warming, and is dashed after an update by touches and dotted after one by presses.
+    """
     contact, presses = touch(forward_map, 1000, is_known=True)
     estimate, _, misfit = result.fitted.predict(presses.charge_pC)
     distance = position_error(estimate, contact)
@@ -73,7 +76,7 @@ def show_errors(label: str, result: CalibrationResult, forward_map: ForwardMap) 
         f"rms, force {np.sqrt(np.mean(force_error**2)):.1f} % rms, {np.mean(force_error):+.1f} % on average, misfit "
         f"above {MISFIT_LIMIT:g} in {100.0 * np.mean(misfit > MISFIT_LIMIT):.1f} % of the touches"
     )
-    plt.plot(np.sort(distance), np.linspace(0.0, 1.0, len(distance)), label=label)
+    plt.plot(np.sort(distance), np.linspace(0.0, 1.0, len(distance)), line, label=label)
 
 
 as_calibrated, warmer_1_K, warmer_2_K, warmer_3_K = (film_at(warming_K) for warming_K in (0.0, 1.0, 2.0, 3.0))
@@ -83,19 +86,21 @@ _, unknown_touches_1_K = touch(warmer_1_K, 60, is_known=False)
 _, unknown_touches_3_K = touch(warmer_3_K, 60, is_known=False)
 _, known_presses_3_K = touch(warmer_3_K, 3, is_known=True)
 
-show_errors("as calibrated", calibration, as_calibrated)
-show_errors("1 K warmer", calibration, warmer_1_K)
-show_errors("1 K warmer, after 60 touches", update(unknown_touches_1_K), warmer_1_K)
-show_errors("3 K warmer", calibration, warmer_3_K)
-show_errors("3 K warmer, after 60 touches", update(unknown_touches_3_K), warmer_3_K)
-show_errors("3 K warmer, after 3 known presses", update(known_presses_3_K), warmer_3_K)
+show_errors("as calibrated", calibration, as_calibrated, "k-")
+show_errors("1 K warmer", calibration, warmer_1_K, "C0-")
+show_errors("1 K warmer, after 60 touches", update(unknown_touches_1_K), warmer_1_K, "C0--")
+show_errors("3 K warmer", calibration, warmer_3_K, "C3-")
+show_errors("3 K warmer, after 60 touches", update(unknown_touches_3_K), warmer_3_K, "C3--")
+show_errors("3 K warmer, after 3 known presses", update(known_presses_3_K), warmer_3_K, "C3:")
 
 _, unknown_touches_2_K = touch(warmer_2_K, 60, is_known=False)
 _, known_presses_2_K = touch(warmer_2_K, 3, is_known=True)
-show_errors("2 K warmer", calibration, warmer_2_K)
-show_errors("2 K warmer, after 60 touches", update(unknown_touches_2_K), warmer_2_K)
-show_errors("2 K warmer, after 3 known presses", update(known_presses_2_K), warmer_2_K)
+show_errors("2 K warmer", calibration, warmer_2_K, "C1-")
+show_errors("2 K warmer, after 60 touches", update(unknown_touches_2_K), warmer_2_K, "C1--")
+show_errors("2 K warmer, after 3 known presses", update(known_presses_2_K), warmer_2_K, "C1:")
 
-plt.gca().set(xlabel="position error, mm", ylabel="share of touches", xlim=(0.0, 3.0))
-plt.legend()
+plt.gca().set(xlabel="position error, mm", ylabel="share of touches", xlim=(0.0, 2.5))
+handles, labels = plt.gca().get_legend_handles_labels()
+order = np.argsort(labels)  # 1 K, 2 K, 3 K, as calibrated
+plt.legend([handles[index] for index in order], [labels[index] for index in order])
 plt.show()
