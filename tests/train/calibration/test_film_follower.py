@@ -376,6 +376,7 @@ def test_touches_with_a_misfit_count_if_most_touches_have_one(mine, film, touch_
     assert follower.film.touches == good_count + used_misfits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change_MPa", [-DEGREE_MPa, DEGREE_MPa])
 def test_uniaxial_film_is_followed_although_most_touches_have_a_misfit(tmp_path, change_MPa):
     """The calibrated model has errors of the force of 13 to 17 %."""
