@@ -30,17 +30,15 @@ from isocharge.serve.tracking.tracker import TrackRule
 SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
 
-SLOW = {"mcap.md", "recordings.md", "virtual_sensor.md", "live_page.md", "live_samples.md"}
-"""Pages whose commands simulate a film each time; those of the tutorial, which do the same, run always."""
+SLOW = {"mcap.md", "recordings.md", "virtual_sensor.md", "live_page.md", "live_samples.md", "secure_service.md"}
+"""Pages whose commands simulate a film or start several servers. The tutorial, which simulates a film, runs always."""
 
 
 EXAMPLE_PAGES = ["serve/README.md", *(f"serve/docs/{name}" for name in PAGES if name != "README.md")]
 
 
 def is_slow(example):
-    is_on_slow_page = Path(example.page).name in SLOW and example.language == "sh"
-    starts_second_server = "client.py" in example.text  # an earlier block of the page starts the same server
-    return is_on_slow_page or starts_second_server
+    return Path(example.page).name in SLOW and example.language == "sh"
 
 
 def test_frame_of_the_documentation_is_read():
