@@ -136,7 +136,8 @@ def test_frames_are_sent_on_time_with_their_truth(film):
         assert truth.x_mm == pytest.approx(script.x_mm[frame.seq % 2000], nan_ok=True)
         np.testing.assert_allclose(frame.values, truth.charge_pC, atol=21.0)
     late_s = np.array([truth.sent_s - frame.seq / 1000.0 for frame, truth in zip(frames, truths, strict=True)])
-    assert late_s[-300:].min() - late_s[:300].min() < 0.02  # 0.05 if it slept for the time between two frames
+    drift_s = late_s[-300:].min() - late_s[:300].min() - sensor.paused_s  # a busy machine postpones the later frames
+    assert drift_s < 0.02  # 0.05 if it slept for the time between two frames
 
 
 def test_truth_of_a_frame_that_was_sent_before_the_script_was_replaced_is_refused(film):
