@@ -31,8 +31,8 @@ def ask(url, method="POST", path="/v2/models/linear/infer", body=BODY):
     return answer.status, content
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_server_answers_until_sigterm(start, number):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_server_answers_until_sigterm_or_sighup(start, number):
     process = start("--port", 0, "--grpc-port", 0)
     url, grpc_url = process.stdout.readline().strip(), process.stdout.readline().strip()
     assert ask(url)[0] == 200

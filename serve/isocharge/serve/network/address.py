@@ -8,6 +8,7 @@ import errno
 import hmac
 import ipaddress
 import os
+import resource
 import socket
 import ssl
 import stat
@@ -49,12 +50,17 @@ class Address:
     def listen(self, backlog: int) -> socket.socket:
         """Open a Unix socket or a TCP socket that listens on this address, and return the socket.
 
+        Each connection needs an open file. The process is therefore allowed as many open files as the system permits.
+
         Args:
             backlog: Largest number of connections that wait to be accepted.
 
         Raises:
             ListenError: If the address is in use or cannot be used. The message states what to do.
         """
+        _, max_open_files = resource.getrlimit(resource.RLIMIT_NOFILE)
+        with contextlib.suppress(ValueError, OSError):  # macOS refuses an unlimited number
+            resource.setrlimit(resource.RLIMIT_NOFILE, (max_open_files, max_open_files))
         try:
             if self.uds is not None:
                 return _listen_unix(self.uds, backlog)

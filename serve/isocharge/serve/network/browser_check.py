@@ -22,7 +22,7 @@ from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from urllib.parse import urlsplit
 
-from isocharge.common.errors import InputError, OriginError
+from isocharge.common.errors import InputError, OriginError, RequestError
 from isocharge.serve.network.address import ip_address
 
 CACHED_REQUESTS = 256
@@ -167,6 +167,26 @@ class BrowserCheck:
     def _served_names(self) -> str:
         """Return the host names of this server in alphabetical order, separated by commas."""
         return ", ".join(sorted(self._host_names))
+
+
+def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
+    """Return the value of each header by its name. The values of a repeated header are joined (RFC 9110, 5.3).
+
+    Args:
+        headers: Pairs of the name of a header in lower case and its value.
+
+    Raises:
+        RequestError: If the header `Host` is repeated (RFC 9112, 3.2). A proxy could have checked the other value.
+    """
+    values: dict[bytes, bytes] = {}
+    for name, value in headers:
+        if name not in values:
+            values[name] = value
+        elif name == b"host":
+            raise RequestError(f"Host: expected one header, got {_quoted(values[name])} and {_quoted(value)}; send one")
+        else:
+            values[name] += b", " + value
+    return values
 
 
 def host_name(text: str) -> str:

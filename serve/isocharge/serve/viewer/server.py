@@ -37,7 +37,7 @@ from isocharge.common.errors import RequestError, TooMany, UnknownPath
 from isocharge.common.structs import parse_json
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.network.address import Token
-from isocharge.serve.network.browser_check import BrowserCheck
+from isocharge.serve.network.browser_check import BrowserCheck, header_values
 from isocharge.serve.network.protocol import Response
 from isocharge.serve.network.protocol.page import PAGE_HEADERS
 from isocharge.serve.network.protocol.response import error_response, json_response, response_of
@@ -280,8 +280,10 @@ class PageServer:
                 return _last_response(self._files[path])
             if path not in (SESSION_PATH, LIVE_PATH):
                 raise UnknownPath(f"nothing is served under {path[:200]!r}; the page is /")
-            header_items = request.headers.raw_items()
-            headers = {name.lower().encode(): value.encode("ascii", "surrogateescape") for name, value in header_items}
+            headers = header_values(
+                (name.lower().encode(), value.encode("ascii", "surrogateescape"))
+                for name, value in request.headers.raw_items()
+            )
             # A request may have several headers with subprotocols, and each header may list several subprotocols.
             subprotocol_list = ",".join(request.headers.get_all("Sec-WebSocket-Protocol"))
             subprotocols = [subprotocol.strip() for subprotocol in subprotocol_list.split(",")]

@@ -2,7 +2,9 @@
 
 import http.client
 import json
+import os
 import re
+import resource
 import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -198,12 +200,63 @@ def test_slow_clients_delay_no_other_client(limited):
         assert [is_well(server) for _ in range(5)] == [True] * 5
 
 
+def test_idle_connections_that_take_all_descriptors_are_replaced(server):
+    with ExitStack() as stack:
+        for _ in range(5):
+            stack.enter_context(connect(server))
+        wait_until(lambda: len(server._connections) == 5)
+        clients = [stack.enter_context(socket.socket()) for _ in range(4)]
+        limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+        stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, limits)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (clients[-1].fileno() + 1, limits[1]))
+        with suppress(OSError):
+            while True:
+                stack.callback(os.close, os.dup(0))
+        for client in clients:
+            client.settimeout(10.0)
+            client.connect(server._socket.getsockname())
+            client.sendall(infer())
+            assert statuses(client.recv(1000)) == [200]
+
+
 def test_client_that_does_not_read_is_disconnected(limited):
     server = limited(body_seconds=0.3)
     body = json.dumps({"inputs": [TENSOR | {"shape": [4096, 3], "data": TENSOR["data"] * 4096}]}).encode()
     with connect(server) as connection, pytest.raises(OSError, match=r"reset|Broken pipe"):
         drip(connection, infer(body=body), 1000)
     assert is_well(server)
+
+
+@pytest.fixture
+def unread(limited):
+    """Return a connection whose client reads no answers and has 0.3 s, and the same connection in the server."""
+    server = limited(header_seconds=0.3, body_seconds=0.3, idle_seconds=0.3)
+    with connect(server) as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        wait_until(lambda: server._connections)
+        (served,) = server._connections
+        served._transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        yield connection, served
+
+
+def test_load_does_not_remove_the_deadline_of_a_client_that_does_not_read(unread):
+    """The load arrives in the same piece as the requests whose answers are not read."""
+    connection, served = unread
+    requests = b"GET /openapi.json HTTP/1.1\r\n\r\n" * 100 + LOAD
+    assert len(requests) < 4096
+    connection.sendall(requests)
+    wait_until(lambda: served not in served._connections)
+
+
+def test_half_closed_client_that_does_not_read_is_disconnected(unread):
+    """The unread answers are too few to block the connection, and the next request is incomplete."""
+    connection, served = unread
+    while not served._transport.get_write_buffer_size():
+        connection.sendall(b"GET /openapi.json HTTP/1.1\r\n\r\n")
+        time.sleep(0.001)
+    connection.sendall(b"GET /v2")
+    connection.shutdown(socket.SHUT_WR)
+    wait_until(lambda: served not in served._connections)
 
 
 @pytest.mark.parametrize("protocol", ["h2c", "websocket"])

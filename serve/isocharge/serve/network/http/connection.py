@@ -122,27 +122,12 @@ class Connection(asyncio.Protocol):
         if isinstance(peer, tuple):
             host, port, *_ = peer
             self._client = (str(host), int(port))
+        is_full = len(self._connections) >= self._limits.connections
+        has_room = not is_full or end_oldest_unused(self._connections)
         self._connections.add(self)
         self._set_deadline(self._limits.header_seconds)
-        is_one_too_many = len(self._connections) > self._limits.connections  # including this connection
-        if is_one_too_many and not self._end_oldest_unused():  # no other connection can make room for this one
+        if not has_room:
             self._refuse(refusal(503, f"all {self._limits.connections} connections are taken; try again later"))
-
-    def _end_oldest_unused(self) -> bool:
-        """End the oldest other connection on which no complete request has arrived, in order to make room for this one.
-
-        The oldest connection is the connection with the earliest deadline.
-
-        Returns:
-            Whether a connection was ended.
-        """
-        unused = [other for other in self._connections if other is not self and not other.has_completed_request]
-        if not unused:
-            return False
-        oldest = min(unused, key=lambda connection: connection.deadline)
-        self._connections.discard(oldest)
-        oldest._transport.abort()
-        return True
 
     def connection_lost(self, _error: Exception | None) -> None:
         """Discard the received data, because the connection has ended."""
@@ -196,8 +181,8 @@ class Connection(asyncio.Protocol):
 
         The connection is closed unless the client reads its responses within `body_seconds`.
         """
-        self._set_deadline(self._limits.body_seconds)  # before `_is_blocked` is set, which protects the deadline
-        self._is_blocked = True
+        self.deadline = self._loop.time() + self._limits.body_seconds
+        self._is_blocked = True  # the deadline does not change until the client has read its responses
         self._transport.pause_reading()
 
     def resume_writing(self) -> None:
@@ -225,7 +210,8 @@ class Connection(asyncio.Protocol):
 
         If a request has begun, a response that states the reason is sent to the client.
         """
-        if self._phase is Phase.IDLE or self._is_refused:
+        can_refuse = self._phase is not Phase.IDLE and not self._is_refused and not self._transport.is_closing()
+        if not can_refuse:
             self._transport.abort()
         else:
             self._refuse(refusal(408, f"waited too long for {self._phase.value}"))
@@ -432,11 +418,11 @@ class Connection(asyncio.Protocol):
     def _answer_in_thread(self, head: Head, body: bytes) -> None:
         """Begin to answer a request in another thread.
 
-        Until the response is sent, the connection has no deadline.
+        Until the response is sent, the connection has no deadline, unless the client must read earlier responses.
         """
         self._answering = self._loop.create_task(self._answer_in_order(head, body))
         self._timed_phase = Phase.IDLE
-        self.deadline = math.inf
+        self._set_deadline(math.inf)
 
     async def _answer_in_order(self, head: Head, body: bytes) -> None:
         """Answer a request in another thread, and then answer the requests that have arrived in the meantime.
@@ -452,6 +438,7 @@ class Connection(asyncio.Protocol):
             self._handler.answer, head.method, head.path, head.headers, body, self._client
         )
         self._answering = None
+        self._set_deadline(self._limits.idle_seconds)  # even if the connection is closing and nothing is sent
         self._write(response, head)
         while self._waiting and self._answering is None:  # _answer_in_thread sets _answering again
             next_head, next_body = self._waiting.popleft()
@@ -505,13 +492,14 @@ class Connection(asyncio.Protocol):
     def _set_deadline(self, seconds: float) -> None:
         """Set the deadline to the current time plus a given duration.
 
-        The deadline is not changed while the client does not read its responses, or while an answer is being computed.
+        While an answer is being computed, the connection has no deadline. While the client does not read its responses,
+        the deadline is not changed.
 
         Args:
             seconds: Time from now to the deadline, s.
         """
-        if not (self._is_blocked or self._answering):
-            self.deadline = self._loop.time() + seconds
+        if not self._is_blocked:
+            self.deadline = math.inf if self._answering else self._loop.time() + seconds
 
     def _header_size(self) -> int:
         """Return the total size of the URL in the request line and of the headers, bytes."""
@@ -575,3 +563,23 @@ def close_overdue(connections: Iterable[Connection], now: float) -> None:
     for connection in list(connections):
         if connection.deadline < now:
             connection.end_overdue()
+
+
+def end_oldest_unused(connections: set[Connection]) -> bool:
+    """End the oldest connection on which no complete request has arrived, in order to make room for another one.
+
+    The oldest connection is the connection with the earliest deadline.
+
+    Args:
+        connections: Connections of the server, from which the ended connection is removed.
+
+    Returns:
+        Whether a connection was ended.
+    """
+    unused = [connection for connection in connections if not connection.has_completed_request]
+    if not unused:
+        return False
+    oldest = min(unused, key=lambda connection: connection.deadline)
+    connections.discard(oldest)
+    oldest.abort()
+    return True

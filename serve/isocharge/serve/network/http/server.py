@@ -1,6 +1,7 @@
 """HTTP server that accepts connections, makes TLS handshakes, and stops when it receives a signal."""
 
 import asyncio
+import errno
 import signal
 import socket
 import threading
@@ -9,7 +10,7 @@ from functools import partial
 import uvloop
 
 from isocharge.serve.network.address import Address, Tls
-from isocharge.serve.network.http.connection import Connection, close_overdue
+from isocharge.serve.network.http.connection import Connection, close_overdue, end_oldest_unused
 from isocharge.serve.network.protocol import Handler
 
 GRACE_SECONDS = 10.0
@@ -21,8 +22,8 @@ TICK_SECONDS = 0.1
 BACKLOG = 2048
 """Largest number of connections that wait to be accepted."""
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT)
-"""Signals that stop the server."""
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""Signals that stop the server, unless they are ignored, as SIGHUP is after `nohup`."""
 
 
 class HttpServer:
@@ -63,7 +64,7 @@ class HttpServer:
     def run(self) -> None:
         """Answer requests until the server is stopped, and then finish the requests that have already begun.
 
-        The server is stopped by the signals SIGTERM and SIGINT, and by the method `stop`.
+        The server is stopped by `SIGNALS` and by the method `stop`.
         """
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
             runner.run(self._serve())
@@ -82,7 +83,9 @@ class HttpServer:
         # Another task accepts connections. The present task checks the deadlines of all connections.
         loop = asyncio.get_running_loop()
         is_main_thread = threading.current_thread() is threading.main_thread()
-        signals = SIGNALS if is_main_thread else ()  # other threads cannot handle signals
+        signals = []
+        if is_main_thread:  # other threads cannot handle signals
+            signals = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
         for signal_number in signals:
             loop.add_signal_handler(signal_number, self.stop)
         accepting = loop.create_task(self._accept(loop))
@@ -121,8 +124,9 @@ class HttpServer:
         while True:
             try:
                 accepted, _ = await loop.sock_accept(self._socket)
-            except OSError:  # the client has disconnected, or no file descriptor is left
-                await asyncio.sleep(TICK_SECONDS)
+            except OSError as error:  # the client has disconnected, or no file descriptor is left
+                has_room = error.errno == errno.EMFILE and end_oldest_unused(self._connections)
+                await asyncio.sleep(0.0 if has_room else TICK_SECONDS)
                 continue
             open_count = len(self._connections) + len(self._handshakes)  # without the new connection
             is_full = open_count >= self._limits.connections

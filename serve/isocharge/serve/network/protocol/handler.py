@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from isocharge.common.errors import UnknownPath, WrongMethod
 from isocharge.serve.network.address import ServerLimits, Token
-from isocharge.serve.network.browser_check import BrowserCheck
+from isocharge.serve.network.browser_check import BrowserCheck, header_values
 from isocharge.serve.network.metrics import Metrics
 from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol import describe
@@ -136,7 +136,7 @@ class Handler:
         start_ns = time.perf_counter_ns()
         match = match_path(path)
         try:
-            response = self._check_and_answer(method, path, match, dict(headers), body)
+            response = self._check_and_answer(method, path, match, header_values(headers), body)
         except Exception as error:  # every error is sent to the client
             response = error_response(error)
         self.traffic.count("http", match.label, response.status)
