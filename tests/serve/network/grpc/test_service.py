@@ -1,5 +1,6 @@
 """gRPC service: numbers that are not raw contents, token, TLS, limits, silent clients, and the compiled messages."""
 
+import asyncio
 import itertools
 import socket
 import subprocess
@@ -9,6 +10,7 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from threading import Event
+from unittest.mock import AsyncMock, Mock
 
 import grpc
 import numpy as np
@@ -17,8 +19,9 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from isocharge.common.errors import InputError
 from isocharge.serve.network.address import ServerLimits, Tls, Token
-from isocharge.serve.network.grpc import grpc_server
+from isocharge.serve.network.grpc import grpc_server, server
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE
+from isocharge.serve.network.grpc.service import Service
 from isocharge.serve.network.protocol import Handler
 
 PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inference.proto"
@@ -33,7 +36,8 @@ def serve(store):
             handler = Handler(store, ServerLimits(**limits), token=token)
             url = stack.enter_context(grpc_server(handler, "127.0.0.1", 0)).removeprefix("grpc://")
             # Each channel has its own connection.
-            return lambda: stack.enter_context(grpc.insecure_channel(url, [("grpc.use_local_subchannel_pool", 1)]))
+            own = ("grpc.use_local_subchannel_pool", 1)
+            return lambda *options: stack.enter_context(grpc.insecure_channel(url, [own, *options]))
 
         yield start
 
@@ -229,6 +233,36 @@ def test_silent_connection_is_closed(store):
         with socket.create_connection((host, int(port)), timeout=6.0) as silent:
             while silent.recv(1000):
                 pass
+
+
+def test_keepalive_pings_do_not_close_a_connection(serve, silent_call, monkeypatch):
+    """By default, gRPC closes a connection after three pings within five minutes, or two hours without a call."""
+    monkeypatch.setattr(server, "MIN_PING_MS", 500)
+    connect = serve()
+    pings = [
+        ("grpc.keepalive_time_ms", 1000),
+        ("grpc.keepalive_permit_without_calls", 1),
+        ("grpc.http2.max_pings_without_data", 0),
+    ]
+    idle_channel = connect(*pings)
+    assert is_served(idle_channel)
+    states = []
+    idle_channel.subscribe(states.append)
+    call = silent_call(connect(*pings), "ModelStreamInfer", [METHODS["ModelStreamInfer"][0]()])
+    next(call)
+    time.sleep(4.0)
+    assert not call.done()
+    assert states == [grpc.ChannelConnectivity.READY]
+
+
+def test_end_of_a_connection_is_not_logged_as_an_error(store, caplog):
+    """If a client ends a call whose responses it does not read, the pending response cannot be sent."""
+    context = Mock(read=AsyncMock(return_value=b""), write=AsyncMock(side_effect=grpc.aio.InternalError))
+    service = Service(Handler(store))
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(service._handle("ModelStreamInfer", None, context))
+    assert ("grpc", "ModelStreamInfer", "CANCELLED") in service._traffic.requests()
+    assert not caplog.records
 
 
 def test_new_call_replaces_the_call_that_waits_longest(serve, silent_call):

@@ -29,6 +29,9 @@ MAX_CALLS_PER_CONNECTION = 100
 If a client begins further calls on the connection, they wait in the client.
 """
 
+MIN_PING_MS = 5000
+"""Shortest time between two keep-alive pings of a client, ms. A client that pings more often is disconnected."""
+
 
 @contextmanager
 def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> Iterator[str]:
@@ -113,6 +116,8 @@ def _options(limits: ServerLimits) -> list[tuple[str, int]]:
         ("grpc.max_allowed_incoming_connections", limits.connections),
         ("grpc.server_handshake_timeout_ms", round(1e3 * limits.header_seconds)),
         ("grpc.max_connection_idle_ms", round(1e3 * limits.idle_seconds)),
+        ("grpc.http2.min_ping_interval_without_data_ms", MIN_PING_MS),
+        ("grpc.keepalive_permit_without_calls", 1),  # the client may also ping while it has no open call
         ("grpc.so_reuseport", 0),
     ]
 

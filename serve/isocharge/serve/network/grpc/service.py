@@ -116,12 +116,14 @@ class Service:
         """
         call = _Call()
         start_ns = time.perf_counter_ns()
-        status = "CANCELLED"  # if the client disconnects, grpcio cancels this coroutine, and the status is not changed
+        status = "CANCELLED"  # if the client disconnects, this coroutine is cancelled, and the status is not changed
         error_type = None
         try:
             response = await self._answer_call(name, context, call)
             status = "OK"
             return response
+        except grpc.aio.InternalError as error:  # no message can be sent or read, as the client has ended the call
+            raise asyncio.CancelledError from error
         except Exception as error:  # every error is sent to the client
             status, message = _status_and_message(error)
             error_type = type(error).__name__
