@@ -8,12 +8,10 @@ from kept import kept
 
 
 def whole_film_map_solved_once(sensor, probe, force_range):
-    """Return the coarse map of a film without coating, which is solved once for all layouts of electrodes.
+    """Return the coarse map of a film, which is solved once for all layouts of electrodes.
 
     The solution does not depend on the electrodes.
     """
-    if sensor.coating:
-        return kept(whole_film_map, sensor, probe, force_range)
     layout = load_sensor("three-25um-biaxial")
     solved = kept(whole_film_map, replace(layout, film=sensor.film), probe, force_range)
     return replace(solved, sensor=sensor)

@@ -3,11 +3,11 @@
     python tests/benchmarks/bench_follow_solved.py [--sensor four-25um-biaxial] [--seeds 0,1,2,3,4,6,7,8,9,10]
         [--change 0.3] [--frames 10] [--orders 4] [--workers 2] [--folder build/solved_films] [--json]
 
-The films are those of `solved_films.py`: orthotropic, unevenly stretched, with an oval clamp and wrong gains. Every
-third film has ink on its electrodes. Each film is calibrated by 20 presses. Its pretension then changes, and 60 touches
-of unknown place and force follow. The force of a touch is constant for the given number of frames, each with its own
-noise. The benchmark gives root-mean-square errors of 60 further contacts, each computed from one frame, and the shares
-of the positions and of the forces within two reported standard deviations:
+The films are those of `solved_films.py`: orthotropic, unevenly stretched, with an oval clamp and wrong gains. Each
+film is calibrated by 20 presses. Its pretension then changes, and 60 touches of unknown place and force follow. The
+force of a touch is constant for the given number of frames, each with its own noise. The benchmark gives
+root-mean-square errors of 60 further contacts, each computed from one frame, and the shares of the positions and of the
+forces within two reported standard deviations:
 
 - calibrated: by the calibrated model;
 - followed: by the model that `serve stream --follow` uses after the touches;

@@ -49,7 +49,7 @@ class SolvedFilm:
 
 
 def draw_film(problem: CalibrationProblem, seed: int) -> tuple[Sensor, Circle]:
-    """Draw a film: the parameters from the prior, and imperfections besides; every third film has ink on its pads."""
+    """Draw a film: the parameters from the prior, and imperfections besides."""
     rng = np.random.default_rng([seed, 49])
     parameters = problem.prior.draw(rng, 1)[0]
     parameters[problem.prior.index("pretension")] = rng.uniform(*PRETENSION_MPa)
@@ -64,14 +64,12 @@ def draw_film(problem: CalibrationProblem, seed: int) -> tuple[Sensor, Circle]:
         oval=rng.uniform(0.0, LARGEST_OVAL),
         oval_axis=angle[2],
     )
-    coating = 0.3 * film.young * film.thickness if seed % 3 == 2 else 0.0
-    return replace(sensor, film=film, coating=coating), probe
+    return replace(sensor, film=film), probe
 
 
 def solve_charges(sensor: Sensor, probe: Circle, contact: np.ndarray) -> np.ndarray:
     """Solve the film under each contact (x, y, F), shape (3,) or (n, 3), and return the charges, pC."""
-    film = sensor.coated_film
-    rows = [touch_charge(sensor, press(film, probe, (x, y), force)) for x, y, force in contact.tolist()]
+    rows = [touch_charge(sensor, press(sensor.film, probe, (x, y), force)) for x, y, force in contact.tolist()]
     return np.array(rows)
 
 

@@ -69,11 +69,10 @@ def test_deflection_of_an_oval_film_with_uneven_tension_agrees_with_greens_funct
 
 
 def test_sensor_file_stores_all_imperfections():
-    sensor = replace(SENSOR, film=replace(ALL, shear=1000.0), piezo=replace(SENSOR.piezo, d12=0.5), coating=22.5)
+    sensor = replace(SENSOR, film=replace(ALL, shear=1000.0), piezo=replace(SENSOR.piezo, d12=0.5))
     sensor = replace(sensor, calibration=replace(sensor.calibration, crosstalk=0.01))
     table = sensor_to_dict(sensor)
     assert table["film"]["pretension_MPa"] == [1.33, 0.67, 0.2]
-    assert table["electrodes"]["coating_N_per_mm"] == 22.5
     assert sensor_to_dict(sensor_from_dict(table)) == table
 
 

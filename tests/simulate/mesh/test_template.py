@@ -1,11 +1,10 @@
-"""Topology of the mesh template: Euler characteristic, rotations and split elements."""
+"""Topology of the mesh template: Euler characteristic and rotations."""
 
 import numpy as np
 import pytest
 
 from isocharge.simulate import Circle, Ellipse, Film, Polygon, Resolution
 from isocharge.simulate.mesh.placed_mesh import place
-from isocharge.simulate.mesh.refinement import RefinedTemplate
 from isocharge.simulate.mesh.template import Template, template_for
 
 FILM = Film(45.0, 0.025, 3000.0, 0.34)
@@ -55,19 +54,3 @@ def test_rotation_by_the_period_maps_elements_onto_elements(probe, folds, resolu
     for fold in range(folds):
         rotated_back = mesh.points[mesh.template.rotated(fold, folds)] * np.exp(-2j * np.pi * fold / folds)
         np.testing.assert_allclose(rotated_back, mesh.points, atol=1e-12)
-
-
-def test_refined_template_locates_points_in_split_elements():
-    """The first element is split into quarters, and one of the quarters is split across xi."""
-    base = template_for(PROBES["triangle"], Resolution(2, 8, 1))
-    low = np.vstack([[(-1, -1), (0, -1), (-1, 0), (0, 0), (0.5, 0)], np.full((base.n_element - 1, 2), -1.0)])
-    size = np.vstack([np.ones((3, 2)), [(0.5, 1.0)] * 2, np.full((base.n_element - 1, 2), 2.0)])
-    parent = np.concatenate([np.zeros(5, dtype=int), np.arange(1, base.n_element)])
-    rng = np.random.default_rng(0)
-    refined = RefinedTemplate(base, parent, low, size)
-    of_base = rng.integers(3, size=300)
-    at = rng.uniform(-1.0, 1.0, (2, 300))
-    element, *local = refined.to_split_elements(of_base, *at)
-    np.testing.assert_array_equal(parent[element], of_base)
-    assert np.abs(local).max() <= 1.0
-    np.testing.assert_allclose(low[element].T + 0.5 * size[element].T * (np.array(local) + 1.0), at)

@@ -7,7 +7,6 @@ import pytest
 
 from isocharge.common.errors import SensorError
 from isocharge.simulate import Calibration, Circle, Electrode, Piezo, Sensor, load_sensor, press, touch_charge
-from isocharge.simulate.sensor.film import Coat
 
 SQUARE = Electrode.of_square("D", (0.0, 0.0), 3.0)
 TRACED = SQUARE.with_trace(((0.0, 0.0), (9.0, 0.0), (9.0, 5.0)), 0.5)
@@ -34,7 +33,6 @@ def three() -> Sensor:
         ({"thickness": 25e-6}, r"film thickness: .* got 2\.5e-05 mm; 2\.5e-05 m are 0\.025 mm"),
         ({"young": 3e9}, r"film young: .* got 3e\+09 MPa; 3e\+09 Pa are 3000 MPa"),
         ({"pretension": 3e6}, r"film pretension: .* 3e\+06 Pa are 3 MPa"),
-        ({"coat": Coat(376.0, ())}, r"film coat: .* up to 5 times the film's, 375 N/mm, got 376 N/mm"),
     ],
 )
 def test_invalid_film_raises_error(film, changes, message):

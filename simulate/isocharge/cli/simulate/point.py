@@ -102,7 +102,7 @@ def point_command(
         selected_theory = replace(selected_theory, stretching=True)
 
     settings = SolveSettings(accuracy=accuracy, theory=selected_theory)
-    film = film_sensor.coated_film
+    film = film_sensor.film
     position = parse_position(at)
     equilibrium = press(film, footprint, position, force, settings, side_force=applied_side_force)
     if friction:

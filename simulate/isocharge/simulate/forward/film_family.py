@@ -129,7 +129,7 @@ class FilmFamily:
         smallest_probe = Circle(smallest_reach * film.radius)
         largest_probe = Circle(largest_reach * film.radius)
         _check_back(film)
-        check_family(prior.sensor.coated_film, largest_probe, domain)
+        check_family(film, largest_probe, domain)
 
         # All solves use the mesh that the smallest probe needs, because the smallest probe needs the finest mesh.
         min_force, max_force = force_range
@@ -173,7 +173,7 @@ class FilmFamily:
             "thickness": film.thickness / film.radius,
             "reach": probe.radius / film.radius,
         }
-        self._check_inside(sensor.coated_film, sensor.surface, film_parameters)
+        self._check_inside(film, sensor.surface, film_parameters)
 
         # The weight of each film of the grid is the product of its weights along the axes (tension, thickness, reach).
         tension_weights = self.grid.weights("tension", film_parameters["tension"])

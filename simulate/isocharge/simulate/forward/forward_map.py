@@ -115,7 +115,7 @@ class ForwardMap:
         """
         film = sensor.film
         domain = Domain(radius, force_range)
-        check_family(sensor.coated_film, probe, domain)
+        check_family(film, probe, domain)
 
         # Choose the settings that are the same for all presses of the family.
         min_force, max_force = force_range

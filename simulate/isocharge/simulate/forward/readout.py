@@ -163,7 +163,7 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
     """Compute the touch charge of each electrode under a solved press.
 
     Args:
-        sensor: Sensor whose `coated_film` was solved.
+        sensor: Sensor whose film was solved.
         equilibrium: Equilibrium of the film under the press.
 
     Returns:
@@ -173,10 +173,8 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
     Raises:
         SensorError: If another film was solved, or if the readout is at an outer surface and the theory omits bending.
     """
-    if sensor.coated_film != equilibrium.film:
-        raise SensorError(
-            f"the equilibrium belongs to another film: expected {sensor.coated_film}, got {equilibrium.film}"
-        )
+    if sensor.film != equilibrium.film:
+        raise SensorError(f"the equilibrium belongs to another film: expected {sensor.film}, got {equilibrium.film}")
     if sensor.surface != "middle" and not equilibrium.theory.bending:
         raise SensorError(
             f"surface {sensor.surface!r} needs bending, but the film was solved as a {equilibrium.theory.name}; solve "

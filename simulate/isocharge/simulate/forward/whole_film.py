@@ -67,7 +67,7 @@ def whole_film_map(
     """
     film = sensor.film
     domain = Domain(outermost_distance(film, probe), force_range)
-    check_family(sensor.coated_film, probe, domain)
+    check_family(film, probe, domain)
 
     # All presses are solved with the same theory and the same coarse mesh. The width of the thin rings at the rim is
     # that of the geometric mean of the smallest and the largest force, unless the mesh of the outermost press needs

@@ -205,7 +205,7 @@ class DesignCase:
                 f"electrodes: expected {MIN_ELECTRODES} to {MAX_ELECTRODES}, got {self.electrodes}; x, y and the force "
                 "of a press are three unknowns"
             )
-        check_family(self.sensor.coated_film, self.probe, Domain(self.radius, (self.force, self.force)))
+        check_family(self.sensor.film, self.probe, Domain(self.radius, (self.force, self.force)))
         _check_length("gap", self.gap, minimum=0.0)
         _check_length("rim", self.rim, minimum=0.0)
         _check_length("side", self.square_side, minimum=1e-2)

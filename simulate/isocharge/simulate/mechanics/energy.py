@@ -22,11 +22,7 @@ C, and a deviator is added to tau I (`scaling.Anisotropy`). The bending stiffnes
 film.
 """
 
-from dataclasses import replace
-
 import numpy as np
-from scipy.sparse import diags_array
-from scipy.sparse.linalg import SuperLU, splu
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.back_pressure import BackPressure
@@ -193,22 +189,6 @@ class Membrane:
         """Pretension minus its mean, in units of E_young A^2, shape (2, 2). None if the pretension is isotropic."""
         return None if self.groups.anisotropy is None else _symmetric_matrix(self.groups.anisotropy.tension)
 
-    def _elastic_stress(self, scaled_strain: Array) -> Array:
-        """Compute the stress of the film and its coat at the quadrature points, without the pretension.
-
-        Args:
-            scaled_strain: Scaled strain E' as (E11, E22, 2 E12), shape (n_element, n_point, 3).
-
-        Returns:
-            Scaled stress (S11, S22, S12), same shape.
-        """
-        elastic_stress = scaled_stress(scaled_strain, self.groups)
-        coat = self.geometry.coat
-        if coat is not None:
-            strain_column = scaled_strain[coat.elements][..., None]  # shape (n_coated_element, n_point, 3, 1)
-            elastic_stress[coat.elements] += (coat.moduli @ strain_column)[..., 0]
-        return elastic_stress
-
     def _slopes(self, field: Array) -> Array:
         """Compute the derivatives of (U1, U2, W) with respect to (X1, X2) at the quadrature points.
 
@@ -253,7 +233,7 @@ class Membrane:
         # The last two axes are the coordinate and the displacement component, shape (n_element, n_point, 2, 3).
         slopes = self._slopes(field)
         scaled_strain = strain(slopes, self.groups.squared_amplitude)
-        energy_density = 0.5 * np.sum(scaled_strain * self._elastic_stress(scaled_strain), axis=-1)
+        energy_density = 0.5 * np.sum(scaled_strain * scaled_stress(scaled_strain, self.groups), axis=-1)
 
         # The difference tr E' - div U is half of the weighted sum of the squared slopes. The weights are A^2 for the
         # slopes of U1 and U2, and 1 for the slopes of W, where A is the amplitude. If the pretension depends on the
@@ -276,7 +256,7 @@ class Membrane:
         geometry = self.geometry
         slopes = self._slopes(field)
         scaled_strain = strain(slopes, self.groups.squared_amplitude)
-        elastic_stress = self._elastic_stress(scaled_strain)
+        elastic_stress = scaled_stress(scaled_strain, self.groups)
 
         # The traction is the derivative of the energy density with respect to the slopes, shape (n_element, n_point, 2,
         # 3). Its terms belong to the elastic stress, to the mean pretension and to the deviator of the pretension.
@@ -309,7 +289,7 @@ class Membrane:
 
         # The total stress (S11, S22, S12) is the sum of the elastic stress, the mean pretension, and the deviator of
         # the pretension. The total stress is multiplied by the integration weights.
-        total_stress = self._elastic_stress(strain(slopes, self.groups.squared_amplitude))
+        total_stress = scaled_stress(strain(slopes, self.groups.squared_amplitude), self.groups)
         total_stress[..., :2] += self.groups.tension
         if self.groups.anisotropy is not None:
             total_stress += self.groups.anisotropy.tension
@@ -364,16 +344,11 @@ class Membrane:
         block[..., 0, 1] = plane_modulus * poisson * f_i1 * f_j2 + shear_modulus * f_i2 * f_j1
         block[..., 1, 0] = plane_modulus * poisson * f_i2 * f_j1 + shear_modulus * f_i1 * f_j2
 
-        # Add the part of the additional moduli of an orthotropic film and of a coat.
+        # Add the part of the additional moduli of an orthotropic film.
         if self.groups.anisotropy is not None:
             i_derivative = _strain_derivative(f_i1, f_i2)
             j_derivative = _strain_derivative(f_j1, f_j2)
             block += i_derivative @ self.groups.anisotropy.moduli @ j_derivative.swapaxes(-1, -2)
-        coat = self.geometry.coat
-        if coat is not None:
-            i_derivative = _strain_derivative(f_i1[coat.elements], f_i2[coat.elements])
-            j_derivative = _strain_derivative(f_j1[coat.elements], f_j2[coat.elements])
-            block[coat.elements] += i_derivative @ coat.moduli @ j_derivative.swapaxes(-1, -2)
         return block
 
 
@@ -423,11 +398,7 @@ class Bending:
         weights = np.repeat(geometry.weights, 2, axis=1)[..., None]
         self._laplace = geometry.stacked.transpose(0, 2, 1) @ (weights * geometry.stacked)
 
-        # Diagonal of M for all nodes, including hanging nodes, shape (n_node,). Hanging nodes have no unknowns of their
-        # own. If there are any, M is not diagonal for the other nodes, and is factorised at the first call of
-        # `laplacian`.
-        self._mass = replace(geometry, constraint=None).gather(geometry.mass)
-        self._mass_factor: SuperLU | None = None
+        self._mass = geometry.gather(geometry.mass)  # diagonal of M, shape (n_node,)
 
     def laplacian(self, deflection: Array) -> Array:
         """Compute the Laplacian m = -M^-1 L W of the deflection W.
@@ -444,18 +415,7 @@ class Bending:
         deflection_column = deflection[self.geometry.nodes][..., None]  # shape (n_element, n_local, 1)
         element_values = (self._laplace @ deflection_column)[..., 0]
         weak_laplacian = self.geometry.gather(element_values)  # L W, shape (n_node,)
-        constraint = self.geometry.constraint
-        if constraint is None:
-            return np.asarray(-weak_laplacian / self._mass)
-
-        # With hanging nodes, the mass matrix is not diagonal. The matrix is factorised at the first call only. The rows
-        # of the hanging nodes are zero, so ones are added to their diagonal elements to make the matrix regular.
-        if self._mass_factor is None:
-            constrained_mass = constraint.T @ diags_array(self._mass) @ constraint
-            is_hanging = constraint.diagonal() == 0.0
-            unit_diagonal = diags_array(is_hanging.astype(float))
-            self._mass_factor = splu((constrained_mass + unit_diagonal).tocsc())
-        return np.asarray(-(constraint @ self._mass_factor.solve(weak_laplacian)))
+        return -weak_laplacian / self._mass
 
     def energy(self, deflection: Array) -> float:
         """Compute the bending energy of a deflection.

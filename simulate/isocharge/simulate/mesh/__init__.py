@@ -1,1 +1,1 @@
-"""Meshes of presses, positions of the elements on the film, and refinement along the edges of a coat."""
+"""Meshes of presses, and positions of the elements on the film."""

@@ -119,7 +119,7 @@ class Blocks:
         self.eta = eta.ravel()
 
     @property
-    def footprint(self) -> slice | Integers:
+    def footprint(self) -> slice:
         """Indices of the elements that fill the footprint."""
         if self.topology.is_curved:
             return slice(0, self.n_quad + self.n_sector)

@@ -4,16 +4,14 @@ The mesh consists of a template, the position of the template on the film, and i
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.coating import Coating
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.point_location import locate_points
 from isocharge.simulate.mesh.template import Template, template_for
@@ -22,7 +20,6 @@ from isocharge.simulate.numerics.interpolation import (
     lobatto_nodes,
     lobatto_quadrature,
     tensor_basis,
-    tensor_values,
 )
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
@@ -43,19 +40,6 @@ After this number of steps, the error is of the order of rounding errors for ova
 """
 
 
-class CoatStiffness(NamedTuple):
-    """Stiffness that a coat adds to some elements of a mesh.
-
-    Attributes:
-        elements: Indices of the coated elements, shape (n,).
-        moduli: Contribution of the coat to the elasticity matrix C / E at the quadrature points of the coated elements,
-            shape (n, n_point, 3, 3).
-    """
-
-    elements: Integers
-    moduli: Array
-
-
 @dataclass(frozen=True)
 class Geometry:
     """Integration rules for the elements of a mesh on the film.
@@ -69,8 +53,6 @@ class Geometry:
         load: Share of the force of the probe that acts on each node, shape (n_node,). The sum of all shares is one over
             the number of copies of the mesh that cover the film.
         mass: Integration weights of the nodes of each element, shape (n_element, n_local).
-        constraint: Matrix for hanging nodes; see `Template.constraint`.
-        coat: Stiffness of the coat; None if there is no coat.
     """
 
     nodes: Integers
@@ -78,8 +60,6 @@ class Geometry:
     weights: Array
     load: Array
     mass: Array
-    constraint: csr_array | None = None
-    coat: CoatStiffness | None = None
 
     @classmethod
     def build(cls, template: Template, points: Complexes, pressure: Pressure | None = None) -> "Geometry":
@@ -116,9 +96,7 @@ class Geometry:
         # of its nodes add up to 1 / copies.
         node_load = np.bincount(template.nodes[footprint].ravel(), element_load.ravel(), template.n_node)
         load = node_load / (template.copies * total_load)
-        if template.constraint is not None:  # move the forces on hanging nodes to the nodes that determine their values
-            load = template.constraint.T @ load
-        return cls(template.nodes, gradient, weights, load, mass, template.constraint)
+        return cls(template.nodes, gradient, weights, load, mass)
 
     @property
     def stacked(self) -> Array:
@@ -131,18 +109,13 @@ class Geometry:
     def gather(self, contributions: Array) -> Array:
         """Sum the contributions of all elements at each node.
 
-        The contributions at a hanging node are distributed to the nodes that determine the value at the hanging node.
-
         Args:
             contributions: Contribution of each element at each of its nodes, shape (n_element, n_local).
 
         Returns:
-            Sums at the nodes, shape (n_node,). The sums at hanging nodes are zero.
+            Sums at the nodes, shape (n_node,).
         """
-        sums = np.bincount(self.nodes.ravel(), contributions.ravel(), self.load.size).astype(np.float64)
-        if self.constraint is None:
-            return np.asarray(sums)
-        return np.asarray(self.constraint.T @ sums)
+        return np.bincount(self.nodes.ravel(), contributions.ravel(), self.load.size).astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,14 +128,12 @@ class PlacedMesh:
         layer: Total width of the thin rings at the rim, in film radii.
         oval: Shape of the clamp as the complex number e exp(2 i alpha). In the direction `angle`, the rim of the film
             lies at the distance 1 + e cos(2 (angle - alpha)) from the centre, in film radii. 0 for a circular clamp.
-        coat: Coat on parts of the film, in film radii and rotated with the press; None if there is no coat.
     """
 
     template: Template
     placement: Placement
     layer: float
     oval: complex = 0.0
-    coat: Coating | None = None
 
     @property
     def resolution(self) -> Resolution:
@@ -173,7 +144,7 @@ class PlacedMesh:
     def points(self) -> Complexes:
         """Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii."""
         circular_points = self.placement.element_points(self.template)
-        return self.template.from_base(to_oval(circular_points, self.oval))
+        return to_oval(circular_points, self.oval)
 
     @property
     def node_points(self) -> Complexes:
@@ -182,19 +153,9 @@ class PlacedMesh:
 
     @cached_property
     def geometry(self) -> Geometry:
-        """Integration rules of the elements, with the stiffness of the coat if the film has one."""
+        """Integration rules of the elements."""
         is_uniform = self.placement.probe.has_uniform_pressure
-        geometry = Geometry.build(self.template, self.points, None if is_uniform else self._pressure)
-        if self.coat is None:
-            return geometry
-
-        # Compute the stiffness of the coat at the quadrature points of all elements that the coat may cover.
-        xi, eta, _ = gauss_reference_square(self.resolution.order + 1)
-        basis_values = tensor_values(self.resolution.order, xi, eta)  # shape (n_point, n_local)
-        quadrature_points = self.points @ basis_values.T  # shape (n_element, n_point)
-        coated_elements = np.flatnonzero(self.coat.near(quadrature_points).any(axis=1))
-        added_moduli = self.coat.moduli(quadrature_points[coated_elements])
-        return replace(geometry, coat=CoatStiffness(coated_elements, added_moduli))
+        return Geometry.build(self.template, self.points, None if is_uniform else self._pressure)
 
     def _pressure(self, points: Complexes) -> Array:
         """Compute the pressure of the probe at film points, divided by the mean pressure.
@@ -223,12 +184,8 @@ class PlacedMesh:
         circular_points = from_oval(points, self.oval)
         meshed_points, is_reflected = self.template.into_meshed_half(circular_points)
 
-        # `locate_points` expects one row of points for each placement. Here, there is a single placement. The function
-        # does not consider that elements may have been split, and returns the unsplit elements.
-        (unsplit_element,), (unsplit_xi,), (unsplit_eta,) = locate_points(
-            self.placement.batch(), self.template, meshed_points[None]
-        )
-        element, xi, eta = self.template.to_split_elements(unsplit_element, unsplit_xi, unsplit_eta)
+        # `locate_points` expects one row of points for each placement. Here, there is a single placement.
+        (element,), (xi,), (eta,) = locate_points(self.placement.batch(), self.template, meshed_points[None])
         return element, xi, eta, is_reflected
 
     def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:

@@ -7,7 +7,6 @@ from functools import lru_cache
 from typing import Self
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
@@ -37,14 +36,7 @@ class Template(Blocks):
         first_occurrence: Index of the first occurrence of each node among the nodes of all elements, shape (n_node,).
         on_rim: Whether each node lies on the rim, shape (n_node,).
         on_axis: Whether each node lies on the line of symmetry of a half mesh, shape (n_node,).
-        splits: Index of the original element of each element and position in the original element, with one row for
-            each element. Empty if no element is split.
-        constraint: Matrix that computes the values at all nodes from the values at the nodes that are not hanging
-            nodes, shape (n_node, n_node). None if there are no hanging nodes.
     """
-
-    splits: Array = np.empty(0)
-    constraint: csr_array | None = None
 
     def __init__(self, resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> None:
         """Count the elements and number their nodes.
@@ -68,34 +60,6 @@ class Template(Blocks):
         node_points = all_points[self.first_occurrence]
         self.on_rim = np.abs(node_points) > 1.0 - 1e-9
         self.on_axis = (np.abs(node_points.imag) < 1e-9) & self.half
-
-    def from_base(self, values: np.ndarray) -> np.ndarray:
-        """Return the given values, because a template of the base class has no split elements.
-
-        The subclass `RefinedTemplate` interpolates the values from the original elements to the split elements.
-
-        Args:
-            values: Values at the nodes of the original elements, shape (n_original_element, n_local, ...).
-
-        Returns:
-            Values at the nodes of the elements, shape (n_element, n_local, ...).
-        """
-        return values
-
-    def to_split_elements(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
-        """Return the given positions, because a template of the base class has no split elements.
-
-        The subclass `RefinedTemplate` converts positions in the original elements into positions in the split elements.
-
-        Args:
-            element: Index of the original element of each point, shape (n,).
-            xi: First local coordinate of each point, shape (n,).
-            eta: Second local coordinate of each point, shape (n,).
-
-        Returns:
-            Index of the element, xi and eta of each point, each of shape (n,).
-        """
-        return element, xi, eta
 
 
 class SampleCurve(CurvedProbe):

@@ -61,36 +61,6 @@ MAX_STATIC_PRESSURE = 0.01
 A film of 25 um bulges by several millimetres under such a pressure.
 """
 
-MAX_COAT_STIFFNESS = 5.0
-"""Largest accepted ratio of the stiffness of a coat to the stiffness of the film, dimensionless.
-
-The bending stiffness of a stiffer coat could not be neglected.
-"""
-
-
-@dataclass(frozen=True)
-class Coat:
-    """Metal or ink that stiffens parts of a film.
-
-    The coat is isotropic, has the same Poisson's ratio as the film, and has no pretension.
-
-    Attributes:
-        stiffness: Young's modulus of the coat times the thickness of one layer, N/mm.
-        layers: The area that at least one layer covers, followed by the area that two layers cover (one on each side of
-            the film) if there is such an area. Each area is a tuple of convex polygons that do not overlap. A polygon
-            is a tuple of its corners (x, y) on the real film, anticlockwise, mm.
-    """
-
-    stiffness: float
-    layers: tuple[tuple[tuple[tuple[float, float], ...], ...], ...]
-
-    def __repr__(self) -> str:
-        """Return a short text with the stiffness and the number of polygons.
-
-        The text does not list the corners, because there may be many corners.
-        """
-        return f"Coat({self.stiffness:.4g} N/mm, {len(self.layers[0])} parts)"
-
 
 @dataclass(frozen=True)
 class Film:
@@ -110,7 +80,6 @@ class Film:
         axis: Angle of axis 1 of an orthotropic film from the x axis, anticlockwise, rad.
         oval: Parameter e of an oval clamp, whose semi-axes are radius * (1 + e) and radius * (1 - e), dimensionless.
         oval_axis: Angle of the longer semi-axis of an oval clamp from the x axis, anticlockwise, rad.
-        coat: Coat that stiffens parts of the film; None if there is no coat.
         back_volume: Volume of the closed cavity behind the film, mm^3; None if the back is vented.
         static_pressure: Constant pressure on the film, MPa, positive in the direction of the push. With a closed
             cavity, this is the pressure on the film if it is flat.
@@ -130,7 +99,6 @@ class Film:
     axis: float = 0.0
     oval: float = 0.0
     oval_axis: float = 0.0
-    coat: Coat | None = None
     back_volume: float | None = None
     static_pressure: float = 0.0
     expansion: tuple[float, float] | None = None
@@ -157,13 +125,13 @@ class Film:
     @property
     def asymmetries(self) -> dict[str, object]:
         """Names and values of the attributes that make the film differ from an axisymmetric film."""
-        names = ("deviator", "young_ratio", "shear", "axis", "oval", "oval_axis", "coat")
+        names = ("deviator", "young_ratio", "shear", "axis", "oval", "oval_axis")
         return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(Film, name)}
 
     @property
     def is_axisymmetric(self) -> bool:
         """Whether the properties of the film remain unchanged if the film is rotated about its centre."""
-        return not self.is_anisotropic and self.oval == 0.0 and self.coat is None
+        return not self.is_anisotropic and self.oval == 0.0
 
     def __post_init__(self) -> None:
         """Check the properties of the film.
@@ -179,13 +147,7 @@ class Film:
         if not 0.0 <= self.poisson < 0.5:
             raise SensorError(f"film poisson: expected 0 <= poisson < 0.5, got {self.poisson}")
 
-        # Check the coat, and the properties that depend on the direction.
-        max_stiffness = MAX_COAT_STIFFNESS * self.young * self.thickness
-        if self.coat is not None and not 0.0 < self.coat.stiffness <= max_stiffness:
-            raise SensorError(
-                f"film coat: expected Young's modulus times thickness up to {MAX_COAT_STIFFNESS:g} times the film's, "
-                f"{max_stiffness:.4g} N/mm, got {self.coat.stiffness:.4g} N/mm"
-            )
+        # Check the properties that depend on the direction.
         for name, value in zip(("(T11 - T22) / 2", "T12"), self.deviator, strict=True):
             check_stress(f"film pretension, {name}", value, -MAX_PRETENSION, MAX_PRETENSION, SensorError)
         if self.shear is not None:

@@ -17,7 +17,7 @@ from isocharge.common.errors import SensorError, cut, shown
 from isocharge.common.printable_text import is_printable
 from isocharge.simulate.numerics.polygon import area_of, is_convex, overlap, to_complex, to_corners
 from isocharge.simulate.numerics.polygon_union import is_simple, subdivide, trace_outline, union_parts
-from isocharge.simulate.sensor.film import Coat, Film, Piezo, Surface
+from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.size_check import check_length
 
 Readout = Literal["area", "edge"]
@@ -288,16 +288,13 @@ class Sensor:
 
     Attributes:
         name: Name of the sensor.
-        film: Film without the metal of the electrodes.
+        film: Film, whose stiffness does not include the metal of the electrodes.
         piezo: Piezoelectric coefficients of the film.
         electrodes: Electrodes, in the order of the charges.
         readout: "area" if the stress is averaged over the area of an electrode, "edge" if it is averaged over its
             edges.
         surface: Surface at which the stress is read: "middle", "top" or "bottom" of the film.
         calibration: Gains and positions of the electrodes that were measured on a real film.
-        coating: Young's modulus of the metal or ink of the electrodes, times its thickness, N/mm. It applies to the
-            front, and to the back if the back is not completely covered. Zero if the stiffness of the metal is
-            neglected.
     """
 
     name: str
@@ -307,7 +304,6 @@ class Sensor:
     readout: Readout = "area"
     surface: Surface = "middle"
     calibration: Calibration = field(default_factory=Calibration)
-    coating: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the names, the gains and the positions of the electrodes.
@@ -355,35 +351,6 @@ class Sensor:
     def guard_names(self) -> tuple[str, ...]:
         """Names of the electrodes with the role "guard"."""
         return tuple(electrode.name for electrode in self.electrodes if electrode.role == "guard")
-
-    @cached_property
-    def coated_film(self) -> Film:
-        """Film with the metal of the electrodes as its coat. If `coating` is zero, this is `film`."""
-        if self.coating == 0.0:
-            return self.film
-
-        # The first area has metal on the front or on the back. To compute it, treat the metal on the back as further
-        # metal on the front (`more`).
-        electrodes_of_all_metal = [
-            replace(electrode, more=(*electrode.more, *electrode.back), back=(), square=False)
-            for electrode in self.electrodes
-        ]
-        areas = [self._placed_parts(electrodes_of_all_metal)]
-
-        # The second area has metal on both sides. It is the collecting area of the electrodes with metal on the back.
-        electrodes_with_back = [electrode for electrode in self.electrodes if electrode.back]
-        if electrodes_with_back:
-            areas.append(self._placed_parts(electrodes_with_back))
-        return replace(self.film, coat=Coat(self.coating, tuple(areas)))
-
-    def _placed_parts(self, electrodes: list[Electrode]) -> tuple[Corners, ...]:
-        """Return the corners (x, y) of all parts of electrodes at their calibrated positions, mm.
-
-        Args:
-            electrodes: Electrodes at their nominal positions.
-        """
-        parts = [self.calibration.place(part) for electrode in electrodes for part in electrode.parts]
-        return tuple(tuple((float(x), float(y)) for x, y in part) for part in parts)
 
     @cached_property
     def part_circles(self) -> tuple[tuple[Complexes, Array], ...]:

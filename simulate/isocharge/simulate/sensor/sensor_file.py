@@ -46,7 +46,7 @@ SIDE = "side_mm"
 """Key of the section `electrodes` whose value is the side of all square electrodes."""
 
 COATING = "coating_N_per_mm"
-"""Key of the section `electrodes` whose value is the stiffness of the metal or ink of the electrodes."""
+"""Key of the section `electrodes` that is refused. It stated the stiffness of the metal or ink of the electrodes."""
 
 Coordinate = Annotated[float, Meta(ge=-MAX_COORDINATE_mm, le=MAX_COORDINATE_mm)]
 Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm, each at most {MAX_COORDINATE_mm:g}")]
@@ -108,7 +108,7 @@ class SensorTable(Settings, frozen=True):
 
     In the section `electrodes`, the keys are the names of the electrodes. The value of a square electrode is its
     centre, and the value of every other electrode is a table of polygons. The section may also contain the side of the
-    squares and the stiffness of the coating.
+    squares.
     """
 
     name: Text
@@ -123,14 +123,21 @@ class SensorTable(Settings, frozen=True):
     def __post_init__(self) -> None:
         """Check the section `electrodes` and the names of the section `roles`.
 
-        Most keys of the section `electrodes` are the names of the electrodes. The values of the keys `SIDE` and
-        `COATING` are numbers that apply to all electrodes.
+        Most keys of the section `electrodes` are the names of the electrodes. The value of the key `SIDE` is a number
+        that applies to all squares.
 
         Raises:
             WrongKey: If a value is not allowed, if a key is missing, or if a role belongs to no electrode.
+            ValueError: If the section contains the key `COATING`.
         """
+        if COATING in self.electrodes:
+            raise ValueError(
+                f"electrodes.{COATING} = {self.electrodes[COATING]}: coats (metal or ink that stiffens the film) are "
+                "not modelled, because their effect on a charge is about 0.2 % once the gains are calibrated; remove "
+                "the key and calibrate the gains"
+            )
         for name, value in self.electrodes.items():
-            if name not in (SIDE, COATING) and isinstance(value, float):
+            if name != SIDE and isinstance(value, float):
                 raise WrongKey(f"electrodes.{name}", "[x, y] in mm or a table", value)
             if isinstance(value, PolygonTable):  # a trace needs a width, and a width needs a trace
                 has_trace = bool(value.trace_mm)
@@ -139,9 +146,6 @@ class SensorTable(Settings, frozen=True):
                     missing = "width_mm" if has_trace else "trace_mm"
                     raise WrongKey(f"electrodes.{name}.{missing}", "trace_mm and a width_mm above 0 together")
 
-        coating = self.electrodes.get(COATING, 0.0)
-        if not (isinstance(coating, float) and 0.0 <= coating <= MAX_COORDINATE_mm):
-            raise WrongKey(f"electrodes.{COATING}", f"a number from 0 to {MAX_COORDINATE_mm:g}", coating)
         side = self.electrodes.get(SIDE)
         if side is not None and not (isinstance(side, float) and 0.0 < side <= MAX_COORDINATE_mm):
             raise WrongKey(f"electrodes.{SIDE}", f"a number above 0 and at most {MAX_COORDINATE_mm:g}", side)
@@ -149,7 +153,7 @@ class SensorTable(Settings, frozen=True):
         if side is None and has_squares:
             raise WrongKey(f"electrodes.{SIDE}")
         for name in self.roles:
-            if name in (SIDE, COATING) or name not in self.electrodes:
+            if name == SIDE or name not in self.electrodes:
                 raise WrongKey(f"roles.{name}", "the name of an electrode of the section `electrodes`", name)
 
 
@@ -203,14 +207,12 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
     file = convert(table, SensorTable, where, SensorError)
     piezo = file.piezo
     calibration = file.calibration
-    coating = file.electrodes.get(COATING)  # absent if the metal does not stiffen the film
     with error_prefix(f"{where}: ", SensorError):
         return Sensor(
             name=file.name,
             film=_film(file.film),
             piezo=Piezo(piezo.d31, piezo.d32, piezo.d33, piezo.pyro_uC_per_m2_K, piezo.d12),
             electrodes=tuple(_electrodes(file.electrodes, file.roles)),
-            coating=coating if isinstance(coating, float) else 0.0,
             readout=file.readout,
             surface=file.surface,
             calibration=Calibration(
@@ -339,7 +341,7 @@ def write_sensor(sensor: Sensor, path: Path, comment: Iterable[str] = ()) -> Non
 
 
 def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
-    """Convert the electrodes and the coating of a sensor into the section `electrodes` of a sensor file.
+    """Convert the electrodes of a sensor into the section `electrodes` of a sensor file.
 
     All squares of a file have the same side. A square whose side differs from that of the first square is therefore
     described as a polygon.
@@ -363,8 +365,6 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
     tables: dict[str, Any] = {}
     if shared_side is not None:
         tables[SIDE] = shared_side
-    if sensor.coating:
-        tables[COATING] = tidy(sensor.coating)
     for electrode in sensor.electrodes:
         if electrode.square and sides[electrode.name] == shared_side:
             tables[electrode.name] = [tidy(value) for value in electrode.centre]
@@ -459,14 +459,14 @@ def _expansion(table: FilmTable) -> tuple[float, float] | None:
 def _electrodes(table: Mapping[str, float | Point | PolygonTable], roles: Mapping[str, Role]) -> Iterator[Electrode]:
     """Yield the electrodes that the section `electrodes` of a sensor file describes, one after the other.
 
-    A value of the section is a table of polygons, the centre of a square, or a number that applies to all electrodes.
+    A value of the section is a table of polygons, the centre of a square, or the side of all squares.
 
     Args:
         table: Content of the section `electrodes`.
         roles: Content of the section `roles`. An electrode that it does not contain has the role "position".
     """
     side = table.get(SIDE)  # side of all squares, mm
-    for name, value in table.items():  # the values of SIDE and COATING are numbers and yield no electrode
+    for name, value in table.items():  # the value of SIDE is a number and yields no electrode
         role = roles.get(name, "position")
         if isinstance(value, PolygonTable):
             electrode = Electrode(name, value.polygon_mm, more=value.more_mm, back=value.back_mm, role=role)

@@ -14,7 +14,7 @@ zero if the field is even, and all unknowns except U2 are zero if the field is o
 from functools import lru_cache
 
 import numpy as np
-from scipy.sparse import csc_array, csc_matrix, csr_array, eye_array, kron
+from scipy.sparse import csc_matrix, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from isocharge.common.arrays import Array, Integers
@@ -31,8 +31,6 @@ class Assembly:
         interior_unknowns: Indices of the interior unknowns of each element, shape (n_element, n_interior).
         side_unknowns: Indices of the unknowns on the sides of each element, shape (n_element, n_side).
         skeleton: Indices of the free unknowns on sides, in the order of elimination, shape (n_skeleton,).
-        constraint: Matrix that computes all skeleton unknowns from the unknowns of nodes that are not hanging nodes;
-            None if there are no hanging nodes.
     """
 
     def __init__(self, mesh: Template, unknowns_per_node: int, odd: bool = False) -> None:
@@ -72,22 +70,7 @@ class Assembly:
         skeleton_number = np.full(self.free.size, -1, dtype=np.intp)
         skeleton_number[self.skeleton] = np.arange(self.skeleton.size)
         self._set_pattern(skeleton_number[self.side_unknowns])
-        self.constraint = None if mesh.constraint is None else self._skeleton_constraint(mesh.constraint)
         self._reorder()
-
-    def _skeleton_constraint(self, node_constraint: csr_array) -> csc_array:
-        """Return the matrix that computes all skeleton unknowns from the skeleton unknowns of the regular nodes.
-
-        All nodes except the hanging nodes are called regular nodes.
-
-        Args:
-            node_constraint: Matrix that computes the values at all nodes from the values at nodes that are not hanging
-                nodes, shape (n_node, n_node). The columns of hanging nodes are zero.
-        """
-        unknown_constraint = kron(node_constraint, eye_array(self.unknowns_per_node)).tocsr()
-        skeleton_constraint = unknown_constraint[self.skeleton][:, self.skeleton]
-        is_regular = skeleton_constraint.diagonal() > 0.0  # false for hanging nodes, whose columns are zero
-        return skeleton_constraint[:, is_regular].tocsc()
 
     def _set_pattern(self, skeleton_numbers: Integers) -> None:
         """Determine which entries of the skeleton matrix may be nonzero, and where the element matrices are added.
@@ -127,18 +110,13 @@ class Assembly:
     def _reorder(self) -> None:
         """Renumber the skeleton unknowns by the minimum-degree method, so that the factors have few nonzero entries.
 
-        The skeleton unknowns are the unknowns on the sides of the elements. If the mesh has hanging nodes, the
-        factorised matrix is C' A C, where A is the skeleton matrix and C is the matrix `constraint`. In this case it is
-        sufficient to reorder the columns of C.
+        The skeleton unknowns are the unknowns on the sides of the elements.
         """
         # SuperLU returns its column order only after a factorisation. The factorised matrix has the pattern of the
         # skeleton matrix and a dominant diagonal, because such a matrix needs no pivoting.
         pattern = self._skeleton_matrix(np.ones(self._indices.size))
         dominant_matrix = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
         order = np.argsort(_factorise(dominant_matrix, "MMD_AT_PLUS_A").perm_c)
-        if self.constraint is not None:
-            self.constraint = self.constraint[:, order]
-            return
 
         # The renumbering moves each stored entry of the matrix to a new position. To find the new positions, set each
         # entry to its old position, permute the matrix, and invert the resulting list of old positions.
@@ -189,15 +167,12 @@ class Assembly:
         return Factor(self, interior_inverse, coupling, reduced_coupling, skeleton_factor)
 
     def _skeleton_matrix(self, entries: np.ndarray) -> csc_matrix:
-        """Create the matrix of the skeleton unknowns, without the unknowns of hanging nodes.
+        """Create the matrix of the skeleton unknowns.
 
         Args:
             entries: Entries of the sparsity pattern, in the order of the compressed sparse column format.
         """
-        matrix = csc_matrix((entries, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
-        if self.constraint is None:
-            return matrix
-        return csc_matrix(self.constraint.T @ matrix @ self.constraint)
+        return csc_matrix((entries, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
 
 
 class Factor:
@@ -249,14 +224,8 @@ class Factor:
         reduced_right = flat_right - np.bincount(assembly.side_unknowns.ravel(), coupled_right.ravel(), flat_right.size)
 
         # Solve for the unknowns of the skeleton.
-        skeleton_right = reduced_right[assembly.skeleton]
-        if assembly.constraint is None:
-            skeleton_solution = self._skeleton_factor.solve(skeleton_right)
-        else:  # solve for the unknowns of regular nodes, which determine the unknowns of hanging nodes
-            regular_solution = self._skeleton_factor.solve(assembly.constraint.T @ skeleton_right)
-            skeleton_solution = assembly.constraint @ regular_solution
         solution = np.zeros(flat_right.size)
-        solution[assembly.skeleton] = skeleton_solution
+        solution[assembly.skeleton] = self._skeleton_factor.solve(reduced_right[assembly.skeleton])
 
         # Compute the interior unknowns of each element from the unknowns on its sides.
         side_solution = solution[assembly.side_unknowns][..., None]  # shape (n_element, n_side, 1)

@@ -141,10 +141,6 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
         second_derivatives = gradient @ nodal_slope_of_deflection
         total_strain += _bending_strain(equilibrium, surface, second_derivatives)
 
-    # At the edges of a coat, the strain of the mesh is the mean strain of the bare and the coated film.
-    if mesh.coat is not None:
-        total_strain = mesh.coat.film_strain(_to_press_frame(equilibrium, points), total_strain)
-
     # Compute the stress in the frame of the press. The shear stress has the opposite sign in the reflected half.
     press_frame_stress = equilibrium.film.young * groups.squared_amplitude * scaled_stress(total_strain, groups)
     press_frame_stress[is_reflected, 2] *= -1.0

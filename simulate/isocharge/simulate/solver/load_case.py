@@ -9,15 +9,12 @@ from typing import Literal, Self
 import numpy as np
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared, scaled_stress
-from isocharge.simulate.mechanics.stress import stress
+from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.theory import ACCURACY, Theory, bending_length, choose_theory
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import CLEARANCE
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, place
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.mesh.refinement import coated
-from isocharge.simulate.numerics.polygon import to_complex
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.solver.error_estimate import shape_error
@@ -279,46 +276,7 @@ class LoadCase:
 
     def place(self, resolution: Resolution) -> PlacedMesh:
         """Create the mesh under this press with a given resolution."""
-        return place_coated(self.film, self.probe, self.at, resolution, self.layer, whole=any(self.side_force))
-
-
-def place_coated(
-    film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float, *, whole: bool = False
-) -> PlacedMesh:
-    """Create the mesh under a press. If the film has a coat, refine the mesh along the edges of the coat.
-
-    Args:
-        film: The film.
-        probe: The probe.
-        at: Centroid (x, y) of the footprint, mm.
-        resolution: Fineness of the mesh.
-        layer: Total width of the thin rings at the rim, in film radii.
-        whole: Whether to mesh the whole film although film and footprint are symmetric.
-
-    Returns:
-        The mesh, in film radii and rotated with the press.
-    """
-    mesh = place(film, probe, at, resolution, layer, whole=whole)
-    if film.coat is None:
-        return mesh
-
-    # Convert the outlines of the coat to complex numbers in film radii, and rotate them with the press onto the x axis.
-    x, y = at
-    angle = float(np.arctan2(y, x))
-    rotation_and_scale = np.exp(-1j * angle) / film.radius
-    coat_layers = []
-    for coat_layer in film.coat.layers:
-        outlines = [to_complex(np.array(part)) * rotation_and_scale for part in coat_layer]
-        coat_layers.append(tuple(outlines))
-
-    # Compute the elasticity matrices of the film and of the coat, divided by Young's modulus of the film. The rows are
-    # the stresses of the three unit strains. The elasticity does not depend on the force, so any force may be used.
-    unit_strains = np.eye(3)
-    groups = DimensionlessGroups.of(film, force=1.0, bending=False, angle=angle)
-    film_moduli = scaled_stress(unit_strains, groups)
-    stiffness_ratio = film.coat.stiffness / (film.young * film.thickness)
-    coat_moduli = stiffness_ratio * stress(unit_strains, film.poisson)
-    return coated(mesh, tuple(coat_layers), film_moduli, coat_moduli)
+        return place(self.film, self.probe, self.at, resolution, self.layer, whole=any(self.side_force))
 
 
 def _choose_thin_ring_width(
@@ -428,7 +386,7 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
 
     # A better accuracy than the default `ACCURACY` requires a higher polynomial order. The factors are empirical.
     extra_order = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.accuracy)))
-    first_order = 5 if case.theory.bending and film.coat is None else 4
+    first_order = 5 if case.theory.bending else 4
 
     # A small radius of the innermost circle and the stretch of the conformal map require more rings (empirical
     # factors).

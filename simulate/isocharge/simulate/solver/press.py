@@ -376,13 +376,12 @@ def _first_field(start: Equilibrium | None, template: Template, default: Array) 
     if start is None:
         return default
 
-    # Compare the blocks, the resolution except for the order, and the refinement along a coat.
+    # Compare the blocks, and the resolution except for the order.
     start_template = start.mesh.template
     has_same_blocks = start_template.topology == template.topology and start_template.half == template.half
     resolution_with_same_order = replace(start_template.resolution, order=template.resolution.order)
     has_same_resolution_except_order = resolution_with_same_order == template.resolution
-    has_same_splits = np.array_equal(start_template.splits, template.splits)
-    if not (has_same_blocks and has_same_resolution_except_order and has_same_splits):
+    if not (has_same_blocks and has_same_resolution_except_order):
         return default
 
     if start_template.resolution.order == template.resolution.order:

@@ -137,6 +137,6 @@ def _simulate_closed_back(charges: FilmCharges, pretension_share: float, contact
     settings = SolveSettings(accuracy=ACCURACY)
     charge_rows = []
     for x, y, force in contact.tolist():
-        solved_press = press(closed_sensor.coated_film, probe, (x, y), force, settings)
+        solved_press = press(closed_sensor.film, probe, (x, y), force, settings)
         charge_rows.append(touch_charge(closed_sensor, solved_press))
     return np.array(charge_rows)
