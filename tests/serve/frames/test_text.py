@@ -14,6 +14,7 @@ from isocharge.serve.frames.frame import SequenceGaps
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_lines import TEXT_FORMATS, Notation, parse_line
 from isocharge.serve.port.device_clock import DeviceClock
+from isocharge.serve.port.source import Chunk
 
 README_OF_TELEPLOT = [
     ("myValue:1234", ("myValue",), (1234.0,)),
@@ -239,9 +240,10 @@ def test_clock_in_text_that_wraps(name, unit, modulus):
     clock = DeviceClock()
     times_us = []
     for number in range(200):
-        time = (start + 5 * number * unit) % modulus
-        frames = feed(f"{name}:{time:.6f},A:1", parser=parser)
-        times_us += [clock.read(frame.t_us, parser.t_us_modulus, 0.0).device_us for frame in frames]
+        sent = (start + 5 * number * unit) % modulus
+        frames = feed(f"{name}:{sent:.6f},A:1", parser=parser)
+        times = clock.read(Chunk(b"", 0.0, 0), [frame.t_us for frame in frames], parser.t_us_modulus)
+        times_us += [time.device_us for time in times]
     assert clock.restarts == 0
     step_us = 5 * unit if name == "t_us" else 5000.0
     np.testing.assert_allclose(np.diff(times_us), step_us, atol=1.1)
@@ -251,8 +253,8 @@ def test_clock_in_text_that_restarts_has_not_wrapped():
     parser = TextParser()
     clock = DeviceClock()
     for number in [*range(1000, 1200), *range(20)]:
-        for frame in feed(f"t_ms:{5 * number},A:1", parser=parser):
-            clock.read(frame.t_us, parser.t_us_modulus, 0.0)
+        frames = feed(f"t_ms:{5 * number},A:1", parser=parser)
+        clock.read(Chunk(b"", 0.0, 0), [frame.t_us for frame in frames], parser.t_us_modulus)
     assert clock.restarts == 1
 
 

@@ -54,7 +54,8 @@ def chunks_of_presses(film, chunk_bytes=37, outage_number=40):
     for number, begin in enumerate(range(0, len(data), chunk_bytes)):
         outage_s = 1.5 if number == outage_number else 0.0
         timestamp = 1e9 + CHUNK_INTERVAL_S * number
-        chunks.append(Chunk(data[begin : begin + chunk_bytes], timestamp, time.perf_counter_ns(), outage_s))
+        clock_ns = round(1e9 * CHUNK_INTERVAL_S * number)
+        chunks.append(Chunk(data[begin : begin + chunk_bytes], timestamp, clock_ns, outage_s))
     return chunks
 
 
@@ -166,7 +167,7 @@ def test_replay_in_real_time_waits_between_chunks(tmp_path, film, predictor, mon
     record_presses(path, film, predictor)
     recording = Recording(path)
     slept_s = []
-    monkeypatch.setattr(time, "time", lambda: 5e9 + sum(slept_s))
+    monkeypatch.setattr(time, "monotonic", lambda: sum(slept_s))
     monkeypatch.setattr(time, "sleep", slept_s.append)
     clock = RecordedClock()
     stream = TouchStream(predictor, device_from_table(recording.device, "recording"), now_ns=clock)
@@ -176,6 +177,19 @@ def test_replay_in_real_time_waits_between_chunks(tmp_path, film, predictor, mon
     chunk_count = sum(event.chunk is not None for event in recording.events())
     expected_s = CHUNK_INTERVAL_S * (chunk_count - 1) if real_time else 0.0
     assert sum(slept_s) == pytest.approx(expected_s, abs=1e-5)
+
+
+def test_replay_in_real_time_ignores_a_step_of_the_wall_clock(tmp_path, predictor, monkeypatch):
+    """A step by 8e10 s is longer than `time.sleep` accepts."""
+    path = tmp_path / "touch.rec"
+    with Recorder(path, predictor.metadata.label, "every", {}) as recorder:
+        for number, wall_s in enumerate((0.0, 0.1, 3600.2, 8e10, 0.4)):
+            recorder.chunk(Chunk(b"A:1,B:2,C:3\n", wall_s, 10**8 * number), [])
+    slept_s = []
+    monkeypatch.setattr(time, "monotonic", lambda: sum(slept_s))
+    monkeypatch.setattr(time, "sleep", slept_s.append)
+    list(replay(Recording(path), TouchStream(predictor), RecordedClock(), real_time=True))
+    assert sum(slept_s) == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize(("label", "model_changes"), [("linear/1", []), ("linear/2", [NewModel("linear/1")])])

@@ -44,7 +44,8 @@ def readings(charge_pC, *, flags=None):
         has_tare = TARE not in frame_flags
         is_contact = has_tare and clean_pC[0] > 20.0
         reading = Reading(noisy_pC, noisy_pC if has_tare else None, tare, contact=is_contact, flags=frame_flags)
-        time = ReadingTime(1e9 + number / RATE_HZ, round(1e6 * number / RATE_HZ), 1.0 / RATE_HZ)
+        time_s = number / RATE_HZ
+        time = ReadingTime(1e9 + time_s, round(1e6 * time_s), 1.0 / RATE_HZ, time_s)
         yield TimedReading(reading, time)
 
 

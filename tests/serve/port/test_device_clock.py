@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 
 from isocharge.serve.port.device_clock import DeviceClock
+from isocharge.serve.port.source import Chunk
 
 MODULUS = 2**32
 START_S = 1_700_000_000.0
+
+
+def chunk_at(monotonic_s, wall_s=None):
+    """Return a chunk that arrives at a monotonic time; the wall clock shows another time only if it is given."""
+    return Chunk(b"x", START_S + (monotonic_s if wall_s is None else wall_s), round(monotonic_s * 1e9))
 
 
 def follow(t_us, arrived_s):
@@ -14,8 +20,7 @@ def follow(t_us, arrived_s):
     clock = DeviceClock()
     times = []
     for device_us, arrival_s in zip(t_us, arrived_s, strict=True):
-        times.append(clock.read(int(device_us) % MODULUS, MODULUS, arrival_s))
-        clock.arrived(arrival_s)
+        times += clock.read(chunk_at(arrival_s - START_S), [int(device_us) % MODULUS], MODULUS)
     return clock, times
 
 
@@ -69,11 +74,8 @@ def test_times_never_decrease():
     starts = np.cumsum(rng.integers(1, 9, 3000))
     delays_s = rng.exponential(0.05, starts.size)
     for start, stop, delay_s in zip(starts, starts[1:], delays_s, strict=False):
-        arrived_s = START_S + 0.004 * stop + delay_s
-        for number in range(start, stop):
-            t_us = 4000 * int(number % 7000)
-            host_s.append(clock.read(t_us, MODULUS, arrived_s).host_s)
-        clock.arrived(arrived_s)
+        t_us = [4000 * int(number % 7000) for number in range(start, stop)]
+        host_s += [time.host_s for time in clock.read(chunk_at(0.004 * stop + delay_s), t_us, MODULUS)]
     assert np.diff(host_s).min() >= 0.0
     assert clock.restarts == 1
 
@@ -82,16 +84,50 @@ def test_readings_of_one_chunk_are_spread_by_the_device_clock():
     clock = DeviceClock()
     host_s = []
     for chunk in range(200):
-        arrived_s = START_S + 0.016 * (chunk + 1)
-        numbers = range(16 * chunk, 16 * chunk + 16)
-        host_s += [clock.read(1000 * number, MODULUS, arrived_s).host_s for number in numbers]
-        clock.arrived(arrived_s)
+        t_us = [1000 * number for number in range(16 * chunk, 16 * chunk + 16)]
+        host_s += [time.host_s for time in clock.read(chunk_at(0.016 * (chunk + 1)), t_us, MODULUS)]
     np.testing.assert_allclose(np.diff(host_s)[160:], 1e-3, rtol=1e-3)
 
 
-def test_time_without_a_device_clock_is_the_arrival():
+def test_readings_without_a_device_clock_share_the_time_between_chunks():
     clock = DeviceClock()
-    times = [clock.read(None, MODULUS, START_S + arrival_s) for arrival_s in (0.0, 0.01, 0.03)]
-    assert [time.device_us for time in times] == [None] * 3
-    assert [time.host_s - START_S for time in times] == pytest.approx([0.0, 0.01, 0.03])
-    assert [time.step_s for time in times] == pytest.approx([0.0, 0.01, 0.02])
+    times = []
+    for arrival_s, n_readings in ((0.0, 2), (0.01, 1), (0.015, 0), (1.01, 200)):
+        times += clock.read(chunk_at(arrival_s), [None] * n_readings, MODULUS)
+    assert {time.device_us for time in times} == {None}
+    assert [time.step_s for time in times] == pytest.approx([0.0, 0.0, 0.01] + [0.005] * 200)
+    assert [time.host_s - START_S for time in times[2:5]] == pytest.approx([0.01, 0.015, 0.02], abs=1e-6)
+    assert times[-1].host_s - START_S == pytest.approx(1.01)
+    np.testing.assert_allclose(np.diff([time.clock_s for time in times[1:]])[1:], 0.005, atol=1e-6)
+
+
+@pytest.mark.parametrize("jump_s", [3.0, -3.0, 3600.0, -3600.0, 0.2, 8e10])
+@pytest.mark.parametrize("has_clock", [False, True])
+def test_wall_clock_that_is_set_changes_no_step(jump_s, has_clock):
+    """The time stamps of the records follow the wall clock, and the integration of the leak does not see the jump."""
+    clock = DeviceClock()
+    times = []
+    for number in range(400):
+        monotonic_s = 0.005 * number
+        t_us = [round(monotonic_s * 1e6) if has_clock else None]
+        times += clock.read(chunk_at(monotonic_s, monotonic_s + jump_s * (number >= 200)), t_us, MODULUS)
+    assert [time.step_s for time in times[1:]] == pytest.approx([0.005] * 399)
+    np.testing.assert_allclose(np.diff([time.clock_s for time in times]), 0.005, atol=1e-6)
+    assert times[-1].host_s - START_S == pytest.approx(1.995 + jump_s, abs=0.2)
+    assert clock.restarts == 0
+
+
+def test_chunks_without_a_monotonic_time_are_timed_by_their_arrivals():
+    clock = DeviceClock()
+    times = []
+    for arrival_s in (0.0, 0.01, 0.03, 0.02):
+        times += clock.read(Chunk(b"x", START_S + arrival_s, 0), [None], MODULUS)
+    assert [time.step_s for time in times] == pytest.approx([0.0, 0.01, 0.02, 0.0])
+
+
+def test_chunks_of_a_file_have_no_time_between_them():
+    clock = DeviceClock()
+    times = []
+    for clock_ns in (0, 10**9):
+        times += clock.read(Chunk(b"x", START_S, clock_ns), [None], MODULUS)
+    assert [time.step_s for time in times] == [0.0, 0.0]

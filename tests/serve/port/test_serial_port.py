@@ -2,6 +2,7 @@
 
 import os
 import socket
+import termios
 import threading
 import time
 import tty
@@ -48,6 +49,10 @@ def test_chunk_has_the_bytes_unchanged_and_the_time_of_arrival(board):
     [
         ("/dev/ttyNone", "there is no such port: plug the board in"),
         ("/dev/null", r"cannot be opened at 115200 baud .*check the cable"),
+        *(
+            (f"{scheme}://127.0.0.1", rf"cannot be opened \(expected a port number, as in {scheme}://127.0.0.1:7000\)")
+            for scheme in ("tcp", "socket", "rfc2217")
+        ),
         ("socket://127.0.0.1:1", r"cannot be opened \(.*refused\); check the host and the port number"),
         ("telepathy://x", r"cannot be opened \(invalid URL"),
         *(
@@ -79,9 +84,80 @@ def test_port_opened_by_another_program_is_refused(board):
 
 def test_silent_port_is_lost_after_the_timeout(board):
     with Port(board.url, silence_s=0.05) as port:
-        assert port.read(0.01) is None
+        board.write_whole(b"x")
+        chunks = iter(port)
+        assert next(chunks).data == b"x"
         with pytest.raises(PortLost, match=r"no data for 0.05 s; check that"):
+            next(chunks)
+
+
+@pytest.mark.parametrize(("wait", "start_up"), [(0.0, "0.06"), (0.1, "0.1")])
+def test_board_that_restarts_when_the_port_is_opened_may_be_silent_longer_at_first(board, wait, start_up):
+    """An Arduino restarts when DTR rises. The option `wait` also sets the time for the first byte."""
+    with (
+        Port(board.url, silence_s=0.03, wait=wait) as port,
+        pytest.raises(PortLost, match=f"no data for {start_up} s"),
+    ):
+        next(iter(port))
+
+
+def test_slow_board_is_not_restarted_for_ever(monkeypatch):
+    """A board restarts whenever its port is opened, and needs ten times as long as the silence of a lost port."""
+    board = PseudoPort()
+    openings_s = []
+    original_open = Port._open
+
+    def open_and_restart(port):
+        openings_s.append(time.monotonic())
+        original_open(port)
+
+    def run():
+        while not is_received.wait(0.01):
+            if openings_s and time.monotonic() - openings_s[-1] > 0.5:
+                board.write_whole(b"ready")
+
+    is_received = threading.Event()
+    running = threading.Thread(target=run)
+    running.start()
+    monkeypatch.setattr(Port, "_open", open_and_restart)
+    with Port(board.url, silence_s=0.05, reconnect=True) as port:
+        assert next(iter(port)).data.startswith(b"ready")
+    is_received.set()
+    running.join()
+    board.close()
+    assert 2 < len(openings_s) < 6
+
+
+def test_closing_a_port_leaves_dtr_set(board):
+    """With HUPCL, the system would clear DTR at the end, and the next opening would restart an Arduino."""
+    with Port(board.url):
+        pass
+    reader = os.open(board.url, os.O_RDWR | os.O_NOCTTY)
+    control_modes = termios.tcgetattr(reader)[2]
+    os.close(reader)
+    assert not control_modes & termios.HUPCL
+
+
+def test_second_program_that_reads_the_port_is_named(board, monkeypatch):
+    """The bytes arrive, but the other program reads them first."""
+    with Port(board.url) as port:
+        monkeypatch.setattr("select.select", lambda read, *_: (read, [], []))
+        with pytest.raises(PortLost, match="another program reads this port") as caught:
             next(iter(port))
+    assert "cable" not in str(caught.value)
+
+
+def test_bytes_that_waited_during_a_stall_are_one_chunk(board, address):
+    """A terminal returns at most 4 kB at a time, and a socket returns one datagram."""
+    with Port(board.url) as port:
+        for _ in range(100):
+            board.write_whole(b"x" * 100)
+        time.sleep(0.1)
+        assert len(next(iter(port)).data) > 5_000
+    with Port(f"udp://127.0.0.1:{address[1]}") as port, socket.socket(type=socket.SOCK_DGRAM) as sender:
+        for _ in range(20):
+            sender.sendto(b"1,2,3\n", address)
+        assert next(iter(port)).data == b"1,2,3\n" * 20
 
 
 def test_reading_a_port_that_is_not_open_is_an_error(board):
@@ -193,8 +269,7 @@ def received(address, *datagrams):
     ):
         for datagram in datagrams:
             board.sendto(datagram, address)
-        chunks = iter(port)
-        return [next(chunks).data for datagram in datagrams if datagram]
+        return [port.read(10.0).data for datagram in datagrams if datagram]
 
 
 TEXT = (b'{"A": 1}', b"A:1\tB:2", "1 µC".encode())

@@ -12,6 +12,7 @@ from isocharge.serve import BinaryParser, Predictor, device_from_table, encode_f
 from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
 from isocharge.serve.frames.frame import T_US_MODULUS, Frame
 from isocharge.serve.port.device_clock import DeviceClock
+from isocharge.serve.port.source import Chunk
 from isocharge.serve.signal_chain.chain import SignalChain
 from isocharge.train.export_c.folder import device_header
 
@@ -271,7 +272,7 @@ def test_clock_overflows_and_restarts_in_c_as_in_python(exported):
     t_us[300:] = (t_us[300:] - t_us[300] + 17) % T_US_MODULUS  # the board was reset
     t_us[400:] = (t_us[400:] + (1 << 31) + 500_000) % T_US_MODULUS
     clock = DeviceClock()
-    times = [clock.read(int(t), T_US_MODULUS, 0.0) for t in t_us]
+    times = clock.read(Chunk(b"", 0.0, 0), t_us.tolist(), T_US_MODULUS)
     t_s, dt_s = exported.clock(t_us)
     np.testing.assert_allclose(t_s, [time.clock_s for time in times], rtol=1e-15)
     np.testing.assert_allclose(dt_s, [time.step_s for time in times], rtol=1e-15)

@@ -223,10 +223,10 @@ def read_frames(received: ReceivedData, device: Device) -> Capture:
     capture = Capture(device.parser(), bytes_seen=received.bytes_seen)
     clock = DeviceClock()
     for chunk in received.chunks:
-        for frame in capture.parser.feed(chunk.data):
-            # The time is that of the device's clock, or the arrival time if the frame contains no time.
-            frame_time = clock.read(frame.t_us, capture.parser.t_us_modulus, chunk.timestamp)
-            capture.frames.append(frame)
-            capture.times_s.append(frame_time.clock_s)
+        frames = capture.parser.feed(chunk.data)
+        times = clock.read(chunk, [frame.t_us for frame in frames], capture.parser.t_us_modulus)
+        capture.frames += frames
+        capture.times_s += [time.clock_s for time in times]
+        for frame in frames:
             capture.gaps.update(frame.seq, capture.parser.seq_modulus)
     return capture

@@ -285,30 +285,34 @@ class ReadingStream:
             TareError: If the film is touched during the whole search for a tare.
             NoFramesError: If the stream has contained no intact frame in more than `BYTES_TO_RECOGNISE` bytes.
         """
-        frames = self.frames(chunk)
-        for frame in frames:
-            yield self.advance(frame, chunk)
-        self.end_chunk(frames, chunk)
+        for frame, time in self.frames(chunk):
+            yield self.advance(frame, time)
 
-    def frames(self, chunk: Chunk) -> list[Frame]:
-        """Parse a chunk, and return the frames whose last byte is in the chunk.
+    def frames(self, chunk: Chunk) -> list[tuple[Frame, ReadingTime]]:
+        """Parse a chunk, and return the frames whose last byte is in the chunk, with their times.
 
         If the chunk follows an outage of the port, the state before the outage is discarded first.
+
+        Raises:
+            NoFramesError: If the stream has contained no intact frame in more than `BYTES_TO_RECOGNISE` bytes.
         """
         if chunk.outage_s > 0.0:
             self._reconnect()
-        return self.parser.feed(chunk.data)
+        frames = self.parser.feed(chunk.data)
+        if not frames:
+            _check_recognised(self.parser)
+        times = self.clock.read(chunk, [frame.t_us for frame in frames], self.parser.t_us_modulus)
+        return list(zip(frames, times, strict=True))
 
-    def advance(self, frame: Frame, chunk: Chunk) -> TimedReading:
-        """Compute the time and the touch charges of the next frame of a chunk.
+    def advance(self, frame: Frame, time: ReadingTime) -> TimedReading:
+        """Compute the touch charges of the next frame of a chunk.
 
-        The clock of the device determines the time of the frame. The counter of missing frames compares the frame
-        number with the previous frame number. The signal chain converts the values of the electrodes to touch charges.
+        The counter of missing frames compares the frame number with the previous frame number. The signal chain
+        converts the values of the electrodes to touch charges.
 
         Args:
             frame: The frame.
-            chunk: The chunk that contains the end of the frame. A frame without a device time has the time at which
-                this chunk arrived.
+            time: Time of the frame.
 
         Returns:
             The touch charges with the flags of the frame, and the time of the frame.
@@ -317,17 +321,12 @@ class ReadingStream:
             ChargeError: If the frame has no value for an electrode.
             TareError: If the film is touched during the whole search for a tare.
         """
-        time_of_reading = self.clock.read(frame.t_us, self.parser.t_us_modulus, chunk.timestamp)
         flags = self._pending_flags + self.gaps.update(frame.seq, self.parser.seq_modulus)
         self._pending_flags = ()
         values = self._picker.pick(frame)
         try:
             reading = self._chain.advance(
-                values,
-                time_of_reading.clock_s,
-                time_of_reading.step_s,
-                limited=bool(frame.flags & SATURATED_BIT),
-                flags=flags,
+                values, time.clock_s, time.step_s, limited=bool(frame.flags & SATURATED_BIT), flags=flags
             )
         except TareError as error:
             # The search may have failed because the film is touched, or because the board has large offsets. In the
@@ -338,25 +337,7 @@ class ReadingStream:
             raise TareError(
                 f"{error}; if the board rests there without a touch, say so in a device file: {setting}"
             ) from error
-        return TimedReading(reading, time_of_reading)
-
-    def end_chunk(self, frames: list[Frame], chunk: Chunk) -> None:
-        """Finish a chunk whose frames have been processed.
-
-        If the chunk contained the end of a frame, the clock of the device is adjusted to the time of arrival of the
-        chunk. Otherwise, the method checks that the stream does not consist of many bytes without an intact frame.
-
-        Args:
-            frames: The frames that `frames` returned for the chunk.
-            chunk: The chunk.
-
-        Raises:
-            NoFramesError: If the stream has contained no intact frame in more than `BYTES_TO_RECOGNISE` bytes.
-        """
-        if frames:
-            self.clock.arrived(chunk.timestamp)
-        else:
-            _check_recognised(self.parser)
+        return TimedReading(reading, time)
 
     def finish(self) -> None:
         """Finish the stream, for example at the end of a file.

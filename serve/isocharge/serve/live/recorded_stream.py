@@ -5,6 +5,7 @@ the replay also uses the same models as the recorded stream, its records are ide
 """
 
 import logging
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -261,7 +262,8 @@ def replay(
         RecordingError: If a line other than the last one is damaged.
         ModelError: If a model of the recording cannot be loaded.
     """
-    delay_s: float | None = None  # time from the recording to this replay; None before the first chunk
+    previous_chunk: Chunk | None = None
+    due_s = 0.0  # monotonic time at which the replay of the next chunk begins
     for event in recording.events():
         match event:
             case Marker():
@@ -276,11 +278,14 @@ def replay(
                 stream.tare()
             case Event(chunk=Chunk() as chunk, latencies_us=latencies_us):
                 clock.set(event)
-                if delay_s is None:
-                    delay_s = time.time() - chunk.timestamp
+                if previous_chunk is None:
+                    due_s = time.monotonic()
+                else:
+                    due_s += chunk.elapsed_since(previous_chunk)
+                previous_chunk = chunk
                 if real_time:
-                    due_s = chunk.timestamp + delay_s
-                    time.sleep(max(0.0, due_s - time.time()))
+                    wait_s = max(0.0, due_s - time.monotonic())
+                    time.sleep(min(wait_s, threading.TIMEOUT_MAX))
                 recorded_count = len(latencies_us)  # the recording contains one latency for each recorded record
                 yield from _recorded_part(stream.feed(chunk), recorded_count)
 

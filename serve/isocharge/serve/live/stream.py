@@ -324,8 +324,8 @@ class TouchStream:
             self._discard_contact()
         frames = self._readings.frames(chunk)
         skipped_flags: set[str] = set()  # flags of the frames in this chunk that have no record
-        for number, frame in enumerate(frames, start=1):
-            timed = self._readings.advance(frame, chunk)  # the signal chain also processes the skipped frames
+        for number, (frame, frame_time) in enumerate(frames, start=1):
+            timed = self._readings.advance(frame, frame_time)  # the signal chain also processes the skipped frames
             is_last = number == len(frames)
             is_skipped = self._policy is Policy.latest and not is_last
             if is_skipped:
@@ -336,7 +336,6 @@ class TouchStream:
                 timed = timed._replace(reading=_with_lasting_flags(timed.reading, skipped_flags))
             self.counts.records += 1
             yield self._record(chunk, frame, timed)
-        self._readings.end_chunk(frames, chunk)
 
     def finish(self) -> None:
         """Finish the stream, for example at the end of a file.

@@ -7,10 +7,16 @@ The clock of the device does not fluctuate, but it runs at a slightly different 
 second-order delay-locked loop (Adriaensen, "Using a DLL to filter time", 2005) fits the clock of the device to the
 arrival times, and computes a smooth host time for each reading. The bandwidth of the loop is small, so that the loop
 averages over many arrivals. In the first seconds, the bandwidth is larger, so that the fit converges quickly.
+
+The wall clock of the host may be set while a stream runs. The time between two readings is therefore never computed
+from the wall clock. If the device sends no clock, it is computed from the monotonic time of the chunks.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
+
+from isocharge.serve.port.source import Chunk
 
 BANDWIDTH_Hz = 0.05
 """Bandwidth of the loop, Hz. A jitter of 1 ms is reduced to 0.2 ms."""
@@ -24,7 +30,8 @@ MAX_LOOP_GAIN = 0.5
 MAX_DEVIATION_s = 1.0
 """Largest difference between an arrival time and its prediction, s.
 
-After a larger difference, the fit starts again, because a clock was set or the device was reset.
+After a larger difference, the fit starts again, because the clock of the device was set or the device was reset. A
+larger difference between the wall clock and the monotonic time of the host means that the wall clock was set.
 """
 
 
@@ -33,26 +40,24 @@ class ReadingTime(NamedTuple):
 
     Attributes:
         host_s: Time of the host, unix seconds. It is computed from the clock of the device. If the device sends no
-            clock, it is the arrival time. The time decreases only if a new fit begins because a clock was set.
+            clock, it is computed from the arrival time. The time decreases only if a clock was set.
         device_us: Clock of the device after the wraps were removed, us; None if the device sends no clock.
-        step_s: Time since the previous reading, s; 0 for the first reading after a start.
+        step_s: Time since the previous reading, s; 0 for the first reading after a start. It does not depend on the
+            wall clock of the host.
+        clock_s: Time of the reading on the clock of the device, s. If the device sends no clock, it is a time of the
+            host that does not jump if the wall clock is set.
     """
 
     host_s: float
     device_us: int | None
     step_s: float
-
-    @property
-    def clock_s(self) -> float:
-        """Time of the reading on the clock of the device, or the host time if the device sends no clock, s."""
-        return self.host_s if self.device_us is None else self.device_us * 1e-6
+    clock_s: float
 
 
 class DeviceClock:
     """Clock of one device, which is fitted to the time of the host.
 
-    Call the method `read` for every reading in order, and call the method `arrived` after the last reading of each
-    chunk. A chunk consists of the bytes that arrived together.
+    Call the method `read` for every chunk in order. A chunk consists of the bytes that arrived together.
 
     Attributes:
         rate: Seconds of the host per second of the device.
@@ -63,6 +68,8 @@ class DeviceClock:
         """Start without a reading."""
         self.rate = 1.0
         self.restarts = 0
+        self._latest_chunk: Chunk | None = None
+        self._monotonic_s = 0.0  # arrival of the latest chunk; it does not jump if the wall clock is set
         self.reset()
 
     def reset(self) -> None:
@@ -73,7 +80,6 @@ class DeviceClock:
         """
         self._sent_us: int | None = None  # clock of the latest reading as the device sent it
         self._device_us = 0  # clock of the latest reading after the wraps were removed
-        self._last_arrival_s: float | None = None  # arrival of the latest reading that was sent without a clock
         self._chunk_arrival_s: float | None = None  # arrival of the latest chunk
 
         # According to the fit, the host time was `_fitted_host_s` when the clock of the device was `_fitted_us`. If
@@ -84,21 +90,62 @@ class DeviceClock:
         self._is_fit_provisional = True  # whether the fit relies on the arrival of only one chunk
         self._latest_host_s = -math.inf  # host time of the latest reading
 
-    def read(self, t_us: int | None, modulus: int, arrival_s: float) -> ReadingTime:
-        """Return the time at which the next reading was taken, and the time since the previous reading.
+    def read(self, chunk: Chunk, t_us: Sequence[int | None], modulus: int) -> list[ReadingTime]:
+        """Return the times at which the readings of a chunk were taken, and adjust the clock to the chunk.
 
         The clock of the device is converted to the time of the host by a straight line, which is called the fit. If the
-        device sends no clock, the host time is the arrival time of the chunk, that is, of the bytes that arrived
-        together with the reading.
+        device sends no clock, the readings of the chunk share the time since the previous chunk evenly, and the last
+        reading has the arrival time of the chunk.
 
         Args:
-            t_us: Clock as the device sent it, us; None if the device sends no clock.
+            chunk: The bytes that contain the ends of the readings.
+            t_us: Clock of each reading as the device sent it, us; None for a reading without a clock.
+            modulus: Time at which the clock wraps to 0, us.
+        """
+        if not t_us:  # the time is shared by the readings of the next chunk
+            return []
+        is_first_chunk = self._chunk_arrival_s is None
+        elapsed_s = self._enter_chunk(chunk)
+        share_s = 0.0 if is_first_chunk else elapsed_s / len(t_us)
+        times = []
+        for n_later, reading_us in zip(range(len(t_us) - 1, -1, -1), t_us, strict=True):
+            if reading_us is None:
+                before_arrival_s = n_later * share_s
+                clock_s = self._monotonic_s - before_arrival_s
+                times.append(ReadingTime(chunk.timestamp - before_arrival_s, None, share_s, clock_s))
+            else:
+                times.append(self._time_of_device(reading_us, modulus, chunk.timestamp))
+        self._end_chunk(chunk.timestamp)
+        return times
+
+    def _enter_chunk(self, chunk: Chunk) -> float:
+        """Return the time from the previous chunk to this chunk, s, and advance the monotonic time of the host.
+
+        If the wall clock was set between the chunks, all stored host times are changed by the same amount.
+        """
+        previous = self._latest_chunk
+        self._latest_chunk = chunk
+        if previous is None:
+            self._monotonic_s = chunk.timestamp
+            return 0.0
+        elapsed_s = chunk.elapsed_since(previous)
+        self._monotonic_s += elapsed_s
+        wall_jump_s = chunk.timestamp - previous.timestamp - elapsed_s
+        if abs(wall_jump_s) > MAX_DEVIATION_s:
+            self._fitted_host_s += wall_jump_s
+            self._latest_host_s += wall_jump_s
+            if self._chunk_arrival_s is not None:
+                self._chunk_arrival_s += wall_jump_s
+        return elapsed_s
+
+    def _time_of_device(self, t_us: int, modulus: int, arrival_s: float) -> ReadingTime:
+        """Return the time of a reading from the clock of the device.
+
+        Args:
+            t_us: Clock as the device sent it, us.
             modulus: Time at which the clock wraps to 0, us.
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
-        if t_us is None:
-            return self._time_without_clock(arrival_s)
-
         step_us = self._unwrap(t_us, modulus)  # time since the previous reading
         if self._is_far_ahead_of(arrival_s):  # no reading can be taken long after its arrival, so a clock was set
             self.restarts += 1
@@ -114,19 +161,7 @@ class DeviceClock:
 
         # The host time must not decrease, even if a correction of the fit has moved the predicted host time back.
         self._latest_host_s = max(self._latest_host_s, self._predict(self._device_us))
-        return ReadingTime(self._latest_host_s, self._device_us, step_us * 1e-6)
-
-    def _time_without_clock(self, arrival_s: float) -> ReadingTime:
-        """Return the arrival time of the chunk as the time of the reading, because the device sends no clock.
-
-        Args:
-            arrival_s: Arrival of the chunk that contains the reading, unix seconds.
-        """
-        step_s = 0.0  # for the first reading
-        if self._last_arrival_s is not None:
-            step_s = max(0.0, arrival_s - self._last_arrival_s)  # the clock of the host may have been set back
-        self._last_arrival_s = arrival_s
-        return ReadingTime(arrival_s, None, step_s)
+        return ReadingTime(self._latest_host_s, self._device_us, step_us * 1e-6, self._device_us * 1e-6)
 
     def _is_far_ahead_of(self, arrival_s: float) -> bool:
         """Return whether the fit predicts a host time for the latest reading that is far later than its arrival.
@@ -143,10 +178,8 @@ class DeviceClock:
             return False
         return self._predict(self._device_us) - arrival_s > MAX_DEVIATION_s
 
-    def arrived(self, arrival_s: float) -> None:
-        """Fit the clock of the device to the arrival time of a chunk.
-
-        A chunk consists of the bytes that arrived together. Call this method after the last reading of the chunk.
+    def _end_chunk(self, arrival_s: float) -> None:
+        """Fit the clock of the device to the arrival time of a chunk, whose readings have been processed.
 
         If the readings come from a file, all chunks have the same arrival time, which contains no information about the
         clock. An arrival time is therefore used only if it differs from the previous arrival time.

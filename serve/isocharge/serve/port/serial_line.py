@@ -152,8 +152,34 @@ OPEN_ERRORS: tuple[type[Exception], ...] = (ValueError, *READ_ERRORS)
 """Exceptions that opening a line can raise."""
 
 
+SOCKET_SCHEMES = ("tcp://", "socket://", "rfc2217://")
+"""First characters of the URLs that need a port number."""
+
+
+def _keep_ready_signal(descriptor: int) -> None:
+    """Make the system leave the signal DTR of a terminal set when the terminal is closed.
+
+    Args:
+        descriptor: File descriptor of the terminal.
+    """
+    termios = importlib.import_module("termios")
+    attributes = termios.tcgetattr(descriptor)
+    control_modes = 2  # index in the attributes
+    attributes[control_modes] &= ~termios.HUPCL
+    termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
+
+
+class OtherReader(OSError):
+    """Bytes arrived at a line, but another program has read them."""
+
+
 class SerialLine:
-    """An open connection to a board through a serial port or another port that pyserial supports."""
+    """An open connection to a board through a serial port or another port that pyserial supports.
+
+    Many boards restart when the signal DTR of the port rises. The operating system sets the signal when a port is
+    opened. If possible, the signal remains set when the line is closed, so that the next opening does not restart the
+    board.
+    """
 
     def __init__(self, url: str, baud: int) -> None:
         """Open the line, and configure the system to deliver received bytes without a delay if this is possible.
@@ -163,8 +189,11 @@ class SerialLine:
             baud: Bits per second.
 
         Raises:
-            OSError, ValueError: If the line cannot be opened.
+            OSError, ValueError: If the line cannot be opened, or the URL of a socket has no port.
         """
+        is_socket = url.startswith(SOCKET_SCHEMES)
+        if is_socket and urlsplit(url).port is None:  # raises ValueError for a port that is no number
+            raise ValueError(f"expected a port number, as in {url.rstrip('/:')}:7000")
         # pyserial is imported only here, so programs that open no port do not wait for the import.
         serial = importlib.import_module("serial")
         if url.startswith("tcp://"):  # pyserial has another name for this scheme
@@ -178,6 +207,8 @@ class SerialLine:
         if HAS_POSIX_PORTS:
             with suppress(AttributeError, io.UnsupportedOperation):
                 self._descriptor = int(self._serial.fileno())
+        if self._descriptor is not None and os.isatty(self._descriptor):
+            _keep_ready_signal(self._descriptor)
 
     def reset_input_buffer(self) -> None:
         """Discard the bytes that have arrived and were not read."""
@@ -209,10 +240,21 @@ class SerialLine:
         if not readable:
             return b""
         # `os.read` needs one system call. pyserial would need five, or one for each byte of a socket.
-        data = os.read(self._descriptor, MAX_READ_BYTES)
+        try:
+            data = os.read(self._descriptor, MAX_READ_BYTES)
+        except BlockingIOError:
+            data = b""
         if not data:  # `select` also reports the end of a stream as readable
+            if os.isatty(self._descriptor):  # false if the terminal was unplugged
+                raise OtherReader
             raise OSError("it is readable and has no data: it was unplugged, or the other end has closed")
         return data
+
+    def receive_waiting(self) -> bytes:
+        """Return the bytes that have already arrived; empty if there are none, or if pyserial reads the line."""
+        if self._descriptor is None:  # `_receive_by_pyserial` returns all bytes that have arrived
+            return b""
+        return self.receive(0.0)
 
     def _receive_by_pyserial(self, timeout_s: float) -> bytes:
         """Receive bytes from a line without a file descriptor.
@@ -291,6 +333,10 @@ class UdpSocket:
             if data:
                 return self._with_line_feed(data)
         return b""
+
+    def receive_waiting(self) -> bytes:
+        """Return the next datagram if it has already arrived, and otherwise empty bytes."""
+        return self.receive(0.0)
 
     def write(self, data: bytes) -> None:
         """Send bytes to the sender of the latest datagram. If no datagram was received yet, nothing is sent."""

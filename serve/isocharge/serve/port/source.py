@@ -28,6 +28,7 @@ from isocharge.serve.port.serial_line import (
     OPEN_ERRORS,
     READ_ERRORS,
     UDP_SCHEME,
+    OtherReader,
     Request,
     Requester,
     SerialLine,
@@ -40,6 +41,19 @@ FIRST_RETRY_PAUSE_s = 0.1
 MAX_RETRY_PAUSE_s = 2.0
 """Longest pause before a lost port is opened again, s."""
 
+START_UP_FACTOR = 2.0
+"""Factor by which a board may be silent for longer after the port was opened than later.
+
+Many boards restart when their port is opened, and send nothing for up to 6 s. If a port was opened again and remained
+silent, the time is longer by the same factor at the next attempt, so that a slow board is not restarted for ever.
+"""
+
+MAX_START_UP_s = 60.0
+"""Longest wait for the first byte after a lost port was opened again, s, unless the user has set a longer time."""
+
+MAX_CHUNK_BYTES = 65536
+"""Number of bytes after which no further waiting bytes are added to a chunk."""
+
 log = logging.getLogger(__name__)
 
 
@@ -49,7 +63,8 @@ class Chunk(NamedTuple):
     Attributes:
         data: The bytes, at least one byte.
         timestamp: Host time of arrival, unix seconds.
-        clock_ns: Value of `time.perf_counter_ns` at arrival, from which latencies are computed.
+        clock_ns: Value of `time.perf_counter_ns` at arrival, from which latencies and the times between chunks are
+            computed.
         outage_s: Length of the outage that ended with these bytes, s; 0 if there was no outage.
     """
 
@@ -57,6 +72,18 @@ class Chunk(NamedTuple):
     timestamp: float
     clock_ns: int
     outage_s: float = 0.0
+
+    def elapsed_since(self, previous: "Chunk") -> float:
+        """Return the time since an earlier chunk of the same source, s. It does not depend on the wall clock.
+
+        All chunks of a file have the same time of arrival, so the result is 0. If the caller that created the chunks
+        states no monotonic time, so that `clock_ns` is constant, the times of arrival are used.
+        """
+        wall_s = self.timestamp - previous.timestamp
+        monotonic_ns = self.clock_ns - previous.clock_ns
+        if wall_s == 0.0 or monotonic_ns == 0:
+            return max(0.0, wall_s)
+        return max(0.0, monotonic_ns * 1e-9)
 
 
 class Port:
@@ -70,7 +97,8 @@ class Port:
         silence_s: Time without a byte after which the port is considered lost, s.
         reconnect: Whether to open a lost port repeatedly until it is back, instead of raising an error.
         request: Request that the board needs for each frame; None for a board that sends frames by itself.
-        wait: Time to wait until the port can be opened, s.
+        wait: Time to wait until the port can be opened, s. The port may also take this time to send its first byte, but
+            at least `START_UP_FACTOR * silence_s`.
 
     Attributes:
         outages: Number of times that the port was lost and came back.
@@ -103,7 +131,9 @@ class Port:
         self._reconnect = reconnect
         self._requester = Requester(request) if request else None
         self._wait = wait
+        self._start_up_s = max(wait, START_UP_FACTOR * silence_s)  # longest wait for the first byte after opening
         self._line: SerialLine | UdpSocket | None = None
+        self._is_starting_up = True  # whether no byte has arrived since the port was opened
 
     def __enter__(self) -> Self:
         """Open the port, and discard the bytes in its buffer.
@@ -147,6 +177,7 @@ class Port:
         except OPEN_ERRORS as error:
             self._close()
             raise self._opening_error(error, is_path=is_path) from error
+        self._is_starting_up = True
         if self._requester:
             self._requester.reset()  # the first request is due at once
 
@@ -186,14 +217,14 @@ class Port:
         """Yield chunks as they arrive. If the port is lost and `reconnect` is true, open the port again.
 
         Raises:
-            PortLost: If the port disappears or stays silent for `silence_s`, and `reconnect` is false.
+            PortLost: If the port disappears or stays silent for too long, and `reconnect` is false.
             PortError: If the port is not open.
         """
         while True:
             wait_start_s = time.monotonic()
             outage_s = 0.0
             try:
-                data = self._read()
+                data = self._read(self._start_up_s)
             except PortLost as error:
                 data = self._read_after_reconnecting(error)
                 outage_s = time.monotonic() - wait_start_s
@@ -231,30 +262,46 @@ class Port:
             raise reason
         log.warning("%s; trying again until it is back", reason)
         pause_s = FIRST_RETRY_PAUSE_s
+        start_up_s = self._start_up_s
         while True:
             self._close()
             time.sleep(pause_s)
             pause_s = min(2.0 * pause_s, MAX_RETRY_PAUSE_s)
             try:
                 self._open()
-                return self._read()
-            except PortError:  # or its subclass PortLost, if no bytes arrive after opening
+                return self._read(start_up_s)
+            except PortLost:  # no bytes have arrived after opening
+                start_up_s = max(start_up_s, min(START_UP_FACTOR * start_up_s, MAX_START_UP_s))
+            except PortError:  # the port cannot be opened
                 continue
 
-    def _read(self) -> bytes:
+    def _read(self, start_up_s: float) -> bytes:
         """Wait for a byte, and return all bytes that have arrived.
 
+        If the program did not read the port for some time, many bytes wait. They belong to one chunk, so that their
+        frames share the time since the previous chunk.
+
+        Args:
+            start_up_s: Longest wait for the first byte after the port was opened, s. The longest wait for later bytes
+                is `silence_s`.
+
         Raises:
-            PortLost: If the port disappears, or no byte arrives within `silence_s`.
+            PortLost: If the port disappears, or no byte arrives in time.
             PortError: If the port is not open.
         """
-        data = self._receive(self._silence_s)
+        timeout_s = start_up_s if self._is_starting_up else self._silence_s
+        data = self._receive(timeout_s)
         if not data:
             speed_advice = f", and that {self._baud} baud is its speed" if has_speed(self.url) else ""
             raise PortLost(
-                f"{self.url}: no data for {self._silence_s:g} s; check that the board is powered and sends"
-                f"{speed_advice}"
+                f"{self.url}: no data for {timeout_s:g} s; check that the board is powered and sends{speed_advice}"
             )
+        self._is_starting_up = False
+        if self._line is None or self._requester is not None:  # a board sends nothing without a request
+            return data
+        with contextlib.suppress(*READ_ERRORS):  # the next call reports the error
+            while len(data) < MAX_CHUNK_BYTES and (waiting := self._line.receive_waiting()):
+                data += waiting
         return data
 
     def _receive(self, timeout_s: float) -> bytes:
@@ -276,6 +323,11 @@ class Port:
             if self._requester is None:
                 return self._line.receive(timeout_s)
             return self._receive_answer(self._line, self._requester, timeout_s)
+        except OtherReader as error:
+            raise PortLost(
+                f"{self.url}: another program reads this port, too, and takes some of its bytes; end that program (on "
+                f"Linux, `fuser {self.url}` shows its number)"
+            ) from error
         except READ_ERRORS as error:
             raise PortLost(
                 f"{self.url}: the port disappeared while it was read ({error}); check the plug and the cable"
@@ -379,7 +431,7 @@ def open_source(
         silence_s: Time without a byte after which a port is considered lost, s.
         reconnect: Whether to open a lost port repeatedly until it is back, instead of raising an error.
         request: Request that the board needs for each frame; None for a board that sends frames by itself.
-        wait: Time to wait until the port can be opened or the file exists, s.
+        wait: Time to wait until the port can be opened or the file exists, s; see `Port`.
 
     Raises:
         InputError: If the file cannot be read, or is a recording, a table or another file that does not come from a
