@@ -262,7 +262,8 @@ def test_doctor_states_the_share_of_presses_outside_the_working_area_without_a_f
     assert json.loads(json_out)["unnoticed_share"] == pytest.approx(0.79, abs=0.02)
 
 
-def test_doctor_exit_code_if_no_frames_are_recognised(command):
+def test_doctor_exit_code_if_no_frames_are_recognised(command, monkeypatch):
+    monkeypatch.setattr("isocharge.serve.port.source.START_UP_FACTOR", 0.1)
     silent = PseudoPort()
     words = ("--seconds", 0.5, "--model", "three-25um-biaxial")
     code, out, err = command("serve", "doctor", "--port", silent.url, *words)

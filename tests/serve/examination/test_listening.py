@@ -51,6 +51,7 @@ class PortOfOneSpeed:
     """A serial port that returns lines at 57600 bit/s, and other bytes at other speeds. A read advances its clock."""
 
     echo_share = 0.0
+    start_up_s = 10.0
     opened: ClassVar[list] = []
     now_s = 0.0
 
@@ -94,10 +95,27 @@ def opened(monkeypatch):
 def test_baud_rate_is_found(opened, bauds, tried, good):
     report = examine("/dev/ttyUSB9", bauds=bauds, seconds=2.0)
     assert report.baud == tried[-1]
-    assert report.good == pytest.approx(good, abs=3)
+    assert report.good == pytest.approx(good, abs=5)
     assert report.seconds == pytest.approx(2.0)
     assert [baud for _, baud, _ in opened] == tried
     assert good or "another baud rate" in report.missing[0]
+
+
+def test_board_that_restarts_when_the_port_is_opened_is_heard_at_its_baud_rate(monkeypatch, opened):
+    """An Arduino sends nothing for some seconds after each opening."""
+    original_read = PortOfOneSpeed.read
+
+    def read_after_restart(port, timeout_s):
+        if port.lines == 0:
+            PortOfOneSpeed.now_s += min(timeout_s, 6.0)
+            if timeout_s < 6.0:
+                return None
+        return original_read(port, timeout_s)
+
+    monkeypatch.setattr(PortOfOneSpeed, "read", read_after_restart)
+    report = examine("/dev/ttyUSB9", bauds=(115200, 57600, 9600), seconds=2.0)
+    assert [baud for _, baud, _ in opened] == [115200, 57600, 57600]
+    assert report.seconds == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("echo", [True, False])

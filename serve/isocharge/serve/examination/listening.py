@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -112,6 +113,8 @@ def listen(
     # Listen for a short time to find out whether the line returns the requests.
     if request is not None and not request.echo:
         received = _listen_at_baud(url, bauds[0], ECHO_S, request, wait)
+        if not received.chunks:
+            return received
         request = replace(request, echo=received.echo_share >= ECHO_SHARE)
 
     # Try the baud rates, unless the port has none, as a network port.
@@ -119,8 +122,9 @@ def listen(
     if has_speed(url) and len(bauds) > 1:
         for baud in bauds:
             received = _listen_at_baud(url, baud, TRY_S, request, wait)
-            is_silent = not received.chunks
-            if is_silent or has_frames(received):
+            if not received.chunks:
+                return received
+            if has_frames(received):
                 chosen_baud = baud
                 break
     return _listen_at_baud(url, chosen_baud, seconds, request, wait)
@@ -132,14 +136,20 @@ def _listen_at_baud(url: str, baud: int, seconds: float, request: Request | None
     Args:
         url: The port.
         baud: Baud rate, bit/s.
-        seconds: Time of listening, s. Listening ends earlier if the port is lost.
+        seconds: Time of listening since the first byte, s. The first byte may arrive late, because many boards restart
+            when their port is opened. Listening ends earlier if the port is lost.
         request: Request that the board needs; None if the board sends frames by itself.
         wait: Time to wait until the port can be opened, s.
     """
     received = ReceivedData(url, baud, request)
     with Port(url, baud=baud, request=request, wait=wait) as port:
         start_s = time.monotonic()
-        while (remaining_s := start_s + seconds - time.monotonic()) > 0.0:
+        with suppress(PortLost):
+            first_chunk = port.read(port.start_up_s)
+            if first_chunk is not None:
+                start_s = time.monotonic()
+                received.chunks.append(first_chunk)
+        while received.chunks and (remaining_s := start_s + seconds - time.monotonic()) > 0.0:
             try:
                 chunk = port.read(remaining_s)
             except PortLost:

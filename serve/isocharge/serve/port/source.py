@@ -102,6 +102,7 @@ class Port:
 
     Attributes:
         outages: Number of times that the port was lost and came back.
+        start_up_s: Longest wait for the first byte after the port was opened, s.
         is_live: Always True, because the bytes arrive whether or not the program reads them, and are lost if the
             program does not read them.
 
@@ -131,7 +132,7 @@ class Port:
         self._reconnect = reconnect
         self._requester = Requester(request) if request else None
         self._wait = wait
-        self._start_up_s = max(wait, START_UP_FACTOR * silence_s)  # longest wait for the first byte after opening
+        self.start_up_s = max(wait, START_UP_FACTOR * silence_s)
         self._line: SerialLine | UdpSocket | None = None
         self._is_starting_up = True  # whether no byte has arrived since the port was opened
 
@@ -224,7 +225,7 @@ class Port:
             wait_start_s = time.monotonic()
             outage_s = 0.0
             try:
-                data = self._read(self._start_up_s)
+                data = self._read(self.start_up_s)
             except PortLost as error:
                 data = self._read_after_reconnecting(error)
                 outage_s = time.monotonic() - wait_start_s
@@ -262,7 +263,7 @@ class Port:
             raise reason
         log.warning("%s; trying again until it is back", reason)
         pause_s = FIRST_RETRY_PAUSE_s
-        start_up_s = self._start_up_s
+        start_up_s = self.start_up_s
         while True:
             self._close()
             time.sleep(pause_s)
