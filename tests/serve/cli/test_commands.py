@@ -176,6 +176,22 @@ def test_stream_option_seconds_ends_a_silent_port(models, run):
     assert "no frames were recognised; to find out what the board sends: isocharge serve doctor" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("stop", "exit_code"), [(("--seconds", 0.2), 1), ((), 0)], ids=["option --seconds", "Ctrl-C or SIGTERM"]
+)
+def test_stream_that_waits_for_its_port_can_be_stopped(models, tmp_path, run, stop, exit_code):
+    ctrl_c = threading.Timer(0.3, interrupt)
+    if not stop:
+        ctrl_c.start()
+    start_s = time.monotonic()
+    words = ("--output", tmp_path / "x.csv", "--wait", 30, *stop)
+    result = run("stream", "linear", "--port", tmp_path / "film", "--models", models, *words)
+    assert result.exit_code == exit_code
+    assert f"{tmp_path / 'film'}: the command was stopped before the port was open" in result.stderr
+    assert time.monotonic() - start_s < 10.0
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_stream_without_frames_that_is_stopped_by_ctrl_c_exits_with_0(models, run):
     silent = PseudoPort()
     ctrl_c = threading.Timer(0.2, interrupt)

@@ -1,9 +1,12 @@
 """Outputs by the form of their target, those of other packages among them."""
 
 import csv
+import time
+from types import SimpleNamespace
 
 import pytest
 
+from boards import interrupt
 from isocharge.common.errors import InputError, OutputError, OutputExists
 from isocharge.serve.outputs.output import OutputContext, OutputKind
 from isocharge.serve.outputs.targets import OUTPUT_KINDS, Outputs, output_kind, target_forms
@@ -26,13 +29,16 @@ def context(**changes):
         ("touch.mcap", "FILE.mcap"),
         ("touch.ros2.mcap", "FILE.ros2.mcap"),
         ("udp://127.0.0.1:9870", "udp://HOST:PORT"),
+        ("udp://127.0.0.1:9870/x.csv", "udp://HOST:PORT"),
     ],
 )
 def test_form_of_a_target_chooses_the_output(target, form):
     assert output_kind(target).form == form
 
 
-@pytest.mark.parametrize("target", ["touch.txt", "", "tcp://127.0.0.1:9", "JSON", "touch"])
+@pytest.mark.parametrize(
+    "target", ["touch.txt", "", "tcp://127.0.0.1:9", "JSON", "touch", "mqtt://h/x.csv", "s3://h/x.ros2.mcap"]
+)
 def test_target_of_no_form_is_refused_with_the_known_forms(target):
     with pytest.raises(InputError, match=r"expected one of the forms json, csv, none, FILE\.jsonl"):
         Outputs([target], context())
@@ -102,20 +108,94 @@ def test_file_that_exists_is_not_overwritten_and_nothing_else_is_left(tmp_path):
     assert not (tmp_path / "a.jsonl").exists()
 
 
-class Failing:
+class Added:
+    """An output of another package, which keeps its records, and calls a function when it is closed."""
+
+    def __init__(self, at_close):
+        self.records = []
+        self.close = at_close
+
+    def write(self, record):
+        record.charge_pC.clear()
+        self.records.append(record)
+
+
+class Failing(Added):
     """An output that fails at once."""
 
-    def write(self, _):
+    def __init__(self):
+        super().__init__(self.write)
+
+    def write(self, _=None):
         raise RuntimeError("no such table")
 
-    def close(self):
-        raise RuntimeError("not open")
+
+def raise_error(*_):
+    raise RuntimeError("not open")
 
 
 @pytest.fixture
-def failing(monkeypatch):
-    kind = OutputKind(form="broken", accepts="broken".__eq__, open=lambda *_: Failing())
-    monkeypatch.setattr("isocharge.serve.outputs.targets.OUTPUT_KINDS", (*OUTPUT_KINDS, kind))
+def add_kind(monkeypatch):
+    """Return a function that adds a kind of output, as an installed package does."""
+
+    def add(accepts, opened):
+        kind = OutputKind(form="added", accepts=accepts, open=lambda *_: opened)
+        entry_point = SimpleNamespace(name="mine", value="mine:KIND", load=lambda: kind)
+        monkeypatch.setattr("isocharge.serve.outputs.targets.entry_points", lambda group: [entry_point])  # noqa: ARG005
+
+    return add
+
+
+@pytest.fixture
+def failing(add_kind):
+    add_kind("broken".__eq__, Failing())
+
+
+@pytest.mark.parametrize("is_live", [True, False], ids=["live", "replay"])
+@pytest.mark.parametrize("at_close", [raise_error, lambda: time.sleep(20.0)], ids=["raises", "does not return"])
+def test_added_output_that_cannot_be_closed_spoils_no_other_output(
+    record, tmp_path, add_kind, monkeypatch, caplog, is_live, at_close
+):
+    monkeypatch.setattr("isocharge.serve.outputs.added_output.CLOSE_TIMEOUT_s", 0.2)
+    add_kind("mine".__eq__, Added(at_close))
+    path = tmp_path / "touch.jsonl"
+    error = None
+    try:
+        with Outputs([str(path), "mine"], context(is_live=is_live)) as outputs:
+            outputs.write(record())
+    except OutputError as caught:
+        error = str(caught)
+    assert path.read_text("utf-8") == record().to_json() + "\n"
+    message = caplog.text if is_live else error
+    assert "mine: the output" in message
+    assert "not open" in message or "within 0.2 s" in message
+
+
+@pytest.mark.parametrize("is_live", [True, False], ids=["live", "replay"])
+def test_added_output_cannot_change_the_records_of_others(record, tmp_path, add_kind, is_live):
+    add_kind("mine".__eq__, Added(lambda: None))
+    path = tmp_path / "touch.csv"
+    with Outputs(["mine", str(path)], context(is_live=is_live)) as outputs:
+        outputs.write(record(charge_pC={"A": 1.0, "B": 2.0}))
+    with path.open(newline="") as file:
+        assert [float(row["charge_pC.A"]) for row in csv.DictReader(file)] == [1.0]
+
+
+def test_ctrl_c_while_an_output_closes_spoils_no_other_output(record, tmp_path, add_kind, monkeypatch):
+    add_kind("mine".__eq__, Added(lambda: None))
+    monkeypatch.setattr("isocharge.serve.outputs.added_output.AddedOutput.close", lambda _: interrupt())
+    path = tmp_path / "touch.jsonl"
+    outputs = Outputs([str(path), "mine"], context()).__enter__()
+    outputs.write(record())
+    with pytest.raises(KeyboardInterrupt):
+        outputs.__exit__(None, None, None)
+    assert path.read_text("utf-8") == record().to_json() + "\n"
+
+
+def test_added_kind_that_cannot_tell_what_it_accepts_is_named(add_kind):
+    add_kind(raise_error, None)
+    with pytest.raises(InputError, match=r"output mine: .* accepts 'touch.txt' \(RuntimeError: not open\)"):
+        output_kind("touch.txt")
 
 
 @pytest.mark.usefixtures("failing")
@@ -134,4 +214,7 @@ def test_output_that_fails_does_not_end_the_live_stream(record, caplog):
             outputs.write(record(seq=number))
     assert len(printed) == 100
     assert outputs.not_written == {"broken": None}
-    assert "broken: stopped (no such table); the records after that are missing" in caplog.text
+    assert (
+        "broken: stopped (broken: the output failed (RuntimeError: no such table)); the records after that are missing"
+        in caplog.text
+    )

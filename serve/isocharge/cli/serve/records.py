@@ -14,7 +14,13 @@ from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.targets import Outputs, target_forms
 
 WaitOption = Annotated[
-    float, typer.Option("--wait", min=0.0, max=3600.0, help="Time to wait until the port can be opened, s.")
+    float,
+    typer.Option(
+        "--wait",
+        min=0.0,
+        max=3600.0,
+        help="Time to wait until the port can be opened, and until the first byte if this is more than 10 s, s.",
+    ),
 ]
 
 

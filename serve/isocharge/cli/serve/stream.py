@@ -36,9 +36,9 @@ from isocharge.cli.shared.live_page import (
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.port_hints import no_frames_advice_added, no_frames_hint
 from isocharge.cli.shared.terminal import (
+    StopTimer,
     on_signal,
     say,
-    stop_after,
     unless_hung_up,
     until_stopped,
 )
@@ -174,12 +174,15 @@ def stream_command(
     latencies: deque[float] = deque(maxlen=LATENCIES)
     recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name) if record else None
     stream = RecordedStream(touch, recorder)
+    timer = StopTimer(seconds)
+    outputs: Outputs | None = None  # until the port is open
     with ExitStack() as stack:  # closes the contexts in reverse order
         stack.enter_context(until_stopped())
         page = None
         if address is not None:
             folder = find_model(model, models)
             page = stack.enter_context(live_page(address, token, touch.frame_id, predictor.metadata, folder, tls=tls))
+        stack.enter_context(timer)
         source = stack.enter_context(
             open_source(port, baud=baud, reconnect=reconnect, request=board.request, wait=wait)
         )
@@ -189,7 +192,6 @@ def stream_command(
         stack.enter_context(on_signal(signal.SIGUSR2, stream.request_film_reset))
         request_latest_model = partial(stream.request_model, partial(_load_latest, model, models))
         stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(request_latest_model)))
-        timer = stack.enter_context(stop_after(seconds))
 
         outputs = stack.enter_context(command_outputs(output, touch, is_live=source.is_live))
         writers: list[RecordWriter] = [outputs.write]
@@ -210,6 +212,9 @@ def stream_command(
             if source.is_live:
                 outputs.close()
             say(summary(touch, latencies))
+    if outputs is None:
+        say(f"{port}: the command was stopped before the port was open")
+        raise typer.Exit(int(timer.has_expired))
     has_no_frames = touch.totals().frames == 0
     if has_no_frames:
         say(f"no frames were recognised; {no_frames_hint(port, device)}")
@@ -280,7 +285,8 @@ def replay_command(
     play = partial(replay, recording, touch, clock, real_time=real_time, load=load)
 
     latencies: deque[float] = deque(maxlen=LATENCIES)
-    with until_stopped(), command_outputs(output, touch, is_live=False) as outputs:
+    outputs = command_outputs(output, touch, is_live=False)
+    with until_stopped(), outputs:
         if address is None:
             write_records(play(), [outputs.write], latencies)
         else:

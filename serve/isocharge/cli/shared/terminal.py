@@ -17,7 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, Self
 
 import typer
 
@@ -179,20 +179,38 @@ def until_stopped() -> Iterator[None]:
 
 
 MIN_TIMER_S = 1e-3
-"""Shortest time of the timer of `stop_after`, s. A time of 0 would switch the timer off."""
+"""Shortest time of a `StopTimer`, s. A time of 0 would switch the timer off."""
 
 
 class StopTimer:
-    """Timer that interrupts the block of `stop_after`.
+    """Context manager that interrupts its block after a given time, even while the command waits for a port.
+
+    A timer of the system sends the signal SIGALRM, whose handler raises KeyboardInterrupt, as Ctrl-C does.
 
     Attributes:
         has_expired: Whether the timer, and not Ctrl-C, has interrupted the block.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, seconds: float | None) -> None:
+        """Store the time, s; None for no limit."""
         self.has_expired = False
+        self._seconds = seconds
+        self._previous_handler: Any = None
 
-    def interrupt(self, *_: object) -> None:
+    def __enter__(self) -> Self:
+        """Start the timer."""
+        if self._seconds is not None:
+            self._previous_handler = signal.signal(signal.SIGALRM, self._interrupt)
+            signal.setitimer(signal.ITIMER_REAL, max(self._seconds, MIN_TIMER_S))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop the timer."""
+        if self._seconds is not None:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, self._previous_handler)
+
+    def _interrupt(self, *_: object) -> None:
         """Interrupt the block. The timer calls this method as the handler of the signal SIGALRM.
 
         Raises:
@@ -200,31 +218,6 @@ class StopTimer:
         """
         self.has_expired = True
         raise KeyboardInterrupt
-
-
-@contextmanager
-def stop_after(seconds: float | None) -> Iterator[StopTimer]:
-    """Context manager that interrupts its block after the given time, even while the command waits for a port.
-
-    A timer of the system sends the signal SIGALRM, whose handler raises KeyboardInterrupt, as Ctrl-C does.
-
-    Args:
-        seconds: Time, s; None for no limit.
-
-    Yields:
-        The timer.
-    """
-    timer = StopTimer()
-    if seconds is None:
-        yield timer
-        return
-    previous_handler = signal.signal(signal.SIGALRM, timer.interrupt)
-    signal.setitimer(signal.ITIMER_REAL, max(seconds, MIN_TIMER_S))
-    try:
-        yield timer
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)  # 0 stops the timer
-        signal.signal(signal.SIGALRM, previous_handler)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from isocharge.common.files import as_output_errors, new_file
 from isocharge.serve.export.record_messages import RecordEncoding
-from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, exit_with_error
+from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, exit_with_error, is_file_with
 from isocharge.serve.record.record import PredictionRecord
 
 SUFFIX = ".mcap"
@@ -75,7 +75,5 @@ def _open_ros2_mcap(target: str, context: OutputContext) -> Output:
     return McapOutput(Path(target), context.electrodes, RecordEncoding.ros2, is_live=context.is_live)
 
 
-ROS2_MCAP_FILE = OutputKind(
-    form=f"FILE{ROS2_SUFFIX}", accepts=lambda target: target.endswith(ROS2_SUFFIX), open=_open_ros2_mcap
-)
-MCAP_FILE = OutputKind(form=f"FILE{SUFFIX}", accepts=lambda target: target.endswith(SUFFIX), open=_open_mcap)
+ROS2_MCAP_FILE = OutputKind(form=f"FILE{ROS2_SUFFIX}", accepts=is_file_with(ROS2_SUFFIX), open=_open_ros2_mcap)
+MCAP_FILE = OutputKind(form=f"FILE{SUFFIX}", accepts=is_file_with(SUFFIX), open=_open_mcap)

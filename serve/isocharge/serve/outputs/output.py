@@ -43,6 +43,14 @@ def discard(output: Output) -> None:
     discard_or_close()
 
 
+def is_file_with(suffix: str) -> Callable[[str], bool]:
+    """Return a function that returns whether a target is the path of a file whose name ends with `suffix`.
+
+    A target with a scheme, such as `mqtt://host/touch.csv`, is not a file.
+    """
+    return lambda target: target.endswith(suffix) and "://" not in target
+
+
 class _Incomplete(Exception):
     """Error with which `exit_with_error` leaves contexts."""
 

@@ -1,10 +1,12 @@
 """Available kinds of outputs, and the class that writes records to all outputs of a command."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Self
 
-from isocharge.common.errors import InputError, IsochargeError, OutputError, shown
+from isocharge.common.errors import InputError, IsochargeError, shown
+from isocharge.serve.outputs.added_output import protected_kind
 from isocharge.serve.outputs.mcap_output import MCAP_FILE, ROS2_MCAP_FILE
 from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, discard
 from isocharge.serve.outputs.queued_output import QueuedOutput
@@ -27,6 +29,8 @@ OUTPUT_KINDS: tuple[OutputKind, ...] = (
 ENTRY_POINTS = "isocharge.outputs"
 """Group of the entry points through which other packages add kinds of outputs."""
 
+log = logging.getLogger(__name__)
+
 
 def target_forms() -> str:
     """Return the forms of all targets that this package accepts, as one text, separated by commas."""
@@ -42,7 +46,7 @@ def output_kind(target: str) -> OutputKind:
         target: Target of an output, such as `json` or `touch.csv`.
 
     Raises:
-        InputError: If no kind accepts the target, or a package that adds a kind cannot be loaded.
+        InputError: If no kind accepts the target, or a package that adds a kind cannot be used.
     """
     for kind in OUTPUT_KINDS:
         if kind.accepts(target):
@@ -81,15 +85,7 @@ def _load_kind(entry_point: EntryPoint) -> OutputKind:
             f"output {entry_point.name} ({entry_point.value}): expected an OutputKind, got {shown(kind)}; correct the "
             "package that adds it"
         )
-    return kind
-
-
-def _unexpected_failure(target: str, error: Exception) -> OutputError:
-    """Return an `OutputError` that states which output raised an unexpected exception.
-
-    The exception may come from another package that adds a kind of output.
-    """
-    return OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
+    return protected_kind(kind, entry_point.name)
 
 
 class Outputs:
@@ -137,12 +133,9 @@ class Outputs:
         for target, kind in self._kinds.items():
             try:
                 output = kind.open(target, self._context)
-            except (IsochargeError, OSError, KeyboardInterrupt):  # the message of such an error states the reason
+            except BaseException:
                 self._discard()
                 raise
-            except Exception as error:  # an unexpected error, for example of another package
-                self._discard()
-                raise _unexpected_failure(target, error) from error
             # A live stream must not wait for a slow consumer, so its records are written by another thread.
             if self._context.is_live and kind.may_block:
                 output = self._queued(output, target, kind)
@@ -179,7 +172,7 @@ class Outputs:
 
         The value is valid only after the outputs were closed.
         """
-        return any(not output_kind(target).is_standard_output for target in self.not_written)
+        return any(not self._kinds[target].is_standard_output for target in self.not_written)
 
     def write(self, record: PredictionRecord) -> None:
         """Write a record to every output.
@@ -187,25 +180,20 @@ class Outputs:
         Raises:
             Exception: In a replay, the error of any output. In a live stream, only an error of standard output.
         """
-        for target, output in self._outputs.items():
-            try:
-                output.write(record)
-            except (IsochargeError, OSError):  # the message of such an error already states the reason
-                raise
-            except Exception as error:  # an unexpected error, for example of another package
-                raise _unexpected_failure(target, error) from error
+        for output in self._outputs.values():
+            output.write(record)
 
     def close(self) -> None:
         """Close all open outputs, and store in `not_written` how many records each output has not received.
 
         Raises:
-            OSError, IsochargeError: The first error that occurred. All other outputs are closed before it is raised.
+            BaseException: The first error that occurred, or Ctrl-C. All other outputs are closed before it is raised.
         """
         errors: list[BaseException] = []
         for target, output in self._remove_each():
             try:
                 output.close()
-            except (OSError, IsochargeError) as error:
+            except (Exception, KeyboardInterrupt) as error:
                 errors.append(error)
             # Only a queue can lose records without raising an error.
             if isinstance(output, QueuedOutput) and output.has_failed:
@@ -216,10 +204,16 @@ class Outputs:
             raise errors[0]
 
     def _discard(self) -> None:
-        """Discard all open outputs, because they have not received all records."""
+        """Discard all open outputs, because they have not received all records.
+
+        An error of an output is written to the log, because the error that has ended the command is more important.
+        """
         for target, output in self._remove_each():
-            discard(output)
-            if not output_kind(target).writes_nothing:
+            try:
+                discard(output)
+            except (IsochargeError, OSError) as error:
+                log.error("%s", error)
+            if not self._kinds[target].writes_nothing:
                 self.not_written[target] = None  # the number of missing records is unknown
 
     def _remove_each(self) -> Iterator[tuple[str, Output]]:

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from isocharge.common.files import AtomicWriter, as_output_errors, new_file
-from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, exit_with_error
+from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, exit_with_error, is_file_with
 from isocharge.serve.record.csv_rows import csv_header, csv_row
 from isocharge.serve.record.record import PredictionRecord
 
@@ -137,5 +137,5 @@ def _open_csv_file(target: str, context: OutputContext) -> Output:
 STDOUT_JSON = OutputKind(form="json", accepts="json".__eq__, open=_open_stdout_json, is_standard_output=True)
 STDOUT_CSV = OutputKind(form="csv", accepts="csv".__eq__, open=_open_stdout_csv, is_standard_output=True)
 NO_OUTPUT = OutputKind(form="none", accepts="none".__eq__, open=_open_nothing, may_block=False, writes_nothing=True)
-JSON_FILE = OutputKind(form="FILE.jsonl", accepts=lambda target: target.endswith(".jsonl"), open=_open_json_file)
-CSV_FILE = OutputKind(form="FILE.csv", accepts=lambda target: target.endswith(".csv"), open=_open_csv_file)
+JSON_FILE = OutputKind(form="FILE.jsonl", accepts=is_file_with(".jsonl"), open=_open_json_file)
+CSV_FILE = OutputKind(form="FILE.csv", accepts=is_file_with(".csv"), open=_open_csv_file)
