@@ -153,6 +153,21 @@ def binary_request(charges, datatype="FP32", **changes):
     return text + raw, len(text)
 
 
+def test_optional_fields_may_be_null(ask):
+    """Older clients of KServe send null for every field that is not given."""
+    null_parameters = dict.fromkeys(["binary_data", "binary_data_output", "binary_data_size", "classification"])
+    fields = {"id": None, "outputs": None, "parameters": None}
+    body = request([[1.0, 2.0, 3.0]])
+    expected = ask("POST", INFER, orjson.dumps(body))
+    for parameters in (None, null_parameters):
+        body["inputs"][0]["parameters"] = parameters
+        assert ask("POST", INFER, orjson.dumps(body | fields | {"parameters": parameters})) == expected
+        outputs = [{"name": "contact", "parameters": parameters}]
+        assert ask("POST", INFER, orjson.dumps(body | {"outputs": outputs}))[0] == 200
+    assert ask("POST", "/v2/repository/index", b'{"ready": null}')[0] == 200
+    assert ask("POST", "/v2/repository/models/linear/load", b'{"parameters": null}')[0] == 200
+
+
 @pytest.mark.parametrize("datatype", ["FP32", "FP64"])
 @pytest.mark.parametrize("blanks", range(4))
 def test_binary_input_at_any_offset_in_the_body(ask, bare, film, datatype, blanks):

@@ -1,4 +1,7 @@
-"""JSON body of a request for an inference. The OpenAPI schema is derived from the same types."""
+"""JSON body of a request for an inference. The OpenAPI schema is derived from the same types.
+
+Some clients send `null` for every field that is not given. All optional fields therefore accept `null`.
+"""
 
 from typing import Annotated, Any, Literal
 
@@ -11,7 +14,7 @@ class Parameters(Struct, frozen=True):
     """Parameters of a request, of an input or of an output. Unknown parameters are ignored, as in Triton."""
 
     binary_data: bool | None = None
-    binary_data_output: bool = False
+    binary_data_output: bool | None = None
     binary_data_size: int | None = None
     shared_memory_region: Unsupported = None
     classification: Unsupported = None
@@ -24,20 +27,20 @@ class InputTensor(Struct, frozen=True):
     datatype: Literal["FP32", "FP64"]
     shape: list[int]
     data: Annotated[Any, Meta(extra_json_schema={"type": "array", "description": "numbers, flat or in rows"})] = None
-    parameters: Parameters = Parameters()
+    parameters: Parameters | None = None
 
 
 class OutputTensor(Struct, frozen=True):
     """Output that the client requests."""
 
     name: Literal["contact", "contact_std", "contact_correlation", "misfit", "flags"]
-    parameters: Parameters = Parameters()
+    parameters: Parameters | None = None
 
 
 class InferBody(Struct, frozen=True):
     """Body of a request for an inference."""
 
     inputs: Annotated[list[InputTensor], Meta(min_length=1, max_length=1, description="a list with one tensor")]
-    id: str = ""
-    outputs: list[OutputTensor] = []
-    parameters: Parameters = Parameters()
+    id: str | None = None
+    outputs: list[OutputTensor] | None = None
+    parameters: Parameters | None = None

@@ -28,7 +28,7 @@ from isocharge.serve.model.session import (
     write_finite,
 )
 from isocharge.serve.network.model_store import LoadedVersion
-from isocharge.serve.network.protocol.infer_body import InferBody, InputTensor, OutputTensor
+from isocharge.serve.network.protocol.infer_body import InferBody, InputTensor, OutputTensor, Parameters
 from isocharge.serve.prediction.contact import Contacts
 
 DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
@@ -146,14 +146,14 @@ def parse_request(
         TooLarge: If the request contains more than `max_presses` presses.
     """
     body = convert(content, InferBody, where="", error_class=RequestError)  # `where` is empty, because there is no file
-    default_is_binary = body.parameters.binary_data_output
+    default_is_binary = bool((body.parameters or Parameters()).binary_data_output)
     if body.outputs:
         names, binary_names = _requested_outputs(body.outputs, loaded, default_is_binary=default_is_binary)
     else:
         names = loaded.outputs
         binary_names = frozenset(names if default_is_binary else ())
     charges = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, max_presses)
-    return InferRequest(body.id, charges, names, binary_names)
+    return InferRequest(body.id or "", charges, names, binary_names)
 
 
 def _requested_outputs(
@@ -183,7 +183,7 @@ def _requested_outputs(
         )
     binary_names: list[str] = []
     for output in outputs:
-        stated_choice = output.parameters.binary_data
+        stated_choice = (output.parameters or Parameters()).binary_data
         is_binary = default_is_binary if stated_choice is None else stated_choice
         if is_binary:
             binary_names.append(output.name)
@@ -211,7 +211,8 @@ def _read_charges(
     """
     shape = tensor.shape
     _check_shape(shape, electrodes, max_presses)
-    stated_size = tensor.parameters.binary_data_size  # number of bytes after the JSON text, as the request states it
+    # number of bytes after the JSON text, as the request states it
+    stated_size = (tensor.parameters or Parameters()).binary_data_size
     if stated_size is None and not binary:  # the charges are numbers in the JSON text
         return _from_values(tensor.data, shape, electrodes)
 

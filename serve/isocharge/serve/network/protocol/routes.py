@@ -186,8 +186,10 @@ INFERENCE = Schema(
     ),
 )
 
-INDEX_BODY = Schema("index", {"type": "object", "properties": {"ready": {"type": "boolean"}}})
-LOAD_BODY = Schema("load", {"type": "object", "properties": {"parameters": {"type": "object", "maxProperties": 0}}})
+INDEX_BODY = Schema("index", {"type": "object", "properties": {"ready": {"type": ["boolean", "null"]}}})
+LOAD_BODY = Schema(
+    "load", {"type": "object", "properties": {"parameters": {"type": ["object", "null"], "maxProperties": 0}}}
+)
 UNLOAD_BODY = Schema("unload", {"type": "object"})
 INFER_BODY = Schema("InferBody", InferBody)
 
@@ -235,15 +237,15 @@ def _show_index(request: Request) -> Response:
 
     If the body contains `ready: true`, the index contains only the loaded versions.
     """
-    ready = read_object(request.body).get("ready", False)
-    if not isinstance(ready, bool):
+    ready = read_object(request.body).get("ready")
+    if not isinstance(ready, bool | None):
         raise RequestError(f"ready: expected true or false, got {ready!r:.100}")
-    return json_response(describe.repository_index(request.service.store, ready=ready))
+    return json_response(describe.repository_index(request.service.store, ready=ready is True))
 
 
 def _load(request: Request) -> Response:
     """Read the files of a model again, and return an empty object."""
-    if read_object(request.body).get("parameters", {}) != {}:
+    if read_object(request.body).get("parameters") not in (None, {}):
         raise RequestError(describe.NO_LOAD_PARAMETERS)
     request.service.store.load(request.model)
     return json_response({})
