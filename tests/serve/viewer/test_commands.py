@@ -119,6 +119,19 @@ def test_replay_page_seeks_and_plays_at_another_speed(film, models, start, comma
         assert 600 in make_reader(file).get_summary().statistics.channel_message_counts.values()
 
 
+def test_page_behind_a_proxy_has_the_host_name_of_allow_host(board, start):
+    """The proxy keeps the name in Host, or replaces it by the address of the page."""
+    _, url = start("stream", "linear", "--port", board.url, "--output", "none", "--allow-host", "proxy.example")
+    for host in ("proxy.example", url.removeprefix("http://")):
+        request = urllib.request.Request(url + "/session.json", headers={"Host": host, "Origin": "http://proxy.example"})
+        assert urllib.request.urlopen(request, timeout=20).status == 200
+
+
+def test_allow_host_of_the_page_expects_a_host_name(refused, models):
+    words = ("--port", "x", "--models", models, "--live", "0", "--allow-host", "http://proxy.example")
+    refused("serve", "stream", "linear", *words, message="--allow-host: expected a host name without scheme")
+
+
 @pytest.mark.parametrize(
     ("live", "message"),
     [

@@ -329,6 +329,12 @@ def test_access_refuses_pages_of_other_sites(origin):
         Access().check({b"host": b"127.0.0.1:8001", b"origin": origin})
 
 
+def test_second_host_header_is_refused(page):
+    with socket.create_connection(page.url.removeprefix("http://").split(":"), timeout=20) as client:
+        client.sendall(b"GET /session.json HTTP/1.1\r\nHost: localhost\r\nHost: 127.0.0.1\r\n\r\n")
+        assert client.recv(1000).startswith(b"HTTP/1.1 400 ")
+
+
 def test_access_refuses_a_rebound_host_name():
     """After DNS rebinding, the page and the server have the same name, which is not a name of this server."""
     headers = {b"host": b"evil.example:8001", b"origin": b"http://evil.example:8001"}

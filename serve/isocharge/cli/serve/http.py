@@ -10,7 +10,14 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.serve.records import LogFormat
-from isocharge.cli.shared.live_page import TlsCertOption, TlsKeyOption, TokenOption, given_tls, given_token
+from isocharge.cli.shared.live_page import (
+    AllowHostOption,
+    TlsCertOption,
+    TlsKeyOption,
+    TokenOption,
+    given_tls,
+    given_token,
+)
 from isocharge.cli.shared.terminal import announce, say, write_stderr
 from isocharge.common.extras import require
 from isocharge.common.writer_queue import WriterQueue
@@ -48,15 +55,7 @@ def http_command(
         int | None,
         typer.Option("--grpc-port", min=0, max=65535, help="TCP port for gRPC; 0 takes a free one. (default: no gRPC)"),
     ] = None,
-    allow_host: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--allow-host",
-            metavar="NAME",
-            help="Further host name by which browsers reach the server, for example through a reverse proxy; repeat "
-            "it for more. (default: IP addresses, localhost and --host)",
-        ),
-    ] = None,
+    allow_host: AllowHostOption = None,
     token: TokenOption = None,
     tls_cert: TlsCertOption = None,
     tls_key: TlsKeyOption = None,

@@ -22,6 +22,7 @@ from isocharge.cli.serve.records import (
     write_records,
 )
 from isocharge.cli.shared.live_page import (
+    AllowHostOption,
     LiveOption,
     PageFeed,
     RecordingHeader,
@@ -143,6 +144,7 @@ def stream_command(
     ] = False,
     live: LiveOption = None,
     token: TokenOption = None,
+    allow_host: AllowHostOption = None,
     tls_cert: TlsCertOption = None,
     tls_key: TlsKeyOption = None,
 ) -> None:
@@ -181,7 +183,9 @@ def stream_command(
         page = None
         if address is not None:
             folder = find_model(model, models)
-            page = stack.enter_context(live_page(address, token, touch.frame_id, predictor.metadata, folder, tls=tls))
+            page = stack.enter_context(
+                live_page(address, token, touch.frame_id, predictor.metadata, folder, tls=tls, allow_host=allow_host)
+            )
         stack.enter_context(timer)
         source = stack.enter_context(
             open_source(port, baud=baud, reconnect=reconnect, request=board.request, wait=wait)
@@ -256,6 +260,7 @@ def replay_command(
     output: OutputOption = None,
     live: LiveOption = None,
     token: TokenOption = None,
+    allow_host: AllowHostOption = None,
     tls_cert: TlsCertOption = None,
     tls_key: TlsKeyOption = None,
 ) -> None:
@@ -290,7 +295,16 @@ def replay_command(
         if address is None:
             write_records(play(), [outputs.write], latencies)
         else:
-            page = live_page(address, token, file.name, predictor.metadata, folder, is_recording=True, tls=tls)
+            page = live_page(
+                address,
+                token,
+                file.name,
+                predictor.metadata,
+                folder,
+                is_recording=True,
+                tls=tls,
+                allow_host=allow_host,
+            )
             with page as link:
                 _play_on_page(play, link, PageFeed(link, touch), outputs, latencies)
     say(summary(touch, latencies))

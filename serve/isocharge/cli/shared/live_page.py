@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -80,6 +80,16 @@ TokenOption = Annotated[
         envvar="ISOCHARGE_TOKEN",
         help="Secret that clients must send as `Authorization: Bearer TOKEN`; the live page asks for it, or takes it "
         "from #TOKEN in its address. (default: none)",
+    ),
+]
+
+AllowHostOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--allow-host",
+        metavar="NAME",
+        help="Further host name by which browsers reach the server, for example through a reverse proxy; repeat it for "
+        "more. (default: IP addresses, localhost and the host that it listens on)",
     ),
 ]
 
@@ -167,6 +177,7 @@ def live_page(
     *,
     is_recording: bool = False,
     tls: Tls | None = None,
+    allow_host: Iterable[str] | None = None,
 ) -> Iterator[ReaderEnd]:
     """Context manager that runs the page of a stream in a separate process, and prints the address of the page.
 
@@ -178,12 +189,14 @@ def live_page(
         model_folder: Folder of the version of the model, which may contain a deflection field.
         is_recording: Whether the stream is a recording. Its replay waits for the page instead of losing records.
         tls: Certificate and key; None for no TLS.
+        allow_host: Values of `--allow-host`; None if the option is not given.
 
     Yields:
         The reader's end of the link to the page.
 
     Raises:
         MissingExtra: If the extra `http` is not installed.
+        InputError: If a value of `--allow-host` is not a host name.
         ListenError: If the address is in use or impossible.
     """
     with require("http"):
@@ -191,7 +204,7 @@ def live_page(
 
     description = describe_film(name, metadata, find_deflection_field(model_folder, metadata))
     reader, page_end = make_link()
-    page = Page(page_end, description, address, given_token(token), is_recording, tls)
+    page = Page(page_end, description, address, given_token(token), is_recording, tls, tuple(allow_host or ()))
     # The process of the page ends when the reader's end of the link is closed. At the end of the block, the contexts
     # are left in reverse order: the second `closing` closes the reader's end before `page_process` waits for the end of
     # the process. The first `closing` is needed if the process cannot be started. Closing twice is harmless.

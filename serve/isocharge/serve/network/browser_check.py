@@ -108,14 +108,14 @@ class BrowserCheck:
         if not is_accepted_host:
             return (
                 f"Host: expected an IP address or one of {self._served_names()}, got {_quoted(host)}; use the server's "
-                "address, or name the host by --allow-host of `isocharge serve http`"
+                "address, or name the host by --allow-host"
             )
         if origin is not None:
             if self._is_own_page(origin, host):
                 return None
             return (
                 f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
-                "itself, or name the page's host by --allow-host of `isocharge serve http`"
+                "itself, or name the page's host by --allow-host"
             )
         # Programs other than browsers do not send the header Sec-Fetch-Site.
         if fetch_site is None or fetch_site.lower() in TRUSTED_FETCH_SITES:

@@ -49,6 +49,7 @@ class Page:
         token: Secret token that viewers must send, or None if viewers need no token.
         is_recording: Whether the stream is a recording.
         tls: Certificate and private key for TLS, or None to serve the page without TLS.
+        allowed_hosts: Further host names of the page, for example the name of a reverse proxy.
     """
 
     link: PageEnd
@@ -57,6 +58,7 @@ class Page:
     token: str | None = None
     is_recording: bool = False
     tls: Tls | None = None
+    allowed_hosts: tuple[str, ...] = ()
 
 
 @contextmanager
@@ -73,7 +75,7 @@ def page_process(page: Page) -> Iterator[str]:
         The URL of the page.
 
     Raises:
-        InputError: If the token or the TLS files cannot be used.
+        InputError: If the token, the TLS files or an allowed host name cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
     # The new process sends the URL of the page, or an error, through a pipe.
@@ -104,12 +106,12 @@ def run_page(page: Page, announce: Callable[[str], object]) -> None:
         announce: Function that is called with the URL when the server listens.
 
     Raises:
-        InputError: If the token or the TLS files cannot be used.
+        InputError: If the token, the TLS files or an allowed host name cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
     # The token and the TLS files are checked before the server listens, because it must not listen if they are invalid.
     token = None if page.token is None else Token(page.token)
-    access = Access(token, page.address.host)
+    access = Access(token, page.address.host, page.allowed_hosts)
     tls_context = None if page.tls is None else page.tls.context()
     hub = Hub(page.link, page.description, is_recording=page.is_recording)
     with closing(hub), page.address.listen(BACKLOG) as listening_socket:

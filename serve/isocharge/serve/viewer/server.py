@@ -57,15 +57,16 @@ class Access:
     Args:
         token: Token that requests must contain, or None if requests need no token.
         host: Name or address on which the page is served.
+        allowed_hosts: Further host names of the page.
     """
 
-    def __init__(self, token: Token | None = None, host: str = "127.0.0.1") -> None:
+    def __init__(self, token: Token | None = None, host: str = "127.0.0.1", allowed_hosts: Iterable[str] = ()) -> None:
         """Store the token, and create the filter of requests from browsers.
 
         The docstring of the class describes the arguments.
         """
         self._token = token
-        self._browser_check = BrowserCheck(host, any_host=token is not None)
+        self._browser_check = BrowserCheck(host, allowed_hosts, any_host=token is not None)
 
     def check(self, headers: Mapping[bytes, bytes], subprotocols: Iterable[str] = ()) -> None:
         """Check whether a request may be answered.
