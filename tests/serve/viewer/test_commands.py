@@ -123,7 +123,9 @@ def test_page_behind_a_proxy_has_the_host_name_of_allow_host(board, start):
     """The proxy keeps the name in Host, or replaces it by the address of the page."""
     _, url = start("stream", "linear", "--port", board.url, "--output", "none", "--allow-host", "proxy.example")
     for host in ("proxy.example", url.removeprefix("http://")):
-        request = urllib.request.Request(url + "/session.json", headers={"Host": host, "Origin": "http://proxy.example"})
+        request = urllib.request.Request(
+            url + "/session.json", headers={"Host": host, "Origin": "http://proxy.example"}
+        )
         assert urllib.request.urlopen(request, timeout=20).status == 200
 
 
