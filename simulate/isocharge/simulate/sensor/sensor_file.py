@@ -133,8 +133,8 @@ class SensorTable(Settings, frozen=True):
         if COATING in self.electrodes:
             raise ValueError(
                 f"electrodes.{COATING} = {self.electrodes[COATING]}: coats (metal or ink that stiffens the film) are "
-                "not modelled, because their effect on a charge is about 0.2 % once the gains are calibrated; remove "
-                "the key and calibrate the gains"
+                "not modelled, because their effect on a charge is typically 0.1 to 0.2 % once the gains are "
+                "calibrated; remove the key and calibrate the gains"
             )
         for name, value in self.electrodes.items():
             if name != SIDE and isinstance(value, float):
