@@ -73,6 +73,21 @@ def test_warming_that_is_inseparable_from_force_is_not_subtracted():
     assert state.blind
 
 
+@pytest.mark.parametrize("warmth_s", [None, 1e3])
+def test_uncertainty_of_the_warming_grows_while_it_is_inseparable_from_force(warmth_s):
+    """A blind time of 10 s. The first estimate after it removes nearly the whole warming of 18 pC."""
+    state = ThermalDrift(rate_variance=4.0)
+    for _ in range(200):
+        state = track_thermal_drift(ThermalRule(), state, np.ones(4), misfit_of(BIAXIAL), 0.05, warmth_s=warmth_s)
+    assert state.blind
+    if warmth_s is None:
+        assert state.variance_pC2 == pytest.approx(10.0 * ThermalRule().wander_pC ** 2)
+    else:
+        assert min(state.variance_pC2, state.covariance, state.rate_variance - 4.0) > 0.0
+    after = track_thermal_drift(ThermalRule(), state, PRESS + 18.0, misfit_of(UNIAXIAL), 0.05, warmth_s=warmth_s)
+    assert after.charge_pC == pytest.approx(18.0, rel=0.05)
+
+
 def test_charge_and_slope_are_estimated_by_a_kalman_filter():
     """The reference is a Kalman filter in matrices, whose state is the common charge and its slope.
 

@@ -96,7 +96,7 @@ def track_thermal_drift(
     subtracted from the charges. The misfit of a trial value is the distance of the remaining charges from the nearest
     single contact. A parabola is fitted to the squared misfits. The minimum of the parabola is the estimate. A Kalman
     filter weights this estimate by its variance and by the predicted variance of p. If the parabola is too flat, p is
-    not changed, and the state is marked as `blind`.
+    not changed, its predicted variance is kept, and the state is marked as `blind`.
 
     Args:
         rule: Settings of the estimate of warming.
@@ -127,7 +127,13 @@ def track_thermal_drift(
     # of the model increase it by `noise` squared. If the parabola is flat, warming cannot be distinguished from force.
     estimate_variance_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
     if estimate_variance_pC2 > rule.blind_pC**2:  # p is not changed
-        return state._replace(waited_s=0.0, blind=True, rate_pC_per_s=0.0)
+        return ThermalDrift(
+            charge_pC=state.charge_pC,
+            variance_pC2=predicted_variance_pC2,
+            blind=True,
+            covariance=predicted_covariance,
+            rate_variance=predicted_rate_variance,
+        )
 
     # The estimate is the minimum of the parabola, limited to the range of the trial values.
     minimum_pC = -slope / (2.0 * curvature)
