@@ -80,7 +80,8 @@ class ContactFilter:
         force, only the force filter is restarted. If the position filter rejects the position, the position may be an
         outlier, which means that no contact moves fast enough to reach the position. Up to `MAX_OUTLIERS` outliers in
         succession are ignored. After any other rejected position, both filters are restarted. They are also restarted
-        if the time since the latest frame is longer than `MAX_GAP_s`, or if the clock was set back.
+        if the time since the latest frame is longer than `MAX_GAP_s`, or if the clock was set back. Frames may have the
+        same time, for example because they were received together.
 
         The filters use only the variance of the noise that changes from frame to frame. Smoothing does not reduce
         errors that are the same in all frames.
@@ -102,7 +103,7 @@ class ContactFilter:
         # Continue the filters. A filter returns None if it rejects its measured value.
         dt_s = t_s - self._latest_time_s  # since the latest frame that was not ignored
         previous = self._tracked
-        if previous is not None and 0.0 < dt_s <= MAX_GAP_s:
+        if previous is not None and 0.0 <= dt_s <= MAX_GAP_s:
             smoothed_position = self._position_filter.step(measured.position, dt_s, measured.shape, position_variance)
             if smoothed_position is not None:
                 smoothed_log_force = self._force_filter.step(measured.log_force, dt_s, SCALAR_SHAPE, force_variance)

@@ -111,7 +111,7 @@ class TwoModeFilter:
 
         Args:
             measured: The measured value of the frame.
-            dt_s: Time since the previous frame, s, positive.
+            dt_s: Time since the previous frame, s, not negative.
             shape: Shape of the covariance of the measured value.
             stated_variance: Variance of the noise that is independent from frame to frame, as stated by the model. A
                 larger variance gives the frame a smaller weight.
