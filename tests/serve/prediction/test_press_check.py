@@ -207,11 +207,22 @@ def test_common_error_is_the_weighted_mean():
     std = rng.uniform(0.5, 2.0, 500)
     for scatter in (1.0, 3.0):
         error = 0.3 + scatter * std * rng.normal(size=500)
-        common = CommonError.from_errors(np.append(error, np.nan), np.append(std, 1.0) ** 2)
+        exact_rig_std = np.zeros(501)
+        common = CommonError.from_errors(np.append(error, np.nan), np.append(std, 1.0) ** 2, exact_rig_std)
         mean, weight = np.average(error, weights=std**-2, returned=True)
         widening = max(1.0, np.sum(((error - mean) / std) ** 2) / 499) ** 0.5  # as the Particle Data Group averages
         assert (common.mean, common.std) == pytest.approx((mean, widening * weight**-0.5))
         assert widening == pytest.approx(scatter, rel=0.1)
+        assert common.significance == pytest.approx(common.mean / common.std)
+
+
+def test_constant_error_of_the_rig_reduces_the_significance_of_a_common_error():
+    """All errors are 0.1 mm. A rig with a standard deviation of 0.2 mm may have a constant error of 0.04 mm."""
+    error = np.full(400, 0.1)
+    variance = np.full(400, 0.01 + 0.2**2)
+    for rig_std_mm, constant_mm in ((0.0, 0.0), (0.2, 0.04)):
+        common = CommonError.from_errors(error, variance, np.full(400, rig_std_mm))
+        assert common.significance == pytest.approx(0.1 / math.hypot(common.std, constant_mm))
 
 
 def test_error_summary_of_known_numbers():

@@ -319,7 +319,7 @@ class CommonError:
     significance: float
 
     @classmethod
-    def from_errors(cls, error: Array, variance: Array) -> "CommonError":
+    def from_errors(cls, error: Array, variance: Array, rig_std: Array) -> "CommonError":
         """Estimate the error that is common to all presses, such as a shift of all positions.
 
         The estimate is the mean of the errors, weighted with the inverse of their expected variances. The significance
@@ -329,6 +329,7 @@ class CommonError:
         Args:
             error: Error of each press, shape (n,); NaN where unknown.
             variance: Expected variance of each error, shape (n,); NaN where unknown.
+            rig_std: Part of the standard deviation of each error that the rig causes, shape (n,); NaN where unknown.
         """
         is_known = ~np.isnan(error)
         count = int(np.count_nonzero(is_known))
@@ -346,12 +347,10 @@ class CommonError:
         chi_squared_per_degree = chi_squared / max(count - 1, 1)
         std = math.sqrt(mean_variance * max(chi_squared_per_degree, 1.0))
 
-        # For the significance, the variance of the mean includes an error of the rig that is equal in all presses, so
-        # that averaging does not reduce it. Its standard deviation is `COMMON_RATIO` times that of a single press.
-        press_variance = count * mean_variance  # typical variance of a single press
-        common_rig_variance = COMMON_RATIO**2 * press_variance
-        std_with_rig = math.sqrt(mean_variance + common_rig_variance)
-        return cls(mean, std, significance=mean / std_with_rig)
+        # For the significance, the standard error also includes an error of the rig that is equal in all presses, so
+        # that averaging does not reduce it. Its standard deviation is `COMMON_RATIO` times that of the rig.
+        common_rig_std = COMMON_RATIO * float(weight @ rig_std[is_known]) / total_weight
+        return cls(mean, std, significance=mean / math.hypot(std, common_rig_std))
 
 
 @dataclass(frozen=True)
@@ -392,11 +391,12 @@ class Agreement:
         # The columns are x, y and the force.
         error = errors.error[is_selected]
         variance = errors.variance[is_selected]
+        rig_std = errors.rig_std[is_selected]
         chi_squared = float(np.nansum(errors.squared_ratio[is_selected]))
         degrees = int(np.count_nonzero(~np.isnan(error)))
-        shift_x = CommonError.from_errors(error[:, X], variance[:, X])
-        shift_y = CommonError.from_errors(error[:, Y], variance[:, Y])
-        force = CommonError.from_errors(error[:, FORCE], variance[:, FORCE])
+        shift_x = CommonError.from_errors(error[:, X], variance[:, X], rig_std[:, X])
+        shift_y = CommonError.from_errors(error[:, Y], variance[:, Y], rig_std[:, Y])
+        force = CommonError.from_errors(error[:, FORCE], variance[:, FORCE], rig_std[:, FORCE])
         known_common_errors = [common for common in (shift_x, shift_y, force) if not math.isnan(common.mean)]
         squared_significance = sum(common.significance**2 for common in known_common_errors)
         return cls(
