@@ -23,7 +23,7 @@ from isocharge.train.calibration.contacts import from_log_contact
 from isocharge.train.calibration.film_fit import fit_film
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.data.presses import draw_contacts
-from isocharge.train.films.films_model import AddedVariance
+from isocharge.train.films.films_model import AddedCovariance
 
 PRETENSION = 0
 """Index of the pretension among the parameters of a film."""
@@ -369,6 +369,20 @@ def test_earlier_calibration_reduces_the_error_of_the_next(drifted, problem):
     assert calibrate(presses, with_earlier).film_error.position_mm < 0.7 * error_mm
 
 
+def test_quantities_are_compared_with_the_earlier_calibration(drifted):
+    """Compared with the sensor file, one press would identify eleven quantities, which were already known."""
+    with_earlier, truth = drifted
+    contact = np.array([[2.0, 1.0, 0.8]])
+    result = calibrate(
+        measured_presses(with_earlier, contact, with_earlier.charges.charges(truth, contact)), with_earlier
+    )
+    pretension = result.quantities["pretension_MPa"]
+    index = with_earlier.prior.index("pretension")
+    earlier_std = np.sqrt(with_earlier.earlier.covariance[index, index]) * with_earlier.prior.std[index]
+    assert pretension.before_std == pytest.approx(earlier_std)
+    assert sum(quantity.identified for quantity in result.quantities.values()) < 4
+
+
 UNKNOWN = np.nan
 
 
@@ -438,8 +452,8 @@ def test_network_of_the_pads_is_adapted_to_traces(problem):
     contact = draw_contacts(np.random.default_rng(3), traced.domain, 40)
     pressed, others = np.split(contact, [10])
     sensor, probe = traced.prior.film(traced.prior.mean)
-    no_added_variance = AddedVariance(others, np.zeros((30, 3)))
-    fitted = traced.fitted(traced.prior.mean, no_added_variance, lambda at: np.ones((len(at), 4)), release=False)
+    no_added_covariance = AddedCovariance(others, np.zeros((30, 3, 3)))
+    fitted = traced.fitted(traced.prior.mean, no_added_covariance, lambda at: np.ones((len(at), 4)), release=False)
     estimated, _, _ = fitted.predict(solved_charges(sensor, probe, pressed))
     assert fitted.sensor.electrodes == sensor.electrodes
     assert position_error(estimated, pressed).mean() < 0.05

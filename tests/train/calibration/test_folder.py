@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from isocharge.common.statistics import rms
 from isocharge.serve import Predictor, load_model, read_presses, write_presses
 from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, read_earlier, write_calibration
+from isocharge.train.calibration import contact_error
+from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.folder import calibration_folder
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
@@ -85,6 +88,43 @@ def test_standard_deviations_include_the_uncertainty_of_the_film(film, problem):
     log_ratio = np.log(Predictor(folder).predict_batch(charge).x_std_mm / expected_std)
     assert np.median(np.abs(log_ratio)) < 0.03
     assert np.abs(log_ratio).max() < 0.5
+
+
+def ellipse_coverage(result, network, monkeypatch):
+    """Return the shares of the errors within the 95 % ellipses of (x, y) and within the 95 % ellipsoids of (x, y, F).
+
+    The errors are caused by noise and by films that are drawn from the posterior of the calibration. They are computed
+    at other contacts than those from which the calibration computes the covariances.
+    """
+    problem, posterior = result.problem, result.posterior
+    monkeypatch.setattr(contact_error, "N_CONTACTS", 300)
+    sensitivity = ContactSensitivity.for_film(problem, posterior.unknowns)
+    exact_charge = problem.charges.charges(posterior.unknowns, sensitivity.contact)
+    copies = np.arange(9000) % 300  # each copy has its own noise and its own film
+    contact = sensitivity.contact[copies]
+    rng = np.random.default_rng(4)
+    charge = problem.noise.add(exact_charge[copies], rng)
+    estimate, std, correlation, _ = network.outputs(charge)
+    film = rng.multivariate_normal(np.zeros(len(posterior.joint)), posterior.joint, len(contact))
+    error = np.column_stack([estimate[:, :2] - contact[:, :2], np.log(estimate[:, 2] / contact[:, 2])])
+    error += np.einsum("nip,np->ni", sensitivity.contact_jacobian[copies], film)
+    deviation = error / np.column_stack([std[:, :2], std[:, 2] / estimate[:, 2]])
+    matrices = np.tile(np.eye(3), (len(contact), 1, 1))
+    for column, (row, other) in enumerate(((0, 1), (0, 2), (1, 2))):
+        matrices[:, row, other] = matrices[:, other, row] = correlation[:, column]
+    return [
+        np.mean(
+            np.sum(deviation[:, :n] * np.linalg.solve(matrices[:, :n, :n], deviation[:, :n, None])[..., 0], 1) < limit
+        )
+        for n, limit in ((2, 5.991), (3, 7.815))  # 95 % quantiles of chi-squared
+    ]
+
+
+def test_95_percent_ellipses_contain_95_percent_of_the_errors_of_film_and_noise(film, monkeypatch):
+    monkeypatch.setattr(contact_error, "N_CONTACTS", 200)  # as in use, not as few as the fixture `coarse` sets
+    result = replace(film[1])  # without the results that were computed from few contacts
+    network = result.fitted_film(result.posterior.parameters, release=True).network
+    assert ellipse_coverage(result, network, monkeypatch) == pytest.approx([0.95, 0.95], abs=0.02)
 
 
 def test_folder_with_other_files_is_refused_and_not_changed(film, tmp_path):

@@ -18,7 +18,7 @@ from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.hypotheses import Hypothesis
 from isocharge.train.calibration.nuisances import PRETENSION_PER_KELVIN
 from isocharge.train.films.films_file import FILE, read_films
-from isocharge.train.films.films_model import AddedVariance, FilmsModel
+from isocharge.train.films.films_model import AddedCovariance, FilmsModel
 from isocharge.train.training.fitted import Fitted
 
 DRIFT = {
@@ -279,7 +279,7 @@ class CalibrationProblem:
     def fitted(
         self,
         parameters: Array,
-        added_variance: AddedVariance,
+        added_covariance: AddedCovariance,
         film_factor_of: Callable[[Array], Array],
         *,
         release: bool = True,
@@ -293,7 +293,7 @@ class CalibrationProblem:
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
-            added_variance: Variances that are added to those of the network.
+            added_covariance: Covariances of errors that are added to those that noise causes.
             film_factor_of: Function that converts contacts (x, y, F), shape (n, 3), mm and N, into factors on the
                 charges, shape (n, n_electrode).
             release: Whether the network will be released. Only a network that will be released learns correlations and
@@ -320,7 +320,7 @@ class CalibrationProblem:
             electrode_factor = sensor_map.charges(contact) / network_map.charges(contact)
             return np.asarray(film_factor * electrode_factor)
 
-        fitted = self.films.film(parameters, added_variance=added_variance, charge_factor=charge_factor, **options)
+        fitted = self.films.film(parameters, added_covariance=added_covariance, charge_factor=charge_factor, **options)
         return replace(fitted, sensor=sensor_map.sensor)
 
     @property

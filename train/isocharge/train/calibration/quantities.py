@@ -82,12 +82,13 @@ class _Definition(NamedTuple):
     offset: float = 0.0
 
 
-def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
+def quantities(prior: FilmPrior, before: FilmEstimate, film: FilmEstimate) -> dict[str, Quantity]:
     """Return the quantities of a film by name, each with its standard deviations before and after the presses.
 
     Args:
-        prior: Distribution of the films, with the standard deviations of the parameters before the presses.
-        film: The estimate of the film.
+        prior: Distribution of the films, with the prior standard deviations of the parameters.
+        before: Estimate of the film before the presses, for example from an earlier calibration.
+        film: Estimate of the film after the presses.
     """
     quantity_of_name = {}
     for name, definition in _definitions(prior).items():
@@ -99,8 +100,7 @@ def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
             definition.meaning,
             value=float(definition.offset + definition.weights @ film.parameters),
             std=float(np.sqrt(scaled_weights @ film.covariance @ scaled_weights)),
-            # In units of the prior standard deviations, the covariance before the presses is the identity matrix.
-            before_std=float(np.sqrt(scaled_weights @ scaled_weights)),
+            before_std=float(np.sqrt(scaled_weights @ before.covariance @ scaled_weights)),
             weights=scaled_weights,
         )
     return quantity_of_name
@@ -191,8 +191,8 @@ def summarise(table: Mapping[str, Quantity]) -> tuple[str, ...]:
     if unidentified:
         meanings = [quantity.meaning.removesuffix(", %").removesuffix(RELATIVE) for quantity in unidentified]
         sentences.append(
-            f"These presses do not determine {', '.join(meanings)}; their values are hardly more certain than in the "
-            "sensor file."
+            f"These presses do not determine {', '.join(meanings)}; their values are hardly more certain than before "
+            "the presses."
         )
 
     # The charge of a press can be known although the single parameters in it are not.

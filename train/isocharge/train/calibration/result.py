@@ -19,7 +19,7 @@ from isocharge.train.calibration.press_data import PressData, no_presses
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity, quantities, summarise
 from isocharge.train.calibration.side_forces import SideForces, solve_side_forces, with_friction
-from isocharge.train.films.films_model import AddedVariance
+from isocharge.train.films.films_model import AddedCovariance
 from isocharge.train.training.fitted import Fitted
 
 PLANNED_PRESSES = 30
@@ -59,7 +59,7 @@ class CalibrationResult:
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
         """Quantities of the film by name, each with its standard deviations before and after the presses."""
-        return quantities(self.problem.prior, self.posterior)
+        return quantities(self.problem.prior, self.problem.before, self.posterior)
 
     @cached_property
     def sensitivity(self) -> ContactSensitivity:
@@ -170,7 +170,7 @@ class CalibrationResult:
     def _network_of(self, unknowns: Array, covariance: Array, *, release: bool = False) -> Fitted:
         """Return a network for a film that is similar to the calibrated film.
 
-        The variances that the network reports include two effects: the uncertainty of the film, and side forces. Both
+        The covariances that the network reports include two effects: the uncertainty of the film, and side forces. Both
         effects are linearised at the calibrated film.
 
         Args:
@@ -181,11 +181,10 @@ class CalibrationResult:
         contact_covariance = self.sensitivity.contact_covariance(covariance)
         if self.side_forces is not None:
             contact_covariance = contact_covariance + self.side_forces.contact_covariance(self.sensitivity)
-        contact_variance = np.diagonal(contact_covariance, axis1=1, axis2=2)  # shape (n, 3)
-        added_variance = AddedVariance(self.sensitivity.contact, contact_variance)
+        added_covariance = AddedCovariance(self.sensitivity.contact, contact_covariance)
         parameters = unknowns[self.problem.charges.layout.parameters]
         factor = partial(self.charge_factor, unknowns)
-        return self.problem.fitted(parameters, added_variance, factor, release=release)
+        return self.problem.fitted(parameters, added_covariance, factor, release=release)
 
     @property
     def reduced_chi2(self) -> float:

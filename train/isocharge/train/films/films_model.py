@@ -1,7 +1,7 @@
 """A trained network for all films, from which the network of each film is computed."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from isocharge.simulate import Domain, FilmPrior, ForwardMap, NoiseModel
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.films.film_scaling import FilmScaling
-from isocharge.train.training.correlation import with_correlation
+from isocharge.train.training.correlation import N_EXAMPLES, with_correlation
 from isocharge.train.training.features import logarithmic_features
 from isocharge.train.training.fitted import Fitted, Provenance
 from isocharge.train.training.folded_network import FoldedNetwork
@@ -104,16 +104,43 @@ class ConditionalWeights:
         return np.asarray(self.arrays[constant] + weighted_sum)
 
 
-class AddedVariance(NamedTuple):
-    """Variances to add to the reported variances of a network.
+class AddedCovariance(NamedTuple):
+    """Covariances of errors that a network makes in addition to the errors that noise causes.
 
     Attributes:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        variance: Variances of (x, y, ln F) to add at these contacts, shape (n, 3), mm^2, mm^2 and 1.
+        covariance: Covariances of the additional errors of (x, y, ln F) at these contacts, shape (n, 3, 3).
     """
 
     contact: Array
-    variance: Array
+    covariance: Array
+
+    @property
+    def variance(self) -> Array:
+        """Variances of the additional errors of (x, y, ln F), shape (n, 3), mm^2, mm^2 and 1."""
+        return np.diagonal(self.covariance, axis1=1, axis2=2)
+
+    def displace(self, presses: LabelledPresses, rng: np.random.Generator) -> LabelledPresses:
+        """Return copies of presses whose contacts are changed by random errors with the covariances.
+
+        The charges of the copies are not changed. On the copies, a network therefore makes the additional errors.
+
+        Args:
+            presses: Presses at the contacts of the covariances.
+            rng: Random number generator.
+
+        Returns:
+            The copies, at least `N_EXAMPLES` presses.
+        """
+        copies = presses.repeated(N_EXAMPLES)
+        variances, directions = np.linalg.eigh(self.covariance)
+        roots = directions * np.sqrt(np.maximum(variances, 0.0))[:, np.newaxis]  # rounding can give variances below 0
+        copied_roots = roots[np.arange(len(copies)) % len(presses)]  # in the order of the copies
+        error = np.einsum("nij,nj->ni", copied_roots, rng.standard_normal((len(copies), 3)))
+        contact = copies.contact.copy()
+        contact[:, :2] += error[:, :2]
+        contact[:, 2] *= np.exp(error[:, 2])
+        return replace(copies, contact=contact)
 
 
 @dataclass(frozen=True)
@@ -170,7 +197,7 @@ class FilmsModel:
         *,
         provenance: Provenance | None = None,
         charge_factor: Callable[[Array], Array] | None = None,
-        added_variance: AddedVariance | None = None,
+        added_covariance: AddedCovariance | None = None,
         correlation: bool = True,
         n_test: int = N_TEST_PRESSES,
     ) -> Fitted:
@@ -180,8 +207,9 @@ class FilmsModel:
         on the simulated film:
 
         1. With `charge_factor`, adapt the network to charges that differ from the simulated charges by known factors.
-        2. With `correlation`, fit the correlations between the errors of x, y and force.
-        3. With `added_variance`, add variances to those that the network reports.
+        2. With `added_covariance`, add variances to those that the network reports.
+        3. With `correlation`, fit the correlations between the errors of x, y and force. These errors include the
+           additional errors.
 
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
@@ -190,8 +218,8 @@ class FilmsModel:
                 divided by the charges of the simulated film, shape (n, n_electrode). None if the charges are equal.
                 With this function, the first and the last layer of the network are changed, and its standard deviations
                 are fitted to the remaining errors.
-            added_variance: Variances that are added to the variances of the network, for example because the parameters
-                of the film are uncertain; None to add nothing.
+            added_covariance: Covariances of additional errors, for example because the parameters of the film are
+                uncertain; None if there are no additional errors.
             correlation: Whether to fit the correlations, which takes one or two seconds.
             n_test: Number of test presses, at most `N_TEST_PRESSES`.
 
@@ -206,10 +234,10 @@ class FilmsModel:
         sensor, probe = self.prior.film(parameters)
         rng = np.random.default_rng(SEED)
 
-        # Draw contacts for the test and for the first two corrections. The contacts for the third correction are given.
+        # Draw contacts for the test and for the corrections. The contacts of the additional errors are given.
         n_train = N_CORRELATION_PRESSES if correlation else N_REGRESSION_PRESSES
         test_contact, train_contact = self._draw_contacts(rng, n_test, n_train)
-        uncertain_contact = np.empty((0, 3)) if added_variance is None else added_variance.contact
+        uncertain_contact = np.empty((0, 3)) if added_covariance is None else added_covariance.contact
 
         # Compute the charges of all three groups of contacts together.
         contact = np.concatenate([test_contact, train_contact, uncertain_contact])
@@ -223,13 +251,15 @@ class FilmsModel:
         if charge_factor is not None:
             regression_rows = train_rows[:N_REGRESSION_PRESSES]
             network = self._adapt_to_factors(network, presses[regression_rows], factors[regression_rows], rng)
-        if correlation:
-            network = with_correlation(network, presses[train_rows], self.noise, SEED)
-        if added_variance is not None:
+        correlation_presses = presses[train_rows]
+        if added_covariance is not None:
             copied_rows = uncertain_rows.repeat(N_COPIES)  # each copy gets its own noise
             noisy_charge = self.noise.add(presses.charge[copied_rows], rng)
-            repeated_variance = added_variance.variance.repeat(N_COPIES, axis=0)
+            repeated_variance = added_covariance.variance.repeat(N_COPIES, axis=0)
             network = add_variance(network, noisy_charge, repeated_variance)
+            correlation_presses = added_covariance.displace(presses[uncertain_rows], rng)
+        if correlation:
+            network = with_correlation(network, correlation_presses, self.noise, SEED)
         test = presses[test_rows]
         return Fitted(
             network=network,
