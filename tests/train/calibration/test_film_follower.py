@@ -28,10 +28,13 @@ from isocharge.serve import (
     device_from_table,
     encode_frame,
 )
+from isocharge.serve.live.contact_stages import ContactFrame, CurrentModel, FilmStage, PredictionStage
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.pretensions import read_pretensions
+from isocharge.serve.signal_chain.chain import Reading
 from isocharge.serve.signal_chain.thermal import TRIED_PC, ThermalRule
-from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule
+from isocharge.serve.tracking.film_follower import FilmFollower, FollowedContact, FollowRule
+from isocharge.serve.tracking.touch_collector import ObservedTouch
 from isocharge.serve.tracking.touch_misfits import TYPICAL_MISFIT, SeriesMisfits
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, write_calibration
@@ -75,6 +78,61 @@ def test_common_offset_of_warm_fingers_is_not_taken_for_pretension(mine, problem
         assert follower.is_lost or abs(answer.x_mm - x_mm) < 4.0 * answer.x_std_mm
         assert follower.is_lost or abs(answer.y_mm - y_mm) < 4.0 * answer.y_std_mm
         assert follower.is_lost or abs(answer.force_N - force_N) < 4.0 * answer.force_std_N
+
+
+@pytest.fixture
+def film_stage(mine):
+    """The stage that follows the film, before the first touch."""
+    return FilmStage(CurrentModel(Predictor(mine)), FollowRule(), 1.0)
+
+
+def frame_at(stage, charge_pC, clock_s, flags=()):
+    """Return a frame with the contact that the model of a stage predicts; None as the charge for no contact."""
+    reading = Reading(np.zeros(4), charge_pC, None, charge_pC is not None, flags)
+    frame = ContactFrame(reading, clock_s, flags)
+    if charge_pC is not None:
+        PredictionStage(CurrentModel(stage.follower.predictor)).step(frame)
+    return frame
+
+
+def test_touch_with_invalid_frames_counts_once(film_stage, touch_charge):
+    for number in range(100):
+        is_invalid = number % 20 == 7
+        film_stage.step(
+            frame_at(film_stage, None if is_invalid else touch_charge, 0.01 * number, ("invalid",) * is_invalid)
+        )
+    film_stage.step(frame_at(film_stage, None, 1.0))
+    assert film_stage.follower.film.touches == 1
+
+
+@pytest.mark.parametrize("misfit", [0.5, 50.0])
+def test_flags_of_a_followed_film_belong_to_the_corrected_contact(film_stage, touch_charge, monkeypatch, misfit):
+    """The contact before the correction has a misfit on the other side of the limit."""
+    frame = frame_at(film_stage, touch_charge, 0.0, ("gap",))
+    frame.flags = ("gap",) if misfit > 1.0 else ("gap", "misfit")
+    corrected_contact = frame.contact._replace(misfit=misfit)
+    monkeypatch.setattr(
+        film_stage.follower, "follow_contact", lambda *_: FollowedContact(corrected_contact, touch_charge)
+    )
+    film_stage.step(frame)
+    assert frame.flags == (("gap", "misfit") if misfit > 1.0 else ("gap",))
+
+
+def test_film_that_is_lost_twice_keeps_the_state_before_the_latest_touches(mine, problem, film, monkeypatch):
+    """The pretension is 0.35 MPa higher than in the calibration. The film is lost at the touches 70 and 90."""
+    follower = FilmFollower(Predictor(mine))
+    calibrated_MPa = follower.film.pretension_MPa
+    lost_touches = {70, 71, 72, 90}
+    monkeypatch.setattr(FilmFollower, "_is_gain_wrong", lambda self: self.film.touches in lost_touches)
+    monkeypatch.setattr(FilmFollower, "_is_unexplained", lambda _: False)
+    _, charge = touch_charges(problem, film, Predictor(mine), 1.0 + DEGREE_MPa, 90, seed=8)
+    pretensions_MPa = []
+    for number, row in enumerate(charge):
+        follower.observe_touch(ObservedTouch(follower.predictor.predict(row), row), 5.0 * number)
+        pretensions_MPa.append(follower.film.pretension_MPa)
+    assert follower.is_lost
+    assert pretensions_MPa[69] == pretensions_MPa[89] == pretensions_MPa[29]
+    assert pretensions_MPa[29] > calibrated_MPa + 0.5 * DEGREE_MPa
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])

@@ -137,10 +137,14 @@ class FilmStage(ContactStage):
             ModelError: If the pretension of this film cannot be estimated with the model.
         """
         self._model = model
+        self._validity = model.predictor.validity  # of the calibrated film
         self.follower = FilmFollower(model.predictor, rule, warming_ratio)
 
     def step(self, frame: ContactFrame) -> None:
         """Correct the contact for the estimated pretension of the film, and then update the estimate with the frame.
+
+        The flags of the frame become those of the corrected contact. A frame with the flag `invalid` does not change
+        the estimate, because it does not show whether the touch has ended.
 
         The model for the new estimate is used from the next frame on. If the pretension can no longer be estimated,
         every frame with a contact gets the flag `film`.
@@ -149,7 +153,10 @@ class FilmStage(ContactStage):
         charge_pC = frame.reading.charge_pC
         if frame.contact is not None and charge_pC is not None:
             frame.contact, frame.model_charge_pC = self.follower.follow_contact(frame.contact, charge_pC)
+            frame.flags = frame.reading.flags + self._validity.flags(frame.contact)
         frame.film = self.follower.film
+        if INVALID in frame.flags:
+            return
 
         # Update the estimate, and use its model for the next frame.
         self.follower.observe_frame(charge_pC, frame.contact, frame.flags, frame.clock_s)

@@ -201,7 +201,8 @@ class FilmFollower:
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
         self._touch_count = 0
         self._recent_misfits: deque[SquaredMisfits] = deque(maxlen=RECENT_TOUCHES)
-        self._recent_estimates: deque[FilmStateEstimate] = deque(maxlen=RECENT_TOUCHES)
+        # Estimates after the latest touches. Before the first touches, the film was in the state of the calibration.
+        self._recent_estimates = deque([self._calibrated_estimate] * RECENT_TOUCHES, maxlen=RECENT_TOUCHES)
         self._touch_collector.reset()
 
     def discard_touch(self) -> None:
@@ -313,16 +314,10 @@ class FilmFollower:
             self._recent_estimates.append(estimate)
             self._apply_estimate(estimate)
         elif not was_lost:  # the film became lost with this touch
-            self._apply_estimate(self._estimate_before_recent_touches())
-            self._recent_estimates.clear()
-
-    def _estimate_before_recent_touches(self) -> FilmStateEstimate:
-        """Return the estimate before the latest `RECENT_TOUCHES` touches.
-
-        If there are fewer than `RECENT_TOUCHES` estimates, the result is the estimate from the calibration.
-        """
-        is_long_enough = len(self._recent_estimates) == RECENT_TOUCHES
-        return self._recent_estimates[0] if is_long_enough else self._calibrated_estimate
+            earlier_estimate = self._recent_estimates[0]  # before the latest `RECENT_TOUCHES` touches
+            self._apply_estimate(earlier_estimate)
+            # If the film is soon lost again, the same estimate is restored, because the later estimates are doubtful.
+            self._recent_estimates.extend([earlier_estimate] * RECENT_TOUCHES)
 
     def _squared_misfits(self, touch: ObservedTouch, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
         """Compute the squared misfits of a touch, which are needed to decide whether the film is lost.
