@@ -19,7 +19,7 @@ def project(tmp_path):
     for name in ("simulate", "train", "serve", "tests", "models", "pyproject.toml"):
         source, target = ROOT / name, tmp_path / name
         if source.is_dir():
-            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", "pictures", "benchmarks"))
+            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", "pictures"))
         else:
             shutil.copy(source, target)
     return tmp_path
