@@ -16,6 +16,7 @@ from hypothesis import settings
 
 from isocharge.cli.main import main
 from isocharge.common.extras import PACKAGES
+from whole_films import whole_film_map_solved_once
 
 ROOT = Path(__file__).parents[1]
 
@@ -81,6 +82,14 @@ def few_check_presses():
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("isocharge.simulate.forward.forward_map.CHECK_COUNT", 4)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def whole_films_are_solved_once():
+    """Solve the coarse map of a whole film once for all sweeps of this film."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("isocharge.simulate.dataset.sweep.whole_film_map", whole_film_map_solved_once)
         yield
 
 

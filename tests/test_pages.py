@@ -6,10 +6,8 @@ import pytest
 
 from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
-from isocharge.train.data import outside_presses
 from isocharge.train.training import correlation
 from kept import ROOT, kept
-from whole_films import whole_film_map_solved_once
 
 FOLDERS = ("simulate", "train", "serve")
 PAGES = {
@@ -104,11 +102,10 @@ def test_an_example_does_what_it_says(page_example, desk, installed, run_example
 
 @pytest.fixture
 def train_in_this_process(monkeypatch, capsys):
-    """Run a Python example that trains, in this process, where the map of the whole film is solved already.
+    """Run a Python example that trains, in this process, where the correlations are fitted to few examples.
 
     It must have one `print`, which prints what the comment on its line says.
     """
-    monkeypatch.setattr(outside_presses, "whole_film_map", whole_film_map_solved_once)
     monkeypatch.setattr(correlation, "N_EXAMPLES", 3_000)
 
     def run(example, folder):

@@ -7,7 +7,7 @@ from isocharge.simulate.forward.whole_film import whole_film_map
 from kept import kept
 
 
-def whole_film_map_solved_once(sensor, probe, force_range):
+def whole_film_map_solved_once(sensor, probe, force_range, **_executor):
     """Return the coarse map of a film, which is solved once for all layouts of electrodes.
 
     The solution does not depend on the electrodes.

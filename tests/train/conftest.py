@@ -5,25 +5,15 @@ import pytest
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Sweep, load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, TrainingData, fit
-from isocharge.train.data import outside_presses
 from isocharge.train.training import correlation
 from isocharge.train.training import fit as fit_module
 from isocharge.train.training.fit import train_network
 from kept import kept
-from whole_films import whole_film_map_solved_once
 
 QUICK = FitConfig(
     network=NetworkConfig(hidden=(32, 32), misfit_hidden=(24, 24)),
     training=TrainingConfig(steps=400, misfit_steps=600, misfit_charges=4_000, batch=256),
 )
-
-
-@pytest.fixture(scope="session", autouse=True)
-def whole_films_are_solved_once():
-    """Solve the coarse map of a whole film once for all trainings with this film."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(outside_presses, "whole_film_map", whole_film_map_solved_once)
-        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -51,9 +41,13 @@ def spline(film):
 
 
 @pytest.fixture(scope="session")
-def dataset(film, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("data") / "presses"
-    return read_dataset(write_sweep(folder, (film,), Sweep(samples=6_000)))
+def dataset_folder(film, tmp_path_factory):
+    return write_sweep(tmp_path_factory.mktemp("data") / "presses", (film,), Sweep(samples=6_000))
+
+
+@pytest.fixture(scope="session")
+def dataset(dataset_folder):
+    return read_dataset(dataset_folder)
 
 
 @pytest.fixture(scope="session")

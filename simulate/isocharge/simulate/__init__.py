@@ -14,9 +14,12 @@ Example:
 from typing import TYPE_CHECKING
 
 from isocharge.common.extras import require
-from isocharge.common.versions import version_attribute
+from isocharge.common.lazy_names import lazy_names
 
 with require("simulate"):
+    import scipy  # noqa: F401 (all modules need it; the error names the extra)
+
+if TYPE_CHECKING:
     from isocharge.simulate.contours.triangulation import Triangulation
     from isocharge.simulate.dataset.sampling import Sweep
     from isocharge.simulate.dataset.shards import Dataset, Samples, read_dataset, write_dataset
@@ -46,6 +49,8 @@ with require("simulate"):
     from isocharge.simulate.solver.equilibrium import Equilibrium, deflection, touch_stress
     from isocharge.simulate.solver.load_case import SolveSettings
     from isocharge.simulate.solver.press import press
+else:  # hidden from type checkers, which would otherwise accept every misspelt name
+    __getattr__ = lazy_names(__name__, "simulate")
 
 __all__ = [
     "Amplifier",
@@ -105,8 +110,3 @@ __version__: str
 def __dir__() -> list[str]:
     """Return the public names, so that tab completion suggests no other names."""
     return list(__all__)
-
-
-if not TYPE_CHECKING:  # with `__getattr__`, a type checker would accept every misspelt name
-    __getattr__ = version_attribute(__name__)
-    del TYPE_CHECKING

@@ -19,7 +19,7 @@ from isocharge.simulate.forward import forward_map
 
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
-SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7)
+SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, outside=15)
 
 
 class Stopped(BaseException):
@@ -198,7 +198,7 @@ if __name__ == "__main__":
     forward_map.CHECK_COUNT = {check_count}  # as in the process that resumes the run
     membrane = Theory(stretching=True, bending=False, pretensioned=False)
     quick = SolveSettings(theory=membrane, resolution=Resolution(4, 8, 4))
-    sweep = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7)
+    sweep = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, outside=15)
     with local_workers(2) as executor, listening(killed):
         print(executor.submit(os.getpid).result(), flush=True)
         run_sweep(Path(sys.argv[1]), load_sensor("three-25um-biaxial"), (Circle(1.0),), sweep, quick, shard=10,

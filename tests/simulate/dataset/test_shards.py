@@ -63,18 +63,35 @@ def test_dataset_round_trip(dataset):
     assert read.sensor == SENSOR
     assert len(read.samples) == 8
     for name in COLUMNS:
-        both = np.concatenate([getattr(samples(5, 0), name), getattr(samples(3, 1), name)])
+        both = np.concatenate([samples(5, 0).columns()[name], samples(3, 1).columns()[name]])
         np.testing.assert_array_equal(getattr(read.samples, name), both)
+
+
+def test_samples_outside_are_read_separately(tmp_path):
+    is_outside = np.array([False, True, False, True, True])
+    mixed = replace(samples(5, 0), outside=is_outside)
+    read = read_dataset(write_dataset(tmp_path / "presses", SENSOR, [mixed, samples(3, 1)], ABOUT))
+    assert read.manifest["samples"] == len(read.samples) == 5
+    np.testing.assert_array_equal(read.samples.x_mm[:2], mixed.x_mm[~is_outside])
+    np.testing.assert_array_equal(read.outside.charge_pC, mixed.charge_pC[is_outside])
+    everywhere = replace(samples(2), outside=np.ones(2, dtype=bool))
+    with pytest.raises(DatasetError, match="expected presses in the working area, got none"):
+        read_dataset(write_dataset(tmp_path / "none", SENSOR, [everywhere], ABOUT))
 
 
 def test_manifest_and_card_describe_the_dataset(dataset):
     manifest = read_dataset(dataset).manifest
-    assert (manifest["format_version"], manifest["samples"], manifest["seed"]) == (1, 8, 3)
+    assert (manifest["format_version"], manifest["samples"], manifest["seed"]) == (2, 8, 3)
     assert (manifest["electrodes"], manifest["columns"]) == (["A", "B", "C"], COLUMNS)
     names = ["shard-00000.npz", "shard-00001.npz"]
     assert sorted(path.name for path in dataset.iterdir()) == ["README.md", "manifest.json", *names]
     assert manifest["shards"] == [
-        {"file": name, "samples": count, "sha256": hashlib.sha256((dataset / name).read_bytes()).hexdigest()}
+        {
+            "file": name,
+            "samples": count,
+            "outside": 0,
+            "sha256": hashlib.sha256((dataset / name).read_bytes()).hexdigest(),
+        }
         for name, count in zip(names, (5, 3), strict=True)
     ]
     card = (dataset / "README.md").read_text()
@@ -139,7 +156,9 @@ def shard(**columns):
 
 
 MANIFESTS = {
-    "a version to come": (lambda table: table.update(format_version=2), "format version 2 is not supported"),
+    "a version to come": (lambda table: table.update(format_version=3), "format version 3 is not supported"),
+    "no presses outside": (lambda table: table.update(format_version=1), "sweep again with 'isocharge simulate sweep'"),
+    "yield": (lambda table: table.update(yield_force_N=0), "yield_force_N"),
     "no sensor": (lambda table: table.pop("sensor"), "key 'sensor' is missing"),
     "no key of shards": (lambda table: table.pop("shards"), "key 'shards' is missing"),
     "no shards": (lambda table: table.update(shards=[]), "lists no shards"),
@@ -161,6 +180,7 @@ COLUMNS_OF = {
     "NaN": (shard(x_mm=np.array([0, 1, np.nan, 3, 4])), "column x_mm holds nan in row 2; every number must be finite"),
     "text": (shard(x_mm=np.array(list("abcde"))), "column x_mm: expected numbers, got <U1"),
     "objects": (shard(x_mm=np.array([None] * 5)), "not a shard"),
+    "outside of numbers": (shard(outside=np.zeros(5)), "column outside: expected truth values, got float64"),
     "probe of numbers": (shard(probe=np.zeros(5)), "column probe: expected text, got float64"),
 }
 FILES = {

@@ -24,7 +24,7 @@ from isocharge.simulate import (
     run_sweep,
     touch_charge,
 )
-from isocharge.simulate.dataset.sweep import SHARD_SIZE, TASK_SIZE, write_sweep
+from isocharge.simulate.dataset.sweep import SHARD_SIZE, TASK_SIZE, outside_samples, write_sweep
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
@@ -33,7 +33,8 @@ QUICK = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
 
 
 def small(samples: int = 60, **changes) -> Sweep:
-    return Sweep(**{"radius": 3.0, "force_range": (1.0, 1.0), "samples": samples, "seed": 7} | changes)
+    sweep = {"radius": 3.0, "force_range": (1.0, 1.0), "samples": samples, "seed": 7, "outside": 50}
+    return Sweep(**sweep | changes)
 
 
 @dataclass(frozen=True)
@@ -88,15 +89,40 @@ def test_manifest_of_a_sweep(small_dataset, three_map):
     }
 
 
+def test_presses_outside_the_radius_reach_up_to_the_clamp(small_dataset):
+    """Their charges are those of the coarse map, which is accurate to 0.5 % within two thirds of the film radius."""
+    read = read_dataset(small_dataset)
+    outside = read.outside
+    distance = np.hypot(outside.x_mm, outside.y_mm)
+    assert distance.min() >= 8.0
+    assert distance.max() == pytest.approx(42.8, abs=0.01)
+    assert np.mean(distance < 25.0) == pytest.approx((25.0**2 - 8.0**2) / (42.8**2 - 8.0**2), abs=1e-3)
+    assert np.mean(outside.force_N < np.sqrt(0.05 * 2.0)) == pytest.approx(0.5, abs=1e-3)
+    for i in np.flatnonzero(distance < 30.0)[:3]:
+        solved = press(read.sensor.film, Circle(1.0), (outside.x_mm[i], outside.y_mm[i]), outside.force_N[i])
+        np.testing.assert_allclose(outside.charge_pC[i], touch_charge(read.sensor, solved), rtol=5e-3)
+    about = read.manifest["outside"]
+    assert (about["samples"], about["probe"], about["radius_mm"]) == (16_384, "circle:1.0", [8.0, 42.8])
+    assert about["interpolation_error"] == 0.05
+    assert read.manifest["yield_force_N"] == pytest.approx(0.866, abs=0.001)
+
+
+@pytest.mark.parametrize("changes", [{"outside": 0}, {"radius": 42.0}])
+def test_a_sweep_without_presses_outside(changes):
+    """No presses are requested, or the ring between the radius and the clamp is narrower than a millimetre."""
+    assert outside_samples(SENSOR, (Circle(1.0),), small(**changes)) is None
+
+
 def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp_path):
     """`run_sweep` stores its parts in a draft, and `write_sweep` does not. The datasets are equal."""
     reports: dict[str, list] = {}
     with listening(lambda title, done, total, _: reports.setdefault(title, []).append((done, total))):
         drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (Circle(1.0),), small(), QUICK)
     maps = [ForwardMap.build(SENSOR, Circle(1.0), 3.0, (1.0, 1.0), QUICK)]
+    assert len(read_dataset(drafted).outside) == 50
     assert files(drafted) == files(write_sweep(tmp_path / "a" / "presses", maps, small()))
     assert [path.name for path in drafted.parent.iterdir()] == ["presses"]
-    assert reports["pressing"] == [(0, 60), (60, 60)]
+    assert reports["pressing"] == [(0, 110), (60, 110), (110, 110)]
     done, total = reports["solving the film"][-1]
     assert done == total
 
@@ -105,7 +131,7 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path):
     """The dataset contains the sum of both angles. The forward map receives the rotation of the press only."""
     probes = [parse_probe(text) for text in ("rectangle:4.0x2.0@30", "triangle:4.0@-30", "circle:1.0@50")]
     for orientation in ("fixed", "random"):
-        sweep = Sweep(samples=999, orientation=orientation)
+        sweep = Sweep(samples=999, orientation=orientation, outside=0)
         read = read_dataset(write_sweep(tmp_path / orientation, [Spy(probe) for probe in probes], sweep)).samples
         assert read.probe.tolist() == ["rectangle:4.0x2.0", "triangle:4.0", "circle:1.0"] * 333
         rotation = read.charge_pC[:, 2]
@@ -120,7 +146,7 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path):
 
 def test_shards_and_tasks_keep_the_order_of_the_presses(tmp_path):
     """The sweep has two shards, and the first shard has several tasks. Each press has its own charges."""
-    sweep = Sweep(samples=SHARD_SIZE + 10, orientation="random")
+    sweep = Sweep(samples=SHARD_SIZE + 10, orientation="random", outside=0)
     maps = [Spy(Polygon.rectangle(side, 2.0)) for side in (3.0, 4.0, 5.0)]
     read = read_dataset(write_sweep(tmp_path / "large", maps, sweep))
     assert SHARD_SIZE > TASK_SIZE

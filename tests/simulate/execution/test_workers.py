@@ -20,7 +20,7 @@ from isocharge.simulate.execution.workers import dask_workers, in_order, local_w
 
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
-SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, orientation="random")
+SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, orientation="random", outside=15)
 
 
 def sweep_with(executor: Executor | None, target: Path) -> dict[str, bytes]:

@@ -1,5 +1,7 @@
 """Training: it is reproducible, stops early, reports failures and continues after a kill; ranges of its settings."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +13,10 @@ from scipy.stats import multivariate_normal, norm
 from isocharge.common.errors import ConfigError, InputError, OutputExists, TrainingError
 from isocharge.common.progress import listening
 from isocharge.common.resumable_run import resume_parts
+from isocharge.serve import load_model
 from isocharge.simulate import Dataset, Domain, NoiseModel, Samples
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config
-from isocharge.train.training import descent, misfit_training
+from isocharge.train.training import descent
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fit import fit_identity, train_network
 from isocharge.train.training.losses import (
@@ -109,9 +112,8 @@ def settings(hidden=(16, 16), misfit_hidden=(8, 8), weights="float32", electrode
 
 @pytest.fixture
 def split_once(trained, monkeypatch):
-    """Use the split of the session's training and few outside presses, which take longer than these trainings."""
+    """Use the split of the session's training, which takes longer than these trainings."""
     monkeypatch.setattr(Split, "by_position", lambda *_: trained.split)
-    monkeypatch.setattr(misfit_training, "N_OUTSIDE_PRESSES", 200)
 
 
 def weights(dataset, config, **options):
@@ -331,7 +333,32 @@ def test_a_killed_training_continues_only_with_its_own_presses_and_settings(data
     monkeypatch.setattr("isocharge.train.training.misfit_training.draw_misfit_examples", pytest.fail)
     with listening(lambda *call: calls.append(call)), resume_parts(tmp_path / "it", identity) as run:
         assert torch.equal(weights(dataset, LONGER, run=run), whole)
-    assert {title for title, *_ in calls} - {"solving the film"} == {"training the misfit network"}
+    assert {title for title, *_ in calls} == {"training the misfit network"}
+
+
+def test_a_training_on_a_dataset_needs_no_solver(dataset_folder, tmp_path):
+    """The command runs in a new process, because other tests of this process have imported the solver."""
+    (tmp_path / "short.toml").write_text(
+        "[network]\nhidden = [8]\nmisfit_hidden = [8]\n"
+        "[training]\nsteps = 10\nmisfit_steps = 10\nmisfit_charges = 500\n"
+    )
+    code = """import sys
+from isocharge.cli.main import main
+try:
+    main()
+finally:
+    unwanted = "isocharge.simulate.solver", "isocharge.simulate.mesh"
+    print(sorted(name for name in sys.modules if name.startswith(unwanted)))
+"""
+    words = ("train", "fit", dataset_folder, "--config", "short.toml", "-o", "models/m")
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert "caution: PVDF yields beyond 0.86" in done.stderr
+    metadata = load_model(tmp_path / "models" / "m" / "1").metadata
+    assert metadata.yield_force_N == pytest.approx(0.866, abs=0.01)
+    assert metadata.unnoticed.to_mm == pytest.approx(42.8, abs=0.01)
 
 
 CONFIGS = Path(__file__).parents[3] / "train" / "configs"

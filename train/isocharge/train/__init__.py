@@ -1,8 +1,8 @@
 """Training of small networks that compute contacts from charges, and calibration of films with measured presses.
 
 A network is trained on a dataset. It is then released as a folder that contains an ONNX model and a model card. Each
-function in the example can be used on its own. The names in `needs_torch` are imported when they are first used,
-because the import of PyTorch takes long.
+function in the example can be used on its own. The public names are imported when they are first used, because the
+import of PyTorch takes long.
 
 Example:
 
@@ -14,13 +14,15 @@ Example:
     release(fitted, Path("models/mine"))
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
 from isocharge.common.extras import require
-from isocharge.common.versions import version_attribute
+from isocharge.common.lazy_names import lazy_names
 
 with require("train"):
+    import scipy  # noqa: F401 (all modules need it; the error names the extra)
+
+if TYPE_CHECKING:
     from isocharge.common.contact_errors import ContactErrorStatistics
     from isocharge.train.bayes.limit import BayesProblem, bayes_estimate, bayes_limit
     from isocharge.train.calibration.calibrate import calibrate
@@ -32,10 +34,19 @@ with require("train"):
     from isocharge.train.data.presses import LabelledPresses
     from isocharge.train.films.films_file import read_films
     from isocharge.train.films.films_model import FilmsModel
+    from isocharge.train.films.fit import FilmsConfig, fit_films
+    from isocharge.train.films.release import release_films
     from isocharge.train.model_release.evaluate import evaluate
     from isocharge.train.model_release.release import Release, release
+    from isocharge.train.model_release.student import StudentCase, student_config, student_data
+    from isocharge.train.rig.rig_data import Rig, rig_data
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
+    from isocharge.train.training.cross_fit import fit_presses
+    from isocharge.train.training.fit import fit
     from isocharge.train.training.fitted import Fitted, Provenance
+    from isocharge.train.training.source import Teacher, TrainingData
+else:  # hidden from type checkers, which would otherwise accept every misspelt name
+    __getattr__ = lazy_names(__name__, "train")
 
 __all__ = [
     "BayesProblem",
@@ -81,34 +92,5 @@ __version__: str
 
 
 def __dir__() -> list[str]:
-    """Return the public names, so that tab completion suggests no other names.
-
-    The list includes public names that are not imported yet.
-    """
+    """Return the public names, so that tab completion suggests no other names."""
     return list(__all__)
-
-
-if TYPE_CHECKING:
-    from isocharge.train.needs_torch import *
-else:  # hidden from type checkers, which would otherwise accept every misspelt name
-    _version_attribute = version_attribute(__name__)
-
-    def __getattr__(name):
-        """Import a public name from `needs_torch` when it is first used, and store it in the module.
-
-        The names are not imported together with the package, because the import of PyTorch takes long.
-
-        Args:
-            name: Name of an attribute that the module does not contain yet.
-
-        Raises:
-            AttributeError: If the name is not public.
-        """
-        if name not in __all__:
-            return _version_attribute(name)  # the version, or AttributeError for all other names
-        with require("train"):
-            value = getattr(import_module("isocharge.train.needs_torch"), name)
-        globals()[name] = value  # Python then no longer calls this function for this name
-        return value
-
-    del TYPE_CHECKING

@@ -11,20 +11,8 @@ from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.resumable_run import draft_of
-from isocharge.simulate import (
-    Dataset,
-    Film,
-    Probe,
-    Sensor,
-    Sweep,
-    noise_model,
-    read_dataset,
-    run_sweep,
-    working_area,
-)
+from isocharge.simulate import Dataset, Film, Probe, Sensor, Sweep, noise_model, read_dataset, working_area
 from isocharge.simulate.execution.workers import dask_workers, local_workers
-from isocharge.simulate.identifiability.identification import map_to_search
-from isocharge.simulate.solver.stress_limit import stress_caution
 
 ROUNDING_MARGIN = 1.0 + 1e-6
 """Factor by which the radius and the largest force of a forward map are increased, because rounding may move the
@@ -79,6 +67,8 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
     """
     if text != "auto":
         return parse_radius_mm(text)
+    from isocharge.simulate.identifiability.identification import map_to_search  # imports the solver
+
     radii = []
     for probe in probes:
         forward_map = map_to_search(sensor, probe, force)  # charges over the largest possible working area
@@ -103,6 +93,8 @@ def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit:
         max_force: Largest force, N.
         limit: Limit of the stress, MPa.
     """
+    from isocharge.simulate.solver.stress_limit import stress_caution  # a training on a dataset needs no solver
+
     for probe in probes:
         with suppress(IsochargeError):  # the caller computes the same press later, and then reports the error
             caution = stress_caution(film, probe, max_force, limit)
@@ -129,6 +121,8 @@ def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, fo
         radius: Largest distance of a press from the centre, mm.
         force: Smallest and largest force, N.
     """
+    from isocharge.simulate import run_sweep  # imports the solver
+
     has_few_electrodes = len(sensor.electrodes) <= FEW_ELECTRODES
     n_press = N_SIMULATED_PRESSES if has_few_electrodes else MANY_SIMULATED_PRESSES
     with TemporaryDirectory() as folder:

@@ -19,7 +19,7 @@ from typing import Literal, get_args
 import numpy as np
 import scipy  # loads each of its subpackages on first use
 
-from isocharge.common.arrays import Array, Complexes, Integers
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError
 from isocharge.simulate.numerics.disk import lattice
@@ -41,6 +41,9 @@ SAMPLING_DESCRIPTIONS = {
 Sampling = Literal["sobol", "random", "grid"]
 """Name of a kind of sampling."""
 
+OUTSIDE_PROBE = -1
+"""Index of the round probe of the presses outside the disk, which is the last of all probes."""
+
 Orientation = Literal["fixed", "random"]
 """Whether all presses have the given orientation of the probe, or each press has a random orientation."""
 
@@ -50,7 +53,7 @@ class SweepPresses:
     """Presses of a sweep, which is a simulation of many presses.
 
     Attributes:
-        probe: Index of the probe of each press, shape (n,).
+        probe: Index of the probe of each press, shape (n,); `OUTSIDE_PROBE` for a press outside the disk of the sweep.
         contact: Contact (x, y, F) of each press, shape (n, 3), mm and N.
         rotation: Rotation of the probe in addition to its own orientation, anticlockwise, shape (n,), rad.
     """
@@ -61,6 +64,11 @@ class SweepPresses:
 
     def __len__(self) -> int:
         return self.probe.size
+
+    @property
+    def is_outside(self) -> Booleans:
+        """Whether each press lies outside the disk of the sweep, shape (n,)."""
+        return np.asarray(self.probe == OUTSIDE_PROBE)
 
     def __getitem__(self, part: slice | Integers) -> "SweepPresses":
         """Return the presses that a slice or an array of indices selects."""
@@ -79,6 +87,7 @@ class Sweep:
         orientation: "fixed" if all presses have the orientation of the given probes, "random" for orientations over a
             full turn. With "random", a grid has equally spaced orientations within the period of the probe.
         sampling: Kind of sampling: "sobol", "random" or "grid".
+        outside: Number of additional presses between the disk and the clamp; 0 for none.
     """
 
     radius: float = DEFAULT_RADIUS
@@ -87,6 +96,7 @@ class Sweep:
     seed: int = 0
     orientation: Orientation = "fixed"
     sampling: Sampling = "sobol"
+    outside: int = 16_384
 
     def __post_init__(self) -> None:
         """Check the definition of the sweep.
@@ -99,6 +109,8 @@ class Sweep:
         if not 1 <= self.samples <= MAX_SAMPLES:
             bound = "at least 1" if self.samples < 1 else f"at most {MAX_SAMPLES}"
             raise SceneError(f"samples: expected {bound}, got {self.samples}")
+        if not 0 <= self.outside <= MAX_SAMPLES:
+            raise SceneError(f"outside: expected 0 to {MAX_SAMPLES} presses outside the radius, got {self.outside}")
         min_force, max_force = self.force_range
         if not 0.0 < min_force <= max_force < np.inf:
             raise SceneError(f"force: expected 0 < smallest <= largest force in N, got {min_force:g} and {max_force:g}")
@@ -110,6 +122,23 @@ class Sweep:
     def contacts(self) -> Array:
         """Return the contacts (x, y, F) of a sweep with one probe, shape (n, 3), mm and N."""
         return self._presses_of_probe(0, 1, FULL_TURN).contact
+
+    def outside_presses(self, outer_radius: float) -> SweepPresses:
+        """Return presses between the disk of the sweep and a larger circle.
+
+        The positions are uniformly distributed over the ring, and the logarithms of the forces over the range of
+        forces. Except for random sampling, the presses are Sobol points.
+
+        Args:
+            outer_radius: Radius of the larger circle, mm.
+        """
+        distance_fraction, angle_fraction, force_fraction, _ = self._unit_cube(self.outside, 0, 1).T
+        # The area within a distance is proportional to the square of the distance.
+        distance = np.sqrt(self.radius**2 + (outer_radius**2 - self.radius**2) * distance_fraction)
+        angle = FULL_TURN * angle_fraction
+        force = self._force(force_fraction)
+        contact = np.stack([distance * np.cos(angle), distance * np.sin(angle), force], axis=1)
+        return SweepPresses(np.full(self.outside, OUTSIDE_PROBE), contact, np.zeros(self.outside))
 
     def over(self, probes: Sequence[Probe]) -> SweepPresses:
         """Return the presses of a sweep with several probes.
@@ -177,18 +206,19 @@ class Sweep:
         rotation = FULL_TURN * rotation_fraction if self.orientation == "random" else np.zeros(count)
         return position, self._force(force_fraction), rotation
 
-    def _unit_cube(self, count: int, probe_index: int) -> Array:
+    def _unit_cube(self, count: int, *stream: int) -> Array:
         """Draw points that are uniformly distributed over the unit cube in four dimensions.
 
         Args:
             count: Number of points.
-            probe_index: Index of the probe in the sweep. Each probe has its own sequence of random numbers.
+            stream: Numbers that select a sequence of random numbers: the index of a probe, or 0 and 1 for the presses
+                outside the disk.
 
         Returns:
             Points, shape (count, 4), with coordinates from 0 to 1. The coordinates are for the distance, the angle, the
             force and the rotation of a press.
         """
-        rng = np.random.default_rng([self.seed, probe_index])
+        rng = np.random.default_rng([self.seed, *stream])
         if self.sampling == "random":
             return rng.random((count, 4))
 

@@ -3,11 +3,14 @@
 The manifest is the file manifest.json. The manifest contains the version of the format and the checksum of each shard.
 It also describes the sensor, the probes, the ranges, the seed, the solver and the columns. The data card is the file
 README.md, which describes the dataset for human readers. The samples are distributed over the shards, which are files
-such as shard-00000.npz. Each shard contains the columns x_mm, y_mm, force_N, probe, orientation_deg and charge_pC. The
-column charge_pC has the shape (n, n_electrode), and all other columns have the shape (n,).
+such as shard-00000.npz. Each shard contains the columns x_mm, y_mm, force_N, probe, orientation_deg, outside and
+charge_pC. The column charge_pC has the shape (n, n_electrode), and all other columns have the shape (n,).
+
+The column outside marks presses between the working area and the clamp. A network is not expected to answer them, but
+must learn to recognise them. Their charges are less accurate than those of the other presses.
 
 A dataset is written into a temporary folder, which is renamed when the dataset is complete. A dataset of measured
-presses has the same format, but its manifest has no entries `solver` and `seed`.
+presses has the same format, but its manifest has no entries `solver` and `seed`, and it has no presses outside.
 """
 
 import io
@@ -21,15 +24,15 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import DatasetError, SensorError, cut, error_prefix, shown
 from isocharge.common.files import new_folder, read_needed, sha256_of, write_whole
 from isocharge.common.npz import npz_arrays
-from isocharge.common.structs import MAX_JSON_BYTES, Text, convert, parse_json
+from isocharge.common.structs import MAX_JSON_BYTES, Positive, Text, convert, parse_json
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Version of the format of datasets, which the manifest contains."""
 
 COLUMNS = {
@@ -38,6 +41,7 @@ COLUMNS = {
     "force_N": "force of the press, N, positive pushes",
     "probe": "the object that presses, notation without the angle",
     "orientation_deg": "angle by which the probe is turned against its notation, deg, anticlockwise",
+    "outside": "whether the press lies between the working area and the clamp, with a less accurate charge",
     "charge_pC": "touch charge of each electrode, pC, electrodes in the manifest's order",
 }
 """Names of the columns of a shard, and their descriptions in the manifest and in the data card."""
@@ -57,6 +61,7 @@ class Samples:
         probe: Notation of the probe of each press without its rotation, shape (n,), text.
         orientation_deg: Rotation of the probe relative to its notation, anticlockwise, shape (n,), degrees.
         charge_pC: Touch charge of each electrode, shape (n, n_electrode), pC.
+        outside: Whether each press lies between the working area and the clamp, shape (n,); None if no press does.
     """
 
     x_mm: Array
@@ -65,13 +70,21 @@ class Samples:
     probe: np.ndarray
     orientation_deg: Array
     charge_pC: Array
+    outside: Booleans | None = None
 
     def __len__(self) -> int:
         return len(self.x_mm)
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return the array of each column, by the name of the column."""
-        return {name: getattr(self, name) for name in COLUMNS}
+        columns = {name: getattr(self, name) for name in COLUMNS}
+        if self.outside is None:
+            columns["outside"] = np.zeros(np.shape(self.x_mm), dtype=bool)
+        return columns
+
+    def __getitem__(self, rows: Booleans) -> "Samples":
+        """Return some of the samples."""
+        return Samples(**{name: column[rows] for name, column in self.columns().items()})
 
 
 @dataclass(frozen=True)
@@ -80,16 +93,18 @@ class Dataset:
 
     Attributes:
         sensor: Sensor to which the charges belong.
-        samples: Samples of all shards, in the order of the shards.
+        samples: Samples within the working area, in the order of the shards.
         manifest: Content of the manifest.
         sha256: Checksum of the manifest. It identifies the whole dataset, because the manifest contains the checksums
             of the shards.
+        outside: Samples between the working area and the clamp; None if there are none.
     """
 
     sensor: Sensor
     samples: Samples
     manifest: dict[str, Any]
     sha256: str
+    outside: Samples | None = None
 
 
 def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about: dict[str, Any]) -> Path:
@@ -115,7 +130,8 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
         for index, samples in enumerate(shards):
             name, data = pack_shard(index, samples, sensor)
             write_whole(temporary_folder / name, data)
-            entries.append(shard_entry(name, len(samples), data))
+            n_outside = int(samples.columns()["outside"].sum())
+            entries.append(shard_entry(name, len(samples), n_outside, data))
         write_manifest(temporary_folder, folder.name, sensor, entries, about)
     return folder
 
@@ -150,15 +166,16 @@ def shard_name(number: int) -> str:
     return f"shard-{number:05d}.npz"
 
 
-def shard_entry(name: str, samples: int, data: bytes) -> dict[str, Any]:
+def shard_entry(name: str, samples: int, outside: int, data: bytes) -> dict[str, Any]:
     """Return the entry of the manifest that describes a shard.
 
     Args:
         name: File name of the shard.
         samples: Number of samples in the shard.
+        outside: Number of these samples that lie outside the working area.
         data: Content of the file.
     """
-    return {"file": name, "samples": samples, "sha256": sha256_of(data)}
+    return {"file": name, "samples": samples, "outside": outside, "sha256": sha256_of(data)}
 
 
 def write_manifest(
@@ -180,7 +197,7 @@ def write_manifest(
         "electrodes": list(sensor.electrode_names),
         **about,
         "columns": COLUMNS,
-        "samples": sum(entry["samples"] for entry in entries),
+        "samples": sum(entry["samples"] - entry["outside"] for entry in entries),
         "shards": list(entries),
     }
     write_whole(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
@@ -196,7 +213,7 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
     """
     probes = manifest.get("probes", [])
     ranges = manifest.get("ranges", {})
-    solver_settings = _flattened_items(manifest.get("solver", {}))
+    settings = _flattened_items({key: manifest.get(key, {}) for key in ("solver", "outside")})
     lines = [
         "---",  # metadata for data hubs: https://huggingface.co/docs/hub/datasets-cards
         f"pretty_name: {json.dumps(name)}",
@@ -220,8 +237,8 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
         "|---|---|",
         f"| probes | {', '.join(probes)} |",
         *(f"| {quantity} | {limits} |" for quantity, limits in ranges.items()),
-        *(f"| {key} | {manifest[key]} |" for key in ("sampling", "noise", "seed") if key in manifest),
-        *(f"| solver: {key} | {setting} |" for key, setting in solver_settings),
+        *(f"| {key} | {manifest[key]} |" for key in ("sampling", "noise", "seed", "yield_force_N") if key in manifest),
+        *(f"| {key.replace(' ', ': ', 1)} | {setting} |" for key, setting in settings),
         "",
         "Read it with `isocharge.simulate.read_dataset(folder)`, which checks every shard's checksum.",
         "",
@@ -264,12 +281,13 @@ def _check_samples(samples: Samples, n_electrode: int, shard_label: str) -> None
             f"{shard_label}: expected columns of shapes {expected_shapes}, at least one sample, got {shapes}"
         )
     for name, column in samples.columns().items():
-        is_text = name == "probe"
-        expected_kinds = "U" if is_text else "fiu"  # U: text; f, i, u: floats, signed and unsigned integers
-        expected_content = "text" if is_text else "numbers"
+        # U: text; b: truth values; f, i, u: floats, signed and unsigned integers
+        expected_kinds, expected_content = {"probe": ("U", "text"), "outside": ("b", "truth values")}.get(
+            name, ("fiu", "numbers")
+        )
         if column.dtype.kind not in expected_kinds:
             raise DatasetError(f"{shard_label}: column {name}: expected {expected_content}, got {column.dtype}")
-        if not is_text and not np.isfinite(column).all():
+        if expected_content == "numbers" and not np.isfinite(column).all():
             first_bad_index = np.argwhere(~np.isfinite(column))[0]
             row = int(first_bad_index[0])
             raise DatasetError(
@@ -285,7 +303,7 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
         sensor: Expected sensor. If it is None, the dataset may belong to any sensor.
 
     Returns:
-        The dataset, with the samples of all shards. Its manifest also contains the entries that this function ignores.
+        The dataset. Its manifest also contains the entries that this function ignores.
 
     Raises:
         DatasetError: If the folder is not a dataset, has a different format version or sensor, or is damaged or
@@ -316,7 +334,12 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
     if not shards:
         raise DatasetError(f"{manifest_path}: lists no shards")
     columns = {name: np.concatenate([getattr(shard, name) for shard in shards]) for name in COLUMNS}
-    return Dataset(dataset_sensor, Samples(**columns), manifest, checksum)
+    all_samples = Samples(**columns)
+    is_outside = columns["outside"]
+    if is_outside.all():
+        raise DatasetError(f"{manifest_path}: expected presses in the working area, got none; sweep again")
+    outside = all_samples[is_outside] if is_outside.any() else None
+    return Dataset(dataset_sensor, all_samples[~is_outside], manifest, checksum, outside)
 
 
 def _difference(sensor: Sensor, expected: Sensor) -> str:
@@ -352,6 +375,7 @@ class _Manifest(Struct):
     sensor: dict[str, Any]
     electrodes: list[str]
     shards: list[_Shard]
+    yield_force_N: Positive | None = None
 
 
 def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
@@ -379,8 +403,9 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
     version = manifest["format_version"]
     if version != FORMAT_VERSION:
         raise DatasetError(
-            f"{path}: format version {shown(version)} is not supported (this version reads {FORMAT_VERSION}); "
-            f"make the dataset again or upgrade isocharge"
+            f"{path}: format version {shown(version)} is not supported (this version reads {FORMAT_VERSION}); sweep "
+            "again with 'isocharge simulate sweep', because version 1 has no presses outside the working area, or "
+            "upgrade isocharge for a later version"
         )
     return manifest, sha256_of(data)
 

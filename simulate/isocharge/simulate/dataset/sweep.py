@@ -1,10 +1,14 @@
 """Simulation of a sweep: the charges of many presses are computed and written as a dataset.
 
-A forward map is built for every probe and evaluated for every press. The division of the work into tasks does not
-depend on the executor. The files of the dataset are therefore the same for every executor. Finished parts are saved in
-a folder next to the dataset, so that an interrupted run can be resumed.
+A forward map is built for every probe and evaluated for every press. For the presses between the radius of the sweep
+and the clamp, a coarse map of the whole film is built, with a round probe. Its error of a few percent is acceptable,
+because a network only learns from these presses which charges belong to no contact in its working area.
+
+The division of the work into tasks does not depend on the executor. The files of the dataset are therefore the same for
+every executor. Finished parts are saved in a folder next to the dataset, so that an interrupted run can be resumed.
 """
 
+import logging
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict
@@ -15,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.common.progress import report
+from isocharge.common.errors import SceneError, SolveError
+from isocharge.common.progress import report, second_thread
 from isocharge.common.resumable_run import ResumableRun, output_errors, prepare_target, resume_folder
 from isocharge.simulate.dataset.sampling import SAMPLING_DESCRIPTIONS, Sweep, SweepPresses
 from isocharge.simulate.dataset.shards import (
@@ -30,10 +35,14 @@ from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.execution.code_version import code_fingerprint
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
+from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.simulate.solver.load_case import SolveSettings
+from isocharge.simulate.solver.stress_limit import yield_force
+
+_log = logging.getLogger(__name__)
 
 SHARD_SIZE = 16384
 """Default number of samples in a shard."""
@@ -44,6 +53,9 @@ TASK_SIZE = 8192
 A task of this size takes about a second. This is long compared with the time in which the forward map (12 MB) is sent
 to the worker.
 """
+
+MIN_RING_WIDTH = 1.0
+"""Smallest width of the ring between the radius of a sweep and the clamp, mm. A narrower ring contains no presses."""
 
 
 def run_sweep(
@@ -102,7 +114,10 @@ def run_sweep(
 
     # BLAS is faster with one thread, because the matrices are small. At the end of the block, the folder of the run is
     # renamed to `folder`.
-    with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh) as run:
+    with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh) as run, second_thread() as thread:
+        # The solves of the whole film keep the workers busy while this thread fits the maps of the probes.
+        outside_executor = run.storing_executor("solve-outside", executor)
+        outside_job = thread.submit(outside_map, sensor, probes, sweep, executor=outside_executor)
         maps = [
             ForwardMap.build(
                 sensor,
@@ -114,9 +129,11 @@ def run_sweep(
             )
             for number, probe in enumerate(probes)
         ]
-        entries = _finish_shards(run, maps, presses, executor, shard)
+        whole_film = outside_job.result()
+        shards = _shards(sweep, presses, shard, whole_film)
+        entries = _finish_shards(run, maps, whole_film, shards, executor)
         with output_errors(folder):
-            write_manifest(run.data, folder.name, sensor, entries, _manifest_entries(maps, sweep))
+            write_manifest(run.data, folder.name, sensor, entries, _manifest_entries(maps, whole_film, sweep))
     return folder
 
 
@@ -143,6 +160,47 @@ def solve_maps(
     )
 
 
+def outside_map(
+    sensor: Sensor, probes: Sequence[Probe], sweep: Sweep, *, executor: Executor | None = None
+) -> ForwardMap | None:
+    """Build the coarse map of the whole film for the presses outside the radius of a sweep.
+
+    The probe of the map is a disk whose radius is the largest reach of the probes of the sweep. The reach of a probe is
+    the distance from the centroid of its footprint to the farthest point of the footprint.
+
+    Args:
+        sensor: Sensor whose charges are computed.
+        probes: Probes of the sweep.
+        sweep: Definition of the presses.
+        executor: Executor that runs the solves; None for this process.
+
+    Returns:
+        The map; None if the sweep has no presses outside, because none are requested, the ring is too narrow, or the
+        film cannot be solved up to the clamp. The last case is logged as a warning.
+    """
+    probe = Circle(max(probe.reach for probe in probes))
+    if sweep.outside == 0 or outermost_distance(sensor.film, probe) < sweep.radius + MIN_RING_WIDTH:
+        return None
+    try:
+        return whole_film_map(sensor, probe, sweep.force_range, executor=executor)
+    except (SceneError, SolveError) as error:
+        _log.warning("presses outside %g mm are not simulated: %s", sweep.radius, error)
+        return None
+
+
+def outside_samples(sensor: Sensor, probes: Sequence[Probe], sweep: Sweep) -> Samples | None:
+    """Simulate only the presses between the radius of a sweep and the clamp. The arguments are those of `outside_map`.
+
+    Returns:
+        The samples; None if there are none.
+    """
+    whole_film = outside_map(sensor, probes, sweep)
+    if whole_film is None:
+        return None
+    (samples,) = _samples((), whole_film, [sweep.outside_presses(whole_film.domain.radius)], None)
+    return samples
+
+
 def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
     """Compute the charges of a sweep with given forward maps, and write them as a dataset.
 
@@ -156,19 +214,32 @@ def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
     Returns:
         Path of the folder.
     """
-    presses = sweep.over([forward_map.probe for forward_map in maps])
-    return write_dataset(
-        folder, maps[0].sensor, _samples(maps, _split(presses, SHARD_SIZE), None), _manifest_entries(maps, sweep)
-    )
+    sensor = maps[0].sensor
+    probes = [forward_map.probe for forward_map in maps]
+    whole_film = outside_map(sensor, probes, sweep)
+    shards = _shards(sweep, sweep.over(probes), SHARD_SIZE, whole_film)
+    samples = _samples(maps, whole_film, shards, None)
+    return write_dataset(folder, sensor, samples, _manifest_entries(maps, whole_film, sweep))
 
 
-def _manifest_entries(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
+def _manifest_entries(maps: Sequence[ForwardMap], whole_film: ForwardMap | None, sweep: Sweep) -> dict[str, Any]:
     """Return the entries of the manifest that describe the presses and the solver of a sweep.
 
     Args:
         maps: Forward map of each probe.
+        whole_film: Map of the presses outside the radius of the sweep; None if there are none.
         sweep: Definition of the presses.
     """
+    outside: dict[str, Any] = {"samples": 0}
+    if whole_film is not None:
+        outside = {
+            "samples": sweep.outside,
+            "probe": whole_film.probe.notation,
+            "radius_mm": [float(f"{radius:.12g}") for radius in (sweep.radius, whole_film.domain.radius)],
+            "force_N": list(sweep.force_range),
+            "solves": whole_film.solves,
+            "interpolation_error": whole_film.error,
+        }
     return {
         "probes": list(dict.fromkeys(forward_map.probe.notation for forward_map in maps)),
         "ranges": {
@@ -185,11 +256,19 @@ def _manifest_entries(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any
             "solves": sum(forward_map.solves for forward_map in maps),
             "interpolation_error": max(forward_map.error for forward_map in maps),
         },
+        "outside": outside,
+        "yield_force_N": yield_force(
+            maps[0].sensor.film, [forward_map.probe for forward_map in maps], sweep.force_range
+        ),
     }
 
 
 def _finish_shards(
-    run: ResumableRun, maps: Sequence[ForwardMap], presses: SweepPresses, executor: Executor | None, shard_size: int
+    run: ResumableRun,
+    maps: Sequence[ForwardMap],
+    whole_film: ForwardMap | None,
+    shards: Sequence[SweepPresses],
+    executor: Executor | None,
 ) -> list[dict[str, Any]]:
     """Compute and save the shards of a sweep that have not been saved yet.
 
@@ -199,45 +278,57 @@ def _finish_shards(
     Args:
         run: Run of the program that computes the sweep. Its folder contains the saved shards.
         maps: Forward map of each probe.
-        presses: All presses of the sweep.
+        whole_film: Map of the presses outside the radius of the sweep; None if there are none.
+        shards: Presses of each shard.
         executor: Executor that computes the charges; None for this process.
-        shard_size: Number of presses in a shard.
 
     Returns:
         Entries of the manifest that describe all shards, in the order of the shards.
     """
     # Load the shards that an interrupted run has saved. The argument `final` states that a shard is a file of the
     # dataset, and not only an intermediate result.
-    presses_of_shards = list(_split(presses, shard_size))
+    n_press = sum(map(len, shards))
     entries: dict[int, dict[str, Any]] = {}  # by the index of the shard
-    for index, shard_presses in enumerate(presses_of_shards):
+    for index, presses in enumerate(shards):
         data = run.load(shard_name(index), bytes, final=True)
         if data is not None:
-            entries[index] = shard_entry(shard_name(index), len(shard_presses), data)
+            entries[index] = shard_entry(shard_name(index), len(presses), int(presses.is_outside.sum()), data)
     finished_presses = sum(entry["samples"] for entry in entries.values())
-    missing_shards = [index for index in range(len(presses_of_shards)) if index not in entries]
-    report("pressing", finished_presses, len(presses))
+    missing_shards = [index for index in range(len(shards)) if index not in entries]
+    report("pressing", finished_presses, n_press)
 
     # Compute and save the missing shards.
-    missing_presses = [presses_of_shards[index] for index in missing_shards]
-    missing_samples = _samples(maps, missing_presses, executor)
-    for index, samples in zip(missing_shards, missing_samples, strict=True):
+    missing_presses = [shards[index] for index in missing_shards]
+    missing_samples = _samples(maps, whole_film, missing_presses, executor)
+    for index, presses, samples in zip(missing_shards, missing_presses, missing_samples, strict=True):
         name, data = pack_shard(index, samples, maps[0].sensor)
         run.save(name, data, final=True)
-        entries[index] = shard_entry(name, len(samples), data)
+        entries[index] = shard_entry(name, len(presses), int(presses.is_outside.sum()), data)
         finished_presses += len(samples)
-        report("pressing", finished_presses, len(presses))
+        report("pressing", finished_presses, n_press)
     return [entries[index] for index in sorted(entries)]
 
 
-def _split(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
-    """Divide the presses into successive parts of `size` presses, and yield the parts. The last part may be smaller."""
-    for start in range(0, len(presses), size):
-        yield presses[start : start + size]
+def _shards(sweep: Sweep, presses: SweepPresses, size: int, whole_film: ForwardMap | None) -> list[SweepPresses]:
+    """Divide the presses of a sweep into shards.
+
+    Args:
+        presses: Presses within the radius of the sweep.
+        size: Number of presses in a shard. The last shard may have fewer.
+        sweep: Definition of the presses.
+        whole_film: Map of the presses outside the radius, which get a shard of their own; None if there are none.
+    """
+    shards = [presses[start : start + size] for start in range(0, len(presses), size)]
+    if whole_film is not None:
+        shards.append(sweep.outside_presses(whole_film.domain.radius))
+    return shards
 
 
 def _samples(
-    maps: Sequence[ForwardMap], shards: Iterable[SweepPresses], executor: Executor | None
+    maps: Sequence[ForwardMap],
+    whole_film: ForwardMap | None,
+    shards: Iterable[SweepPresses],
+    executor: Executor | None,
 ) -> Iterator[Samples]:
     """Compute the samples of shards, and yield them in the order of the shards.
 
@@ -246,30 +337,33 @@ def _samples(
 
     Args:
         maps: Forward map of each probe.
+        whole_film: Map of the presses outside the radius of the sweep; None if there are none.
         shards: Presses of each shard.
         executor: Executor that computes the charges; None for this process.
     """
+    # The index `OUTSIDE_PROBE` selects the last map.
+    all_maps = list(maps) if whole_film is None else [*maps, whole_film]
     # The loop that creates the tasks is ahead of the loop that collects the charges. Each loop therefore has its own
     # iterator over the shards.
     shards_for_samples, shards_for_tasks = tee(shards)
     tasks = (
-        (maps[probe], presses.contact[rows], presses.rotation[rows])
+        (all_maps[probe], presses.contact[rows], presses.rotation[rows])
         for presses in shards_for_tasks
-        for probe, rows in _tasks(presses, len(maps))
+        for probe, rows in _tasks(presses)
     )
     charges_of_tasks = in_order(executor, _charges, tasks)
     for presses in shards_for_samples:
-        charge = np.empty((len(presses), len(maps[0].electrodes)))
-        for _, rows in _tasks(presses, len(maps)):  # the tasks in the order in which they were submitted
+        charge = np.empty((len(presses), len(all_maps[0].electrodes)))
+        for _, rows in _tasks(presses):  # the tasks in the order in which they were submitted
             charge[rows] = next(charges_of_tasks)
-        yield _samples_of_shard(maps, presses, charge)
+        yield _samples_of_shard(all_maps, presses, charge)
 
 
 def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses, charge: Array) -> Samples:
     """Convert the presses of a shard and their charges into the columns of a dataset.
 
     Args:
-        maps: Forward map of each probe.
+        maps: Forward map of each probe, and of the whole film if presses lie outside the radius of the sweep.
         presses: Presses of the shard.
         charge: Touch charges, shape (n, n_electrode), pC.
     """
@@ -284,22 +378,22 @@ def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses, charge:
         probe=probe_notations[presses.probe],
         orientation_deg=np.mod(np.round(rotation_deg, 9), 360.0),  # rounded, so that 359.999... degrees become 0
         charge_pC=charge,
+        outside=presses.is_outside,
     )
 
 
-def _tasks(presses: SweepPresses, n_probes: int) -> Iterator[tuple[int, Integers]]:
+def _tasks(presses: SweepPresses) -> Iterator[tuple[int, Integers]]:
     """Divide the presses of a shard into tasks, and yield these tasks.
 
     All presses of a task have the same probe. A task has at most `TASK_SIZE` presses.
 
     Args:
         presses: Presses of the shard, which is one file of the dataset.
-        n_probes: Number of probes of the sweep.
 
     Yields:
         Index of the probe, and indices of the presses of the task in the shard.
     """
-    for probe in range(n_probes):
+    for probe in np.unique(presses.probe).tolist():
         rows = np.flatnonzero(presses.probe == probe)
         for start in range(0, rows.size, TASK_SIZE):
             yield probe, rows[start : start + TASK_SIZE]

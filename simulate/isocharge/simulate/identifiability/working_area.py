@@ -7,7 +7,6 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
-from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.identifiability.ambiguous_pairs import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import find_folds
@@ -118,8 +117,16 @@ def working_area(
     Raises:
         SceneError: If the map has fewer than three electrodes.
     """
+    from isocharge.simulate.forward.charge_spline import with_fast_derivatives  # imports the solver
+
+    return search_working_area(with_fast_derivatives(charge_map), noise, error=error, search_pairs=search_pairs)
+
+
+def search_working_area(
+    charge_map: ChargeMap, noise: NoiseModel, *, error: float = DEFAULT_ERROR, search_pairs: bool = True
+) -> WorkingArea:
+    """Find the working area like `working_area`, but evaluate the charge map itself, of whatever class it is."""
     check_electrode_count(len(charge_map.electrodes))
-    charge_map = with_fast_derivatives(charge_map)
     search_radius = charge_map.domain.radius
     min_force, max_force = charge_map.domain.force_range
     middle_force = float(np.sqrt(min_force * max_force))

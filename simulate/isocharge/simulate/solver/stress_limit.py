@@ -8,13 +8,14 @@ centre. In a membrane, the stress is proportional to F^(2/3), where F is the for
 increases slightly more slowly with the force.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
 import scipy  # scipy.optimize is imported when it is used
 
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
-from isocharge.common.errors import SceneError
+from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.solver.equilibrium import principal_stress
@@ -104,3 +105,29 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
     # The secant method ends after a step of 1 %, when its error is about 0.01 %.
     log_force = scipy.optimize.newton(log_stress_ratio, np.log(min_force), x1=np.log(max_force), tol=0.01)
     return float(np.exp(log_force))
+
+
+def yield_force(film: Film, probes: Sequence[Probe], force_range: tuple[float, float]) -> float | None:
+    """Compute the smallest force at which the film yields under any of several probes.
+
+    The film yields if its stress exceeds `DEFAULT_STRESS_LIMIT`.
+
+    Args:
+        film: The film.
+        probes: The probes. A probe under which the stress cannot be computed is ignored.
+        force_range: Smallest and largest force, N.
+
+    Returns:
+        Force, N, rounded to 0.001 N; None if the film does not yield within the range of forces.
+    """
+    min_force, max_force = force_range
+    smallest_force = max_force  # stays at this value if the film does not yield
+    for probe in probes:
+        try:
+            probe_force = force_within_stress(film, probe, DEFAULT_STRESS_LIMIT, force_range)
+        except SceneError:  # the film yields already at the smallest force
+            probe_force = min_force
+        except SolveError:
+            continue
+        smallest_force = min(smallest_force, probe_force)
+    return round(smallest_force, 3) if smallest_force < max_force else None

@@ -1,7 +1,7 @@
 """`isocharge train fit`: make a model from a dataset, from measured presses, or from the description of a sensor."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,7 +17,6 @@ from isocharge.cli.shared.options import (
     worker_count,
 )
 from isocharge.cli.shared.terminal import say, shown_progress
-from isocharge.cli.train.calibrate import calibrate_into
 from isocharge.cli.train.resumable_release import (
     ModelFolderOption,
     ReleaseOptions,
@@ -30,25 +29,12 @@ from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle, FilmPrior, load_sensor, local_workers, parse_probe, read_dataset
 from isocharge.simulate.sensor.probe import PROBE_HELP
-from isocharge.train import (
-    CalibrationProblem,
-    FilmsConfig,
-    FilmsModel,
-    FitConfig,
-    Fitted,
-    Rig,
-    TrainingData,
-    fit,
-    fit_films,
-    fit_presses,
-    load_config,
-    release,
-    release_films,
-    rig_data,
-)
-from isocharge.train.films.fit import films_identity
+from isocharge.train import FitConfig, Fitted, TrainingData, fit, fit_presses, load_config, release
 from isocharge.train.training.cross_fit import presses_identity, usable_presses
 from isocharge.train.training.fit import fit_identity
+
+if TYPE_CHECKING:  # these modules import the solver, which a training on a dataset does not need
+    from isocharge.train import CalibrationProblem, FilmsModel, Rig
 
 DEFAULT_PROBE = "circle:1.0"
 """Notation of the probe if `--probe` is not given."""
@@ -134,7 +120,7 @@ def fit_command(
     # Case 1, --films: train a network for all films.
     if films:
         film_prior = _film_prior(dataset, sensor, notations, radius, config)
-        _release_films_model(film_prior, FilmsConfig(radius=parse_radius_mm(radius)), options)
+        _release_films_model(film_prior, parse_radius_mm(radius), options)
         return
 
     press_file = dataset if dataset is not None and dataset.is_file() else None
@@ -158,11 +144,16 @@ def fit_command(
 
         # Case 3, measured presses with --sensor and a network for all films: calibrate the film.
         if problem is not None:
+            from isocharge.cli.train.calibrate import calibrate_into
+
             refuse_training_options(config, version, radius)
             calibrate_into(rig.presses, problem, output, json=json)
             return
 
         # Case 4, the same without such a network: train a network on simulated charges that the presses correct.
+        from isocharge.train import rig_data
+
+        warn_of_stress(rig.sensor.film, [rig.probe], DEFAULT_FORCE_RANGE[1])
         with shown_progress():
             data = rig_data(rig, seed=fit_config.training.seed)
     else:
@@ -172,19 +163,23 @@ def fit_command(
     _release_data_model(data, fit_config, options)
 
 
-def _release_films_model(film_prior: FilmPrior, films_config: FilmsConfig, options: ReleaseOptions) -> None:
+def _release_films_model(film_prior: FilmPrior, radius_mm: float, options: ReleaseOptions) -> None:
     """Train a network for all films of a sensor, and release it.
 
     Args:
         film_prior: Distribution of the films.
-        films_config: Settings of the training.
+        radius_mm: Radius of the working area, mm.
         options: Folder and version of the model.
     """
+    from isocharge.train import FilmsConfig, fit_films, release_films
+    from isocharge.train.films.fit import films_identity
+
+    films_config = FilmsConfig(radius=radius_mm)
     version_folder = options.check_version_folder(film_prior.sensor.electrode_names)
     _, max_force = films_config.force_range
     warn_of_stress(film_prior.sensor.film, [film_prior.probe], max_force)
 
-    def train(run: ResumableRun) -> FilmsModel:
+    def train(run: ResumableRun) -> "FilmsModel":
         """Train the network on all cores of this machine, and save the state of the training in the run."""
         with local_workers(worker_count(None)) as executor:
             return fit_films(film_prior, films_config, executor=executor, run=run)
@@ -222,9 +217,6 @@ def _release_data_model(data: TrainingData, fit_config: FitConfig, options: Rele
         options: Folder and version of the model.
     """
     version_folder = options.check_version_folder(data.sensor.electrode_names)
-    probes = [parse_probe(notation) for notation in data.probes]
-    _, max_force = data.domain.force_range
-    warn_of_stress(data.sensor.film, probes, max_force)
 
     def train(run: ResumableRun) -> Fitted:
         """Train the network, and save the state of the training in the run."""
@@ -248,11 +240,15 @@ def _read_or_simulate_data(dataset: Path | None, sensor: str | None, notations: 
     if dataset is not None and sensor is not None:
         raise InputError("expected either a DATASET folder or --sensor SENSOR, got both; leave one of them out")
     if dataset is not None:
-        return TrainingData.of(read_dataset(dataset))
+        data = TrainingData.of(read_dataset(dataset))
+        if data.yield_force_N is not None:
+            say(f"caution: PVDF yields beyond {data.yield_force_N:g} N, and a dent stays")
+        return data
     if sensor is None:
         raise InputError("expected either a DATASET folder or --sensor SENSOR, got neither")
     described_sensor = load_sensor(sensor)
     probes = [parse_probe(notation) for notation in notations]
+    warn_of_stress(described_sensor.film, probes, DEFAULT_FORCE_RANGE[1])
     radius_mm = sweep_radius(radius, described_sensor, probes, DEFAULT_FORCE_RANGE)
     return TrainingData.of(simulated_presses(described_sensor, probes, radius_mm, DEFAULT_FORCE_RANGE))
 
@@ -284,7 +280,7 @@ def _read_presses_of_unknown_sensor(
 
 def _read_rig(
     file: Path, sensor: str | None, notations: list[str], radius: str, position_std_mm: float, force_std: float
-) -> Rig:
+) -> "Rig":
     """Read presses that were measured with a sensor for which a sensor file exists.
 
     Args:
@@ -313,10 +309,12 @@ def _read_rig(
     (notation,) = notations
     described_sensor = load_sensor(sensor)
     presses = read_press_file(file, described_sensor.electrode_names, position_std_mm, force_std)
+    from isocharge.train import Rig
+
     return Rig(presses, described_sensor, parse_probe(notation), parse_radius_mm(radius))
 
 
-def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | None:
+def calibration_problem(rig: "Rig", models: Path | None) -> "CalibrationProblem | None":
     """Return the calibration problem of the film on which measured presses were made.
 
     Args:
@@ -326,6 +324,8 @@ def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | N
     Returns:
         The calibration problem. None, with a warning on the terminal, if no network for all films fits the sensor.
     """
+    from isocharge.train import CalibrationProblem
+
     try:
         return CalibrationProblem.of(rig.sensor, rig.probe, models)
     except (ModelError, SceneError) as error:

@@ -38,6 +38,7 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, version_folders
 from isocharge.serve.model.pretensions import FILE as PRETENSIONS
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
+from isocharge.simulate.solver.stress_limit import yield_force
 from isocharge.train.calibration.calibration_file import film_table, read_film
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.cross_validation import FOLD_COUNT
@@ -205,8 +206,10 @@ def _write_version(result: CalibrationResult, folder: Path, command: str) -> Pat
         if series is not None:
             files[FILM_CHARGES] = series.to_bytes()
 
+    sensor, probe = result.problem.prior.film(result.posterior.parameters)
+    yield_force_N = yield_force(sensor.film, [probe], fitted.domain.force_range)
     released_model = release(
-        replace(fitted, provenance=Provenance(files=files)),
+        replace(fitted, provenance=Provenance(files=files), yield_force_N=yield_force_N),
         folder,
         version=max(version_folders(folder), default=0) + 1,
         command=command,

@@ -27,9 +27,10 @@ from isocharge.common.chebyshev_series import CHUNK_SIZE, Series, chebyshev_term
 from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.common.statistics import rms
 from isocharge.serve.model.charge_series import ChargeSeries
-from isocharge.simulate import NoiseModel, working_area
+from isocharge.simulate import NoiseModel
 from isocharge.simulate.forward.charge_map import ChargeMap, Domain, within
 from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
+from isocharge.simulate.identifiability.working_area import search_working_area
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 
 CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
@@ -504,7 +505,7 @@ def _fold_radius(field: ChargeField, noise: NoiseModel) -> float:
         field: Charge field in whose domain folds are searched for.
         noise: Noise of good presses.
     """
-    area = working_area(within(field, SEARCHED_RADIUS_RATIO * field.domain.radius), noise, search_pairs=False)
+    area = search_working_area(within(field, SEARCHED_RADIUS_RATIO * field.domain.radius), noise, search_pairs=False)
     if not np.isfinite(area.fold_radius):
         return np.inf
     return float(f"{area.unambiguous_radius:.6g}")

@@ -14,7 +14,7 @@ from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import DatasetError, PressError
 from isocharge.common.files import sha256_of
 from isocharge.common.measured_presses import MeasuredPresses
-from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
+from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor, parse_probe
 from isocharge.train.data.channel_noise import Noise
 
 LOWEST_CHARGE = 1.0
@@ -25,6 +25,9 @@ HIGHEST_CHARGE = 1e6
 
 SOLVER = "solver"
 """Name of a manifest entry. Every simulated dataset has this entry, and no measured dataset has it."""
+
+YIELD_FORCE = "yield_force_N"
+"""Name of the manifest entry with the force at which the film yields."""
 
 FEWEST = 500
 """Smallest number of presses for a fit."""
@@ -53,11 +56,15 @@ class LabelledPresses:
     @classmethod
     def of(cls, dataset: Dataset) -> "LabelledPresses":
         """Return all presses of a dataset without checking them."""
-        samples = dataset.samples
-        contact = np.stack([samples.x_mm, samples.y_mm, samples.force_N], axis=1)
-        return cls(contact, samples.charge_pC, is_measured(dataset))
+        return cls.of_samples(dataset.samples, measured=is_measured(dataset))
 
-    def __getitem__(self, rows: np.ndarray) -> "LabelledPresses":
+    @classmethod
+    def of_samples(cls, samples: Samples, *, measured: bool) -> "LabelledPresses":
+        """Return the contacts and charges of samples, which were measured or simulated."""
+        contact = np.stack([samples.x_mm, samples.y_mm, samples.force_N], axis=1)
+        return cls(contact, samples.charge_pC, measured)
+
+    def __getitem__(self, rows: np.ndarray | slice) -> "LabelledPresses":
         """Return some of the presses."""
         return LabelledPresses(self.contact[rows], self.charge[rows], self.measured)
 
@@ -69,9 +76,19 @@ class LabelledPresses:
         """Whether at least one charge is zero or negative, so that it has no logarithm."""
         return bool((self.charge <= 0.0).any())
 
+    @property
+    def distance(self) -> Array:
+        """Distance of each press from the centre, shape (n,), mm."""
+        return np.asarray(np.hypot(self.contact[:, 0], self.contact[:, 1]))
+
     def within(self, radius: float) -> "LabelledPresses":
         """Return the presses whose distance from the centre is at most `radius`, mm."""
-        return self[np.hypot(self.contact[:, 0], self.contact[:, 1]) <= radius]
+        return self[self.distance <= radius]
+
+    def joined(self, other: "LabelledPresses") -> "LabelledPresses":
+        """Return these presses, followed by other presses of the same kind."""
+        contact = np.concatenate([self.contact, other.contact])
+        return LabelledPresses(contact, np.concatenate([self.charge, other.charge]), self.measured)
 
     def repeated(self, min_count: int) -> "LabelledPresses":
         """Return at least `min_count` presses, by repeating all presses in their order.
@@ -145,6 +162,30 @@ def domain_of(dataset: Dataset) -> Domain:
             f"samples, which reach {sample_radius:g} mm and {smallest_force:g} to {largest_force:g} N"
         )
     return Domain(radius, (min_force, max_force))
+
+
+def outside_presses_of(dataset: Dataset) -> LabelledPresses | None:
+    """Return the presses of a dataset that lie between its working area and the clamp; None if there are none."""
+    if dataset.outside is None:
+        return None
+    return LabelledPresses.of_samples(dataset.outside, measured=is_measured(dataset))
+
+
+def yield_force_of(dataset: Dataset) -> float | None:
+    """Return the smallest force of a dataset at which the film yields under any of its probes, N.
+
+    The manifest of a sweep states the force. For other datasets, the stress of the film is computed.
+
+    Returns:
+        The force; None if the film does not yield within the range of forces.
+    """
+    if YIELD_FORCE in dataset.manifest:
+        force: float | None = dataset.manifest[YIELD_FORCE]
+        return force
+    from isocharge.simulate.solver.stress_limit import yield_force  # the solver is not needed for datasets of a sweep
+
+    probes = [parse_probe(str(notation)) for notation in np.unique(dataset.samples.probe)]
+    return yield_force(dataset.sensor.film, probes, domain_of(dataset).force_range)
 
 
 def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tuple[LabelledPresses, LabelledPresses]:

@@ -10,8 +10,11 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.contact_errors import position_error
 from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.simulate import Sweep
+from isocharge.simulate.dataset.sweep import outside_samples
+from isocharge.simulate.solver.stress_limit import yield_force
 from isocharge.train.data.outside_presses import OutsidePresses
-from isocharge.train.data.presses import draw_contacts
+from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.films.films_file import FILE, films_bytes, films_from_bytes
 from isocharge.train.films.films_model import FilmsModel
 from isocharge.train.model_release.evaluate import ONLY_SIMULATED, contact_errors, rounded
@@ -196,25 +199,32 @@ def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command:
     errors = evaluate_films(rounded_films)
     made_with = {**films.made_with, "films": dict(errors.with_known_film)}
     provenance = Provenance(made_with=made_with, files={FILE: data})
+    sensor, probe = rounded_films.prior.film(errors.parameters)
     assumed_film_model = rounded_films.film(errors.parameters, provenance=provenance)
-    fitted = replace(assumed_film_model, outside=_outside_presses(rounded_films, errors.parameters))
+    fitted = replace(
+        assumed_film_model,
+        outside=_outside_presses(rounded_films, errors.parameters, assumed_film_model.test),
+        yield_force_N=yield_force(sensor.film, [probe], films.domain.force_range),
+    )
     return release(fitted, folder, version=version, command=command, card=partial(films_card, rounded_films, errors))
 
 
-def _outside_presses(films: FilmsModel, parameters: Array) -> OutsidePresses | None:
-    """Simulate the part of a film that lies outside the working area.
+def _outside_presses(films: FilmsModel, parameters: Array, presses: LabelledPresses) -> OutsidePresses | None:
+    """Simulate presses on the part of a film that lies outside the working area.
 
     Args:
         films: The network for all films, with the prior of the films and the working area.
         parameters: Parameters of the film, shape (n_parameter,).
+        presses: Presses within the working area.
 
     Returns:
-        Forward map of the film, from which presses outside the working area are drawn; None if this part of the film
-        cannot be simulated.
+        The presses; None if this part of the film cannot be simulated.
     """
     sensor, probe = films.prior.film(parameters)
-    whole_film = OutsidePresses.simulate(sensor, (probe.notation,), films.domain.force_range)
-    return None if whole_film is None else whole_film.beyond(films.domain.radius)
+    samples = outside_samples(sensor, [probe], Sweep(films.domain.radius, films.domain.force_range))
+    if samples is None:
+        return None
+    return OutsidePresses.of(films.domain, presses, LabelledPresses.of_samples(samples, measured=False))
 
 
 def films_card(films: FilmsModel, errors: FilmsErrors, about: ModelMetadata, fitted: Fitted) -> str:

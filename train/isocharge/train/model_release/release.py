@@ -16,15 +16,13 @@ from msgspec import structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
-from isocharge.common.errors import ModelError, SceneError, SolveError
+from isocharge.common.errors import ModelError
 from isocharge.common.structs import convert
 from isocharge.serve.model.golden import contact_floors
 from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
 from isocharge.serve.model.model_folder import check_target, write_model
-from isocharge.simulate import parse_probe
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
-from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
 from isocharge.train.model_release.evaluate import evaluate
 from isocharge.train.model_release.graph_check import check_graph
@@ -329,7 +327,7 @@ def release(
             "python": platform.python_version(),
             **fitted.provenance.made_with,
         },
-        yield_force_N=_yield_force(fitted),
+        yield_force_N=fitted.yield_force_N,
     )
     unnoticed = unnoticed_presses(fitted, metadata_without_unnoticed)
     complete_metadata = structs.replace(metadata_without_unnoticed, unnoticed=unnoticed)
@@ -354,34 +352,6 @@ def _working_area(domain: Domain) -> tuple[tuple[float, float], ...]:
     if isinstance(domain, PressedArea):
         return domain.corners
     return _disk_polygon(domain.radius)
-
-
-def _yield_force(fitted: Fitted) -> float | None:
-    """Compute the smallest force at which the film yields under any of the probes.
-
-    The film yields if its stress exceeds `DEFAULT_STRESS_LIMIT`.
-
-    Args:
-        fitted: The network, with the sensor, the probes and the range of forces.
-
-    Returns:
-        Force, N; None if the film does not yield within the range of forces, or its stress is not simulated.
-    """
-    if isinstance(fitted.sensor, MeasuredSensor):
-        return None
-    force_range = fitted.domain.force_range
-    min_force, max_force = force_range
-    yield_force = max_force  # stays at this value if the film does not yield
-    for notation in fitted.probes:
-        probe = parse_probe(notation)
-        try:
-            probe_limit = force_within_stress(fitted.sensor.film, probe, DEFAULT_STRESS_LIMIT, force_range)
-        except SceneError:  # the film yields already at the smallest force
-            probe_limit = min_force
-        except SolveError:  # the stress of this film cannot be computed
-            continue
-        yield_force = min(yield_force, probe_limit)
-    return round(yield_force, 3) if yield_force < max_force else None
 
 
 def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:

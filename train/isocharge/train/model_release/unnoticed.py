@@ -29,7 +29,7 @@ MIN_NAMED_SHARE = 0.005
 
 
 def unnoticed_presses(fitted: Fitted, metadata: ModelMetadata) -> UnnoticedPresses | None:
-    """Measure how often the answer to a simulated press outside the working area is wrong and carries no flag.
+    """Measure how often the answer to a press outside the working area is wrong and carries no flag.
 
     An answer is wrong if an estimated coordinate or the estimated force differs from the true value by more than
     `WRONG_STDS` standard deviations that the network reports.
@@ -39,13 +39,12 @@ def unnoticed_presses(fitted: Fitted, metadata: ModelMetadata) -> UnnoticedPress
         metadata: Metadata of the model, which contain the thresholds of the flags.
 
     Returns:
-        The shares of wrong answers without a flag, by place; None if the film outside the working area was not
-        simulated.
+        The shares of wrong answers without a flag, by place; None if there are no presses outside the working area.
     """
     outside = fitted.outside
     if outside is None:
         return None
-    presses = outside.grid()
+    presses = outside.test
     contact, std, misfit = fitted.predict(presses.noisy(fitted.misfit_noise, NOISE_SEED))
     is_value_wrong = np.abs(contact - presses.contact) > WRONG_STDS * std  # for x, y and F, shape (n, 3)
     is_wrong = is_value_wrong.any(axis=1)

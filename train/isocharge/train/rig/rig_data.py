@@ -14,7 +14,8 @@ from isocharge.common.arrays import Booleans
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.files import sha256_of
 from isocharge.common.measured_presses import MeasuredPresses, presses_text
-from isocharge.simulate import Dataset, Domain, ForwardMap, Probe, Samples, Sensor, noise_model
+from isocharge.simulate import Dataset, Domain, ForwardMap, Probe, Samples, Sensor, Sweep, noise_model
+from isocharge.simulate.dataset.sweep import outside_samples
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.data.presses import (
     SOLVER,
@@ -171,7 +172,10 @@ def _draw_dataset(film: CorrectedFilm, count: int, seed: int) -> Dataset:
     contact_bytes = np.ascontiguousarray(contact).tobytes()
     charge_bytes = np.ascontiguousarray(charge).tobytes()
     checksum = sha256_of(contact_bytes + charge_bytes)
-    return Dataset(film.forward_map.sensor, samples, manifest, checksum)
+    # The presses outside the domain have the charges of the described sensor, because no press was measured there.
+    sweep = Sweep(film.domain.radius, film.domain.force_range, seed=seed)
+    outside = outside_samples(film.forward_map.sensor, [film.forward_map.probe], sweep)
+    return Dataset(film.forward_map.sensor, samples, manifest, checksum, outside)
 
 
 def _provenance(film: CorrectedFilm, presses: MeasuredPresses, is_held_out: Booleans) -> Provenance:

@@ -121,6 +121,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
         requested_domain=data.domain,
         cautions=cautions,
         outside=trained.outside,
+        yield_force_N=data.yield_force_N,
     )
 
 
@@ -211,8 +212,7 @@ class TrainedNetwork:
 def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | None = None) -> TrainedNetwork:
     """Train the contact perceptron and the misfit perceptron at the same time, in two threads.
 
-    The second thread first simulates the whole film, while the first thread splits the presses. The second thread then
-    trains the misfit perceptron on examples from the working area and from the rest of the film.
+    The misfit perceptron is trained on examples from the working area and from the rest of the film.
 
     Args:
         data: Presses, and possibly a teacher.
@@ -227,14 +227,7 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
     _check_electrodes(config.network, data.sensor)
     training = config.training
     with threads_and_seed(training.threads, training.seed), second_thread() as executor:
-        # Second thread: simulate the whole film
-        film_simulation = None
-        if not data.presses.measured:
-            film_simulation = executor.submit(
-                OutsidePresses.simulate, data.sensor, data.probes, data.domain.force_range
-            )
-
-        # This thread: split the presses, and draw the examples from the working area
+        # Split the presses, and draw the examples from the working area.
         split = Split.by_position(data, training)
         for caution in split.cautions:
             _log.warning("%s", caution)
@@ -242,22 +235,12 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
         network = InverseNetwork(split.domain, features, config.network)
         examples = MisfitExamples(split, features, training, run)
         inner_examples = examples.inner()
+        outside = None if data.presses.measured else OutsidePresses.of(split.domain, data.presses, data.outside)
 
-        def train_misfit() -> OutsidePresses | None:
-            """Train the misfit perceptron, and return the presses outside the working area.
-
-            The perceptron learns examples from the working area and, if the presses are simulated, also from the rest
-            of the film. The function returns None if there are no presses outside the working area.
-            """
-            # Wait until the presses on the whole film are simulated, and select those outside the working area.
-            outside = None
-            if film_simulation is not None:
-                film_presses = film_simulation.result()  # None if the film cannot be simulated
-                if film_presses is not None:
-                    outside = film_presses.beyond(split.domain.radius)
+        def train_misfit() -> None:
+            """Train the misfit perceptron on examples from the working area and from the rest of the film."""
             all_examples = examples.with_outside(inner_examples, outside)
             train_perceptron(misfit_stage(network, all_examples, training), network.misfit_vector, config, run)
-            return outside
 
         # Second thread: train the misfit perceptron. This thread: train the contact perceptron
         misfit_training = executor.submit(train_misfit)
@@ -275,7 +258,7 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
             linear_targets=linear_targets,
         )
         train_perceptron(stage, network.contact, config, run)
-        outside = misfit_training.result()
+        misfit_training.result()
     return TrainedNetwork(network.eval(), split, outside)
 
 

@@ -65,6 +65,8 @@ class Fitted:
         cross_validated: Answers to the charges of `test` by networks that were not trained on these presses; None if
             `network` itself was not trained on them.
         outside: Presses outside the working area; None if they were not simulated.
+        yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
+            or above the range of forces.
     """
 
     network: FoldedNetwork
@@ -80,6 +82,7 @@ class Fitted:
     cautions: tuple[str, ...] = ()
     cross_validated: Answers | None = None
     outside: OutsidePresses | None = None
+    yield_force_N: float | None = None
 
     @property
     def misfit_noise(self) -> Noise:

@@ -35,13 +35,10 @@ MISFIT_RATE_FACTOR = 1.5
 """Learning rate of the misfit network, relative to the learning rate of the contact network. It can be larger, because
 the targets of the misfit network have no noise."""
 
-N_OUTSIDE_PRESSES = 6_000
-"""Number of presses outside the working area from which charges for the misfit network are drawn."""
-
 OUTSIDE_SHARE = 0.15
 """Share of the examples of the misfit network that are presses outside the working area, dimensionless.
 
-If these presses are not simulated, there are no such examples.
+If the dataset has no such presses, there are no such examples.
 """
 
 MANY_OUTSIDE_SHARE = 0.3
@@ -110,8 +107,7 @@ class MisfitExamples:
 
         Args:
             inner_examples: Result of `inner`.
-            outside: Presses outside the working area. If they were not simulated (None), the examples are returned
-                unchanged.
+            outside: Presses outside the working area. If there are none (None), the examples are returned unchanged.
 
         Returns:
             Charges and residuals in random order, with the shape and the units of `inner_examples`.
@@ -123,7 +119,7 @@ class MisfitExamples:
         n_outside = round(outside_share * self._example_count)
         draw = partial(
             draw_outside_examples,
-            outside.draw(N_OUTSIDE_PRESSES, seed).charge,
+            outside.train.charge,
             self.split.field,
             self._noise(),
             n_outside,

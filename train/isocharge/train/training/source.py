@@ -9,7 +9,7 @@ from torch import Tensor
 from isocharge.common.arrays import Array
 from isocharge.simulate import Dataset, Domain, Sensor
 from isocharge.train.data.measured_checks import check_measured_dataset
-from isocharge.train.data.presses import LabelledPresses, domain_of, presses_of
+from isocharge.train.data.presses import LabelledPresses, domain_of, outside_presses_of, presses_of, yield_force_of
 from isocharge.train.training.fitted import Provenance
 from isocharge.train.training.network import as_tensor
 
@@ -64,6 +64,9 @@ class TrainingData:
         presses: Presses for training. Noise is added to the charges during the training. For measured presses, this is
             a regularisation.
         sha256: Checksum of the presses.
+        outside: Presses between the domain and the clamp; None if there are none.
+        yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
+            or above the range of forces.
         test: Measured presses for measuring errors; None to hold out a part of `presses`.
         teacher: Model whose answers the network learns; None if it learns the contacts of the presses.
         provenance: Additional information about the origin of the model, for the release.
@@ -74,6 +77,8 @@ class TrainingData:
     domain: Domain
     presses: LabelledPresses
     sha256: str
+    outside: LabelledPresses | None = None
+    yield_force_N: float | None = None
     test: LabelledPresses | None = None
     teacher: Teacher | None = None
     provenance: Provenance = field(default_factory=Provenance)
@@ -94,4 +99,6 @@ class TrainingData:
             domain=domain_of(dataset),
             presses=presses,
             sha256=dataset.sha256,
+            outside=outside_presses_of(dataset),
+            yield_force_N=yield_force_of(dataset),
         )
