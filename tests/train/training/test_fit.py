@@ -340,7 +340,7 @@ def test_a_training_on_a_dataset_needs_no_solver(dataset_folder, tmp_path):
     """The command runs in a new process, because other tests of this process have imported the solver."""
     (tmp_path / "short.toml").write_text(
         "[network]\nhidden = [8]\nmisfit_hidden = [8]\n"
-        "[training]\nsteps = 10\nmisfit_steps = 10\nmisfit_charges = 500\n"
+        "[training]\nsteps = 10\nmisfit_steps = 10\nmisfit_charges = 1000\n"
     )
     code = """import sys
 from isocharge.cli.main import main
