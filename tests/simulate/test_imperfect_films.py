@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     Circle,
     Film,
-    ForwardMap,
     SolveSettings,
     Theory,
     deflection,
@@ -81,9 +79,3 @@ def test_crosstalk_adds_a_share_of_the_charges_of_the_other_electrodes():
     own = touch_charge(SENSOR, solved)
     wired = replace(SENSOR, calibration=replace(SENSOR.calibration, crosstalk=0.01))
     np.testing.assert_allclose(touch_charge(wired, solved), 0.99 * own + 0.01 * own.sum(), rtol=1e-12)
-
-
-@pytest.mark.parametrize("changes", [{"oval": 0.01}, {"deviator": (0.1, 0.0)}])
-def test_forward_maps_reject_films_that_are_not_axisymmetric(changes):
-    with pytest.raises(SceneError, match=f"axisymmetric film, got .*{next(iter(changes))}"):
-        ForwardMap.build(replace(SENSOR, film=replace(SENSOR.film, **changes)), PROBE)

@@ -20,8 +20,8 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.forward.family import Family, spread_check_presses
-from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR, NODE_COUNTS
+from isocharge.simulate.forward.family import NODE_COUNTS, Family, NodeCount, spread_check_presses
+from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
 
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
@@ -191,10 +191,37 @@ def test_invalid_domains_raise_error(arguments, message):
 
 def test_unreachable_interpolation_error_raises_solve_error(monkeypatch):
     monkeypatch.setattr("isocharge.simulate.forward.forward_map.INTERPOLATION_ERROR", 1e-13)
-    monkeypatch.setattr("isocharge.simulate.forward.forward_map.NODE_COUNTS", NODE_COUNTS[:2])
+    monkeypatch.setattr("isocharge.simulate.forward.family.NODE_COUNTS", NODE_COUNTS[:2])
     settings = replace(QUICK_SETTINGS, resolution=Resolution(3, 8, 2))
     with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to .* only, expected 1e-13"):
         ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0), **{**QUICK, "settings": settings})
+
+
+UNEVEN_FILMS = {
+    "tension": {"pretension": 0.75, "deviator": (0.25, 0.1)},
+    "moduli": {"young_ratio": 3.4 / 2.4, "shear": 1100.0, "axis": 0.35},
+    "oval": {"oval": 0.01, "oval_axis": 0.4},
+}
+"""Properties that make a film differ from an axisymmetric film."""
+
+
+@pytest.mark.parametrize(
+    ("changes", "probe"),
+    [
+        (UNEVEN_FILMS["tension"] | UNEVEN_FILMS["moduli"] | UNEVEN_FILMS["oval"], Circle(1.0)),
+        pytest.param(UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), marks=pytest.mark.slow),
+        *(pytest.param(changes, Circle(1.0), marks=pytest.mark.slow) for changes in UNEVEN_FILMS.values()),
+    ],
+)
+def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_electrodes, changes, probe):
+    """The presses lie in all directions from the centre, and a probe that is not round has random orientations."""
+    sensor = replace(near_electrodes, film=replace(near_electrodes.film, **changes))
+    forward_map = kept(ForwardMap.build, sensor, probe, **QUICK)
+    contact, rotation = draw(forward_map, 10, seed=12)
+    assert errors(forward_map, contact, 0.0 if probe.is_axisymmetric else rotation).max() < 1e-3
+    turned = replace(sensor.film, oval_axis=sensor.film.oval_axis + 1.0, axis=sensor.film.axis + 1.0)
+    other = replace(forward_map, sensor=replace(sensor, film=turned))
+    assert errors(other, contact).max() > 2e-3, "the direction of the film does not matter"
 
 
 # Where a family is solved
@@ -202,37 +229,54 @@ def test_unreachable_interpolation_error_raises_solve_error(monkeypatch):
 DOMAIN = Domain(8.0, (0.05, 2.0))
 
 
-@pytest.mark.parametrize(("folds", "rotations"), [(1, 14), (2, 14), (3, 15), (4, 16)])
-def test_orientations_are_spread_evenly_and_solved_once_each(folds, rotations):
-    family = Family.spread(DOMAIN, 45.0, (3, 2), 2.0 * np.pi / folds, 14)
+FILM = load_sensor("three-25um-biaxial").film
+SCALENE = Polygon.of([(0.0, 0.0), (3.0, 0.0), (0.0, 1.0)])
+SQUARE = Polygon.rectangle(2.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("probe", "folds", "rotations"),
+    [(SCALENE, 1, 14), (Ellipse(2.0, 1.0), 2, 14), (Polygon.triangle(2.0), 3, 15), (SQUARE, 4, 16)],
+)
+def test_orientations_are_spread_evenly_and_solved_once_each(probe, folds, rotations):
+    family = Family.spread(DOMAIN, FILM, probe, NodeCount(3, 2, 14))
     assert family.rotation.size == rotations
     np.testing.assert_allclose(np.diff(family.rotation), 2.0 * np.pi / rotations, rtol=1e-12)
     assert family.solved_rotations.size * folds == rotations
 
 
-@pytest.mark.parametrize("period", [2 * np.pi, np.pi, 2 * np.pi / 3])
-def test_family_weights_interpolate_smooth_functions(period):
-    """The function is a power of the force, smooth in the distance, and has the first harmonics of the orientation."""
+@pytest.mark.parametrize("probe", [SCALENE, Ellipse(2.0, 1.0), Polygon.triangle(2.0)])
+@pytest.mark.parametrize("changes", [{}, {"young_ratio": 1.4}])
+def test_family_weights_interpolate_smooth_functions(probe, changes):
+    """The function is a power of the force, smooth in the distance, and has the first harmonics of both angles.
+
+    On a film that is not axisymmetric, it also has two harmonics of the angle between the probe and the film.
+    """
+    film = replace(FILM, **changes)
     rng = np.random.default_rng(9)
     distance, force = 8.0 * np.sqrt(rng.random(200)), np.exp(rng.uniform(np.log(0.05), np.log(2.0), 200))
-    rotation = rng.uniform(-7.0, 7.0, 200)
+    angle, rotation = rng.uniform(-7.0, 7.0, (2, 200))
 
-    def smooth(d: np.ndarray, f: np.ndarray, t: np.ndarray) -> np.ndarray:
-        return f**0.02 / (1.0 + (d / 12.0) ** 2) + 0.1 * np.cos(t - 0.3) + 0.05 * np.sin(3.0 * t)
+    def smooth(d: np.ndarray, f: np.ndarray, turn: np.ndarray, t: np.ndarray) -> np.ndarray:
+        even = f**0.02 / (1.0 + (d / 12.0) ** 2) + 0.1 * np.cos(t - 0.3) + 0.05 * np.sin(3.0 * t)
+        return even if film.is_axisymmetric else even * (1.0 + 0.1 * np.cos(2.0 * turn) + 0.02 * np.sin(6.0 * turn))
 
-    for count, expected in (((8, 3), 1e-4), ((15, 8), 1e-7)):
-        family = Family.spread(DOMAIN, 45.0, count, period)
-        grid = np.meshgrid(family.distance, family.force, family.rotation, indexing="ij")
-        found = family.weights(distance, force, rotation) @ smooth(*grid).ravel()
-        np.testing.assert_allclose(found, smooth(distance, force, rotation), rtol=expected)
+    for count, expected in ((NodeCount(8, 3), 1e-4), (NodeCount(15, 8), 1e-7)):
+        family = Family.spread(DOMAIN, film, probe, count)
+        d, f, turn, t = np.meshgrid(family.distance, family.force, family.direction, family.rotation, indexing="ij")
+        # The solved presses cover one period of the probe, within which the sum of both angles is a node.
+        period = 2.0 * np.pi / family.symmetry_order
+        node_values = smooth(d, f, turn + period * np.floor(t / period + 1e-9), t)
+        found = family.weights(distance * np.exp(1j * angle), force, rotation) @ node_values.ravel()
+        np.testing.assert_allclose(found, smooth(distance, force, angle + rotation, rotation), rtol=expected)
 
 
 def test_family_interpolates_fields_that_change_over_the_distance_to_the_clamp():
     """The function depends on the distance to the clamp, as the image of a point load in the clamped circle does."""
     domain = Domain(41.0, (1.0, 1.0))
-    family = Family.spread(domain, 45.0, (12, 1), 0.0)
+    family = Family.spread(domain, FILM, Circle(1.0), NodeCount(12, 1))
     distance = np.linspace(0.0, 41.0, 300)
-    weights = family.weights(distance, np.ones(300), np.zeros(300))
+    weights = family.weights(distance.astype(complex), np.ones(300), np.zeros(300))
     found = weights @ np.log(1.0 - (family.distance / 45.0) ** 2)
     np.testing.assert_allclose(found, np.log(1.0 - (distance / 45.0) ** 2), atol=1e-5)
 

@@ -7,12 +7,12 @@ are therefore computed for fewer presses than the stress of a forward map.
 from concurrent.futures import Executor
 from dataclasses import replace
 
-from isocharge.simulate.forward.family import Chain, Family, Reading, solve_chains
+from isocharge.simulate.forward.family import Family, NodeCount, Reading
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.solver.load_case import SolveSettings
 
-NODE_COUNTS = (6, 6)
-"""Number of distances from the centre, and number of forces, at which the derivatives are solved."""
+NODE_COUNT = NodeCount(distances=6, forces=6)
+"""Numbers of distances, forces and directions at which the derivatives are solved."""
 
 
 def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor | None) -> ForwardMap:
@@ -28,7 +28,7 @@ def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor
 
     Returns:
         Copy of the forward map. In place of the stress, its table contains the derivatives that `read` computes, shape
-        (n_distance * n_force, n_value).
+        (n_distance * n_force * n_direction, n_value).
 
     Raises:
         SolveError: If a press has no equilibrium.
@@ -36,16 +36,10 @@ def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor
     sensor = forward_map.sensor
     film = sensor.film
     # Choose the distances and forces of the presses. A circular probe has no orientation.
-    family = Family.spread(forward_map.domain, film.radius, NODE_COUNTS, period=0.0)
+    family = Family.spread(forward_map.domain, film, forward_map.probe, NODE_COUNT)
     theory = replace(forward_map.theory, stretching=True)  # `read` needs a theory that includes stretching
     settings = SolveSettings(theory=theory, resolution=forward_map.resolution, layer=forward_map.layer)
 
-    # A chain contains the presses with all forces at one distance. They are solved one after the other, because each
-    # solve starts from the equilibrium under the previous force.
-    chains = [
-        Chain(film, forward_map.probe, distance, family.force, sensor.surface, settings, read)
-        for distance in family.distance.tolist()
-    ]
-    derivatives = solve_chains(chains, executor)  # shape (n_distance, n_force, n_value)
+    derivatives = family.solve(sensor, forward_map.probe, settings, executor, read)
     table = derivatives.reshape(-1, derivatives.shape[-1])
     return replace(forward_map, family=family, theory=theory, table=table)

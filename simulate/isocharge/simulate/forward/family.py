@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
 from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
@@ -21,7 +21,12 @@ from isocharge.simulate.forward.film_grid import FilmGrid
 from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.mesh.template import Template
-from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
+from isocharge.simulate.numerics.interpolation import (
+    barycentric_weights,
+    chebyshev_nodes,
+    lagrange_values,
+    periodic_weights,
+)
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
@@ -37,22 +42,36 @@ film. The rim is far from the probe. A few harmonics of the orientation therefor
 """
 
 
+DIRECTION_PERIOD = np.pi
+"""Rotation of a film that is not axisymmetric, after which its properties are the same again, rad."""
+
+
+DIRECTIONS = 7
+"""Smallest number of directions, within half a turn, on a film that is not axisymmetric.
+
+The stress contains even harmonics of the direction, whose amplitudes decrease like powers of the relative differences
+of the moduli and of the pretensions.
+"""
+
+
 class NodeCount(NamedTuple):
-    """Numbers of distances, forces and orientations for which a family of presses is solved.
+    """Numbers of distances, forces, orientations and directions for which a family of presses is solved.
 
     Attributes:
         distances: Number of distances of the presses from the centre of the film.
         forces: Number of forces of the presses.
         min_orientations: Smallest number of orientations of a probe that is not axisymmetric.
+        directions: Number of directions within half a turn, on a film that is not axisymmetric.
     """
 
     distances: int
     forces: int
-    min_orientations: int
+    min_orientations: int = ROTATIONS
+    directions: int = DIRECTIONS
 
 
 NODE_COUNTS = (
-    NodeCount(5, 3, ROTATIONS),
+    NodeCount(5, 3),
     NodeCount(8, 5, 2 * ROTATIONS),
     NodeCount(10, 7, 3 * ROTATIONS),
     NodeCount(13, 12, 3 * ROTATIONS),
@@ -61,6 +80,18 @@ NODE_COUNTS = (
 
 The last entry is for films with a large pretension. With increasing force, the charges of such a film change from one
 power of the force to another, and pass through zero.
+"""
+
+ASYMMETRIC_NODE_COUNTS = (
+    NodeCount(5, 3),
+    NodeCount(5, 7),
+    NodeCount(8, 7, 2 * ROTATIONS, directions=9),
+    NodeCount(13, 12, 3 * ROTATIONS, directions=11),
+)
+"""Numbers of nodes that are tried for a film that is not axisymmetric.
+
+Every solve is repeated in several directions. If the first number of forces is not sufficient, only this number is
+increased at first. A film with a pretension starts with the second entry.
 """
 
 
@@ -74,6 +105,9 @@ class Family:
         distance: Distances of the solved presses from the centre of the film, shape (n_distance,), mm. Their
             `distance_coordinate` has Chebyshev nodes.
         force: Forces of the solved presses, shape (n_force,), N. Their logarithms are Chebyshev nodes.
+        direction: Directions of the solved presses on the film, evenly spaced over half a turn, shape (n_direction,),
+            rad. This is the direction from the centre of the film to the press, plus the rotation of a probe that is
+            not axisymmetric. An axisymmetric film has a single direction.
         rotation: Rotations of the probe relative to the direction of the press, evenly spaced over a full turn, shape
             (n_rotation,), rad.
         symmetry_order: Order of the rotational symmetry of the probe: the number of rotations within a full turn that
@@ -84,35 +118,31 @@ class Family:
     film_radius: float
     distance: Array
     force: Array
+    direction: Array
     rotation: Array
     symmetry_order: int
 
     @classmethod
-    def spread(
-        cls, domain: Domain, film_radius: float, count: tuple[int, int], period: float, rotations: int = ROTATIONS
-    ) -> "Family":
+    def spread(cls, domain: Domain, film: Film, probe: Probe, count: NodeCount) -> "Family":
         """Distribute the solved presses over a domain.
 
         Args:
             domain: Presses for which the stress will be interpolated.
-            film_radius: Radius of the film, mm.
-            count: Number of distances and number of forces.
-            period: Smallest rotation that maps the probe onto itself, rad; 0 for an axisymmetric probe.
-            rotations: Smallest number of orientations of a probe that is not axisymmetric.
+            film: Film on which the probe presses.
+            probe: Probe that presses the film.
+            count: Numbers of distances, forces, orientations and directions.
 
         Returns:
             The family. It has only one force if the smallest and the largest force of the domain are equal.
         """
-        n_distance, n_force = count
-
-        # The distance coordinate is atanh(distance / film_radius), and tanh is its inverse.
-        largest_coordinate = float(distance_coordinate(domain.radius / film_radius))
-        distance = film_radius * np.tanh(chebyshev_nodes(n_distance, 0.0, largest_coordinate))
+        # The distance coordinate is atanh(distance / film radius), and tanh is its inverse.
+        largest_coordinate = float(distance_coordinate(domain.radius / film.radius))
+        distance = film.radius * np.tanh(chebyshev_nodes(count.distances, 0.0, largest_coordinate))
 
         # The logarithms of the forces are Chebyshev nodes, unless the domain has a single force.
         min_log_force, max_log_force = np.log(domain.force_range)
         if max_log_force > min_log_force:
-            force = np.exp(chebyshev_nodes(n_force, min_log_force, max_log_force))
+            force = np.exp(chebyshev_nodes(count.forces, min_log_force, max_log_force))
         else:
             force = np.array([domain.force_range[0]])
 
@@ -120,11 +150,15 @@ class Family:
         # axisymmetric probe needs only one rotation.
         symmetry_order = 1
         n_rotation = 1
-        if period > 0.0:
-            symmetry_order = round(2.0 * np.pi / period)
-            n_rotation = symmetry_order * math.ceil(rotations / symmetry_order)
+        if not probe.is_axisymmetric:
+            symmetry_order = round(2.0 * np.pi / probe.period)
+            n_rotation = symmetry_order * math.ceil(count.min_orientations / symmetry_order)
         rotation = 2.0 * np.pi * np.arange(n_rotation) / n_rotation
-        return cls(domain, film_radius, distance, force, rotation, symmetry_order)
+
+        # The elasticity, the pretension and the clamp do not change if the film is turned by half a turn.
+        n_direction = 1 if film.is_axisymmetric else count.directions
+        direction = DIRECTION_PERIOD * np.arange(n_direction) / n_direction
+        return cls(domain, film.radius, distance, force, direction, rotation, symmetry_order)
 
     @property
     def solved_rotations(self) -> Array:
@@ -135,59 +169,70 @@ class Family:
         """
         return self.rotation[: self.rotation.size // self.symmetry_order]
 
-    def weights(self, distance: Array, force: Array, rotation: Array) -> Array:
+    def weights(self, position: Complexes, force: Array, rotation: Array) -> Array:
         """Compute the weights that interpolate the stress between the solved presses (nodes).
 
-        Lagrange polynomials interpolate in the distance coordinate and in the logarithm of the force. A trigonometric
-        polynomial interpolates in the rotation of the probe.
+        Lagrange polynomials interpolate in the distance coordinate and in the logarithm of the force. Trigonometric
+        polynomials interpolate in the direction of the press and in the rotation of the probe.
 
         Args:
-            distance: Distances of the interpolated presses from the centre, shape (n,), mm.
+            position: Positions x + iy of the interpolated presses, shape (n,), mm.
             force: Forces of the interpolated presses, shape (n,), N.
             rotation: Rotations of the probe relative to the direction of the press, shape (n,), rad.
 
         Returns:
-            Weights, shape (n, n_distance * n_force * n_rotation), dimensionless. An interpolated value is the sum over
-            the nodes of the weight of a node times the value at this node.
+            Weights, shape (n, n_distance * n_force * n_direction * n_rotation), dimensionless. An interpolated value is
+            the sum over the nodes of the weight of a node times the value at this node.
         """
         # Interpolation weights along each axis; `rotation` may have the shape (1,) if it is the same for all presses.
         distance_nodes = distance_coordinate(self.distance / self.film_radius)
-        press_coordinates = distance_coordinate(distance / self.film_radius)
+        press_coordinates = distance_coordinate(np.abs(position) / self.film_radius)
         distance_weights = lagrange_values(distance_nodes, barycentric_weights(distance_nodes), press_coordinates)
         force_nodes = np.log(self.force)
         force_weights = lagrange_values(force_nodes, barycentric_weights(force_nodes), np.log(force))
-        rotation_weights = self._rotation_weights(rotation)
+        turn_weights = self._turn_weights(np.angle(position), rotation)
 
-        # The weight of a node is the product of its weights along the axes (press, distance, force, rotation).
+        # The weight of a node is the product of its weights along the axes (press, distance, force, turn).
         distance_force_weights = distance_weights[:, :, None, None] * force_weights[:, None, :, None]
-        node_weights = distance_force_weights * rotation_weights[:, None, None, :]
-        return np.asarray(node_weights.reshape(distance.size, -1))
+        weights = distance_force_weights * turn_weights[:, None, None, :]
+        return np.asarray(weights.reshape(position.size, -1))
 
-    def _rotation_weights(self, rotation: Array) -> Array:
-        """Compute the weights that interpolate between the rotations of the family by a trigonometric polynomial.
+    def _turn_weights(self, angle: Array, rotation: Array) -> Array:
+        """Compute the weights that interpolate between the directions and the rotations of the family.
 
-        The family has N evenly spaced rotations. Let t be the angle between the interpolated rotation and a rotation of
-        the family. The weight of this rotation of the family is the Dirichlet kernel
-
-            (1 + 2 cos(t) + 2 cos(2 t) + ...) / N.
-
-        It contains all harmonics up to N / 2. If N is even, the highest harmonic has the amplitude 1 instead of 2,
-        because its sine is zero at every rotation of the family.
+        In the frame of the probe, the stress depends on the direction of the axes of the film through even harmonics,
+        and on the direction of the centre of the film through low harmonics. The sum of both angles and the rotation
+        are therefore interpolated separately. The solved presses cover one period of the probe. If the probe is rotated
+        by further periods, the press is the same, but the sum of both angles is larger by these periods.
 
         Args:
-            rotation: Rotations of the probe relative to the direction of the press, shape (n,), rad.
+            angle: Directions from the centre of the film to the interpolated presses, shape (n,), rad.
+            rotation: Rotations of the probe relative to the direction of the press, shape (n,) or (1,), rad.
 
         Returns:
-            Weights, shape (n, n_rotation). The weights of each press sum to 1.
+            Weights, shape (n, n_direction * n_rotation).
         """
-        n_rotation = self.rotation.size
-        harmonics = np.arange(1, n_rotation // 2 + 1)
-        amplitudes = np.where(2 * harmonics == n_rotation, 1.0, 2.0)
-        angle_from_node = rotation[:, None] - self.rotation  # shape (n, n_rotation)
-        phase = angle_from_node[..., None] * harmonics  # shape (n, n_rotation, n_harmonic)
-        return np.asarray((1.0 + np.cos(phase) @ amplitudes) / n_rotation)
+        rotation_weights = periodic_weights(self.rotation, 2.0 * np.pi, rotation)
+        is_axisymmetric_probe = self.rotation.size == 1
+        film_angle = angle if is_axisymmetric_probe else angle + rotation
+        period_starts = 2.0 * np.pi * np.arange(self.symmetry_order) / self.symmetry_order
+        angle_in_periods = film_angle[:, None] - period_starts  # shape (n, symmetry_order)
+        direction_weights = periodic_weights(self.direction, DIRECTION_PERIOD, angle_in_periods.ravel())
+        direction_weights = direction_weights.reshape(angle.size, self.symmetry_order, -1)
 
-    def solve(self, sensor: Sensor, probe: Probe, settings: SolveSettings, executor: Executor | None) -> Array:
+        # All rotations within one period have the same direction weights.
+        weights_of_rotations = np.repeat(direction_weights, self.solved_rotations.size, axis=1)
+        weights = weights_of_rotations.swapaxes(1, 2) * rotation_weights[:, None, :]
+        return np.asarray(weights.reshape(angle.size, -1))
+
+    def solve(
+        self,
+        sensor: Sensor,
+        probe: Probe,
+        settings: SolveSettings,
+        executor: Executor | None,
+        read: "Reading | None" = None,
+    ) -> Array:
         """Compute the stress under the presses of the family, for the rotations within one period of the probe.
 
         Args:
@@ -195,20 +240,32 @@ class Family:
             probe: Probe that presses the film.
             settings: Theory, mesh and width of the thin rings at the rim, which are the same for all presses.
             executor: Executor that runs the solves; None for this process.
+            read: Function that computes the returned values from each solved press; None for the scaled stress in the
+                frame of the probe.
 
         Returns:
-            Scaled stress at the nodes of the mesh, shape
-            (n_distance, n_solved_rotation, n_force, n_element * n_local * 3), dimensionless. The method `unfold`
-            extends it to all rotations.
+            Values that `read` computes, shape (n_distance, n_force, n_direction, n_solved_rotation, n_value),
+            dimensionless. The method `unfold` extends stresses to all rotations.
         """
-        # A chain contains the presses with all forces at one distance and rotation.
+        # A chain contains the presses with all forces at one position and rotation. Instead of the press, the film is
+        # rotated, so that every press lies on the positive x axis.
         chains = [
-            Chain(sensor.film, probe.rotated(float(rotation)), float(distance), self.force, sensor.surface, settings)
+            Chain(
+                film=sensor.film.rotated(float(rotation - direction)),
+                probe=probe.rotated(float(rotation)),
+                distance=float(distance),
+                forces=self.force,
+                surface=sensor.surface,
+                settings=settings,
+                read=read or probe_frame_stress,
+            )
             for distance in self.distance
+            for direction in self.direction
             for rotation in self.solved_rotations
         ]
         solved = solve_chains(chains, executor)
-        return solved.reshape(self.distance.size, self.solved_rotations.size, self.force.size, -1)
+        shape = (self.distance.size, self.direction.size, self.solved_rotations.size, self.force.size, -1)
+        return np.moveaxis(solved.reshape(shape), 3, 1)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
         """By symmetry, extend the stress from the rotations within one period of the probe to all rotations.
@@ -219,16 +276,15 @@ class Family:
 
         Args:
             solved: Scaled stress in a frame that rotates with the probe, as returned by `solve`, shape
-                (n_distance, n_solved_rotation, n_force, n_element * n_local * 3), dimensionless.
+                (n_distance, n_force, n_direction, n_solved_rotation, n_element * n_local * 3), dimensionless.
             mesh: Template of the mesh of the solves.
 
         Returns:
-            Scaled stress, shape (n_distance * n_force * n_rotation, n_element * n_local * 3), dimensionless. The rows
-            have the order of the columns of `weights`.
+            Scaled stress, shape (n_distance * n_force * n_direction * n_rotation, n_element * n_local * 3),
+            dimensionless. The rows have the order of the columns of `weights`.
         """
-        # The order of the axes becomes (distance, force, rotation), as in `weights`.
-        n_distance, n_rotation, n_force, n_value = solved.shape
-        solved_period = np.moveaxis(solved, 1, 2).reshape(n_distance, n_force, n_rotation, mesh.n_element, -1, 3)
+        n_value = solved.shape[-1]
+        solved_period = solved.reshape(*solved.shape[:-1], mesh.n_element, -1, 3)
         stress_of_periods = []
         for period_index in range(self.symmetry_order):
             angle = 2.0 * np.pi * period_index / self.symmetry_order
@@ -236,8 +292,16 @@ class Family:
             reordered_stress = solved_period[..., rotated_elements, :, :]
             # The stress itself does not change, but its components refer to a frame that was rotated by `angle`.
             stress_of_periods.append(rotate_stress(reordered_stress, -angle))
-        all_rotations = np.concatenate(stress_of_periods, axis=2)
+        all_rotations = np.concatenate(stress_of_periods, axis=3)
         return np.asarray(all_rotations.reshape(-1, n_value))
+
+
+def node_counts(film: Film) -> tuple[NodeCount, ...]:
+    """Return the numbers of nodes that are tried one after the other for a film."""
+    if film.is_axisymmetric:
+        return NODE_COUNTS
+    is_taut = film.pretension != 0.0 or film.deviator != (0.0, 0.0)
+    return ASYMMETRIC_NODE_COUNTS[1:] if is_taut else ASYMMETRIC_NODE_COUNTS
 
 
 class CheckPress(NamedTuple):
@@ -304,8 +368,8 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
         domain: Presses that the forward map would cover.
 
     Raises:
-        SceneError: If the radius or the forces are not positive numbers, if the film is not axisymmetric, or if the
-            outermost press with the largest force cannot exist.
+        SceneError: If the radius or the forces are not positive numbers, or if the outermost press with the largest
+            force cannot exist.
     """
     radius = domain.radius
     min_force, max_force = domain.force_range
@@ -313,11 +377,6 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
         raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {min_force} to {max_force}")
     if not (np.isfinite(radius) and radius > 0.0):
         raise SceneError(f"radius: expected a positive number, got {radius} mm")
-    if not film.is_axisymmetric:
-        raise SceneError(
-            f"film: expected an axisymmetric film, got {film.asymmetries}: a forward map computes charges of presses "
-            "in all directions from presses along one radius; use `press` or `isocharge simulate point` for this film"
-        )
     if radius + probe.reach >= film.radius:
         raise SceneError(
             f"radius: presses up to {radius:.4g} mm from the centre with {probe.notation}, which reaches "

@@ -196,6 +196,7 @@ class FilmFamily:
             film_radius=film.radius,
             distance=self.grid.distance * film.radius,
             force=self.grid.load * force_unit,
+            direction=np.zeros(1),
             rotation=np.zeros(1),
             symmetry_order=1,
         )

@@ -21,13 +21,14 @@ from isocharge.common.errors import SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain, as_contacts, differences
-from isocharge.simulate.forward.family import NODE_COUNTS, CheckPress, Family, check_family, spread_check_presses
+from isocharge.simulate.forward.family import CheckPress, Family, check_family, node_counts, spread_check_presses
 from isocharge.simulate.forward.press_chunk import PressChunk
 from isocharge.simulate.forward.readout import ReadoutPoints, contact_charge, touch_charge
 from isocharge.simulate.forward.readout_rules import ReadoutRules
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.theory import Theory, theory_for
 from isocharge.simulate.mesh.blocks import Resolution
+from isocharge.simulate.mesh.placed_mesh import film_oval
 from isocharge.simulate.mesh.placement import Placement, widest_smooth_layer
 from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.sensor.probe import Probe
@@ -51,7 +52,7 @@ The stress under a press on an isotropic round film is such a field.
 """
 
 SKIP_RATIO = 10.0
-"""Ratio of the error to `INTERPOLATION_ERROR` above which the next entry of `NODE_COUNTS` is skipped, dimensionless.
+"""Ratio of the error to `INTERPOLATION_ERROR` above which the next entry of `node_counts` is skipped, dimensionless.
 
 With such a large error, the next entry would not suffice either.
 """
@@ -72,7 +73,7 @@ class ForwardMap:
         resolution: Fineness of the mesh of the solves.
         layer: Width of the thin rings of the mesh at the rim, in film radii.
         table: Scaled stress at the nodes of every element under the solved presses, in a frame that rotates with the
-            probe, shape (n_distance * n_force * n_rotation, n_element * n_local * 3), dimensionless.
+            probe, shape (n_distance * n_force * n_direction * n_rotation, n_element * n_local * 3), dimensionless.
         error: Largest relative error of a charge with respect to the direct solves of `build`, dimensionless.
     """
 
@@ -126,7 +127,7 @@ class ForwardMap:
         layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
         settings = replace(settings, theory=theory, layer=layer)
         resolution = needed_resolution(film, probe, (radius, 0.0), middle_force, settings)
-        template = template_for(probe, resolution)
+        template = template_for(probe, resolution, whole=not film.is_axisymmetric)
         layer = min(layer, widest_smooth_layer(template, probe, radius, film.radius))
         settings = replace(settings, resolution=resolution, layer=layer)
 
@@ -136,11 +137,10 @@ class ForwardMap:
         checks = spread_check_presses(domain, CHECK_COUNT)
         check_charges: list[Array] = []
         error = np.inf
-        remaining_counts = list(NODE_COUNTS)
+        remaining_counts = list(node_counts(film))
         while remaining_counts:
             count = remaining_counts.pop(0)
-            node_count = (count.distances, count.forces)
-            family = Family.spread(domain, film.radius, node_count, probe.period, count.min_orientations)
+            family = Family.spread(domain, film, probe, count)
             solved_stress = family.solve(sensor, probe, settings, executor)
             table = family.unfold(solved_stress, template)
             forward_map = cls(sensor, probe, family, theory, resolution, layer, table, error)
@@ -178,7 +178,9 @@ class ForwardMap:
     @property
     def solves(self) -> int:
         """Number of equilibria that were solved for the map."""
-        return self.family.distance.size * self.family.force.size * self.family.solved_rotations.size
+        family = self.family
+        n_position = family.distance.size * family.direction.size
+        return n_position * family.force.size * family.solved_rotations.size
 
     def charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
         """Compute the touch charges of presses.
@@ -337,10 +339,10 @@ class ForwardMap:
         """
         n_distance = self.family.distance.size
         n_force = self.family.force.size
-        n_rotation = self.family.rotation.size
-        stress = self.table.reshape(n_distance, n_force, n_rotation, -1, 3)
-        force_as_field = np.moveaxis(stress, 1, 3)  # shape (n_distance, n_rotation, n_node, n_force, 3)
-        table = force_as_field.reshape(n_distance * n_rotation, -1)
+        n_turn = self.family.direction.size * self.family.rotation.size
+        stress = self.table.reshape(n_distance, n_force, n_turn, -1, 3)
+        force_as_field = np.moveaxis(stress, 1, 3)  # shape (n_distance, n_turn, n_node, n_force, 3)
+        table = force_as_field.reshape(n_distance * n_turn, -1)
         family = replace(self.family, force=self.family.force[:1])
         return replace(self, family=family, table=table.astype(np.float32))
 
@@ -476,11 +478,17 @@ class ForwardMap:
         distance = np.abs(position)
         direction = np.angle(position)  # from the centre of the film to the press, rad
         rotation = orientation - direction  # of the probe relative to the direction of the press
-        weights = self.family.weights(distance, force, rotation)
+        weights = self.family.weights(position, force, rotation)
         nodal_fields = weights.astype(self.table.dtype) @ self.table  # in the precision of the table
-        mesh = template_for(self.probe, self.resolution)
-        placement = Placement.of(mesh, self.probe, distance, self.sensor.film.radius, self.layer, rotation)
-        return PressChunk(mesh, placement, nodal_fields, direction, rotation + self.probe.angle)
+        film = self.sensor.film
+        mesh = template_for(self.probe, self.resolution, whole=not film.is_axisymmetric)
+        placement = Placement.of(mesh, self.probe, distance, film.radius, self.layer, rotation)
+
+        # The stress refers to the direction of the press or, if the probe is not axisymmetric, to the probe.
+        frame_angle = direction
+        if not self.probe.is_axisymmetric:
+            frame_angle = direction + rotation + self.probe.angle
+        return PressChunk(mesh, placement, nodal_fields, direction, frame_angle, film_oval(film, direction))
 
     @cached_property
     def _readout_rules(self) -> ReadoutRules:

@@ -6,6 +6,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mechanics.stress import rotate_stress
+from isocharge.simulate.mesh.placed_mesh import from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.point_location import locate_points
 from isocharge.simulate.mesh.template import Template
@@ -22,15 +23,17 @@ class PressChunk:
         field: Scaled stresses of all fields at the nodes of every element, shape (n, n_element * n_local * n_field *
             3), dimensionless. The values of all fields at one node are adjacent.
         direction: Direction from the centre of the film to each press, shape (n,), rad.
-        probe_angle: Angle of the probe relative to the direction of the press, shape (n,), rad. If the probe is not
-            axisymmetric, the frame of the stress fields is rotated by this angle.
+        frame_angle: Angle of axis 1 of the stress fields from the x axis, shape (n,), rad.
+        oval: Shape of an oval clamp, rotated with each press, shape (n,); see `mesh.placed_mesh.PlacedMesh`. Zero for a
+            circular clamp.
     """
 
     mesh: Template
     placement: Placement
     field: Array
     direction: Array
-    probe_angle: Array
+    frame_angle: Array
+    oval: Complexes
 
     def scaled_charges(self, press_index: Integers, points: Complexes, weights: Array, is_odd: Booleans) -> Array:
         """Compute the charge of each pair of a press and an electrode, by integration of the stress fields.
@@ -47,12 +50,7 @@ class PressChunk:
         """
         stress, is_mirrored = self._interpolated_stress(press_index, points, is_odd.size)
 
-        # Axis 1 of the interpolated stress is the direction of the press. If the whole film is meshed, the axes are
-        # also rotated by the angle of the probe.
-        frame_angle = self.direction[press_index]
-        if not self.mesh.half:
-            frame_angle = frame_angle + self.probe_angle[press_index]
-
+        frame_angle = self.frame_angle[press_index]
         charge = np.empty((len(stress), is_odd.size))
         for field_index, is_field_odd in enumerate(is_odd):
             field_stress = stress[:, :, field_index]  # shape (n_pair, n_point, 3)
@@ -82,6 +80,8 @@ class PressChunk:
         # each point.
         mesh = self.mesh
         rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]
+        if self.oval.any():
+            rotated_points = from_oval(rotated_points, self.oval[press_index, None])
         position, is_mirrored = mesh.into_meshed_half(rotated_points)
         element, first_local, second_local = locate_points(self.placement[press_index], mesh, position)
 

@@ -43,10 +43,9 @@ class SideForceMap:
     Attributes:
         film: Forward map of the film without side forces.
         fields: Forward map whose table contains the two stress fields of a side force.
-        holding: Ratio of the holding force to the force of the press for each solved press, shape (n_distance *
-            n_force,), dimensionless. The holding force is the side force that prevents the film from slipping under a
-            probe on a vertical stage. It acts along the direction from the centre of the film to the press, and is
-            negative if it points to the centre.
+        holding: Ratio of the holding force to the force of the press for each solved press, shape (n_press, 2),
+            dimensionless. The holding force is the side force that prevents the film from slipping under a probe on a
+            vertical stage. Its components act along and across the direction from the centre of the film to the press.
     """
 
     film: ForwardMap
@@ -74,11 +73,11 @@ class SideForceMap:
                 f"side forces: expected a circular probe, got {forward_map.probe.notation}; use "
                 "`press(..., side_force=...)` or `isocharge simulate point --side-force` for other probes"
             )
-        # The table contains the stress fields and, in the last column, the holding force divided by the force of the
-        # press.
+        # The table contains the stress fields and, in the last two columns, the holding force divided by the force of
+        # the press.
         derivative_map = solve_derivatives(forward_map, _side_force_changes, executor)
-        stress_table, holding_column = np.split(derivative_map.table, [-1], axis=1)
-        return cls(forward_map, replace(derivative_map, table=stress_table), holding_column.ravel())
+        stress_table, holding = np.split(derivative_map.table, [-2], axis=1)
+        return cls(forward_map, replace(derivative_map, table=stress_table), holding)
 
     def jacobian(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to the side force (Fx, Fy) that the probe exerts.
@@ -127,15 +126,16 @@ class SideForceMap:
         """
         check_friction(coefficient)
         contact = self.film.domain.check(contact, "side forces")
-        distance = np.hypot(contact[:, 0], contact[:, 1])
         force = contact[:, 2]
-        orientation = np.zeros(1)  # a circular probe has no orientation
-        weights = self.fields.family.weights(distance, force, orientation)
-        relative_holding_force = weights @ self.holding  # holding force over the force of the press
-        # Unit vectors from the centre to the presses. The lower bound avoids a division by zero at the centre.
-        direction = contact[:, :2] / np.maximum(distance, 1e-12)[:, None]
-        holding_force = (relative_holding_force * force)[:, None] * direction
-        return limit_to_friction(holding_force, coefficient * force)
+        position = contact[:, 0] + 1j * contact[:, 1]
+        rotation = np.zeros(1)  # a circular probe has no orientation
+        weights = self.fields.family.weights(position, force, rotation)
+
+        # Rotate the holding force, Fx + i Fy, from the frame of the press to the axes x and y.
+        relative_force = (weights @ self.holding) @ np.array([1.0, 1j])  # divided by the force of the press
+        holding_force = force * relative_force * np.exp(1j * np.angle(position))
+        components = np.stack([holding_force.real, holding_force.imag], axis=1)
+        return limit_to_friction(components, coefficient * force)
 
     def friction_charges(self, contact: Array, coefficient: float) -> Array:
         """Compute, to first order, how the friction of a probe on a vertical stage changes the charges.
@@ -172,10 +172,9 @@ def _side_force_changes(solved: Equilibrium, surface: Surface) -> Array:
 
     Returns:
         One array, as the interpolation between presses requires. It contains all changes of the scaled stress, which
-        `side_force_stress` computes, and then the holding force divided by the force of the press. Shape
-        (n_change + 1,), dimensionless. The holding force is the side force that prevents the film from slipping under
-        the probe. It is positive if it points away from the centre.
+        `side_force_stress` computes, and then the two components of the holding force divided by the force of the
+        press. Shape (n_change + 2,), dimensionless. The holding force is the side force that prevents the film from
+        slipping under the probe.
     """
-    # The second component is zero, because the press is symmetric about the x axis.
-    outward_force, _ = holding_force(solved)
-    return np.append(side_force_stress(solved, surface), outward_force / solved.force)
+    relative_holding_force = np.array(holding_force(solved)) / solved.force
+    return np.append(side_force_stress(solved, surface), relative_holding_force)

@@ -10,7 +10,7 @@ from concurrent.futures import Executor
 import numpy as np
 
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.forward.family import ROTATIONS, Family, check_family
+from isocharge.simulate.forward.family import Family, NodeCount, check_family
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.blocks import Resolution
@@ -36,11 +36,8 @@ RIM_GAP = 1.2
 The coarse mesh does not resolve a narrower gap.
 """
 
-DISTANCES = 10
-"""Number of distances from the centre at which presses are solved."""
-
-FORCES = 4
-"""Number of forces at which presses are solved."""
+NODE_COUNT = NodeCount(distances=10, forces=4)
+"""Numbers of distances, forces, orientations and directions at which presses are solved."""
 
 
 def outermost_distance(film: Film, probe: Probe) -> float:
@@ -56,7 +53,7 @@ def whole_film_map(
     The error of the interpolation is not computed. The attribute `error` of the map is the constant `COARSE_ERROR`.
 
     Args:
-        sensor: Sensor with an axisymmetric film.
+        sensor: The sensor.
         probe: Probe that presses the film.
         force_range: Smallest and largest force, N.
         executor: Executor that runs the solves; None for this process.
@@ -75,11 +72,11 @@ def whole_film_map(
     theory = Theory(stretching=True, bending=True, pretensioned=film.pretension != 0.0)
     min_force, max_force = force_range
     middle_force = float(np.sqrt(min_force * max_force))
-    template = template_for(probe, COARSE_RESOLUTION)
+    template = template_for(probe, COARSE_RESOLUTION, whole=not film.is_axisymmetric)
     layer = min(layer_for(film, middle_force), widest_smooth_layer(template, probe, domain.radius, film.radius))
     settings = SolveSettings(theory=theory, resolution=COARSE_RESOLUTION, layer=layer)
 
-    family = Family.spread(domain, film.radius, (DISTANCES, FORCES), probe.period, ROTATIONS)
+    family = Family.spread(domain, film, probe, NODE_COUNT)
     solved_stress = family.solve(sensor, probe, settings, executor)
     table = family.unfold(solved_stress, template)
     return ForwardMap(sensor, probe, family, theory, COARSE_RESOLUTION, layer, table, COARSE_ERROR)

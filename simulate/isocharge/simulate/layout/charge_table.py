@@ -10,6 +10,8 @@ The equilibrium is solved for presses at a few distances from the centre. In `di
 Chebyshev nodes. The stress and its derivatives are stored on a polar grid in z. The derivatives are computed by finite
 differences. The rows of the grid are equally spaced in |z| within the circle, and equally spaced in ln|z| between the
 circle and the rim. Between the solved distances, the table is interpolated by polynomials in the distance coordinate.
+If the film is not axisymmetric, presses are also solved in several directions from the centre, and the table is
+interpolated by a trigonometric polynomial in the direction.
 Between the nodes of the grid, the table is interpolated by local cubic polynomials. The charge of an electrode is its
 area times the mean charge per area.
 """
@@ -18,21 +20,25 @@ import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
+from isocharge.simulate.forward.family import DIRECTION_PERIOD
 from isocharge.simulate.forward.readout import electrode_rule
 from isocharge.simulate.mechanics.theory import theory_for
 from isocharge.simulate.mesh.conformal_map import automorphism_onto, distance_coordinate
+from isocharge.simulate.mesh.placed_mesh import film_oval, from_oval, to_oval
 from isocharge.simulate.numerics.interpolation import (
     barycentric_weights,
     chebyshev_nodes,
     cubic_weights,
     gauss_square,
     lagrange_values,
+    periodic_weights,
 )
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.probe import Circle
@@ -81,6 +87,9 @@ N_DISTANCES = 5
 N_DISTANCES_WIDE = 8
 """Number of solved distances if the largest distance of a press is above `WIDE_RADIUS`."""
 
+N_DIRECTIONS = 7
+"""Number of solved directions within half a turn, if the film is not axisymmetric."""
+
 GAUSS_RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
 """Integration rules of squares in ascending order of the distance between the square and the press.
 
@@ -103,19 +112,23 @@ class ChargeTable:
     The presses may lie anywhere in a disk around the centre of the film.
 
     Attributes:
-        film_radius: Radius of the film, mm.
+        film: Film that is pressed.
         probe: Circular probe that presses the film.
         piezo: Piezoelectric coefficients d31 and d32, pC/N.
         distance: Distances of the solved presses from the centre of the film, shape (n_distance,), mm.
+        direction: Directions from the centre of the film to the solved presses, evenly spaced over half a turn, shape
+            (n_direction,), rad. An axisymmetric film has a single direction.
         stress: Stress (s11, s22, s12) in MPa and its derivatives in the frame of the press, at the nodes of the polar
-            grid. The array has the shape (n_distance * 3, n_node * 6) and single precision. The first axis contains the
-            stress components of each distance. The second axis contains the `COLUMNS` of each node.
+            grid. The array has the shape (n_distance * n_direction * 3, n_node * 6) and single precision. The first
+            axis contains the stress components of each solved position. The second axis contains the `COLUMNS` of each
+            node.
     """
 
-    film_radius: float
+    film: Film
     probe: Circle
     piezo: tuple[float, float]
     distance: Array
+    direction: Array
     stress: np.ndarray
 
     @classmethod
@@ -146,14 +159,17 @@ class ChargeTable:
         n_distance = N_DISTANCES_WIDE if is_wide else N_DISTANCES
         largest_coordinate = float(distance_coordinate(radius / film.radius))
         distance = film.radius * np.tanh(chebyshev_nodes(n_distance, 0.0, largest_coordinate))
+        n_direction = 1 if film.is_axisymmetric else N_DIRECTIONS
+        direction = DIRECTION_PERIOD * np.arange(n_direction) / n_direction
+        presses = list(product(distance.tolist(), direction.tolist()))
         solve = partial(_stress_at, film, sensor.surface, probe, force, settings)
-        stresses = list(track(in_order(executor, solve, distance.tolist()), "solving the film", n_distance))
+        stresses = list(track(in_order(executor, solve, presses), "solving the film", len(presses)))
 
         # A column is one of the quantities in `COLUMNS`: the stress itself, or one of its derivatives. The axes
-        # (distance, column, node, stress component) become (distance, stress component, node, column).
+        # (press, column, node, stress component) become (press, stress component, node, column).
         component_before_node = np.stack(stresses).transpose(0, 3, 2, 1)
-        stress = component_before_node.reshape(3 * n_distance, -1).astype(np.float32)
-        return cls(film.radius, probe, (sensor.piezo.d31, sensor.piezo.d32), distance, stress)
+        stress = component_before_node.reshape(3 * len(presses), -1).astype(np.float32)
+        return cls(film, probe, (sensor.piezo.d31, sensor.piezo.d32), distance, direction, stress)
 
     def rows(self, presses: Array, centres: Array, side: float, others: tuple[Electrode, ...] = ()) -> Array:
         """Compute the charges of square and other electrodes under presses, and the derivatives of these charges.
@@ -212,23 +228,25 @@ class _PressedFilm:
         """
         position = presses @ np.array([1.0, 1j])  # x + iy
         direction = np.exp(1j * np.angle(position))  # unit vector from the centre of the film to the press
-        relative_distance = np.abs(position) / table.film_radius
+        relative_distance = np.abs(position) / table.film.radius
 
-        # Compute the weights that interpolate between the distances of the table, shape (n, n_distance).
-        nodes = distance_coordinate(table.distance / table.film_radius)
+        # Compute the weights that interpolate between the solved presses, shape (n, n_distance * n_direction).
+        nodes = distance_coordinate(table.distance / table.film.radius)
         coordinate = distance_coordinate(relative_distance)
         distance_weights = lagrange_values(nodes, barycentric_weights(nodes), coordinate)
+        direction_weights = periodic_weights(table.direction, DIRECTION_PERIOD, np.angle(position))
+        press_weights = (distance_weights[:, :, None] * direction_weights[:, None, :]).reshape(len(position), -1)
 
         # Compute the coefficients that convert the three stress components into charge per area, shape (n, 3).
         coefficients = _piezo_in_press_frame(table.piezo, direction)
 
         # One matrix product interpolates the stress and converts it into charge per area, for all nodes of the grid.
-        weights = distance_weights[:, :, None] * coefficients[:, None, :]  # shape (n, n_distance, 3)
+        weights = press_weights[:, :, None] * coefficients[:, None, :]  # shape (n, n_distance * n_direction, 3)
         flat_weights = weights.reshape(len(position), -1).astype(np.float32)
         density = (flat_weights @ table.stress).reshape(-1, len(COLUMNS))  # shape (n * n_node, 6)
 
         # Compute the conformal map of each press, which transforms the edge of the probe into the circle |z| = r0.
-        relative_radius = np.full(len(position), table.probe.radius / table.film_radius)
+        relative_radius = np.full(len(position), table.probe.radius / table.film.radius)
         map_parameter, circle_radius = automorphism_onto(relative_distance, relative_radius)
         return cls(table, position, direction, map_parameter, circle_radius, density)
 
@@ -359,7 +377,10 @@ class _PressedFilm:
         # Compute the coordinate z of the conformal map of the press, which maps the footprint onto the disk |z| <= r0.
         map_parameter = self.map_parameter[press_index, None]
         circle_radius = self.circle_radius[press_index, None]
-        relative_points = points / self.table.film_radius
+        relative_points = points / self.table.film.radius
+        if self.table.film.oval:
+            oval = film_oval(self.table.film, np.angle(self.direction[press_index, None]))
+            relative_points = from_oval(relative_points, oval)
         unit_points = relative_points / np.maximum(np.abs(relative_points), 1.0)  # moves points beyond the rim
         z = (unit_points - map_parameter) / (1.0 - map_parameter * unit_points)
         radius = np.abs(z)
@@ -424,9 +445,9 @@ def _row_weights(fractional_row: Array) -> tuple[Integers, Array]:
 
 
 def _stress_at(
-    film: Film, surface: Surface, probe: Circle, force: float, settings: SolveSettings, distance: float
+    film: Film, surface: Surface, probe: Circle, force: float, settings: SolveSettings, polar: tuple[float, float]
 ) -> Array:
-    """For a press on the positive x axis, compute the stress and its derivatives on the polar grid.
+    """Compute the stress under a press and its derivatives on the polar grid, in the frame of the press.
 
     The derivatives are computed by finite differences between solved presses.
 
@@ -436,12 +457,15 @@ def _stress_at(
         probe: Circular probe that presses the film.
         force: Force of the press, N.
         settings: Theory and mesh of the solves.
-        distance: Distance of the press from the centre, mm.
+        polar: Distance of the press from the centre, mm, and direction from the centre to the press, rad.
 
     Returns:
         Stress (s11, s22, s12) in MPa, and its derivatives in the order of `COLUMNS`, shape (6, n_node, 3).
     """
-    points = _grid_points(film.radius, probe.radius, distance)
+    # Instead of the press, the film is rotated, so that the press lies on the positive x axis.
+    distance, direction = polar
+    film = film.rotated(-direction)
+    points = _grid_points(film, probe.radius, distance)
     unchanged_press = press(film, probe, (distance, 0.0), force, settings)
 
     def changed_stress(
@@ -496,7 +520,7 @@ def _stress_at(
     )
 
 
-def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Array:
+def _grid_points(film: Film, probe_radius: float, distance: float) -> Array:
     """For a press on the positive x axis, compute the points of the polar grid.
 
     The grid is polar in the coordinate z of a conformal map. The conformal map transforms the edge of the probe into a
@@ -504,7 +528,7 @@ def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Ar
     spaced in ln|z| outside the circle.
 
     Args:
-        film_radius: Radius of the film, mm.
+        film: Film, rotated with the press.
         probe_radius: Radius of the probe, mm.
         distance: Distance of the press from the centre, mm.
 
@@ -512,8 +536,8 @@ def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Ar
         Points (x, y) on the film, row by row, shape (n_node, 2), mm.
     """
     # Create the grid in the plane of z, with a small gap on both sides of the circle |z| = r0.
-    relative_distance = np.array(distance / film_radius)
-    relative_radius = np.array(probe_radius / film_radius)
+    relative_distance = np.array(distance / film.radius)
+    relative_radius = np.array(probe_radius / film.radius)
     map_parameter, circle_radius = automorphism_onto(relative_distance, relative_radius)
     inner_radii = circle_radius * (1.0 - MARGIN) * np.linspace(0.0, 1.0, INNER_ROWS)
     outer_radii = (circle_radius * (1.0 + MARGIN)) ** np.linspace(1.0, 0.0, OUTER_ROWS)  # ends at 1, which is the rim
@@ -524,5 +548,5 @@ def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Ar
     # Map the grid onto the film by the inverse of the conformal map z = (p - c) / (1 - c p) of a point p. The
     # last factor keeps the outermost points on the film despite rounding errors.
     unit_points = ((z + map_parameter) / (1.0 + map_parameter * z)).ravel()
-    points = film_radius * unit_points * (1.0 - 1e-12)
+    points = film.radius * to_oval(unit_points * (1.0 - 1e-12), film_oval(film, 0.0))
     return np.stack([points.real, points.imag], axis=1)

@@ -255,8 +255,17 @@ def place(
     direction = float(np.arctan2(y, x))
     distance = np.array(np.hypot(x, y))
     placement = Placement.of(template, probe.rotated(-direction), distance, film.radius, layer)
-    oval = film.oval * np.exp(2j * (film.oval_axis - direction))
-    return PlacedMesh(template, placement, layer, oval)
+    return PlacedMesh(template, placement, layer, complex(film_oval(film, direction)))
+
+
+def film_oval(film: Film, direction: float | Array) -> Complexes:
+    """Return the shape of the clamp in the frame of a press; see `PlacedMesh.oval`.
+
+    Args:
+        film: The film.
+        direction: Direction from the centre of the film to the press, any shape, rad.
+    """
+    return np.asarray(film.oval * np.exp(2j * (film.oval_axis - direction)))
 
 
 def to_oval(points: Complexes, oval: complex) -> Complexes:
@@ -279,19 +288,20 @@ def to_oval(points: Complexes, oval: complex) -> Complexes:
     return np.asarray(points * (1.0 + _displacement_ratio(radius) * rim_displacement))
 
 
-def from_oval(points: Complexes, oval: complex) -> Complexes:
+def from_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
     """Convert points of an oval film into points of a circular film. This function is the inverse of `to_oval`.
 
     The radius of each point on the circular film is computed by Newton's method with an approximate slope.
 
     Args:
         points: Points x + iy of the oval film, any shape, in film radii.
-        oval: Shape e exp(2 i alpha) of the clamp; see `PlacedMesh`.
+        oval: Shape e exp(2 i alpha) of the clamp, a number or an array that broadcasts with the points; see
+            `PlacedMesh`.
 
     Returns:
         Points x + iy of the circular film, same shape, in film radii.
     """
-    if oval == 0.0:
+    if not np.any(oval):
         return points
     oval_radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
     rim_displacement = (np.conj(oval) * (points / oval_radius) ** 2).real  # e cos(2 (angle - alpha))

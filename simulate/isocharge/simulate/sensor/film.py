@@ -1,8 +1,8 @@
 """Mechanical properties and piezoelectric coefficients of the film."""
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, Self
 
 from isocharge.common.errors import SensorError
 from isocharge.simulate.sensor.size_check import check_length, check_stress
@@ -132,6 +132,20 @@ class Film:
     def is_axisymmetric(self) -> bool:
         """Whether the properties of the film remain unchanged if the film is rotated about its centre."""
         return not self.is_anisotropic and self.oval == 0.0
+
+    def rotated(self, angle: float) -> Self:
+        """Return the film after a rotation about its centre.
+
+        Args:
+            angle: Angle of the rotation, anticlockwise, rad.
+        """
+        if self.is_axisymmetric:
+            return self
+        half_difference, shear = self.deviator
+        cosine = math.cos(2.0 * angle)
+        sine = math.sin(2.0 * angle)
+        deviator = (half_difference * cosine - shear * sine, half_difference * sine + shear * cosine)
+        return replace(self, deviator=deviator, axis=self.axis + angle, oval_axis=self.oval_axis + angle)
 
     def __post_init__(self) -> None:
         """Check the properties of the film.

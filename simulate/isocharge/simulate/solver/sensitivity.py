@@ -66,12 +66,19 @@ def _tension_imperfection(direction: tuple[float, float, float]) -> AddImperfect
 
     def add_tension(solved: Equilibrium, value: float) -> Equilibrium:
         """Return the equilibrium with `value` units of additional tension."""
-        # The film of `solved` is isotropic, so this is its only anisotropy.
         unit = 1.0 + solved.groups.tension  # divided by E A^2, like all tensions in `groups`
-        anisotropy = Anisotropy(moduli=np.zeros((3, 3)), tension=value * unit * np.array(direction))
-        return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
+        anisotropy = _anisotropy(solved)
+        tension = anisotropy.tension + value * unit * np.array(direction)
+        return replace(solved, groups=replace(solved.groups, anisotropy=replace(anisotropy, tension=tension)))
 
     return add_tension
+
+
+def _anisotropy(solved: Equilibrium) -> Anisotropy:
+    """Return the direction-dependent properties of the film of an equilibrium, which are zero for an isotropic film."""
+    if solved.groups.anisotropy is None:
+        return Anisotropy(moduli=np.zeros((3, 3)), tension=np.zeros(3))
+    return solved.groups.anisotropy
 
 
 def _stiffness_imperfection(angle: float) -> AddImperfection:
@@ -93,8 +100,9 @@ def _stiffness_imperfection(angle: float) -> AddImperfection:
         # Rotate the change into the frame of the press.
         rotation = stress_rotation(angle)
         moduli_change = rotation @ change_in_film_axes @ rotation.T
-        anisotropy = Anisotropy(moduli=moduli_change, tension=np.zeros(3))
-        return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
+        anisotropy = _anisotropy(solved)
+        moduli = anisotropy.moduli + moduli_change
+        return replace(solved, groups=replace(solved.groups, anisotropy=replace(anisotropy, moduli=moduli)))
 
     return add_stiffness
 
@@ -125,7 +133,7 @@ def _oval_imperfection(direction: complex) -> AddImperfection:
 
     def add_oval(solved: Equilibrium, value: float) -> Equilibrium:
         """Return the equilibrium of a film whose oval clamp has the parameter `value`."""
-        return replace(solved, mesh=replace(solved.mesh, oval=value * direction))
+        return replace(solved, mesh=replace(solved.mesh, oval=solved.mesh.oval + value * direction))
 
     return add_oval
 
@@ -214,7 +222,7 @@ def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array
     corresponding side force in N.
 
     Args:
-        solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
+        solved: Press with a circular probe, solved with a theory that includes stretching.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
@@ -231,7 +239,7 @@ def tension_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
     Young's modulus and A is the amplitude of the press.
 
     Args:
-        solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
+        solved: Press with a circular probe, solved with a theory that includes stretching.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
@@ -301,7 +309,7 @@ def _change_by_imperfection(
 
     # The nodes of an oval film move with the rim. Subtract the change of the stress that the movement of the nodes
     # causes, so that the result holds for fixed points of the film.
-    if positive_press.mesh.oval != 0.0:
+    if positive_press.mesh.oval != negative_press.mesh.oval:
         # Derivative of the positions x + iy of the nodes, shape (n_element, n_local)
         node_shift = (positive_press.mesh.points - negative_press.mesh.points) / (2.0 * STEP)
         stress_gradient = solved.mesh.node_derivatives(nodal_stress(solved, surface))
