@@ -268,7 +268,7 @@ def film_oval(film: Film, direction: float | Array) -> Complexes:
     return np.asarray(film.oval * np.exp(2j * (film.oval_axis - direction)))
 
 
-def to_oval(points: Complexes, oval: complex) -> Complexes:
+def to_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
     """Convert points of a circular film into points of an oval film.
 
     Each point is displaced in the radial direction. Points within `UNDEFORMED_RADIUS` remain unchanged. The point of
@@ -281,7 +281,7 @@ def to_oval(points: Complexes, oval: complex) -> Complexes:
     Returns:
         Points x + iy of the oval film, same shape, in film radii.
     """
-    if oval == 0.0:
+    if not np.any(oval):
         return points
     radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)  # the displacement ratio is zero at `UNDEFORMED_RADIUS`
     rim_displacement = (np.conj(oval) * (points / radius) ** 2).real  # e cos(2 (angle - alpha))
