@@ -159,6 +159,19 @@ def test_systemd_analyze_accepts_the_units(tmp_path, names):
     assert "/nowhere/isocharge" in verified(unit)[1]  # so verify has read this file
 
 
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
+def test_the_page_states_the_exposure_of_the_units(tmp_path):
+    page = (ROOT / "serve/docs/systemd.md").read_text("utf-8")
+    tls = ["isocharge.service", "isocharge.service.d/tls.conf"]
+    for number, names in enumerate((tls, tls[:1], ["isocharge-stream.service"])):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        words = ["systemd-analyze", "security", "--offline=true", installed_unit(folder, names)]
+        report = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False).stdout
+        exposure, word = re.findall(r"exposure level for .*: ([\d.]+) (\w+)", report)[0]
+        assert re.search(rf"as {re.escape(exposure)}( of 10)? \({word}\)", page)
+
+
 def unit_command(name):
     """The words of the command of a unit, without the program."""
     return shlex.split(re.findall(r"^ExecStart=(\S.*)$", (SYSTEMD / name).read_text(), re.MULTILINE)[0])[1:]
@@ -214,6 +227,7 @@ def test_the_compose_file_agrees_with_the_schema_of_compose():
     for path in (COMPOSE, DEPLOY / "monitoring/compose.yaml"):
         content = yaml.safe_load(path.read_text())
         jsonschema_rs.validate(schema, content)
+        assert all({"mem_limit", "pids_limit"} <= service.keys() for service in content["services"].values())
         content["services"][next(iter(content["services"]))]["prots"] = []
         assert not jsonschema_rs.is_valid(schema, content)
 
@@ -243,6 +257,13 @@ def test_every_image_is_pinned():
         assert re.fullmatch(r"[\w./-]+:[\w.-]+@sha256:[0-9a-f]{64}", image), image
 
 
+def test_every_action_of_a_workflow_is_pinned_by_its_commit():
+    workflows = "".join(path.read_text() for path in (ROOT / ".github/workflows").iterdir())
+    actions = re.findall(r"uses: (\S+)", workflows)
+    assert actions
+    assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", action) for action in actions)
+
+
 def test_the_manifests_with_and_without_kserve_run_the_same_container():
     """And the Service and the PodDisruptionBudget without KServe select the pods of the Deployment."""
     kserve = yaml.safe_load((DEPLOY / "kserve/inference_service.yaml").read_text())["spec"]["predictor"]
@@ -252,6 +273,7 @@ def test_the_manifests_with_and_without_kserve_run_the_same_container():
     (kserve_container,) = kserve["containers"]
     assert container | {"name": "kserve-container"} == kserve_container
     assert pod["securityContext"] == kserve["securityContext"]
+    assert pod["automountServiceAccountToken"] is kserve["automountServiceAccountToken"] is False
     labels = deployment["spec"]["template"]["metadata"]["labels"]
     assert labels == deployment["spec"]["selector"]["matchLabels"]
     assert labels == service["spec"]["selector"]
