@@ -88,7 +88,8 @@ def http_command(
         store = open_model_store(models)
         for reason in store.refusals():
             _report(traffic, "warning", "refused", reason)
-        handler = Handler(store, traffic=traffic, token=secret, browser_check=browser_check)
+        scheme = "https" if tls else "http"
+        handler = Handler(store, traffic=traffic, token=secret, browser_check=browser_check, scheme=scheme)
         server = HttpServer(handler, address, tls=tls)
         with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:  # empty without gRPC
             labels = [loaded.metadata.label for loaded in store.loaded_versions()]

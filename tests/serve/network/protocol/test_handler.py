@@ -6,6 +6,7 @@ schemathesis creates valid and invalid requests from the OpenAPI document, and c
 import base64
 import gzip
 import hashlib
+import html
 import re
 import tracemalloc
 import zlib
@@ -27,7 +28,7 @@ from schemathesis.specs.openapi.checks import (
 )
 
 from isocharge.common.errors import InputError
-from isocharge.serve.network.address import ServerLimits
+from isocharge.serve.network.address import ServerLimits, Token
 from isocharge.serve.network.protocol import Handler, routes
 from isocharge.serve.network.protocol.response import compress, decompress
 
@@ -417,19 +418,45 @@ def test_model_metadata_equal_those_of_the_file(ask, store):
     assert properties == store.get("linear").metadata.to_props()
 
 
-def test_start_page_lists_models_with_their_cards(ask, store, tmp_path):
-    (tmp_path / "models/linear/2/card.md").write_text("# Card\n\n<script>x</script>\n")
+def test_start_page_links_each_model_to_its_card(ask, store):
     page = ask("GET", "/")[2].decode()
-    parts = "<article>", "<pre># The linear film", "&lt;script&gt;x&lt;/script&gt;"
-    assert [page.count(part) for part in parts] == [2, 1, 1]
+    links = re.findall('href="(v2/models/[^"]*/card)"', page)
+    assert len(links) == len(store.loaded_versions())
+    for link in links:
+        status, headers, body = ask("GET", f"/{link}")
+        assert (status, headers["content-type"]) == (200, "text/plain; charset=utf-8")
+        assert body.startswith(b"# The linear film")
+    assert all(f"<code>{name}</code>" in page for name in ("contact", "flags"))
+    (store.get("linear").model.folder / "card.md").unlink()
+    assert refusal(ask("GET", "/v2/models/linear/card"))[0] == 404
     store.unload("linear")
     assert "No model is loaded" in ask("GET", "/")[2].decode()
 
 
 def test_example_of_the_start_page_runs(ask):
-    page = ask("GET", "/")[2].decode()
-    body = page.split("-d &#x27;")[1].split("&#x27;")[0].replace("&quot;", '"')
+    page = html.unescape(ask("GET", "/", host="127.0.0.1:8000")[2].decode())
+    assert "curl 'http://127.0.0.1:8000/v2/models/linear/infer' -d '" in page
+    body = page.split("-d '")[1].split("'")[0]
     assert ask("POST", INFER, body.encode())[0] == 200
+
+
+def test_host_of_a_request_cannot_change_the_example_of_the_start_page(store):
+    handler = Handler(store, token=Token("sesame"))  # accepts any host
+    headers = [(b"host", b"x';reboot;'"), (b"authorization", b"Bearer sesame")]
+    page = handler.answer("GET", "/", headers, b"").body
+    assert b"reboot" not in page
+    assert b"Bearer $ISOCHARGE_TOKEN" in page
+
+
+def test_browser_without_the_token_receives_a_page_that_asks_for_it(store):
+    handler = Handler(store, token=Token("sesame"))
+    for path in ("/", "/v2/models/linear/card", "/nope"):
+        status, headers, body, error = handler.answer("GET", path, [(b"accept", b"text/html,*/*")], b"")
+        assert (status, dict(headers)[b"content-type"], error) == (401, b"text/html; charset=utf-8", "TokenError")
+        script = body.split(b"<script>")[1].split(b"</script>")[0]
+        digest = base64.b64encode(hashlib.sha256(script).digest())
+        assert b"script-src 'sha256-%s'" % digest in dict(headers)[b"content-security-policy"]
+        assert handler.answer("GET", path, [], b"").body.startswith(b'{"error":')
 
 
 def test_start_page_forbids_scripts_and_loading(ask):
@@ -485,9 +512,9 @@ def test_server_conforms_to_its_openapi_document(operations, mode):
 
 def test_start_page_begins_with_an_example_request(ask):
     _, _, body = ask("GET", "/")
-    html = body.decode()
-    assert html.index("curl $SERVER/v2/models/linear/infer") < html.index("<article>")
-    assert html.index("x_mm, y_mm, force_N: position (mm) and force (N") < html.index("<article>")
+    assert (
+        body.index(b"curl ") < body.index(b"x_mm, y_mm, force_N: position (mm) and force (N") < body.index(b"<table>")
+    )
 
 
 def test_openapi_describes_each_output(ask):

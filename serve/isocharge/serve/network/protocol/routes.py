@@ -24,7 +24,7 @@ from isocharge.serve.network.protocol.inference import (
     read_object,
     write_answer,
 )
-from isocharge.serve.network.protocol.page import PAGE_HEADERS, page
+from isocharge.serve.network.protocol.page import PAGE_HEADERS, card, page
 from isocharge.serve.network.protocol.response import Response, compress, json_response, response_of
 
 Json = dict[str, Any]
@@ -38,12 +38,14 @@ class Service(NamedTuple):
         limits: Limits of the size of a body and of a batch.
         metrics: Counters of the server in the format of Prometheus.
         openapi: Function that returns the OpenAPI document.
+        scheme: Scheme of the address of the server, which is "http" or "https".
     """
 
     store: ModelStore
     limits: ServerLimits
     metrics: Metrics
     openapi: Callable[[], Json]
+    scheme: str = "http"
 
 
 class Request(NamedTuple):
@@ -202,7 +204,17 @@ EXAMPLE = {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3],
 
 def _show_page(request: Request) -> Response:
     """Return the start page of the server."""
-    response = response_of(200, b"text/html; charset=utf-8", page(request.service.store).encode())
+    service = request.service
+    host = request.headers.get(b"host", b"").decode("latin-1")
+    has_token = b"authorization" in request.headers  # the token was checked if the server has one
+    text = page(service.store, f"{service.scheme}://{host}", has_token=has_token)
+    response = response_of(200, b"text/html; charset=utf-8", text.encode())
+    response.headers.extend(PAGE_HEADERS)
+    return response
+
+
+def _show_card(request: Request) -> Response:
+    response = response_of(200, b"text/plain; charset=utf-8", card(request.loaded.model).encode())
     response.headers.extend(PAGE_HEADERS)
     return response
 
@@ -385,6 +397,14 @@ ROUTES: tuple[Route, ...] = (
         respond=_is_model_ready,
         summary="Whether a model is loaded",
         answer=ANY,
+    ),
+    Route(
+        method="GET",
+        paths=model_paths("/card"),
+        respond=_show_card,
+        summary="Card of a model, in Markdown",
+        answer=PLAIN_TEXT,
+        answer_type="text/plain",
     ),
     Route(
         method="GET",
