@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from itertools import chain, pairwise
 
 import numpy as np
@@ -22,6 +23,7 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from boards import TcpBoard, interrupt, taps
+from isocharge.cli.serve.records import write_records
 from isocharge.common.errors import InputError
 from isocharge.serve import Predictor, Recording, Script, VirtualSensor
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
@@ -190,6 +192,17 @@ def test_stream_that_waits_for_its_port_can_be_stopped(models, tmp_path, run, st
     assert f"{tmp_path / 'film'}: the command was stopped before the port was open" in result.stderr
     assert time.monotonic() - start_s < 10.0
     assert list(tmp_path.iterdir()) == []
+
+
+def test_new_tare_is_announced_once(record, capsys):
+    """A frame with `nan` or `ovf` has no tare, and a tare that follows a drift changes in each frame."""
+    records = []
+    for tare_pC in (None, {"A": 1.0}):
+        records += [record(tare_pC=None, flags=("tare",))] * 3
+        records += [record(tare_pC={"A": 0.1 * number}, flags=()) for number in range(3)]
+        records += [record(tare_pC=None, flags=("invalid",)), record(tare_pC=tare_pC, flags=())]
+    write_records(records, [], deque())
+    assert capsys.readouterr().err.count("tared: ") == 2
 
 
 def test_stream_without_frames_that_is_stopped_by_ctrl_c_exits_with_0(models, run):

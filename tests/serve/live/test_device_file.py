@@ -132,7 +132,7 @@ def test_device_file_with_a_request(device):
 WRONG = [
     ('[frames]\nrequest = "hello"\n', r"frames\.request: expected bytes in hexadecimal, as in '20 4E', got 'hello'"),
     ('[frames]\nrequest = "3F"\nrequest_Hz = 0\n', r"frames\.request_Hz: expected a number above 0"),
-    ("[gain]\noffset = 1\n", "key 'gain.pC_per_unit' is missing"),
+    ("[gain]\noffset = 1\n", r"gain\.pC_per_unit: expected .*, or V_per_unit and feedback_pF .*, got \['offset'\]"),
     ("[gain]\nV_per_unit = 1.0\n", "key 'gain.feedback_pF' is missing"),
     ("[gain]\nV_per_unit = 1.0\nfeedback_pF = 0\n", r"gain\.feedback_pF: expected a positive number or a table, got 0"),
     ("[gain]\nV_per_unit = 1.0\npC_per_unit = 1.0\n", r"gain\.V_per_unit: expected either pC_per_unit, or"),
@@ -140,6 +140,7 @@ WRONG = [
     ("[gane]\n", r"unknown key 'gane'; did you mean 'gain'\? Known are name, frames, channels, gain"),
     ("[tare]\nframe = 50\n", r"unknown key 'tare.frame'; did you mean 'frames'\? Known are on, frames, noise_limit_pC"),
     ("[tare]\nframes = 50.5\n", r"tare\.frames: expected a whole number from 0 to 1000000000, got 50\.5"),
+    ("[tare]\nframes = 3000\n", r"tare\.patience: expected at least the 3000 frames of a tare, or 0 .*, got 2000"),
     ("[tare]\npatience = 2000000000\n", r"tare\.patience: expected a whole number from 0 to 1000000000"),
     ("[tare]\non = 1\n", r"tare\.on: expected true or false, got 1"),
     ("[touch]\nfloor_pC = -3\n", r"touch\.floor_pC: expected a number from 0 to .*, got -3"),
@@ -147,7 +148,7 @@ WRONG = [
     ("[hum]\nsettle_s = 0\n", r"hum\.settle_s: expected a number from 0\.001 to 1"),
     ("[leak]\ntau_s = 1.0\nrelax_s = 1e-300\n", r"leak\.relax_s: expected a number from 0\.001 to 1"),
     ("[common_mode]\nblind_pC = 1e300\n", r"common_mode\.blind_pC: expected a number from 0 to 1"),
-    ("[gain]\n", "key 'gain.pC_per_unit' is missing"),
+    ("[gain]\n", r"gain\.pC_per_unit: expected .*, or V_per_unit and feedback_pF .*, got \[\]"),
     (
         "[gain]\npC_per_unit = 0\n",
         r"gain\.pC_per_unit: expected a finite number that is not 0, or one for each electrode, got 0",

@@ -5,8 +5,8 @@ import pytest
 from mcap.writer import Writer
 from pyarrow.parquet import write_table
 
-from isocharge.common.errors import InputError
-from isocharge.serve import Frame, Port, Recorder, TouchStream, encode_text, open_source
+from isocharge.common.errors import InputError, RecordingError
+from isocharge.serve import Frame, Port, Recorder, Recording, TouchStream, encode_text, open_source
 from isocharge.serve.port.source import Chunk, FileSource
 from isocharge.serve.record.csv_rows import csv_header
 
@@ -96,3 +96,10 @@ def test_file_of_bytes_is_refused_as_a_port(tmp_path):
     path.write_bytes(b"\x01\x02")
     with pytest.raises(InputError, match="expected a port, got a file; only `isocharge serve stream`"), Port(str(path)):
         pass
+
+
+def test_replay_of_an_mcap_file_names_the_kind_of_the_file(tmp_path):
+    path = tmp_path / "touch.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + bytes(range(256)))
+    with pytest.raises(RecordingError, match=r"got an MCAP file; MCAP files hold results.*serve replay touch\.rec"):
+        Recording(path)

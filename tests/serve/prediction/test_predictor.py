@@ -1,7 +1,10 @@
 """Predictions equal those of a plain onnxruntime session, and arguments that are no charges are refused."""
 
+import copy
 import math
+import pickle
 import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 from decimal import Decimal
 
 import numpy as np
@@ -250,3 +253,23 @@ def test_repr_of_a_predictor_shows_its_domain(predictor):
     assert repr(predictor) == (
         "Predictor(linear/1: sensor linear-film, charges A B C (pC), positions up to 8 mm, forces 0.05 to 2 N)"
     )
+
+
+def test_predictor_answers_rightly_in_several_threads(film, predictor):
+    """One predictor is used by four threads at once, each with its own press."""
+    charges = film.charge_pC(np.linspace(-3.0, 3.0, 4), np.zeros(4), np.full(4, 0.5)).tolist()
+    expected = [predictor.predict(row) for row in charges]
+
+    def wrong_answers(number):
+        return sum(predictor.predict(charges[number]) != expected[number] for _ in range(300))
+
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(wrong_answers, range(4))) == [0] * 4
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_predictor_can_be_copied_and_pickled(film, predictor, copied):
+    charges = film.charge_pC([1.0], [2.0], [0.5])[0]
+    other = copied(predictor)
+    assert other.predict(charges) == predictor.predict(charges)
+    assert other._press is not predictor._press

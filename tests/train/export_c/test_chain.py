@@ -214,7 +214,7 @@ def test_second_tare_does_not_fail(build, restless_frames):
 
 def test_tare_that_is_too_long_for_c_is_refused():
     with pytest.raises(DeviceError, match=r"board: tare.frames: expected a whole number from 1 to 10000.*got 50000"):
-        device_header(device_from_table({"tare": {"frames": 50_000}}, "board"), ("A", "B", "C"))
+        device_header(device_from_table({"tare": {"frames": 50_000, "patience": 0}}, "board"), ("A", "B", "C"))
 
 
 FLOAT32 = st.floats(width=32, allow_nan=False)

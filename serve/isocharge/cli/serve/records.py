@@ -10,6 +10,7 @@ import typer
 
 from isocharge.cli.shared.terminal import say, stdout_is_ready, stdout_writer
 from isocharge.serve import PredictionRecord, TouchStream
+from isocharge.serve.flags import TARE
 from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.targets import Outputs, target_forms
 
@@ -61,15 +62,16 @@ def write_records(
         writers: Functions that write a record, which are called in their order.
         latencies: Queue to which the latency of each record is added, us.
     """
-    last_tare_pC = None
+    is_tare_new = True
     for record in records:
         for write in writers:
             write(record)
-        if record.tare_pC != last_tare_pC:
-            last_tare_pC = record.tare_pC
-            if last_tare_pC is not None:  # None until a tare is measured
-                tare_text = ", ".join(f"{electrode} {charge:.2f} pC" for electrode, charge in last_tare_pC.items())
-                say(f"tared: {tare_text}")
+        if TARE in record.flags:  # the tare is being measured
+            is_tare_new = True
+        elif is_tare_new and record.tare_pC is not None:  # an invalid record has no tare
+            is_tare_new = False
+            tare_text = ", ".join(f"{electrode} {charge:.2f} pC" for electrode, charge in record.tare_pC.items())
+            say(f"tared: {tare_text}")
         if record.latency_us is not None:
             latencies.append(record.latency_us)
 

@@ -99,7 +99,12 @@ class Gain(Rule, frozen=True, kw_only=True):
             raise WrongKey("feedback_pF")
 
         if self.per_unit is None:
-            raise WrongKey("pC_per_unit")  # the section contains neither form
+            given_keys = [] if self.offset is None else ["offset"]
+            raise WrongKey(
+                "pC_per_unit",
+                "the charge of one unit of the board, or V_per_unit and feedback_pF of its amplifiers",
+                given_keys,
+            )
         gains = self.per_unit.values() if isinstance(self.per_unit, dict) else [self.per_unit]
         if 0.0 in gains:
             key = "V_per_unit" if has_voltage else "pC_per_unit"

@@ -34,10 +34,20 @@ def refuse_foreign_file(name: str, head: bytes) -> None:
     Raises:
         InputError: If the file is of another kind. The message states the kind, and how to use such a file.
     """
+    kind = foreign_kind(name, head)
+    if kind:
+        raise InputError(f"{name}: expected a port, or a file of bytes from a board, got {kind}")
+
+
+def foreign_kind(name: str, head: bytes) -> str:
+    """Return the kind of a file that does not come from a board, with advice; empty if it may come from a board.
+
+    Args:
+        name: Path of the file, or - for the standard input.
+        head: First bytes of the file.
+    """
     kind_and_advice = _kind_and_advice(name, head)
-    if kind_and_advice is not None:
-        kind, advice = kind_and_advice
-        raise InputError(f"{name}: expected a port, or a file of bytes from a board, got {kind}; {advice}")
+    return "" if kind_and_advice is None else "; ".join(kind_and_advice)
 
 
 def _kind_and_advice(name: str, head: bytes) -> tuple[str, str] | None:

@@ -32,6 +32,7 @@ from isocharge.common.model_labels import ModelLabel
 from isocharge.common.printable_text import is_printable
 from isocharge.common.progress import report
 from isocharge.common.structs import WrongKey, parse_json
+from isocharge.serve.port.foreign_files import HEAD_BYTES, RECORDING_START, foreign_kind
 from isocharge.serve.port.source import Chunk
 
 VERSION = 1
@@ -218,6 +219,12 @@ class Recording:
         try:
             if not path.is_file():
                 raise RecordingError("there is no file of that name")
+            with path.open("rb") as binary_file:
+                head = binary_file.read(HEAD_BYTES)
+            if not head.startswith(RECORDING_START):
+                kind = foreign_kind(str(path), head)
+                if kind:
+                    raise RecordingError(f"got {kind}")
             with path.open(encoding="utf-8") as file:
                 first_line = next(bounded_lines(file, LONGEST_ENTRY), "")  # empty if the file is empty
             header = parse_json(first_line, "first line", RecordingError, _Header)

@@ -9,9 +9,10 @@ and writes the contact into an existing array, which is faster in a loop.
 """
 
 import logging
+import threading
 from collections.abc import Mapping, Sequence
-from copy import copy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
@@ -37,8 +38,10 @@ log = logging.getLogger(__name__)
 class Predictor:
     """A loaded model that computes contacts from charges.
 
-    `predict` and `predict_into` write into memory that the predictor allocates once. Each thread therefore needs its
-    own Predictor. `predict_batch` does not use this memory and may be called from any thread.
+    All methods may be called from any thread. `predict` and `predict_into` use memory that the predictor allocates
+    once, so that only one thread at a time executes them. Threads that must not wait for each other need their own
+    predictors. `predict_batch` does not use this memory. A predictor that is copied or unpickled is loaded again from
+    its folder.
 
     Attributes:
         folder: Version folder of the model.
@@ -72,6 +75,7 @@ class Predictor:
         self._graph = loaded.graph
         self._session = loaded.session
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
+        self._press_lock = threading.Lock()  # held while a method uses the memory of `_press`
         # The limits of implausible contacts are stored here, because `predict` compares them with every contact.
         self._centre_x_mm, self._centre_y_mm = self.validity.centre_mm
         self._max_distance_squared_mm2, self._max_force_N = self.validity.implausible_limits
@@ -90,11 +94,17 @@ class Predictor:
         Raises:
             ModelError: If the graph contains no constant with one of the names, or a new value has another shape.
         """
-        new_predictor = copy(self)
+        new_predictor = object.__new__(type(self))
+        new_predictor.__dict__.update(self.__dict__)
         new_predictor._constants = constants  # keeps the arrays alive, because onnxruntime uses their memory
         new_predictor._session = open_session(self._graph, self.metadata.label, constants)
         new_predictor._press = BoundPress(new_predictor._session, len(self.metadata.electrodes))
+        new_predictor._press_lock = threading.Lock()
         return new_predictor
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how `copy` and `pickle` create the predictor again, because the onnxruntime session has no copy."""
+        return _load_again, (type(self), self.folder.resolve(), dict(self._constants))
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
         """Compute the contact of one press. Call `flags` to find out whether the contact is valid.
@@ -109,12 +119,14 @@ class Predictor:
             ChargeError: If the number of charges is wrong, or a charge is not finite.
         """
         values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
-        # `write_finite` writes the charges, and returns False if it cannot convert them or a charge is not finite.
-        if not write_finite(self._press.write, values):
-            # The slow conversion `as_press` accepts more number types. Its errors name the electrode.
-            self._press.write(*as_press(charge_pC, self.metadata.electrodes))
-        self._press.run()
-        contact = Contact(*self._press.read())
+        press = self._press
+        with self._press_lock:
+            # `write_finite` writes the charges, and returns False if it cannot convert them or a charge is not finite.
+            if not write_finite(press.write, values):
+                # The slow conversion `as_press` accepts more number types. Its errors name the electrode.
+                press.write(*as_press(charge_pC, self.metadata.electrodes))
+            press.run()
+            contact = Contact(*press.read())
 
         # These lines repeat `Validity.is_beyond`, because a call would slow down the prediction.
         x_from_centre_mm = contact.x_mm - self._centre_x_mm
@@ -160,7 +172,8 @@ class Predictor:
             >>> touch.predict_into(charges, contact)  # doctest: +SKIP
         """
         try:
-            self._press.run_into(charge_pC, out)
+            with self._press_lock:
+                self._press.run_into(charge_pC, out)
         except (AttributeError, NotImplementedError, TypeError, ValueError) as error:
             raise ChargeError(
                 f"expected charges {self.metadata.electrodes} and a writable `out` of the {self._press.size} numbers "
@@ -218,6 +231,16 @@ class Predictor:
             contact.y_mm,
             contact.force_N,
         )
+
+
+def _load_again(predictor_class: type[Predictor], folder: Path, constants: Mapping[str, Singles]) -> Predictor:
+    """Load a predictor from its folder, with the constants of `with_constants` if there are any.
+
+    Raises:
+        ModelError: If the model is no longer in the folder, or is damaged.
+    """
+    predictor = predictor_class(folder)
+    return predictor.with_constants(constants) if constants else predictor
 
 
 def _describe(value: object) -> str:

@@ -5,7 +5,8 @@
 - `Gain` converts values of the device to charges in pC, with the offset, the sign and the gain of each channel.
 - `Limit` marks frames with a charge at the limit of the converter.
 - `HumStage` estimates and subtracts mains hum.
-- `TareStage` measures the mean and the noise of quiet frames, and subtracts the mean from all later frames.
+- `TareStage` measures the mean and the noise of quiet frames, and subtracts the mean from all later frames. Without the
+  next stage, the mean follows a slow drift while nothing touches the film.
 - `LeakStage` corrects the leak of the amplifiers, and estimates the inflow, a slow current into each amplifier. If the
   settings describe the memory of the film, `MemoryStage` replaces `LeakStage`, and also corrects creep, the
   thermoelastic step and the warmth of the film.
@@ -139,13 +140,13 @@ class SignalChain:
             stages.append(Limit(settings.limit_pC))
         if settings.hum is not None:
             stages.append(HumStage(settings.hum, n_electrode))
-        self._tare_stage = TareStage(settings.tare, n_electrode)
+        compensation = _leak_or_memory_stage(settings)
+        self._tare_stage = TareStage(settings.tare, n_electrode, follows_drift=compensation is None)
         stages.append(self._tare_stage)
 
         # The offset stage is the last stage that stores the charge at rest. The warming stage adds the charge of the
         # warming to this charge.
         offset_stage: OffsetStage = self._tare_stage
-        compensation = _leak_or_memory_stage(settings)
         if compensation is not None:
             stages.append(compensation)
             offset_stage = compensation

@@ -23,7 +23,7 @@ from isocharge.serve.signal_chain.memory import (
     undo_memory,
 )
 from isocharge.serve.signal_chain.stage import ChainFrame, OffsetStage, Stage, WarmingChange
-from isocharge.serve.signal_chain.tare import Tare, TareRule, look_for_tare
+from isocharge.serve.signal_chain.tare import Tare, TareRule, follow_drift, look_for_tare
 from isocharge.serve.signal_chain.thermal import NO_DRIFT, Misfit, ThermalRule, track_thermal_drift
 
 
@@ -98,14 +98,17 @@ class HumStage(Stage):
 class TareStage(OffsetStage):
     """Measures the charge at rest in quiet frames, and subtracts this charge from all later frames."""
 
-    def __init__(self, rule: TareRule | None, n_electrode: int) -> None:
+    def __init__(self, rule: TareRule | None, n_electrode: int, *, follows_drift: bool) -> None:
         """Begin without a tare.
 
         Args:
             rule: Conditions of a tare; None to subtract nothing.
             n_electrode: Number of electrodes.
+            follows_drift: Whether the tare follows a slow drift out of contact. False if a later stage integrates the
+                charge and estimates the drift itself.
         """
         self._rule = rule
+        self._follows_drift = follows_drift
         self._tare: Tare | None = None
         self._latest_pC = np.empty((0, n_electrode))  # charges of the latest frames, from which the tare is measured
         self._searched_frames = 0  # number of frames since the beginning of the search
@@ -119,6 +122,8 @@ class TareStage(OffsetStage):
     def step(self, frame: ChainFrame) -> None:
         """Subtract the tare, which is the charge at rest. While there is no tare, search for a tare.
 
+        While nothing touches the film, the tare follows a slow drift.
+
         The later stages skip a frame without a tare.
 
         Args:
@@ -128,6 +133,12 @@ class TareStage(OffsetStage):
             TareError: If the film is touched during the whole search for a tare.
         """
         if self._tare is not None:
+            if self._follows_drift and self._rule is not None:
+                if not frame.was_contact:
+                    self._tare = follow_drift(self._rule, self._tare, frame.charge_pC, frame.dt_s)
+                # The charge out of contact decays, but the charge of a finger that is leaving the film does not.
+                frame.base_relax_s = self._rule.relax_s
+                frame.is_base_held = True
             frame.tare = self._tare
             frame.charge_pC = frame.charge_pC - self._tare.charge_pC
             return

@@ -1,15 +1,18 @@
 """Measurement of the tare in quiet frames.
 
-The tare consists of the mean and the noise of the charge of each electrode.
+The tare consists of the mean and the noise of the charge of each electrode. While nothing touches the film, the tare
+follows a slow drift of the charge at rest.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import TareError
-from isocharge.serve.signal_chain.rule import Count, Rule, Setting
+from isocharge.common.structs import WrongKey
+from isocharge.serve.signal_chain.rule import Count, Rule, Setting, TimeConstant
 
 
 class TareRule(Rule, frozen=True, kw_only=True):
@@ -22,12 +25,24 @@ class TareRule(Rule, frozen=True, kw_only=True):
             more on a film of 25 um, the mean charge of three electrodes is larger. The tare therefore fails even if the
             press is held still.
         patience: Number of frames after which the search for quiet frames ends with an error; 0 for no limit.
+        relax_s: Time constant with which the tare follows a slow drift while nothing touches the film, s. The tare
+            changes by at most `noise_limit_pC / relax_s`, so that a touch does not change it noticeably.
     """
 
     frames: Count = 100
     noise_limit_pC: Setting = 5.0
     offset_limit_pC: Setting = 100.0
     patience: Count = 2000
+    relax_s: TimeConstant = 2.0
+
+    def __post_init__(self) -> None:
+        """Check that the search can find enough frames.
+
+        Raises:
+            WrongKey: If the search would end before it has the frames of a tare.
+        """
+        if 0 < self.patience < self.frames:
+            raise WrongKey("patience", f"at least the {self.frames} frames of a tare, or 0 for no limit", self.patience)
 
 
 class Tare(NamedTuple):
@@ -97,3 +112,21 @@ def measure_tare(rule: TareRule, raw_pC: Array) -> Tare:
             "rests there"
         )
     return tare
+
+
+def follow_drift(rule: TareRule, tare: Tare, charge_pC: Array, dt_s: float) -> Tare:
+    """Return the tare after a frame in which nothing touches the film.
+
+    The tare approaches the charge of the frame exponentially. Its rate is limited, so that a finger that rests lightly
+    on the film or is just arriving hardly changes it.
+
+    Args:
+        rule: Time constant, and the limit of the difference between the charge and the tare.
+        tare: The tare before the frame.
+        charge_pC: Charges of the frame, shape (electrodes,), pC.
+        dt_s: Time since the previous frame, s.
+    """
+    limit_pC = rule.noise_limit_pC
+    difference_pC = np.minimum(np.maximum(charge_pC - tare.charge_pC, -limit_pC), limit_pC)
+    share = -math.expm1(-dt_s / rule.relax_s)
+    return tare._replace(charge_pC=tare.charge_pC + share * difference_pC)

@@ -25,7 +25,13 @@ static real smaller(real a, real b) { return b < a ? b : a; }
 
 static real larger(real a, real b) { return b > a ? b : a; }
 
-#if ISOCHARGE_HUM || ISOCHARGE_LEAK
+#if ISOCHARGE_TARE_ON && !ISOCHARGE_LEAK
+#define TARE_FOLLOWS 1
+#else
+#define TARE_FOLLOWS 0
+#endif
+
+#if ISOCHARGE_HUM || ISOCHARGE_LEAK || TARE_FOLLOWS
 static real within(real value, real limit) { return smaller(larger(value, -limit), limit); }
 #endif
 
@@ -304,6 +310,18 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
 {
     real output_pC[N], *charge_pC = reading->charge_pC, total_pC = 0, decay = 1;
 
+#if TARE_FOLLOWS
+    const real kept = EXP(-dt_s / (real)ISOCHARGE_TARE_RELAX_S);
+    if (!chain->contact) {
+        EACH(k)
+        {
+            const real apart = quiet_pC[k] - chain->tare_pC[k];
+            chain->tare_pC[k] += (1 - kept) * within(apart, (real)ISOCHARGE_TARE_NOISE_LIMIT_PC);
+        }
+    }
+    if (chain->base_pC < 0)
+        decay = kept;
+#endif
     EACH(k)
     {
         reading->tare_pC[k] = chain->tare_pC[k];
