@@ -210,7 +210,7 @@ def test_device_text_has_lines_to_fill_in(gain, lines):
     text = device_text(examine_received(received(board), electrodes=("A", "B"), gain=gain))
     assert all(f"\n{line}" in text for line in lines)
     assert ("= ?" in text) == (not gain)
-    assert re.search(r"\n# text, CSV: 3 columns without names; 20[01] frames per second\n", text)
+    assert re.search(r"\n# text: 3 columns without names; 20[01] frames per second\n", text)
     assert "channels that no electrode uses: 3" in text
 
 

@@ -5,6 +5,7 @@ charges of the board.
 """
 
 import struct
+from pathlib import Path
 
 import crcmod.predefined
 import numpy as np
@@ -211,3 +212,25 @@ def test_header_of_a_csv_stream_becomes_part_of_the_device_file():
     parser = device_from_table({"frames": table, "channels": {"A": "south"}}, "test").parser()
     (*_, last) = parser.feed("\n".join(["", *lines[200:], ""]).encode())
     assert (last.seq, last.t_us, last.names) == (399, 798_000, ("north", "south"))
+
+
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parents[2] / "data" / "serial_text").glob("*.txt")), ids=lambda path: path.stem
+)
+def test_notations_of_public_firmware_are_text(path):
+    """At rest, the electrodes A, B and C have 3, -2 and 5 pC, with a noise of 1 pC."""
+    data = path.read_bytes()
+    table = recognise([data], 0.3)
+    assert table["format"] == "text"
+    frames = device_from_table({"frames": table}, "test").parser().feed(data)
+    assert len(frames) >= 58
+    values = np.array([frame.values for frame in frames])
+    np.testing.assert_allclose(values.mean(axis=0)[-3:], [3.0, -2.0, 5.0], atol=0.5)
+    assert values.shape[1] == 3
+
+
+@pytest.mark.parametrize("line", ["G1 X{:.1f}Y2Z3 ;layer", "no numbers {:.0f}x", "v1.2.{:.0f} <- ok"])
+def test_printable_bytes_are_never_a_binary_format(line):
+    rng = np.random.default_rng(0)
+    data = "".join(line.format(value) + "\r\n" for value in rng.normal(500, 100, 400)).encode()
+    assert (recognise([data], 1.0) or {"format": "text"})["format"] == "text"

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from isocharge.common.errors import shown
 from isocharge.common.printable_text import printable
 from isocharge.serve.examination.channel_health import MAINS_HZ, ChannelHealth
 from isocharge.serve.examination.held_press import HeldPress
@@ -68,6 +69,12 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
         yield (
             "no bytes were received: check the power and the cable; if the board sends only after a request, state the "
             "request with --request"
+        )
+        return
+    if not capture.frames and capture.parser.unread_line:
+        yield (
+            f"the lines of text are not understood, for example {shown(capture.parser.unread_line)}: send the numbers "
+            "of all channels in each line, with the same text between them"
         )
         return
     if not capture.frames:

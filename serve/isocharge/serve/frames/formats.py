@@ -50,6 +50,7 @@ class AutoParser(Parser):
                     self.counts = candidate.counts
                     rest = data[match.end() :]
                     return frames + self._feed_recognised(candidate, rest)
+                self.unread_line = candidate.unread_line or self.unread_line
         return []
 
     def reset(self) -> None:

@@ -276,10 +276,8 @@ class Columns:
         self.channels = [
             (column, scale) for column, scale in enumerate(scales) if column not in columns_without_channel
         ]
-        self.names: tuple[str, ...] = ()
-        has_names = any(names)
-        if has_names:
-            self.names = tuple(names[column] for column, _ in self.channels)
+        channel_names = tuple(names[column] for column, _ in self.channels)
+        self.names = channel_names if any(channel_names) else ()
 
     def frame(self, numbers: Sequence[Any]) -> Frame:
         """Convert a row of numbers to a frame.
@@ -304,6 +302,7 @@ class Parser(ABC):
 
     Attributes:
         counts: Counters since the parser was created.
+        unread_line: Latest line of text that has not the layout of the frames; empty without such a line.
     """
 
     def __init__(self, format: str, seq_modulus: int = SEQ_MODULUS, t_us_modulus: int = T_US_MODULUS) -> None:
@@ -318,6 +317,7 @@ class Parser(ABC):
         self.seq_modulus = seq_modulus
         self.t_us_modulus = t_us_modulus
         self.counts = FrameCounts()
+        self.unread_line = ""
         self._tail = b""  # bytes of an unfinished frame
 
     @abstractmethod

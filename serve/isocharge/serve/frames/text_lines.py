@@ -1,230 +1,446 @@
-"""Functions that parse the lines of text that boards send, and functions that write frames as lines of text.
+"""Numbers in the lines of text that boards send, and functions that write frames as lines of text.
 
-A board may send its lines in any of the following notations.
+Text is numbers with something between them. The numbers are taken out of a line, and the rest of the line is its
+skeleton. Lines with the same skeleton are frames of one layout, in whatever notation the board writes them:
 
-| notation | example |
-|---|---|
-| CSV, also with semicolons, tabs or blanks; with or without a header | `12, 801.2, 799.5, 803.3` |
-| one or several pairs name:value in a line | `A:801.2,B:799.5,C:803.3` |
-| Teleplot (github.com/nesnes/teleplot) | `>A:1627551892437:801.2§pC` (time in ms and unit are optional) |
-| JSON object or list | `{"seq": 12, "A": 801.2}` |
-| sentence in the style of NMEA 0183, with or without a checksum | `$PZT,801.2,799.5,803.3*5D` |
+| line | names | numbers |
+|---|---|---|
+| `801.2, -799.5, 803.3` | | 801.2, -799.5, 803.3 |
+| `A:801.2 pC, B:-799.5 pC` | A, B | 801.2, -799.5 |
+| `3,1;-2,0` | | 3.1, -2.0 |
+| `12:34:56.5 -> (0x1F, 0x2E)` | t_s | 45296.5, 31, 46 |
+| `{"charge": {"A": 801.2}, "q": [3, 4]}` | charge.A, q.0, q.1 | 801.2, 3, 4 |
 
-Blank lines and lines that begin with # have no values. `isocharge.common.number_text` parses the numbers.
+A word directly before a number is the name of the number. Digits in a word, as in `ch3`, are not a number. Words that
+are neither names nor followed by a colon or an equals sign may change from line to line.
 """
 
 import json
+import math
 import re
-from collections.abc import Callable
-from enum import StrEnum
+from collections.abc import Callable, Iterator, Sequence
 from functools import reduce
+from itertools import zip_longest
 from operator import xor
 from typing import Any, NamedTuple
 
-from isocharge.common.number_text import parse_number
+from isocharge.common.tables.header_advice import OTHER_UNITS
 from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame
 
-TELEPLOT_TIME = "t_ms"
-"""Name under which the time of a Teleplot line is stored, because it has no name in Teleplot."""
+_WORD = r"(?>\w+(?:[./-]\w+)*(?:\[\w*\])*)"
 
-MAX_JSON_LEVEL = 3
-"""Largest number of nested objects and lists in JSON from which numbers are read."""
+_QUOTED = r'"(?:[^"\\]|\\.)*"' + r"|(?<!\w)'[^']*'(?!\w)"
 
-_SEPARATOR = re.compile(r"\s*[,;\t]\s*|\s+")
+_DATE = r"[0-9]{1,4}[-/.][0-9]{1,2}[-/.][0-9]{1,4}[T ,;]+"
 
-_PAIR = re.compile(r"\s*(?P<name>[^\s:=,;]+)\s*[:=]\s*(?P<value>[^\s:=,;]+)\s*(?:[,;]\s*|\s|$)")
+_SECONDS = r"[0-9]{2}(?:\.[0-9]+(?:,[0-9]{3}(?=\]))?|,[0-9]{3}(?=\s))?"  # 56, 56.789, 56.789,012] or 56,789
 
-_NAME = re.compile(r"[^\W\d][\w.\[\]/-]*")
+_TIME = rf"(?:{_DATE})?([0-9]{{1,2}}:[0-9]{{2}}:{_SECONDS})(?:Z|[-+][0-9]{{2}}:?[0-9]{{2}}(?![\w.]))?"
 
 
-class Notation(StrEnum):
-    """Notation of a line of text."""
+def _number_pattern(decimal_marks: str) -> str:
+    """Return the regular expression of a decimal number, which also matches `nan`, `inf` and the `ovf` of Arduino."""
+    digits = rf"[0-9]+(?:[{decimal_marks}][0-9]*)?|[{decimal_marks}][0-9]+"
+    return rf"((?>[-+]?(?:(?:{digits})(?:[eE][-+]?[0-9]+)?|(?<!<)(?i:nan|inf(?:inity)?|ovf)(?!\w))))"
 
-    csv = "CSV"
-    header = "CSV header"
-    pairs = "name:value"
-    teleplot = "Teleplot"
-    json = "JSON"
-    sentence = "sentences"
-    nothing = "nothing"
+
+_PATTERNS = {
+    "time": _TIME,
+    "uptime": "([0-9]+)",
+    "hexadecimal": "([-+]?(?:0[xX])?[0-9A-Fa-f]++)",
+    "number": _number_pattern("."),
+    "number with a decimal comma": _number_pattern(".,"),
+    "quoted": f"(?:{_QUOTED})",
+    "word": _WORD,
+    "blanks": r"\s++",
+    "optional blanks": r"\s*+",
+    "end": r"[\s,;]*+",
+}
+"""Regular expressions of the parts of a line that may change from line to line. Numbers are in groups."""
+
+_CODES = {kind: chr(code) for code, kind in enumerate(_PATTERNS)}
+"""Control characters that stand for these parts in a skeleton. A line with control characters is not parsed."""
+
+_NUMBER_KINDS = ("time", "uptime", "hexadecimal", "number")
+
+_NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
+"""Names of a time of day, in seconds since midnight, and of the time in a log prefix such as `I (1234)`."""
+
+_CHARGE_UNITS = {unit for unit in OTHER_UNITS["pC"] if unit != "C"}  # C may be the name of an electrode
+
+
+def _token_pattern(number: str) -> re.Pattern[str]:
+    """Return the regular expression of a part of a line.
+
+    Args:
+        number: Regular expression of a decimal number.
+    """
+    key = r"""(?:[0-9]+(?=[^\W\d_]))?(?![0-9()\[\]+.*$|-])(?>(?:[^\s:=,;{}"'<>()]|\([^\s()]*\))+)"""
+    return re.compile(
+        rf"(?P<time>(?<![\w.:]){_TIME}(?![\w:]))"
+        r"|(?P<uptime>(?<=\b[EWIDV]\s\()[0-9]+(?=\)))"
+        rf"|(?P<key>(?<=^>)[^:]+(?=:)|(?<=^\$)\w+|(?:{key}|{_QUOTED})(?=\s*[:=]))"
+        rf"|(?P<quoted>{_QUOTED})"
+        r"|(?P<hexadecimal>(?<![\w.])[-+]?0[xX][0-9A-Fa-f]+(?!\w))"
+        rf"|(?P<number>(?<![\w.]){number}(?!\.[0-9])(?=[^\W\d_]*(?!\w)))"
+        rf"|(?P<word>{_WORD})"
+        r"|(?P<mark>\S)"
+    )
+
+
+_TOKENS = {kind: _token_pattern(_PATTERNS[kind]) for kind in ("number", "number with a decimal comma")} | {
+    "hexadecimal": re.compile(r"(?P<hexadecimal>\w+)|(?P<mark>\S)")
+}
+"""Regular expressions of a part of a line, by the kind of the numbers in the line."""
+
+
+class _Token(NamedTuple):
+    """Part of a line: a number, a key before a colon or an equals sign, a text in quotes, a word, or another mark."""
+
+    kind: str
+    content: str
+    start: int
+    is_after_blank: bool
 
 
 class Line(NamedTuple):
-    """Content of a line of text.
+    """Numbers and skeleton of a line of text.
 
     Attributes:
-        notation: Notation of the line.
-        names: Names of the values, or of the columns in a header; empty for CSV.
-        values: The numbers; empty for a header.
+        text: The line.
+        skeleton: The parts of the line that are the same in each line of a layout, with one control character for each
+            number, each other part that may change, and optional blanks.
+        names: Name of each number; empty for a number without a name.
+        numbers: The numbers as texts.
+        starts: Position in the line at which each number begins.
+        hexadecimal: Index of each hexadecimal number.
+        is_prose: Whether the line resembles a message, such as `Channel 3 is ready`, because it has at least as many
+            words as numbers. Keys, and words after a comma or another mark, do not count.
     """
 
-    notation: Notation
-    names: tuple[str, ...] = ()
-    values: tuple[float, ...] = ()
+    text: str
+    skeleton: str
+    names: tuple[str, ...]
+    numbers: tuple[str, ...]
+    starts: tuple[int, ...]
+    hexadecimal: tuple[int, ...]
+    is_prose: bool
 
 
-LINE_WITHOUT_VALUES = Line(Notation.nothing)
-"""Content of a line without values, such as a comment."""
+def clean_text(text: str) -> str:
+    """Return the part of a line that may contain numbers; empty for a blank line, a comment or a text of Teleplot.
 
-
-def parse_line(data: bytes) -> Line:
-    """Recognise the notation of a line of text from its characters, and parse the line.
+    A Teleplot line has the form `>name:time:value;time:value§unit|flags`. Only its latest value is returned. A sentence
+    in the style of NMEA 0183 has the form `$NAME,1.5,2.5*3A`. Its checksum is the exclusive or of all bytes between `$`
+    and `*`.
 
     Args:
-        data: Bytes of the line, without the line feed at its end.
+        text: The line.
 
     Raises:
-        ValueError: If the line has no supported notation, or is not valid in its notation.
+        ValueError: If the checksum of a sentence is wrong.
     """
-    text = data.decode("utf-8").strip()
-    if not text or text[0] == "#":  # a blank line or a comment
-        return LINE_WITHOUT_VALUES
-    # The first character is tested before the separators, because JSON and Teleplot lines also contain colons.
-    if text[0] in "{[":
-        return _parse_json(text)
-    if text[0] == ">":
-        return _parse_teleplot(text)
-    if text[0] == "$":
-        return _parse_sentence(text)
-    if ":" in text or "=" in text:
-        return _parse_pairs(text)
-    return _parse_csv(text)
-
-
-def _parse_csv(text: str) -> Line:
-    """Parse a line of CSV, which contains either numbers or, in a header, the names of the columns.
-
-    The cells of the line may be separated by commas, semicolons, tabs or blanks. Separators at the end of the line are
-    ignored.
-
-    Raises:
-        ValueError: If the line contains neither only numbers nor only names that all differ.
-    """
-    cells = _SEPARATOR.split(text.rstrip(",; \t"))
-    try:
-        return Line(Notation.csv, values=tuple(map(parse_number, cells)))
-    except ValueError:  # a cell is not a number, but the line may be a header
-        are_names = all(_NAME.fullmatch(cell) for cell in cells)
-        are_different = len(set(cells)) == len(cells)
-        if are_names and are_different:
-            return Line(Notation.header, names=tuple(cells))
-        raise
-
-
-def _parse_sentence(text: str) -> Line:
-    """Parse a sentence such as `$FILM,1.5,2.5*3A`, which consists of a name and numbers.
-
-    The sentence may end with `*` and a checksum. The checksum is the exclusive or of all bytes between `$` and `*`,
-    written as two hexadecimal digits.
-
-    Raises:
-        ValueError: If the checksum is wrong, or the sentence does not consist of a name and numbers.
-    """
-    text_after_dollar = text[1:]
-    content, star, sent_checksum = text_after_dollar.partition("*")
-    has_checksum = star != ""
-    if has_checksum:
-        computed_checksum = reduce(xor, content.encode(), 0)
-        if len(sent_checksum) != 2 or int(sent_checksum, 16) != computed_checksum:
+    if "\x1b" in text:
+        text = re.sub(r"\x1b\[[0-9;]*m", "", text)  # removes the colours that loggers use
+    text = text.strip()
+    if text[:1] == ">":
+        content, _, flags = text.partition("|")
+        name, _, values = content.partition(":")
+        latest_value = values.rstrip("; ").rpartition(";")[2]
+        return "" if "t" in flags or "xy" in flags else f"{name}:{latest_value}"
+    if text[:1] == "$" and "*" in text:
+        content, _, checksum = text.partition("*")
+        if len(checksum) != 2 or int(checksum, 16) != reduce(xor, content[1:].encode(), 0):
             raise ValueError(f"expected the checksum of the sentence, got {text[-100:]!r}")
-    _name, *cells = _SEPARATOR.split(content.rstrip(",; \t"))
-    if not cells:
-        raise ValueError(f"expected numbers after the first word, got {text[:100]!r}")
-    return Line(Notation.sentence, values=tuple(map(parse_number, cells)))
+        return content
+    return "" if text[:1] == "#" else text
 
 
-def _parse_pairs(text: str) -> Line:
-    """Parse a line of one or several pairs `name:value` or `name=value`.
+def parse_line(text: str) -> Line:
+    """Take the numbers out of a line of text.
 
-    Raises:
-        ValueError: If a part of the line is not a pair, or a name occurs twice.
-    """
-    pairs: dict[str, float] = {}
-    position = 0
-    while position < len(text):
-        match = _PAIR.match(text, position)
-        if match is None or match["name"] in pairs:
-            raise ValueError(f"expected name:value, got {text[position:]!r}")
-        pairs[match["name"]] = parse_number(match["value"])
-        position = match.end()
-    return Line(Notation.pairs, names=tuple(pairs), values=tuple(pairs.values()))
-
-
-def _parse_teleplot(text: str) -> Line:
-    """Parse a Teleplot line of the form `>name:time:value;time:value§unit|flags`, and return its latest value.
-
-    The time, the unit and the flags may be missing. If the line is a text (flag `t`) or contains points of an x-y plot
-    (flag `xy`), the result contains no value.
+    Args:
+        text: The line, as `clean_text` returns it.
 
     Raises:
-        ValueError: If the line has another form.
+        ValueError: If the line contains characters that are not printable, two numbers with the same name, or a
+            decimal number after a hexadecimal number, such as the size after the address of a part of a program.
     """
-    content, _, flags = text[1:].partition("|")  # without the first character ">"
-    name, _, values = content.partition(":")
-    if not name.strip() or not values:
-        raise ValueError(f"expected >name:value, got {text!r}")
-    if "t" in flags or "xy" in flags:
-        return LINE_WITHOUT_VALUES
+    if not text.replace("\t", " ").isprintable():
+        raise ValueError(f"expected printable characters, got {text[:100]!r}")
+    number_kind = "number"
+    if _are_hexadecimal(text):
+        number_kind = "hexadecimal"
+    elif _has_decimal_commas(text):
+        number_kind = "number with a decimal comma"
+    tokens = _tokens(text.rstrip(",; \t"), number_kind)
+    number_tokens = [token for token in tokens if token.kind in _NUMBER_KINDS]
+    kinds = [token.kind for token in number_tokens]
+    hexadecimal = tuple(index for index, kind in enumerate(kinds) if kind == "hexadecimal")
+    if hexadecimal and "number" in kinds[hexadecimal[0] :]:
+        raise ValueError(f"expected only hexadecimal numbers after the first one, got {text[:100]!r}")
 
-    _earlier_values, _, latest_value = values.rstrip("; ").rpartition(";")
-    time_and_value, _, _unit = latest_value.partition("§")
-    *times, value = time_and_value.split(":")  # one time, or none
-    if len(times) > 1:
-        raise ValueError(f"expected >name:time:value, got {text!r}")
-    pairs = {}
-    if times:
-        pairs[TELEPLOT_TIME] = parse_number(times[0])
-    pairs[name.strip()] = parse_number(value)
-    return Line(Notation.teleplot, names=tuple(pairs), values=tuple(pairs.values()))
+    word_names = _names(tokens)
+    names = _with_units(_json_names(text, word_names, number_tokens), tokens)
+    channel_names = [name for name in names if name and name not in TIMES_US]
+    if len(set(channel_names)) < len(channel_names):
+        raise ValueError(f"expected different names, got {text[:100]!r}")
+
+    skeleton = ""
+    word_count = 0
+    for previous, token in zip([None, *tokens], tokens, strict=False):
+        is_beside_mark = previous is None or "mark" in (previous.kind, token.kind)
+        if token.kind == "word" and (previous is None or not is_beside_mark):
+            word_count += 1
+        if is_beside_mark:
+            skeleton += _CODES["optional blanks"]
+        elif token.is_after_blank:
+            skeleton += _CODES["blanks"]
+        if token.kind in ("key", "mark") or token.content in word_names:
+            skeleton += token.content
+        else:
+            skeleton += _CODES[number_kind if token.kind == "number" else token.kind]
+    numbers = tuple(token.content for token in number_tokens)
+    starts = tuple(token.start for token in number_tokens)
+    is_prose = word_count >= len(numbers)
+    return Line(text, skeleton + _CODES["end"], tuple(names), numbers, starts, hexadecimal, is_prose)
 
 
-def _parse_json(text: str) -> Line:
-    """Parse a JSON text, and return all numbers in it, each with its path in the text as its name.
+def _are_hexadecimal(text: str) -> bool:
+    """Return whether a line consists of words of equal length that are hexadecimal numbers, such as `01F3 FFE2`."""
+    words = re.findall(r"\w+", text)
+    has_letters_and_digits = re.search("[A-Fa-f]", text) is not None and re.search("[0-9]", text) is not None
+    are_numbers = re.fullmatch(r"[0-9A-Fa-f]{3,8}(?:[\s,;]+[0-9A-Fa-f]{3,8})+[\s,;]*", text) is not None
+    return are_numbers and has_letters_and_digits and len(set(map(len, words))) == 1
 
-    A list that contains only numbers has the notation CSV in the result, because its numbers have no names.
 
-    Raises:
-        ValueError: If the text is not valid JSON, or contains no numbers.
+def _has_decimal_commas(text: str) -> bool:
+    """Return whether the commas between digits are decimal commas, as in `3,1;-2,0` and `A: 3,1 pC, B: -2,0 pC`.
+
+    They are separators if a number has a decimal point or two commas, if a comma stands before a sign, beside a blank
+    or before a name, if the line has brackets, or if nothing else separates two numbers.
     """
+    runs = re.findall(r"[0-9]+(?:[.,][0-9]+)*", re.sub(_TIME, "", text))
+    are_decimal = all("." not in run and run.count(",") <= 1 for run in runs)
+    return (
+        are_decimal
+        and len(runs) > 1
+        and any("," in run for run in runs)
+        and re.search(r"[\[({]|[0-9],[-+.]|,[0-9]+\s*[:=]|,0[xX]|[0-9]\s*,\s+[-+.0-9]|[0-9]\s+,", text) is None
+    )
+
+
+def _tokens(text: str, number_kind: str) -> list[_Token]:
+    """Divide a line into its parts.
+
+    Args:
+        text: The line.
+        number_kind: Kind of the numbers in the line, a key of `_TOKENS`.
+    """
+    tokens = []
+    for match in _TOKENS[number_kind].finditer(text):
+        kind = str(match.lastgroup)
+        content = match[2] if kind == "time" else match[0]  # the second group is a time without its date
+        is_after_blank = text[match.start() - 1 : match.start()].isspace()
+        tokens.append(_Token(kind, content.strip(), match.start(), is_after_blank))
+
+    # In pairs of numbers, such as `1:801,2:799`, the first number of each pair is a name.
+    shape = "".join("#" if token.kind in _NUMBER_KINDS else token.content for token in tokens)
+    if re.fullmatch(r"(?:#[:=]#[,;]*)+", shape):
+        is_name = [token.content in ":=" for token in tokens[1:]] + [False]
+        tokens = [
+            token._replace(kind="key") if is_name_of_next else token
+            for token, is_name_of_next in zip(tokens, is_name, strict=True)
+        ]
+    return tokens
+
+
+def _names(tokens: list[_Token]) -> list[str]:
+    """Return the name of each number, which is the word or the key directly before the number; empty without a name.
+
+    Words are units and not names if the first number follows no word but the last number precedes one. A single name
+    at the first of several numbers is a label of the line, unless it is a name of a counter or a clock.
+
+    Args:
+        tokens: Parts of the line.
+    """
+    names = []
+    words = []  # names that are neither in quotes nor before a colon or an equals sign
+    candidate = ""
+    for previous, token in zip([None, *tokens], tokens, strict=False):
+        if token.kind in _NUMBER_KINDS:
+            names.append(_NAMES_OF_TIMES.get(token.kind, candidate))
+            if previous is not None and previous.kind == "word":
+                words.append(candidate)
+            candidate = ""
+        elif token.kind in ("key", "word"):
+            candidate = token.content.strip("\"'")
+        elif token.content not in ":=":
+            candidate = ""
+
+    channels = [index for index, name in enumerate(names) if name not in TIMES_US]
+    are_units = bool(channels) and not names[channels[0]] and tokens[-1].kind == "word"
+    names = ["" if name in words and (are_units or words.count(name) > 1) else name for name in names]
+    named = [index for index in channels if names[index]]
+    if len(channels) > 1 and named == channels[:1] and names[named[0]] != SEQ:
+        names[named[0]] = ""
+    if tokens and tokens[0].content == ">" and len(names) == 2:  # `>name:time:value`
+        names = [_NAMES_OF_TIMES["uptime"], next(token.content for token in tokens if token.kind == "key")]
+    return names
+
+
+def _json_names(text: str, names: list[str], number_tokens: list[_Token]) -> list[str]:
+    """If a line ends with a JSON text, replace the names of the numbers in it by their paths, such as `charge.A`.
+
+    The numbers of a list that contains only numbers keep their names.
+
+    Args:
+        text: The line.
+        names: Name of each number.
+        number_tokens: The numbers.
+    """
+    bracket = re.search(r"[\[{]", text)
+    if bracket is None:
+        return names
     try:
         # Integers are parsed as floats, so that integers of hundreds of digits become infinite, as in other notations.
-        content = json.loads(text, parse_int=float)
-    except RecursionError as error:
-        raise ValueError("nested too deeply") from error
-    if isinstance(content, list) and content and all(isinstance(item, float) for item in content):
-        return Line(Notation.csv, values=tuple(content))
-    numbers_by_path = dict(_json_numbers("", content))
-    if not numbers_by_path:
-        raise ValueError(f"expected numbers, got {text!r}")
-    return Line(Notation.json, names=tuple(numbers_by_path), values=tuple(numbers_by_path.values()))
+        content = json.loads(text[bracket.start() :], parse_int=float)
+        paths = list(_number_paths("", content))
+    except (ValueError, RecursionError):
+        return names
+    n_before = sum(token.start < bracket.start() for token in number_tokens)
+    is_list_of_numbers = isinstance(content, list) and all(isinstance(item, float) for item in content)
+    if is_list_of_numbers or n_before + len(paths) != len(names):
+        return names
+    return names[:n_before] + paths
 
 
-def _json_numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, float]]:
-    """Return all numbers in a JSON value, each with its path, such as `charge.A` or `charge.0.re`.
-
-    Numbers that are nested in more than `MAX_JSON_LEVEL` objects and lists are ignored.
+def _number_paths(path: str, content: Any) -> Iterator[str]:
+    """Yield the path of each number in a JSON value, such as `charge.A` or `charge.0.re`.
 
     Args:
         path: Path of the value; empty for the whole text.
-        content: The value, which is a number, a list, an object or a value that contains no number.
-        level: Number of objects and lists in which the value is nested.
+        content: The value.
     """
     if isinstance(content, float):  # integers were read as floats
-        return [(path, content)]
-    if level >= MAX_JSON_LEVEL:
-        return []
-    if isinstance(content, dict):
-        items = [(str(key), value) for key, value in content.items()]
-    elif isinstance(content, list):
-        items = [(str(index), value) for index, value in enumerate(content)]
-    else:
-        return []
-
-    numbers = []
-    prefix = f"{path}." if level > 0 else ""  # the whole text has no path
+        yield path
+        return
+    items = content.items() if isinstance(content, dict) else enumerate(content if isinstance(content, list) else ())
     for key, value in items:
-        numbers += _json_numbers(prefix + key, value, level + 1)
-    return numbers
+        yield from _number_paths(f"{path}.{key}" if path else str(key), value)
+
+
+def _with_units(names: list[str], tokens: list[_Token]) -> list[str]:
+    """Return the names of the numbers with units of charge or voltage other than pC added, as in `A_nC`.
+
+    Args:
+        names: Name of each number.
+        tokens: Parts of the line. A unit is the word behind a number.
+    """
+    names_with_units: list[str] = []
+    for token, following in zip_longest(tokens, tokens[1:]):
+        if token.kind in _NUMBER_KINDS:
+            index = len(names_with_units)
+            name = names[index]
+            if following is not None and following.content in _CHARGE_UNITS - set(names):
+                name = f"{name or f'ch{index + 1}'}_{following.content}"
+            names_with_units.append(name)
+    return names_with_units
+
+
+class Skeleton:
+    """Text between the numbers of the lines of a layout.
+
+    Attributes:
+        names: Name of each number; empty for a number without a name.
+    """
+
+    def __init__(self, lines: Sequence[Line]) -> None:
+        """Prepare the reading of lines.
+
+        Hexadecimal numbers of a fixed length are signed (two's complement) if all of them are closer to zero or to the
+        end of their range than to its middle.
+
+        Args:
+            lines: Lines with the same skeleton, at least one.
+        """
+        self.names = lines[0].names
+        skeleton = lines[0].skeleton
+        patterns = {_CODES[kind]: pattern for kind, pattern in _PATTERNS.items()}
+        self._match = re.compile("".join(patterns.get(part) or re.escape(part) for part in skeleton)).fullmatch
+        self._hexadecimal = lines[0].hexadecimal
+        self._modulus = 0  # number of values of a signed hexadecimal number; 0 if the numbers are unsigned
+        digits = {line.numbers[index].lower().removeprefix("0x") for line in lines for index in self._hexadecimal}
+        are_near_zero = all(text[0] in "0123cdef" for text in digits)
+        lengths = set(map(len, digits))
+        if lengths in ({4}, {6}, {8}) and are_near_zero:
+            self._modulus = 16 ** lengths.pop()
+
+    def values(self, text: str) -> tuple[float, ...] | None:
+        """Return the numbers in a line; None if the line has another skeleton.
+
+        Args:
+            text: The line.
+        """
+        match = self._match(text)
+        if match is None:
+            return None
+        numbers = match.groups()
+        if self._hexadecimal:
+            return tuple(
+                self._hexadecimal_value(number) if index in self._hexadecimal else _value(number)
+                for index, number in enumerate(numbers)
+            )
+        try:
+            return tuple(map(float, numbers))
+        except ValueError:  # a number is a time of day, has a decimal comma, or is `ovf`
+            return tuple(map(_value, numbers))
+
+    def _hexadecimal_value(self, number: str) -> float:
+        """Return the value of a hexadecimal number."""
+        value = int(number, 16)
+        is_negative = 2 * value >= self._modulus > 0
+        return float(value - self._modulus if is_negative else value)
+
+
+def _value(number: str) -> float:
+    """Return the value of a decimal number, which is NaN for `ovf`, or the seconds since midnight of a time of day."""
+    if ":" in number:
+        hours, minutes, seconds = number.split(":")
+        whole, _, fraction = seconds.replace(",", ".").partition(".")
+        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{whole}.{fraction.replace('.', '')}")
+    if number[-3:].lower() == "ovf":
+        return math.nan
+    return float(number.replace(",", "."))
+
+
+def split_columns(text: str) -> list[str]:
+    """Divide a line into columns, which are separated by commas, semicolons, tabs or blanks."""
+    return [column for column in re.split(r"[,;\s]+", text) if column]
+
+
+def header_names(header: str, line: Line) -> tuple[str, ...]:
+    """Return the names that a header states for the numbers without names in a line.
+
+    The result is empty if the text is no header of the line. A column of the header is a name, which begins with a
+    letter. Columns of the line that contain a text, and a label before the first column, are ignored.
+
+    Args:
+        header: A line without numbers.
+        line: The line.
+    """
+    starts = [start for start, name in zip(line.starts, line.names, strict=True) if not name]
+    columns = split_columns(header)
+    if len(columns) != len(starts):
+        separator = next((mark for mark in "\t;," if mark in header), None)  # None: blanks
+        columns = header.split(separator)
+        first_column = 0 if separator is None else -1  # the part before the first separator is the first column
+        indices = [len(line.text[:start].split(separator)) + first_column for start in starts]
+        columns = [columns[index] for index in indices if index < len(columns)]
+    names = tuple(column.rpartition(":")[2].strip(" \"'") for column in columns)
+    are_names = all(re.match(r"[^\W\d]", name) for name in names)
+    are_different = len(names) == len(set(names)) == len(starts)
+    return names if are_names and are_different else ()
 
 
 def _named_values(frame: Frame) -> list[tuple[str, str]]:

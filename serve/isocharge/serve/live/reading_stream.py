@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import ChargeError, NoFramesError, TareError, cut
+from isocharge.common.errors import ChargeError, NoFramesError, TareError, cut, shown
 from isocharge.serve.flags import RECONNECTED
 from isocharge.serve.frames.frame import SATURATED_BIT, Frame, Parser, SequenceGaps
 from isocharge.serve.frames.frame_layout import FrameLayout
@@ -368,7 +368,8 @@ def _check_recognised(parser: Parser, max_bytes: int = BYTES_TO_RECOGNISE) -> No
     """
     counts = parser.counts
     if counts.frames == 0 and counts.bytes_dropped > max_bytes:
+        line = f", such as {shown(parser.unread_line)}" if parser.unread_line else ""
         raise NoFramesError(
             f"no intact frame among the first {counts.bytes_dropped} bytes ({counts.crc_errors} with a wrong CRC, "
-            f"{counts.malformed} of another form); {parser.format}: check baud rate and device"
+            f"{counts.malformed} of another form{line}); {parser.format}: check baud rate and device"
         )

@@ -15,7 +15,6 @@ from isocharge.serve.frames.frame import SEQ, Frame, Parser
 from isocharge.serve.frames.frame_field import PADDING, ByteOrder
 from isocharge.serve.frames.frame_layout import SYNC
 from isocharge.serve.frames.text import Layout, TextParser
-from isocharge.serve.frames.text_lines import Notation
 from isocharge.serve.recognition.fields import Part, Weights, identify_clock, possible_parts, split_frame, steady_step
 from isocharge.serve.recognition.framing import (
     MAX_EXAMINED_BYTES,
@@ -207,10 +206,22 @@ The share is much less than 1, because the other bytes may be echoes of requests
 """
 
 
+TEXT_SHARE = 0.95
+"""Smallest share of printable characters in text. The other bytes may be damaged, or letters that are not ASCII."""
+
+
+def is_text(chunks: Sequence[bytes]) -> bool:
+    """Return whether bytes are text, which is never a binary format."""
+    data = np.frombuffer(b"".join(chunks), np.uint8)
+    is_printable = ((data >= ord(" ")) & (data <= ord("~"))) | np.isin(data, list(b"\t\r\n\x1b"))
+    return len(data) > 0 and bool(is_printable.mean() >= TEXT_SHARE)
+
+
 def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False) -> dict[str, Any] | None:
     """Recognise the format of a board, and return the section `[frames]` that describes this format in a device file.
 
     The function first tries the binary frames of isocharge, then lines of text, and then other frames of fixed length.
+    Bytes that are printable characters are never taken for binary frames.
 
     Args:
         chunks: Received bytes, divided as they arrived.
@@ -235,6 +246,8 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
         text_section = {"format": "text"} | _text_keys(text_parser.layout, text_frames, frame_rate_Hz)
         if text_share >= CLEAR_SHARE:
             return text_section
+    if is_text(chunks):
+        return text_section
 
     # If most of the bytes are not lines of one layout, the board may send binary frames that resemble text in places.
     described_section = described_frames_section(chunks, seconds, are_datagrams=are_datagrams)
@@ -252,43 +265,32 @@ def _parse_all(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], fl
 def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) -> dict[str, Any]:
     """Return the keys that describe the counter, the clock and the columns of lines of text in a device file.
 
-    If each line contains names, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for its
-    counter and its clock. Otherwise, the key `columns` lists the names of all columns. No keys are needed if the board
-    sends no names, no counter and no clock.
+    For values with names in each line, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for
+    its counter and its clock. For the other values, the key `columns` lists the names, which are copied from a header,
+    because a program that starts later does not receive the header. No keys are needed if the board sends no names, no
+    counter and no clock.
 
     Args:
         layout: Layout of the lines.
         frames: Frames that the lines contain.
         frame_rate_Hz: Number of frames per second, Hz.
     """
-    last_frame = frames[-1]
     meanings = _meanings(frames, frame_rate_Hz)  # "seq" or the name of a clock, by the position of the value in a frame
+    names = list(layout.names)
+    channels = [column for column, _ in layout.columns.channels]
+    keys: dict[str, Any] = {}
+    for position, column in enumerate(channels):
+        if position in meanings and column not in layout.unnamed:
+            keys[meanings[position]] = names[column]
+        names[column] = meanings.get(position, names[column])
 
-    # Case 1: a CSV with a header. The names in the header are copied, because a program that starts later does not
-    # receive it. Only the names of the counter and the clock are replaced.
-    if layout.notation is Notation.csv and layout.names:
-        columns = list(layout.names)
-        for position, meaning in meanings.items():
-            column, _ = layout.columns.channels[position]
-            columns[column] = meaning
-        return {"columns": columns}
-
-    # Case 2: each line contains the names of its values. The key `columns` is not needed.
-    if last_frame.names:
-        return {meaning: last_frame.names[position] for position, meaning in meanings.items()}
-
-    # Case 3: the board sends no names. If no column is a counter or a clock, the columns need no names.
-    if not meanings:
-        return {}
-    column_names = []
-    channel_count = 0
-    for position in range(len(last_frame.values)):
-        if position in meanings:
-            column_names.append(meanings[position])
-        else:
-            channel_count += 1
-            column_names.append(f"ch{channel_count}")
-    return {"columns": column_names}
+    # Number the channels without names. Without names from a header, a counter or a clock, the columns need no names.
+    if any(names[column] for column in layout.unnamed):
+        unnamed_channels = [column for column in channels if not names[column]]
+        for number, column in enumerate(unnamed_channels, 1):
+            names[column] = f"ch{number}"
+        keys["columns"] = [names[column] for column in layout.unnamed]
+    return keys
 
 
 @np.errstate(over="ignore", invalid="ignore")
