@@ -324,6 +324,7 @@ BAD = [
         "SceneError: probe radius: expected at least 0.02 mm",
     ),
     (("simulate", "point", SENSOR, "--force", "1e6"), 2, "beyond small strains"),
+    (("simulate", "point", SENSOR, "--force", "1e308"), 2, "beyond small strains"),
     (
         ("simulate", "sweep", SENSOR, "--samples", "1000000000000", "-o", "OUT"),
         2,

@@ -40,10 +40,12 @@ def test_charges_of_imperfect_films_agree_with_scikit_fem(film, expected):
     np.testing.assert_allclose(charge, expected, rtol=8e-4)
 
 
-def test_deflection_of_an_oval_film_with_uneven_tension_agrees_with_greens_function():
+@pytest.mark.parametrize("distance", [10.3, 20.0])
+def test_deflection_of_an_oval_film_with_uneven_tension_agrees_with_greens_function(distance):
     """If T1 / T2 is the ratio of the squared half axes, Green's function of the disk holds in scaled coordinates.
 
     The tension along the axes is (1 +- e)^2 times a constant, and the half axes are 1 +- e times the radius.
+    The rim differs from an ellipse by terms of second order in e, which matter more for presses near the rim.
     """
     e = 0.02
     tension = 2.0
@@ -52,7 +54,8 @@ def test_deflection_of_an_oval_film_with_uneven_tension_agrees_with_greens_funct
     mean = (1.0 + e**2) * tension
     deviator = (half_difference * np.cos(2.0 * axis), half_difference * np.sin(2.0 * axis))
     film = replace(SENSOR.film, pretension=mean, deviator=deviator, oval=e, oval_axis=axis)
-    solved = press(film, Circle(0.1), (9.0, -5.0), 1e-6, SolveSettings(theory=Theory(True, False, True)))
+    at = (0.87 * distance, -0.49 * distance)
+    solved = press(film, Circle(0.1), at, 1e-6, SolveSettings(theory=Theory(True, False, True)))
 
     def scaled(points):
         in_oval_axes = np.asarray(points) @ [1.0, 1j] * np.exp(-1j * axis) / film.radius
@@ -60,10 +63,18 @@ def test_deflection_of_an_oval_film_with_uneven_tension_agrees_with_greens_funct
 
     points = np.array([[-10.0, 3.0], [15.0, 12.0], [0.0, 20.0], [-30.0, -10.0]])
     z = scaled(points)
-    source = scaled((9.0, -5.0))
+    source = scaled(at)
     green = np.log(np.abs((1.0 - z * np.conj(source)) / (z - source)))
     expected = 1e-6 / (2.0 * np.pi * film.thickness * tension * (1.0 - e**2)) * green
-    np.testing.assert_allclose(deflection(solved, points), expected, rtol=3.0 * e**2)
+    tolerance = 3.0 * e**2 * film.radius / (film.radius - distance)
+    np.testing.assert_allclose(deflection(solved, points), expected, rtol=tolerance)
+
+
+@pytest.mark.parametrize("at", [(0.0, 42.5), (43.5, 0.0)])
+def test_presses_near_the_rim_of_an_oval_film_are_solved(at):
+    """The half axes are 45.9 and 44.1 mm."""
+    film = replace(SENSOR.film, pretension=1.0, oval=0.02)
+    assert press(film, PROBE, at, 0.1).status == "converged"
 
 
 def test_sensor_file_stores_all_imperfections():

@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
 from isocharge.common.errors import ChargeError, ModelError, OutputExists
@@ -184,6 +185,16 @@ def test_graph_with_other_inputs_or_outputs_is_refused(film, own_model, changes,
     golden.write_text(json.dumps(json.loads(golden.read_text()) | {"sha256": sha256_of(data)}))
     (own_model / "model.onnx").write_bytes(data)
     with pytest.raises(ModelError, match=message):
+        load_model(own_model)
+
+
+def test_graph_that_loads_its_numbers_from_another_file_is_refused(own_model):
+    path = own_model / "model.onnx"
+    graph = onnx.load(path)
+    onnx.save_model(graph, path, save_as_external_data=True, location="weights.bin", size_threshold=0)
+    golden = own_model / "golden.json"
+    golden.write_text(json.dumps(json.loads(golden.read_text()) | {"sha256": sha256_of(path.read_bytes())}))
+    with pytest.raises(ModelError, match="external data"):
         load_model(own_model)
 
 

@@ -181,10 +181,15 @@ def test_error_message_names_the_key_of_the_wrong_type(path):
     [
         (("piezo", "d32"), -2e-4, r"piezo d32: expected pC/N, got -0\.0002 pC/N"),
         (("film", "poisson"), 0.5, "film poisson: expected 0 <= poisson < 0.5, got 0.5"),
-        (("film", "thickness_um"), -25.0, r"film\.thickness_um: expected a positive number, got -25\.0"),
+        (("film", "thickness_um"), -25.0, r"film\.thickness_um: expected at least 0\.1 um, got -25\.0"),
+        (("film", "thickness_um"), 0.025, r"film\.thickness_um: expected at least 0\.1 um, got 0\.025"),
+        (("film", "young_GPa"), 3000, r"film\.young_GPa: expected .* 0\.001 to 1000 GPa .*, got 3000"),
+        (("film", "young_GPa"), [3.0, 3e9], r"film\.young_GPa\[1\]: expected .* 0\.001 to 1000 GPa .*, got 3000000000"),
+        (("film", "shear_GPa"), 1100, r"film\.shear_GPa: expected .* 0\.001 to 1000 GPa .*, got 1100"),
+        (("film", "pretension_MPa"), 500.0, r"film pretension: expected -10 to 300 MPa, got 500 MPa"),
         (("film", "radius_mm"), 1e300, r"film\.radius_mm: expected a number above 0 and at most 1e\+06, got 1e\+300"),
         (("film", "radius_mm"), 0.03, r"film radius: expected at least 1 mm, .* 0\.03 m are 30 mm"),
-        (("film", "pretension_MPa"), -11, r"film pretension: expected -10 to 10000 MPa, got -11 MPa"),
+        (("film", "pretension_MPa"), -11, r"film pretension: expected -10 to 300 MPa, got -11 MPa"),
         (("film", "thickness_um"), 3000.3, r"film thickness: .* radius \(30 mm\), got 3\.0003 mm"),
         (("electrodes", "side_mm"), 0.0, "electrodes.side_mm: expected a number above 0"),
         (("electrodes", "A"), [8.0, 5.0], "electrodes 'A' and 'B' overlap"),
@@ -298,6 +303,14 @@ def test_sensor_that_cannot_be_written_raises_error(tmp_path, name, message):
     with pytest.raises(SensorError, match=message):
         write_sensor(replace(load_sensor("three-25um-biaxial"), name=name), tmp_path / "mine.toml")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("expansion", [None, (0.0, 0.0), (1e-4, 1e-4)])
+@pytest.mark.parametrize("ring_expansion", [0.0, 23e-6, 1.5e-5])
+def test_the_expansion_of_film_and_ring_is_written_and_read(expansion, ring_expansion):
+    sensor = load_sensor("three-25um-biaxial")
+    sensor = replace(sensor, film=replace(sensor.film, expansion=expansion, ring_expansion=ring_expansion))
+    assert sensor_from_dict(tomllib.loads(sensor_to_toml(sensor))) == sensor
 
 
 def test_write_and_load_round_trip(tmp_path):

@@ -26,6 +26,7 @@ from isocharge.simulate import (
     write_sensor,
 )
 from isocharge.simulate.forward.film_family import FilmFamily
+from isocharge.simulate.solver.error_estimate import mesh_error
 
 ATMOSPHERE = 0.101325
 """Pressure of the atmosphere, MPa."""
@@ -68,6 +69,18 @@ def test_deflection_with_trapped_air_equals_that_of_a_taut_membrane(volume, at):
     expected = by_force - pressure * (a**2 - np.abs(z) ** 2) / (4.0 * tension)
     solved = press(film, Circle(1.0), at, force, MEMBRANE)
     np.testing.assert_allclose(deflection(solved, points), expected, atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("at", [(12.0, -5.0), (20.0, 8.0)])
+def test_estimated_error_holds_for_a_closed_back_off_the_centre(at):
+    sensor = sensor_with(back_volume=CAVITY)
+    solved = press(sensor.film, Circle(1.0), at, 1.0)
+    resolution = solved.mesh.resolution
+    fine = SolveSettings(theory=solved.theory, resolution=replace(resolution, order=resolution.order + 2))
+    charge = touch_charge(sensor, solved)
+    fine_charge = touch_charge(sensor, press(sensor.film, Circle(1.0), at, 1.0, fine))
+    relative_error = np.abs(charge - fine_charge).max() / np.abs(fine_charge).max()
+    assert relative_error <= mesh_error(solved) <= 1e-3
 
 
 def axisymmetric_charges(sensor: Sensor, probe_radius: float, force: float, static_pressure: float) -> np.ndarray:

@@ -33,6 +33,9 @@ CORRELATION = "contact_correlation"
 OUTPUTS = {"contact": 3, "contact_std": 3, CORRELATION: 3, "misfit": 1}
 """Names of the outputs and their numbers of columns. `OUTPUT_MEANINGS` describes the columns."""
 
+EXTERNAL_DATA = b"\x0a\x08location"
+"""Encoded key of the entry of an ONNX tensor that names the file with the numbers of the tensor."""
+
 OUTPUT_MEANINGS = {
     "contact": "x_mm, y_mm, force_N: position (mm) and force (N, positive when the probe pushes)",
     "contact_std": "one standard deviation of x (mm), y (mm) and the force (N)",
@@ -65,8 +68,14 @@ def open_session(
             memory of the arrays. The arrays must therefore not be changed afterwards.
 
     Raises:
-        ModelError: If the bytes are not an ONNX graph that onnxruntime can run.
+        ModelError: If the bytes are not an ONNX graph that onnxruntime can run, or if the graph loads external data.
     """
+    if EXTERNAL_DATA in onnx_model:
+        raise ModelError(
+            f"{where}: expected a model with all of its numbers inside, got one that loads external data from another "
+            "file, which no checksum covers; save the model again with onnx.save(model, path, "
+            "save_as_external_data=False)"
+        )
     options = _single_thread_options()
     try:
         # In onnxruntime, the constants of a graph are called "initializers".

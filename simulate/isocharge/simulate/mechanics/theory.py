@@ -25,13 +25,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups, slenderness
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared, slenderness
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 ACCURACY = 1e-3
 """Default target of the relative error of a charge, dimensionless."""
+
+MAX_AMPLITUDE2 = 0.1
+"""Largest squared amplitude A^2 for which Saint-Venant-Kirchhoff elasticity is valid, dimensionless.
+
+The strains are of the order A^2.
+"""
 
 LINEAR_WEIGHT = 4.0
 """Factor in the estimate of the relative error of a charge that is computed with a linear theory.
@@ -190,6 +196,25 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
     return stretching_error + bending_error
 
 
+def check_strains(film: Film, force: float) -> None:
+    """Raise an error if the strains under a force are too large for Saint-Venant-Kirchhoff elasticity.
+
+    Args:
+        film: The film.
+        force: Force of the press, N.
+
+    Raises:
+        SceneError: If the squared amplitude exceeds `MAX_AMPLITUDE2` or is not finite.
+    """
+    with np.errstate(over="ignore"):  # the amplitude of a huge force is infinite, and is refused
+        squared_amplitude = amplitude_squared(film, force)
+    if not squared_amplitude <= MAX_AMPLITUDE2:
+        raise SceneError(
+            f"force {force:.4g} N stretches a film of {film.thickness:.4g} mm beyond small strains: expected "
+            f"(F / (E h a))^(2/3) up to {MAX_AMPLITUDE2:g}, got {squared_amplitude:.3g}"
+        )
+
+
 def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
     """Return the cheapest theory that is sufficiently accurate, or the full theory if no cheaper theory is sufficient.
 
@@ -200,7 +225,11 @@ def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Th
         probe: The probe.
         force: Force of the press, N.
         accuracy: Largest allowed relative error of a charge.
+
+    Raises:
+        SceneError: If the strains are too large for Saint-Venant-Kirchhoff elasticity.
     """
+    check_strains(film, force)
     is_pretensioned = film.pretension > 0.0
     full_theory = Theory(stretching=True, bending=True, pretensioned=is_pretensioned)
     error_estimate_is_valid = film.pretension >= 0.0 and film.is_axisymmetric

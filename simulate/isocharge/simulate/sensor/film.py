@@ -4,6 +4,9 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal, Self
 
+import numpy as np
+
+from isocharge.common.arrays import Array
 from isocharge.common.errors import SensorError
 from isocharge.simulate.sensor.size_check import check_length, check_stress
 
@@ -28,14 +31,14 @@ MIN_PIEZO = 1e-3
 A smaller value was probably given in C/N.
 """
 
-MIN_YOUNG = 1e-6
-"""Smallest accepted Young's modulus of a film, MPa."""
+MIN_YOUNG = 1.0
+"""Smallest accepted Young's modulus of a film, MPa. It is that of a soft rubber."""
 
-MAX_YOUNG = 1e7
-"""Largest accepted Young's modulus of a film, MPa. A larger value was probably given in Pa."""
+MAX_YOUNG = 1e6
+"""Largest accepted Young's modulus of a film, MPa. It is nearly that of diamond."""
 
-MAX_PRETENSION = 1e4
-"""Largest accepted pretension of a film, MPa. A larger value was probably given in Pa."""
+MAX_PRETENSION = 300.0
+"""Largest accepted pretension of a film, MPa. It is the tensile strength of stretched PVDF."""
 
 MAX_SLACK = 10.0
 """Largest accepted magnitude of a negative pretension, MPa. A slack film wrinkles under small forces."""
@@ -103,6 +106,14 @@ class Film:
     static_pressure: float = 0.0
     expansion: tuple[float, float] | None = None
     ring_expansion: float = ALUMINIUM_EXPANSION
+
+    def rim_distance(self, angle: Array) -> Array:
+        """Return the distance of the rim from the centre of the film in given directions, mm.
+
+        Args:
+            angle: Angles from the x axis, anticlockwise, any shape, rad.
+        """
+        return np.asarray(self.radius * (1.0 + self.oval * np.cos(2.0 * (angle - self.oval_axis))))
 
     @property
     def expands_evenly(self) -> bool:

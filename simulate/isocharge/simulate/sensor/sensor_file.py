@@ -10,6 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from msgspec import Meta, field
 
@@ -27,6 +28,7 @@ from isocharge.common.structs import (
     read_toml,
 )
 from isocharge.common.toml_text import to_toml
+from isocharge.simulate.sensor import film as limits
 from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, Film, Piezo, Surface
 from isocharge.simulate.sensor.sensor import Calibration, Corners, Electrode, Readout, Role, Sensor
 from isocharge.simulate.sensor.size_check import tidy
@@ -52,15 +54,21 @@ Coordinate = Annotated[float, Meta(ge=-MAX_COORDINATE_mm, le=MAX_COORDINATE_mm)]
 Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm, each at most {MAX_COORDINATE_mm:g}")]
 
 
+MIN_THICKNESS_um = 1e3 * limits.MIN_THICKNESS
+THICKNESS = f"at least {MIN_THICKNESS_um:g} um"
+MODULUS = f"a modulus from {1e-3 * limits.MIN_YOUNG:g} to {1e-3 * limits.MAX_YOUNG:g} GPa (PVDF: 1 to 9 GPa)"
+Modulus_GPa = Annotated[float, Meta(ge=1e-3 * limits.MIN_YOUNG, le=1e-3 * limits.MAX_YOUNG, description=MODULUS)]
+
+
 class FilmTable(Settings, frozen=True):
     """Content of the section `film` of a sensor file, with the mechanical properties of the film."""
 
     radius_mm: Annotated[float, Meta(gt=0.0, le=MAX_COORDINATE_mm)]
-    thickness_um: Positive
-    young_GPa: Positive | Annotated[list[Positive], Meta(min_length=2, max_length=2)]
+    thickness_um: Annotated[float, Meta(ge=MIN_THICKNESS_um, le=MAX_COORDINATE_mm, description=THICKNESS)]
+    young_GPa: Modulus_GPa | Annotated[list[Modulus_GPa], Meta(min_length=2, max_length=2)]
     poisson: Finite
     pretension_MPa: Finite | Annotated[list[Finite], Meta(min_length=3, max_length=3)] = 0.0
-    shear_GPa: Positive | None = None
+    shear_GPa: Modulus_GPa | None = None
     axis_deg: Finite = 0.0
     oval: Finite = 0.0
     oval_axis_deg: Finite = 0.0
@@ -278,7 +286,7 @@ def film_to_dict(film: Film) -> dict[str, Any]:
     root_of_ratio = np.sqrt(film.young_ratio)
     young_GPa = [tidy(film.young * 1e-3 * root_of_ratio), tidy(film.young * 1e-3 / root_of_ratio)]
 
-    # Collect the optional keys. Keys whose value is zero or None are omitted below.
+    # Collect the optional keys. Keys that have their default value are omitted below.
     optional: dict[str, Any] = {
         "shear_GPa": None if film.shear is None else tidy(film.shear * 1e-3),
         "axis_deg": tidy(float(np.rad2deg(film.axis))),
@@ -286,17 +294,19 @@ def film_to_dict(film: Film) -> dict[str, Any]:
         "oval_axis_deg": tidy(float(np.rad2deg(film.oval_axis))),
         "back_volume_mm3": None if film.back_volume is None else tidy(film.back_volume),
         "static_pressure_Pa": tidy(film.static_pressure * PASCAL_PER_MPA),
+        "ring_expansion_ppm_per_K": tidy(PPM * film.ring_expansion),
     }
+    default_of_key: dict[str, Any] = {field.name: field.default for field in msgspec.structs.fields(FilmTable)}
     if film.expansion is not None:
         optional["expansion_ppm_per_K"] = [tidy(PPM * coefficient) for coefficient in film.expansion]
-        optional["ring_expansion_ppm_per_K"] = tidy(PPM * film.ring_expansion)
+        del default_of_key["ring_expansion_ppm_per_K"]  # a film that expands is always written with its ring
     return {
         "radius_mm": tidy(film.radius),
         "thickness_um": tidy(film.thickness * 1e3),
         "young_GPa": tidy(film.young * 1e-3) if film.young_ratio == 1.0 else young_GPa,
         "poisson": film.poisson,
         "pretension_MPa": tension_MPa if any(film.deviator) else tidy(mean_tension),
-        **{name: value for name, value in optional.items() if value},
+        **{name: value for name, value in optional.items() if value != default_of_key.get(name)},
     }
 
 

@@ -275,19 +275,14 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
     points = np.asarray(points, dtype=float)
     film = equilibrium.film
     distance = np.hypot(points[:, 0], points[:, 1])  # from the centre of the film
-
-    # Distance of the rim from the centre in the direction of each point
-    rim_distance: Array | float = film.radius
-    if film.oval:
-        angle = np.arctan2(points[:, 1], points[:, 0])
-        rim_distance = film.radius * (1.0 + film.oval * np.cos(2.0 * (angle - film.oval_axis)))
+    rim_distance = film.rim_distance(np.arctan2(points[:, 1], points[:, 0]))
 
     # The condition is negated, so that points with NaN count as outside. The tolerance is for rounding errors.
     is_outside = ~(distance <= rim_distance * (1.0 + 1e-9))
     if is_outside.any():
         first_outside = np.argmax(is_outside)
         x, y = points[first_outside]
-        raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {film.radius:.4g} mm")
+        raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {rim_distance[first_outside]:.4g} mm")
     return equilibrium.mesh.locate(_to_press_frame(equilibrium, points))
 
 

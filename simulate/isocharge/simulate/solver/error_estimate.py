@@ -3,7 +3,8 @@
 In the inner part of the film, two quantities indicate the error that the mesh causes: the shapes of the elements, and
 the contribution of the highest polynomial modes to the slopes of the deflection. The estimate is not reliable for
 presses near the rim or for large footprints that are not circular. Under such presses, elements that are too coarse may
-lie far from the elements with the largest stress. These presses are therefore solved on meshes of increasing polynomial
+lie far from the elements with the largest stress. The same holds for a pressure on the whole film, which bends also the
+large elements far from the probe. These presses are therefore solved on meshes of increasing polynomial
 order, until two successive meshes result in nearly the same charges. Presses are also solved on several meshes if the
 required accuracy is better than the default accuracy. If the polynomial order of the elements increases by one, the
 error decreases by a factor of three to ten. The difference between the charges of two successive meshes is therefore an
@@ -211,7 +212,7 @@ def _patch_charges(equilibrium: Equilibrium, centres: Array) -> Array:
     points = np.stack([complex_points.real, complex_points.imag], axis=1)
 
     # Stress at the integration points. The stress is set to zero outside the film.
-    is_on_film = np.abs(complex_points) < film_radius
+    is_on_film = np.abs(complex_points) < equilibrium.film.rim_distance(np.angle(complex_points))
     stress = np.zeros((len(points), 3))
     stress[is_on_film] = touch_stress(equilibrium, points[is_on_film])
 

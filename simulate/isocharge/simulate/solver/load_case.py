@@ -9,8 +9,7 @@ from typing import Literal, Self
 import numpy as np
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.scaling import amplitude_squared
-from isocharge.simulate.mechanics.theory import ACCURACY, Theory, bending_length, choose_theory
+from isocharge.simulate.mechanics.theory import ACCURACY, Theory, bending_length, check_strains, choose_theory
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import CLEARANCE
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, place
@@ -36,12 +35,6 @@ MIN_LAYER_REUSE = 0.75
 
 MAX_LAYER_REUSE = 2.0
 """Largest ratio of the width of the thin rings of a starting equilibrium to `LAYER_WIDTH` at which it is reused."""
-
-MAX_AMPLITUDE2 = 0.1
-"""Largest squared amplitude A^2 for which Saint-Venant-Kirchhoff elasticity is valid, dimensionless.
-
-The strains are of the order A^2.
-"""
 
 MAX_SIDE_SHARE = 1.0
 """Largest ratio of the side force to the force of the press. It corresponds to a coefficient of friction of one."""
@@ -143,12 +136,7 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
             "press farther inside"
         )
 
-    squared_amplitude = amplitude_squared(film, force)
-    if squared_amplitude > MAX_AMPLITUDE2:
-        raise SceneError(
-            f"force {force:.4g} N stretches a film of {film.thickness:.4g} mm beyond small strains: expected "
-            f"(F / (E h a))^(2/3) up to {MAX_AMPLITUDE2:g}, got {squared_amplitude:.3g}"
-        )
+    check_strains(film, force)
 
 
 def check_side_force(side_force: tuple[float, float], force: float) -> None:
@@ -344,7 +332,8 @@ def needs_second_mesh(case: LoadCase) -> bool:
     radius = case.film.radius
     is_large = not case.probe.topology.fills_circle and case.probe.reach > RELIABLE_REACH * radius
     is_near_rim = case.probe.farthest_distance(case.at) > RELIABLE_RADIUS * radius
-    return is_large or is_near_rim or case.accuracy < ACCURACY
+    has_back_pressure = case.film.has_back_pressure
+    return is_large or is_near_rim or has_back_pressure or case.accuracy < ACCURACY
 
 
 def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
