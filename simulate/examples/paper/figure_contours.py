@@ -117,7 +117,7 @@ def _row_of_percentile(accuracy: Accuracy, degree: int) -> Row:
         if layout == "three" and other != degree
     )
     return Row(
-        "percentile of 0.122 mm over the working area",
+        "share of all presses over the working area with an error below 0.122 mm",
         "0.122 mm",
         f"{errors.share_below(ERROR_MM):.0f} %; median {errors.percentile(50):.3f}, "
         f"95 % {errors.percentile(95):.3f} mm; "

@@ -53,8 +53,8 @@ class Errors:
         return float(np.percentile(self.found_mm, share)) if self.found_mm.size else float("nan")
 
     def share_below(self, error_mm: float) -> float:
-        """Percentage of the presses with a position whose error is at most `error_mm`."""
-        return float(100.0 * np.mean(self.found_mm <= error_mm)) if self.found_mm.size else float("nan")
+        """Percentage of all presses that have a position with an error of at most `error_mm`."""
+        return 100.0 * np.count_nonzero(self.found_mm <= error_mm) / len(self.at)
 
     def numbers(self) -> dict[str, object]:
         """Return the statistics of the errors for programs."""
@@ -62,7 +62,7 @@ class Errors:
             "presses": len(self.at),
             **{meeting.name: int(np.sum(self.fix.status == meeting)) for meeting in Meeting},
             **{f"p{share}_mm": self.percentile(share) for share in (25, 50, 75, 95)},
-            "percentile_of_0.122_mm": self.share_below(ERROR_MM),
+            "percent_of_all_presses_below_0.122_mm": self.share_below(ERROR_MM),
         }
 
 
