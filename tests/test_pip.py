@@ -58,13 +58,27 @@ def wheel(distributions):
     return path
 
 
-def install(requirement, folder, timeout):
+def install(requirement, folder, timeout, constraints=""):
     """Install a requirement into an empty environment, and return the bin folder of the environment."""
     venv.create(folder / "env")
     python = folder / "env" / "bin" / "python"
+    constraint_file = folder / "constraints.txt"
+    constraint_file.write_text(constraints)
     pip = [sys.executable, "-m", "pip", "--python", python]
-    subprocess.run([*pip, "install", "--quiet", "--no-compile", requirement], check=True, timeout=timeout)
+    options = ["--quiet", "--no-compile", "--constraint", constraint_file]
+    subprocess.run([*pip, "install", *options, requirement], check=True, timeout=timeout)
     return python.parent
+
+
+def lower_bounds():
+    """Constraints with which pip installs the smallest allowed version of each package.
+
+    Torch is left out, because it is too large to be installed in a second version.
+    """
+    extras = PROJECT["optional-dependencies"]
+    requirements = [*PROJECT["dependencies"], *(line for name in COMMANDS_OF_EXTRAS for line in extras[name])]
+    bounds = (re.match(r"([\w-]+)>=([\d.]+)", line) for line in requirements)
+    return "".join(f"{bound[1]}=={bound[2]}\n" for bound in bounds if bound and bound[1] != "torch")
 
 
 @pytest.fixture(scope="module")
@@ -146,11 +160,32 @@ def test_a_missing_extra_says_how_to_get_it(base, tmp_path, words, extra):
     assert "Traceback" not in done.stderr
 
 
+def check_help_and_missing_argument(bin_folder, folder):
+    """Check what typer and click print."""
+    for command in ("", "serve stream", "serve predict"):
+        done = run(bin_folder, "isocharge", *command.split(), "--help", cwd=folder)
+        assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+    done = run(bin_folder, "isocharge", "serve", "predict", cwd=folder)
+    assert (done.returncode, "Missing argument 'MODEL'" in done.stderr) == (2, True), done.stderr
+
+
+def test_help_and_a_missing_argument_are_no_crash(base, tmp_path):
+    check_help_and_missing_argument(base, tmp_path)
+
+
+@pytest.mark.slow
+def test_the_base_install_works_with_the_lower_bounds_of_its_packages(wheel, tmp_path):
+    bin_folder = install(str(wheel), tmp_path, timeout=280, constraints=lower_bounds())
+    assert predicted(bin_folder, tmp_path) == pytest.approx([3.0, -2.0, 1.0], abs=0.06)
+    check_help_and_missing_argument(bin_folder, tmp_path)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
+@pytest.mark.parametrize("constraints", ["", lower_bounds()], ids=["newest", "lower bounds"])
 @pytest.mark.parametrize("extra", sorted(COMMANDS_OF_EXTRAS))
-def test_the_wheel_with_an_extra_runs_the_readme_and_a_command_of_the_extra(wheel, tmp_path, extra):
-    bin_folder = install(f"{wheel}[{extra}]", tmp_path, timeout=3000)
+def test_the_wheel_with_an_extra_runs_the_readme_and_a_command_of_the_extra(wheel, tmp_path, extra, constraints):
+    bin_folder = install(f"{wheel}[{extra}]", tmp_path, 3000, constraints)
     example = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)[1]
     done = run(bin_folder, "python", "-c", example, cwd=tmp_path)
     assert done.stdout.splitlines() == re.findall(r"^print\(.*\)  # (.+)$", example, re.MULTILINE), done.stderr

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import socket
+import subprocess
 import tomllib
 from contextlib import ExitStack
 from pathlib import Path
@@ -39,6 +40,19 @@ EXAMPLE_PAGES = ["serve/README.md", *(f"serve/docs/{name}" for name in PAGES if 
 
 def is_slow(example):
     return Path(example.page).name in SLOW and example.language == "sh"
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed")
+def test_the_sketch_for_teensy_and_arduino_compiles_and_sends_lines_that_are_read(tmp_path):
+    sketch = tmp_path / "frames.ino"
+    sketch.write_text(re.search(r"```cpp\n(.*?)```", PAGES["boards.md"], re.DOTALL)[1])
+    board = Path(__file__).parents[1] / "train" / "export_c" / "board"
+    words = ["g++", "-Wall", "-DISOCHARGE_ELECTRODES=3", f'-DSKETCH="{sketch}"', "-I", board, board / "run_sketch.cpp"]
+    subprocess.run([*words, "-o", tmp_path / "sketch"], check=True)
+    pins = b"".join(b"%d 512 %d 498\n" % (5000 * k, 500 + k) for k in range(1, 21))
+    sent = subprocess.run([tmp_path / "sketch"], input=pins, capture_output=True, check=True).stdout
+    frames = TextParser().feed(b"\n" + sent)
+    assert frames[-1].values == (512.0, 520.0, 498.0)
 
 
 def test_frame_of_the_documentation_is_read():

@@ -18,6 +18,8 @@ static inline int analogRead(int pin) { return pins[pin - A0]; }
 struct Port {
     void begin(long) {}
     void print(const char *text) { fputs(text, stdout); }
+    void print(int value) { printf("%d", value); }
+    void println(int value) { printf("%d\r\n", value); }
     void println(float value, int digits) { printf("%.*f\r\n", digits, (double)value); }
     size_t write(const uint8_t *bytes, size_t count) { return fwrite(bytes, 1, count, stdout); }
 };
