@@ -6,7 +6,7 @@ from concurrent.futures import CancelledError
 
 import pytest
 
-from isocharge.common.progress import listening, report, second_thread
+from isocharge.common.progress import listening, report, reporting_as, second_thread
 
 
 def test_the_progress_of_a_second_thread_reaches_the_listener():
@@ -45,3 +45,14 @@ def test_a_second_thread_stops_at_its_next_report_if_the_first_thread_is_interru
         interrupted_block()
     (future,) = futures
     assert isinstance(future.exception(), CancelledError)
+
+
+def test_another_title_replaces_that_of_all_reports():
+    calls = []
+    with listening(lambda *call: calls.append(call)):
+        with reporting_as("the other film"):
+            report("the film", 1, 2, "soon")
+        report("the film", 2, 2)
+    assert calls == [("the other film", 1, 2, "soon"), ("the film", 2, 2, "")]
+    with reporting_as("nobody listens"):
+        report("the film", 1, 2)

@@ -54,6 +54,23 @@ def report(title: str, done: int, total: int, note: str = "") -> None:
 
 
 @contextmanager
+def reporting_as(title: str) -> Iterator[None]:
+    """During the `with` block, report the progress of the present thread under another title.
+
+    Two computations that run at the same time need different titles, because a title identifies a progress bar.
+
+    Args:
+        title: Title that replaces those of all reports.
+    """
+    listener = _listener.get()
+    if listener is None:
+        yield
+        return
+    with listening(lambda _title, done, total, note: listener(title, done, total, note)):
+        yield
+
+
+@contextmanager
 def second_thread() -> Iterator[Executor]:
     """Provide an executor with one thread. The calls in this thread report to the listener of the present thread.
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import SceneError, SolveError
-from isocharge.common.progress import report, second_thread
+from isocharge.common.progress import report, reporting_as, second_thread
 from isocharge.common.resumable_run import ResumableRun, output_errors, prepare_target, resume_folder
 from isocharge.simulate.dataset.sampling import SAMPLING_DESCRIPTIONS, Sweep, SweepPresses
 from isocharge.simulate.dataset.shards import (
@@ -182,7 +182,8 @@ def outside_map(
     if sweep.outside == 0 or outermost_distance(sensor.film, probe) < sweep.radius + MIN_RING_WIDTH:
         return None
     try:
-        return whole_film_map(sensor, probe, sweep.force_range, executor=executor)
+        with reporting_as("solving the film up to the clamp"):
+            return whole_film_map(sensor, probe, sweep.force_range, executor=executor)
     except (SceneError, SolveError) as error:
         _log.warning("presses outside %g mm are not simulated: %s", sweep.radius, error)
         return None
