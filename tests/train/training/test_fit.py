@@ -98,10 +98,51 @@ def test_weights_of_the_warm_up_are_never_the_best():
 
 
 @pytest.mark.usefixtures("_short_reports")
-def test_a_score_of_nan_is_an_error():
+def test_scores_that_are_always_nan_are_an_error():
     stage, _ = stage_with_scores([float("nan")] * 20)
-    with pytest.raises(TrainingError, match=r"the stage loss is .* at step 20 of 400; lower training.learning_rate"):
+    with pytest.raises(TrainingError, match=r"the stage loss is .* at step 180 of 400.*lower training.learning_rate"):
         run_stage(stage)
+    short_stage, _ = stage_with_scores([float("nan")] * 20, steps=2 * REPORT_EVERY)
+    with pytest.raises(TrainingError, match="the stage network has no finite validation score after 40 steps"):
+        run_stage(short_stage)
+
+
+@pytest.mark.usefixtures("_short_reports")
+@pytest.mark.parametrize("bad_value", ["nan", "inf"])
+def test_a_step_whose_loss_is_nan_is_taken_back_with_a_smaller_learning_rate(bad_value):
+    stage, weights_at_scores = stage_with_scores([5.0, 1.0, 3.0, 2.0], steps=4 * REPORT_EVERY)
+    bad_step = 2 * REPORT_EVERY + 3
+
+    def loss(step, random):
+        return stage.loss(step, random) * (float(bad_value) if step == bad_step else 1.0)
+
+    training = Descent(replace(stage, loss=loss), 1e-2, 10**6, seed=0)
+    while training.step <= bad_step:
+        training.take_step()
+        if training.step % REPORT_EVERY == 0:
+            training._evaluate(0.0)
+    assert have_same_weights(stage.network.state_dict(), weights_at_scores[1])
+    assert training.rate == 0.5e-2
+    training.run()
+    assert training.best_score == 1.0
+    assert have_same_weights(stage.network.state_dict(), weights_at_scores[1])
+
+
+@pytest.mark.usefixtures("_short_reports")
+def test_a_score_of_nan_takes_the_weights_back_and_the_training_goes_on():
+    stage, weights_at_scores = stage_with_scores([5.0, float("nan"), 3.0, 4.0], steps=4 * REPORT_EVERY)
+    run_stage(stage)
+    assert have_same_weights(stage.network.state_dict(), weights_at_scores[2])
+
+
+@pytest.mark.parametrize("patience", [1, 7, 50])
+def test_a_training_with_little_patience_ends_after_a_validation_with_trained_weights(patience):
+    stage, weights_at_scores = stage_with_scores([3.0] * 400, steps=400)
+    initial = {name: weight.clone() for name, weight in stage.network.state_dict().items()}
+    reports = run_stage(stage, patience)
+    assert [step for step, *_ in reports] == [patience, 2 * patience]
+    assert have_same_weights(stage.network.state_dict(), weights_at_scores[0])
+    assert not have_same_weights(stage.network.state_dict(), initial)
 
 
 def settings(hidden=(16, 16), misfit_hidden=(8, 8), weights="float32", electrodes=0, **training):

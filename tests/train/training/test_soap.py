@@ -80,6 +80,23 @@ def test_a_gradient_of_zero_changes_nothing():
     torch.testing.assert_close(weight, torch.ones(4, 3))
 
 
+def test_rows_that_get_a_gradient_only_later_do_not_cause_long_steps():
+    """Until the 180th step, half of the rows have no gradient, so that their mean square in the eigenbasis is zero."""
+    random = torch.Generator().manual_seed(0)
+    weight = nn.Parameter(torch.zeros(8, 12))
+    optimiser = Soap([weight], lr=0.02)
+    longest_step = 0.0
+    for step in range(240):
+        gradient = torch.randn(8, 12, generator=random) + 1.0
+        if step < 180:
+            gradient[4:] = 0.0
+        weight.grad = gradient
+        before = weight.detach().clone()
+        optimiser.step()
+        longest_step = max(longest_step, (weight.detach() - before).norm().item())
+    assert longest_step <= 0.02 * soap.MAX_RATIO * np.sqrt(weight.numel())
+
+
 def test_a_restored_state_continues_with_the_same_steps():
     loss = ill_conditioned_problem((5, 4))
     weight = nn.Parameter(torch.zeros(5, 4))

@@ -81,9 +81,17 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     calls.append(f"last({buffers[-1]}, skipped, answers);")
     hidden_buffers = dict.fromkeys(buffers[1:])  # removes repeated names, and keeps the order
 
-    # The template of the file contains a placeholder for each of these arguments. The arguments `plane`, `logs` and
-    # `known` are the numbers of outputs of the last layer up to the position, up to the logarithms, and up to the
-    # angles of the correlations.
+    limits = ""
+    log_std = "answers[i]"
+    if network.log_std_limits is not None:
+        lower, upper = map(_to_single_precision, network.log_std_limits)
+        limits = f"{c_array('LOWEST_LOG_STD', lower)}{c_array('HIGHEST_LOG_STD', upper)}\n"
+        row = f"[i - {LOG_STD.start}]"
+        log_std = f"clip(answers[i], LOWEST_LOG_STD{row}, HIGHEST_LOG_STD{row})"
+
+    # The template of the file contains a placeholder for each of these arguments. The arguments `plane`, `stds`,
+    # `logs` and `known` are the numbers of outputs of the last layer up to the position, up to the force, up to the
+    # standard deviations, and up to the angles of the correlations.
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),
@@ -94,7 +102,10 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         calls="\n    ".join(calls),
         electrodes=network.features.n_electrode,
         plane=POSITION.stop,
+        stds=LOG_STD.start,
         logs=LOG_STD.stop,
+        limits=limits,
+        log_std=log_std,
         known=network.angle_columns.stop,
         answers=last.weight.shape[1],
         all=_correlations_source(network) if network.n_angle else "",

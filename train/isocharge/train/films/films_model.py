@@ -18,7 +18,7 @@ from isocharge.train.training.correlation import N_EXAMPLES, with_correlation
 from isocharge.train.training.features import logarithmic_features
 from isocharge.train.training.fitted import Fitted, Provenance
 from isocharge.train.training.folded_network import FoldedNetwork
-from isocharge.train.training.folding import fold, linear_answer_map
+from isocharge.train.training.folding import fold, linear_answer_map, log_std_limits
 from isocharge.train.training.output_regression import adapt_to_charges, add_variance
 
 N_REGRESSION_PRESSES = 750
@@ -345,4 +345,5 @@ class FilmsModel:
         rotation = self.scaling.rotation(parameters)
         offset = self.scaling.offset(parameters)
         answer_map = linear_answer_map(self.domain, rotation, offset, features.n_electrode)
-        return FoldedNetwork(features, fold(perceptrons, features_mean, self.whitening, answer_map))
+        layers = fold(perceptrons, features_mean, self.whitening, answer_map)
+        return FoldedNetwork(features, layers, log_std_limits(self.domain))

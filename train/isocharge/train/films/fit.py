@@ -43,7 +43,7 @@ from isocharge.train.training.losses import (
     warm_up_loss,
     with_fresh_noise,
 )
-from isocharge.train.training.network import as_tensor, compress_length
+from isocharge.train.training.network import as_tensor, compress_length, limit_log_std
 
 RADIUS_MARGIN = 1.5
 """Distance by which the forward maps reach beyond the radius of the domain, mm.
@@ -364,7 +364,9 @@ class _ContactTraining:
         # baddbmm(o, u, T') computes o + u T' for each film, with one press in each row of u
         mean = torch.baddbmm(offset[:, None], outputs[..., MEAN], rotation.transpose(1, 2))
         target = as_tensor(scaling.domain.to_unit(contact.reshape(-1, 3).astype(float)))
-        return _Batch(mean.reshape(-1, 3), outputs[..., LOG_STD].reshape(-1, 3), target)
+        flat_mean = mean.reshape(-1, 3)
+        log_std = limit_log_std(outputs[..., LOG_STD].reshape(-1, 3), flat_mean, scaling.domain)
+        return _Batch(flat_mean, log_std, target)
 
 
 def _redraw_piezo_and_gains(prior: FilmPrior, parameters: Array, random: torch.Generator) -> Array:

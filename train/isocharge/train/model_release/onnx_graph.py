@@ -129,16 +129,26 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
 
     # Split the answers: x and y, the logarithms of the force and of the three standard deviations, the angles that
     # determine the correlations, and the misfit vector.
-    widths = {"plane": POSITION.stop, "logs": LOG_STD.stop - POSITION.stop}
+    n_std = LOG_STD.stop - LOG_STD.start
+    widths = {"plane": POSITION.stop, "log_force": 1, "log_std": n_std}
+    if network.log_std_limits is None:
+        widths = {"plane": POSITION.stop, "logs": 1 + n_std}
     if network.n_angle:
         widths["angles"] = network.n_angle
     widths["misfit_vector"] = n_electrode
-    answers = _add_answers(builder, network)
-    position, logarithms, *optional_angles, misfit_vector = builder.split(answers, widths)
+    position, *logarithms, misfit_vector = builder.split(_add_answers(builder, network), widths)
+    optional_angles = logarithms[-1:] if network.n_angle else []
 
-    # The exponentials of the logarithms are the force and the standard deviations. The second result of the split has
-    # the name of an output of the graph, `contact_std`, so it needs no further node.
-    force, _ = builder.split(builder.add("Exp", logarithms), {"force": 1, "contact_std": 3})
+    # The exponentials of the logarithms are the force and the standard deviations.
+    if network.log_std_limits is None:
+        # A result of the split has the name of an output of the graph, `contact_std`, so it needs no further node.
+        force, _ = builder.split(builder.add("Exp", logarithms[0]), {"force": 1, "contact_std": n_std})
+    else:
+        lower, upper = network.log_std_limits
+        log_force, log_std = logarithms[:2]
+        force = builder.add("Exp", log_force)
+        limited_below = builder.add("Max", log_std, builder.constant(lower))
+        builder.add("Exp", builder.add("Min", limited_below, builder.constant(upper)), to="contact_std")
     builder.add("Concat", position, force, to="contact", axis=1)
     for angles in optional_angles:  # one tensor, or none if the network has no correlations
         cosines = builder.add("Cos", angles)
@@ -294,10 +304,16 @@ def _recover_network(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
         skip = next(constants)
         bias = next(constants)
         perceptron = Perceptron(tuple(hidden), Layer(next(constants), bias), skip, activation)
+        next(constants)  # the widths of the split of the answers
+        has_limits = operators.count("Max") > is_signed  # the standard deviations have limits
+        limits = [next(constants), next(constants)] if has_limits else []
     except StopIteration:
         _refuse(where, f"expected more constants than these {len(graph.initializer)}")
     _check_shapes(features, perceptron, where)
-    return FoldedNetwork(features, perceptron)
+    n_std = LOG_STD.stop - LOG_STD.start
+    if any(limit.shape != (n_std,) for limit in limits):
+        _refuse(where, f"expected {n_std} limits of standard deviations, got {[limit.shape for limit in limits]}")
+    return FoldedNetwork(features, perceptron, np.array(limits) if has_limits else None)
 
 
 def _hidden_activation(operators: Sequence[str], where: str) -> Activation:

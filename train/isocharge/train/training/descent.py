@@ -30,7 +30,13 @@ INITIAL_RATE = 0.04
 """Learning rate of the first step, relative to the largest rate."""
 
 REPORT_EVERY = 200
-"""Number of steps between two evaluations on the validation data."""
+"""Largest number of steps between two evaluations on the validation data."""
+
+RETRY_RATE_FACTOR = 0.5
+"""Factor of the learning rate after a loss that is not finite."""
+
+MAX_RETRIES = 8
+"""Largest number of losses that are not finite. After more of them, the training is given up."""
 
 SAVE_EVERY_S = 3.0
 """Time between two checkpoints, s."""
@@ -124,7 +130,7 @@ class Descent:
 
     Attributes:
         best_score: Lowest validation score so far.
-        best_weights: State of the network at this score.
+        best_weights: State of the network at this score. During the warm-up, the state at the latest validation.
     """
 
     def __init__(self, stage: TrainingStage, rate: float, patience: int, seed: int) -> None:
@@ -139,6 +145,7 @@ class Descent:
         self.stage = stage
         self.patience = patience
         self.rate = rate
+        self.retry_count = 0
         self.optimisers = stage.optimisers(stage)
         self.random = torch.Generator().manual_seed(seed)
         self.step = 0
@@ -150,14 +157,17 @@ class Descent:
         """Train the network, and finally restore the weights with the best validation score.
 
         The training ends after all steps of the stage, or earlier if the validation score has not improved in the last
-        `patience` steps.
+        `patience` steps. In both cases, the last step is followed by a validation.
+
+        If a loss, a gradient or a validation score is not finite, the best weights so far are restored. The training
+        continues from them with new optimisers and half of the learning rate.
 
         Args:
             resumable_run: Run that saves the state every few seconds. An interrupted training can then be continued,
                 and ends with the same weights. None to save nothing.
 
         Raises:
-            TrainingError: If the loss is not finite.
+            TrainingError: If the loss is not finite in more than `MAX_RETRIES` steps, or no validation score is finite.
         """
         last_save_s = time.monotonic()
         if resumable_run is not None:
@@ -165,24 +175,36 @@ class Descent:
             if state is not None:
                 self._restore(state)
 
-        while self.step < self.stage.steps and not self._is_stalled():
+        validation_interval = min(REPORT_EVERY, self.patience)
+        is_stalled = False
+        while self.step < self.stage.steps and not is_stalled:
             loss = self.take_step()
             is_last_step = self.step == self.stage.steps
-            if is_last_step or self.step % REPORT_EVERY == 0:
+            if is_last_step or self.step % validation_interval == 0:
                 self._evaluate(loss.item())
+                is_stalled = self._is_stalled()
             if resumable_run is not None and time.monotonic() - last_save_s >= SAVE_EVERY_S:
                 resumable_run.save(self.stage.name, tensor_bytes(self._state()))
                 last_save_s = time.monotonic()
 
         if resumable_run is not None:
             resumable_run.save(self.stage.name, tensor_bytes(self._state()))
+        if not math.isfinite(self.best_score):
+            raise TrainingError(
+                f"the {self.stage.name} network has no finite validation score after {self.step} steps; lower "
+                "training.learning_rate, or check the presses"
+            )
         self.stage.network.load_state_dict(self.best_weights)
 
     def take_step(self) -> Tensor:
         """Change the weights by one step of the optimisers, and return the loss of the batch before the change.
 
         The method first sets the learning rates of this step. After the warm-up, a gradient whose norm exceeds
-        `largest_gradient` is scaled down to this norm.
+        `largest_gradient` is scaled down to this norm. If the loss or the gradient is not finite, the best weights so
+        far are restored instead.
+
+        Raises:
+            TrainingError: If too many losses were not finite.
         """
         stage = self.stage
         rate = self.rate * stage.rate_factor * _relative_rate(self.step / stage.steps)
@@ -194,36 +216,57 @@ class Descent:
         stage.network.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         is_warm_up = self.step < stage.warm_up_steps
-        if not is_warm_up and math.isfinite(stage.largest_gradient):
-            torch.nn.utils.clip_grad_norm_(stage.network.parameters(), stage.largest_gradient)
-        for optimiser in self.optimisers:
-            optimiser.step()
+        largest_gradient = math.inf if is_warm_up else stage.largest_gradient
+        gradient_norm = torch.nn.utils.clip_grad_norm_(stage.network.parameters(), largest_gradient)
         self.step += 1
+        if torch.isfinite(loss) and torch.isfinite(gradient_norm):
+            for optimiser in self.optimisers:
+                optimiser.step()
+        else:
+            self._restore_best_weights(loss.item())
         return loss
 
-    def _evaluate(self, loss: float) -> None:
-        """Compute the validation score, keep the weights if the score is the best so far, and report the progress.
-
-        Weights from the warm-up are never kept, because the warm-up steps minimise another loss.
+    def _restore_best_weights(self, loss: float) -> None:
+        """Continue from the best weights so far, with new optimisers and a smaller learning rate.
 
         Args:
             loss: Loss of the latest batch.
 
         Raises:
-            TrainingError: If the loss or the score is not finite.
+            TrainingError: If this has happened too often.
+        """
+        self.retry_count += 1
+        if self.retry_count > MAX_RETRIES:
+            raise TrainingError(
+                f"the {self.stage.name} loss is {loss} at step {self.step} of {self.stage.steps}, after {MAX_RETRIES} "
+                "earlier losses that were not finite; lower training.learning_rate"
+            )
+        self.rate *= RETRY_RATE_FACTOR
+        self.optimisers = self.stage.optimisers(self.stage)
+        self.stage.network.load_state_dict(self.best_weights)
+
+    def _evaluate(self, loss: float) -> None:
+        """Compute the validation score, keep the weights if the score is the best so far, and report the progress.
+
+        Weights from the warm-up are only kept until the first validation after the warm-up, because the warm-up steps
+        minimise another loss.
+
+        Args:
+            loss: Loss of the latest batch.
+
+        Raises:
+            TrainingError: If the score is not finite, and too many losses were not finite.
         """
         with torch.no_grad():
             score, text = self.stage.score()
-        if not (math.isfinite(loss) and math.isfinite(score)):
-            raise TrainingError(
-                f"the {self.stage.name} loss is {loss} at step {self.step} of {self.stage.steps}; lower "
-                "training.learning_rate"
-            )
-        is_after_warm_up = self.step > self.stage.warm_up_steps
-        if is_after_warm_up and score < self.best_score:
-            self.best_score = score
-            self.best_step = self.step
+        is_warm_up = self.step <= self.stage.warm_up_steps
+        if not math.isfinite(score):
+            self._restore_best_weights(loss)
+        elif is_warm_up or score < self.best_score:
             self.best_weights = copy.deepcopy(self.stage.network.state_dict())
+            if not is_warm_up:
+                self.best_score = score
+                self.best_step = self.step
         report(f"training the {self.stage.name} network", self.step, self.stage.steps, f"loss {loss:.3f}, {text}")
 
     def _is_stalled(self) -> bool:
@@ -239,6 +282,7 @@ class Descent:
             "random": self.random.get_state(),
             "step": self.step,
             "best": (self.best_score, self.best_step),
+            "rate": (self.rate, self.retry_count),
             "best_weights": self.best_weights,
         }
 
@@ -254,6 +298,7 @@ class Descent:
         self.random.set_state(state["random"])
         self.step = state["step"]
         self.best_score, self.best_step = state["best"]
+        self.rate, self.retry_count = state["rate"]
         self.best_weights = state["best_weights"]
 
 

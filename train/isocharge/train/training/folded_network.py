@@ -36,6 +36,14 @@ LOG_STD = slice(3, 6)
 N_CONTACT_ANSWERS = 6
 """Number of answers about the contact. They come before the angles of the correlations and before the misfit vector."""
 
+UNIT_LOG_STD_RANGE = (-10.0, 3.0)
+"""Smallest and largest logarithm of a standard deviation, relative to half of the width of the domain.
+
+The range includes all standard deviations that have a meaning: from a twenty-thousandth of the half width to twenty
+times the half width. Without these limits, charges unlike those of the training could have infinite standard deviations
+or standard deviations of zero, and a training could diverge.
+"""
+
 COSINES_TO_CORRELATIONS = np.array(
     [
         [1, 0, 0],
@@ -70,10 +78,14 @@ class FoldedNetwork:
         layers: Perceptron that computes the answers from the features. The answers are x and y (2), ln F (1),
             logarithms of the standard deviations (3), angles of the correlations (8, or 0 without correlations), and
             the misfit vector (n_electrode).
+        log_std_limits: Smallest and largest logarithms of the standard deviations, shape (2, 3), in the units of the
+            answers (`isocharge.train.training.folding.log_std_limits`). None for a network without limits, as in models
+            of which the graph contains none.
     """
 
     features: ChargeFeatures
     layers: Perceptron[Array]
+    log_std_limits: Array | None = None
 
     @property
     def n_angle(self) -> int:
@@ -134,7 +146,10 @@ class FoldedNetwork:
         """
         force = np.exp(answers[:, LOG_FORCE])
         contact = np.concatenate([answers[:, POSITION], force], axis=1)
-        std = np.exp(answers[:, LOG_STD])
+        log_std = answers[:, LOG_STD]
+        if self.log_std_limits is not None:
+            log_std = np.clip(log_std, *self.log_std_limits)
+        std = np.exp(log_std)
         outputs = [contact, std]
         if self.n_angle > 0:
             # Each correlation is a weighted sum of the cosines of the eight angles.

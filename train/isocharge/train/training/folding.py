@@ -14,7 +14,13 @@ from scipy.linalg import block_diag
 from isocharge.common.arrays import Array
 from isocharge.common.perceptron import Layer, Perceptron
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.train.training.folded_network import LOG_FORCE, LOG_STD, MEAN, N_CONTACT_ANSWERS
+from isocharge.train.training.folded_network import (
+    LOG_FORCE,
+    LOG_STD,
+    MEAN,
+    N_CONTACT_ANSWERS,
+    UNIT_LOG_STD_RANGE,
+)
 
 LOG_FORCE_STD = slice(LOG_STD.stop - 1, LOG_STD.stop)
 """Column of the answers with the logarithm of the standard deviation of the force."""
@@ -104,6 +110,21 @@ def linear_answer_map(domain: Domain, rotation: Array, offset: Array, n_electrod
     weight[MEAN, LOG_FORCE_STD] = weight[MEAN, LOG_FORCE]
     bias[LOG_FORCE_STD] += bias[LOG_FORCE]
     return Layer(weight, bias)
+
+
+def log_std_limits(domain: Domain) -> Array:
+    """Return the smallest and largest answers for the logarithms of the standard deviations, shape (2, 3).
+
+    The limits are `UNIT_LOG_STD_RANGE` relative to the scale of the domain. The third answer belongs to the absolute
+    standard deviation of the force. Its limits are those of the smallest and of the largest force.
+
+    Args:
+        domain: Domain that defines the centre and the scale of the unit coordinates.
+    """
+    log_force_limits = domain.centre[LOG_FORCE] + domain.scale[LOG_FORCE] * [-1.0, 1.0]
+    limits = np.log(domain.scale) + np.array(UNIT_LOG_STD_RANGE)[:, None]
+    limits[:, LOG_FORCE] += log_force_limits[:, None]
+    return limits
 
 
 def _join_perceptrons(perceptrons: Sequence[Perceptron[Array]]) -> Perceptron[Array]:

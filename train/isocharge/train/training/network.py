@@ -28,7 +28,7 @@ from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.folded_network import LOG_STD, MEAN, MISFIT_UNIT, N_CONTACT_ANSWERS, FoldedNetwork
-from isocharge.train.training.folding import fold, linear_answer_map
+from isocharge.train.training.folding import fold, linear_answer_map, log_std_limits
 from isocharge.train.training.torch_evaluation import evaluate, evaluate_features
 
 LARGEST_INT8 = 127
@@ -252,7 +252,8 @@ class InverseNetwork(nn.Module):
             of shape (n, 3).
         """
         outputs = self.contact(self.inputs(charge))
-        return outputs[:, MEAN], outputs[:, LOG_STD], outputs[:, TRAINING_ANGLES]
+        mean = outputs[:, MEAN]
+        return mean, limit_log_std(outputs[:, LOG_STD], mean, self.domain), outputs[:, TRAINING_ANGLES]
 
     def forward(self, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Estimate contacts.
@@ -277,6 +278,28 @@ class InverseNetwork(nn.Module):
         misfit_vector = self.misfit_vector(self.inputs(charge))
         compressed_misfit = torch.linalg.vector_norm(misfit_vector, dim=1, keepdim=True)
         return contact, contact_std, MISFIT_UNIT * torch.sinh(compressed_misfit)
+
+
+def limit_log_std(log_std: Tensor, mean: Tensor, domain: Domain) -> Tensor:
+    """Limit the logarithms of the standard deviations as a folded network does (`log_std_limits`).
+
+    The gradient is not zero beyond the limits, but that at the limit. A training therefore leaves a limit as soon as
+    the errors require it.
+
+    Args:
+        log_std: Logarithms of the standard deviations of the unit coordinates, shape (n, 3).
+        mean: Means of the unit coordinates, shape (n, 3).
+        domain: Domain that defines the unit coordinates.
+
+    Returns:
+        Limited logarithms, shape (n, 3).
+    """
+    # The limits are those of the standard deviations of x, y and F, where the one of F is F times the one of ln F.
+    log_unit = as_tensor(np.log(domain.scale)).repeat(len(mean), 1)
+    log_unit[:, 2] += mean[:, 2].detach() * domain.scale[2] + domain.centre[2]
+    answer = log_std.detach() + log_unit
+    lower, upper = as_tensor(log_std_limits(domain))
+    return log_std + (answer.clamp(lower, upper) - answer)
 
 
 def compress_length(residual: Tensor) -> Tensor:
@@ -312,7 +335,7 @@ def fold_network(network: InverseNetwork) -> FoldedNetwork:
     # The contact perceptron estimates the unit coordinates directly, so they are neither rotated nor shifted.
     answer_map = linear_answer_map(network.domain, np.eye(3), np.zeros(3), charge_features.n_electrode)
     perceptrons = [_contact_to_numpy(network), network.misfit_vector.to_numpy()]
-    return _fold(network, perceptrons, answer_map)
+    return replace(_fold(network, perceptrons, answer_map), log_std_limits=log_std_limits(network.domain))
 
 
 def fold_contact_mean(network: InverseNetwork) -> FoldedNetwork:

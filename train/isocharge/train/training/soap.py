@@ -20,6 +20,15 @@ EPSILON = 1e-10
 """Number that is added to each root mean square of the gradient, so that no division by zero occurs."""
 
 
+MAX_RATIO = 2.0
+"""Largest ratio of the averaged gradient to its root mean square, in the eigenbasis.
+
+With equal decay rates, the ratio is at most 1, except where an update of the eigenvectors has moved a part of the
+averaged gradient to an entry whose mean square is nearly zero. Such entries arise where the gradient of some weights
+becomes different from zero only during the training. Without the limit, the step would be arbitrarily long.
+"""
+
+
 class Soap:
     """The optimiser SOAP. Parameters with one dimension, such as biases, are trained by Adam.
 
@@ -117,8 +126,9 @@ def _update(
     mean_weight = 1.0 - mean_decay ** state["step"]
     square_weight = 1.0 - square_decay ** state["step"]
     root_mean_square = (mean_square / square_weight).sqrt_().add_(EPSILON)
-    direction = _rotate_back(_rotate(mean, state) / root_mean_square, state)
-    parameter.add_(direction, alpha=-rate / mean_weight)
+    ratio = _rotate(mean, state) / (mean_weight * root_mean_square)
+    direction = _rotate_back(ratio.clamp_(-MAX_RATIO, MAX_RATIO), state)
+    parameter.add_(direction, alpha=-rate)
 
 
 def _initial_state(gradient: Tensor) -> dict[str, Any]:

@@ -101,6 +101,8 @@ function multiply(row, matrix, bias) {
 /** The operations of ONNX that occur in released models. All of them act on one row. */
 const OPERATIONS = {
   Clip: (row, low, high) => [{ values: row.values.map((value) => Math.min(Math.max(value, low.values[0]), high.values[0])) }],
+  Max: (row, low) => [{ values: row.values.map((value, k) => Math.max(value, low.values[k])) }],
+  Min: (row, high) => [{ values: row.values.map((value, k) => Math.min(value, high.values[k])) }],
   Mul: (row, factor) => [{ values: row.values.map((value, k) => value * factor.values[factor.values.length > 1 ? k : 0]) }],
   Log: mapped(Math.log),
   Tanh: mapped(Math.tanh),

@@ -13,7 +13,7 @@ static float clip(float x, float low, float high)
 
 $features
 $layers
-/* What the last layer gives, still without the functions of `contact_of`. */
+$limits/* What the last layer gives, still without the functions of `contact_of`. */
 static void answers_of(const float charge_pC[ISOCHARGE_ELECTRODES], float answers[$answers])
 {
     float logs[$electrodes], $rows, skipped[$answers];
@@ -28,8 +28,10 @@ static void contact_of(const float answers[$answers], float contact[7])
 
     for (int i = 0; i < $plane; ++i)
         contact[i] = answers[i];
-    for (int i = $plane; i < $logs; ++i)
+    for (int i = $plane; i < $stds; ++i)
         contact[i] = expf(answers[i]);
+    for (int i = $stds; i < $logs; ++i)
+        contact[i] = expf($log_std);
     for (int i = $known; i < $answers; ++i)
         length += answers[i] * answers[i];
     contact[$logs] = sinhf(sqrtf(length)) * $misfit_unit;
