@@ -13,7 +13,9 @@ from isocharge.serve import Predictor, check_golden, load_model
 from isocharge.simulate import Calibration, load_sensor, press, touch_charge
 from isocharge.train import Provenance, evaluate, release
 from isocharge.train.films.film_scaling import FilmScaling
+from isocharge.train.model_release.onnx_graph import read_graph, write_graph
 from isocharge.train.training.folded_network import MISFIT_UNIT
+from isocharge.train.training.folding import log_std_limits
 from isocharge.train.training.output_regression import adapt_to_charges
 
 POSITION_mm = (3.0, -4.0)
@@ -85,8 +87,9 @@ def torch_answers(films, inputs, networks, parameters, charge):
         )
     mean, log_std = np.split(contact_outputs, 2, axis=1)
     contact = films.domain.to_contact(films.scaling.to_film(np.tile(film, (len(mean), 1)), mean))
-    std = np.exp(log_std) * films.domain.scale
-    std[:, 2] *= contact[:, 2]
+    log_std += np.log(films.domain.scale)
+    log_std[:, 2] += np.log(contact[:, 2])
+    std = np.exp(np.clip(log_std, *log_std_limits(films.domain)))
     length = np.linalg.norm(misfit_vector, axis=1, keepdims=True)
     return contact, std, MISFIT_UNIT * np.sinh(length)
 
@@ -168,7 +171,9 @@ def test_a_film_becomes_a_served_model(films, random_films, drawn, tmp_path):
     assert (folder / "card.md").read_text().endswith("\n# mine\n")
     assert (folder / "presses.csv").read_bytes() == b"x_mm\n"
     released = Path(__file__).parents[3] / "models" / "four-25um-biaxial" / "1" / "model.onnx"
-    mine, trained = (onnx.load(path).graph for path in (folder / "model.onnx", released))
+    released_network = replace(read_graph(released.read_bytes(), "f"), log_std_limits=fitted.network.log_std_limits)
+    trained = onnx.load_from_string(write_graph(released_network, {})).graph
+    mine = onnx.load(folder / "model.onnx").graph
     assert [node.op_type for node in mine.node] == [node.op_type for node in trained.node]
     assert [list(c.dims) for c in mine.initializer] == [list(c.dims) for c in trained.initializer]
     three, _, _ = random_films(THREE)

@@ -290,6 +290,18 @@ def test_presses_at_one_place_are_in_the_same_fold():
     np.testing.assert_array_equal(fold == 0, held_out(contact))
 
 
+def test_no_fold_is_empty_beside_a_reference_position_with_many_presses():
+    contact = np.concatenate([contacts_on_l(600, 5), np.tile([[1.0, 2.0, 3.0]], (400, 1))])
+    assert (np.bincount(folds_by_place(contact, 5), minlength=5) > 50).all()
+
+
+def test_noise_is_right_where_presses_repeat_places_and_forces():
+    """A press with the same contact as another must not be its own neighbour."""
+    contact = np.repeat(contacts_on_l(200, 5), 6, axis=0)
+    noise = ChannelNoise.estimate(charges_on_l(contact, 8), PressedArea.of_contacts(contact).to_unit(contact))
+    np.testing.assert_allclose(noise.sigma(np.zeros((1, 4)))[0], NOISE_pC, rtol=0.07)
+
+
 def test_factors_of_standard_deviations_are_the_ratio_of_errors_to_standard_deviations():
     rng = np.random.default_rng(0)
     truth = rng.standard_normal((20_000, 3))
@@ -403,8 +415,56 @@ def test_presses_of_one_force_are_learned_with_a_warning(caplog):
     usable_presses(with_contact(2, lambda _: np.full(1_200, 2.0)))
     assert "all presses have a force of about 2 N: the model can estimate no other force" in caplog.text
     caplog.clear()
+    usable_presses(with_contact(2, lambda _: np.full(1_200, np.nan)))
+    assert "no press has a known force" in caplog.text
+    caplog.clear()
     usable_presses(presses_on_l())
     assert not caplog.text
+
+
+def flat_presses(force_N):
+    """Return presses like a public data set: eight channels, positions on a grid, one dead weight, noise of 3 %.
+
+    Args:
+        force_N: Force of all presses; NaN if it is unknown.
+    """
+    rng = np.random.default_rng(9)
+    grid = np.stack(np.meshgrid(np.arange(-20.0, 21.0, 4.0), np.arange(-20.0, 21.0, 4.0)), axis=-1).reshape(-1, 2)
+    place = np.repeat(grid, 8, axis=0)
+    angle = np.arange(8) * np.pi / 4.0
+    channel_places = 22.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    distance = np.linalg.norm(place[:, None] - channel_places, axis=2)
+    pressure = 100.0 / (1.0 + (distance / 12.0) ** 2) * (1.0 + 0.03 * rng.standard_normal(distance.shape))
+    contact = np.column_stack([place, np.full(len(place), force_N)])
+    return measured_presses(contact, pressure, tuple("STUVWXYZ"))
+
+
+@pytest.mark.parametrize(("force_N", "stated_N", "stated_std"), [(2.0, 2.0, 0.005), (np.nan, 1.0, 1.0)])
+def test_presses_of_one_force_or_without_forces_train_x_and_y(force_N, stated_N, stated_std, tmp_path, caplog):
+    presses = flat_presses(force_N)
+    fitted = fit_presses(presses, "pad", QUICK)
+    assert "the model learns x and y alone" in caplog.text or "and learns x and y alone" in caplog.text
+    contact, std, _ = fitted.predict(presses.charge_pC)
+    np.testing.assert_allclose(contact[:, 2], stated_N, rtol=1e-6)
+    np.testing.assert_allclose(std[:, 2], stated_std * stated_N, rtol=1e-4)
+    errors = evaluate(fitted)
+    assert errors["position_rms_mm"] < 1.5
+    assert 0.65 <= errors["coverage_68"] <= 0.71
+    assert not [name for name in errors if name.startswith("force_")]
+    folder = release(fitted, tmp_path / "pad").folder
+    assert "| forces | not estimated: every answer is" in (folder / "card.md").read_text()
+    assert np.isfinite(Predictor(folder).predict(presses.charge_pC[0])[:7]).all()
+    assert Predictor(folder).flags(Predictor(folder).predict(presses.charge_pC[0])) == ()
+
+
+def test_a_real_pad_is_trained_in_a_short_form():
+    """Every fold of an earlier version diverged to NaN or to errors of 70 mm after the warm-up."""
+    presses = read_presses(ROOT / "tests" / "data" / "tactile_fsi.csv")
+    training = TrainingConfig(steps=300, misfit_steps=50, misfit_charges=1_000, batch=256)
+    errors = evaluate(fit_presses(presses, "pad", FitConfig(network=QUICK.network, training=training)))
+    assert errors["position_rms_mm"] < 8.0
+    assert errors["force_rms_percent"] < 30.0
+    assert 0.65 <= errors["coverage_68"] <= 0.71
 
 
 def test_intact_presses_are_accepted():

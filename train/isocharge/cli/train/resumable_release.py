@@ -110,10 +110,13 @@ def train_and_release(
 def _errors_sentence(metadata: ModelMetadata) -> str:
     """Return a sentence that states the errors of a model."""
     errors = metadata.errors
+    force_words = "the force is not estimated"
+    if "force_rms_percent" in errors:
+        force_words = f"force {errors['force_rms_percent']:g} % rms"
     return (
         f"{_measured_presses_words(metadata)}position error {errors['position_median_mm']:g} mm median, "
         f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "
-        f"force {errors['force_rms_percent']:g} % rms"
+        f"{force_words}"
     )
 
 

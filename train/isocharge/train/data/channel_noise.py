@@ -194,7 +194,10 @@ class LocalPlanes:
         """
         tree = cKDTree(unit_contact)
         distance, nearest = tree.query(unit_contact, NEIGHBOURS + 1)  # both of shape (n, NEIGHBOURS + 1)
-        neighbours = nearest[:, 1:]  # the nearest point is the press itself
+        # A press with the same contact may come before the press itself, which is therefore found by its number.
+        is_itself = nearest == np.arange(len(unit_contact))[:, None]
+        columns_without_itself = np.argsort(is_itself, axis=1, kind="stable")[:, :NEIGHBOURS]
+        neighbours = np.take_along_axis(nearest, columns_without_itself, axis=1)
         offsets = unit_contact[neighbours] - unit_contact[:, None]  # shape (n, NEIGHBOURS, 3)
         # The constant and the offsets of the neighbours, shape (n, NEIGHBOURS, 1 + number of coordinates)
         columns = np.concatenate([np.ones((*neighbours.shape, 1)), offsets], axis=2)

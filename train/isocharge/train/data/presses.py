@@ -287,10 +287,10 @@ def held_out(contact: Array) -> Booleans:
     Returns:
         Whether each press is held out, shape (n,).
     """
-    count = len(contact)
+    presses_before, count = _count_presses_before(contact, round(1.0 / HELD_SHARE))
     smallest_held_count = min(FEWEST_HELD, 0.5 * count)
     held_count = max(HELD_SHARE * count, smallest_held_count)
-    return _count_presses_before(contact) < held_count
+    return presses_before < held_count
 
 
 def folds_by_place(contact: Array, count: int) -> Integers:
@@ -303,30 +303,36 @@ def folds_by_place(contact: Array, count: int) -> Integers:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         count: Number of folds.
     """
-    return np.asarray(_count_presses_before(contact) * count // len(contact), dtype=np.intp)
+    presses_before, total_count = _count_presses_before(contact, count)
+    return np.asarray(presses_before * count // total_count, dtype=np.intp)
 
 
-def _count_presses_before(contact: Array) -> Integers:
+def _count_presses_before(contact: Array, part_count: int) -> tuple[Integers, int]:
     """For each press, count the presses at all positions that are chosen before its own position.
 
     Positions are chosen in the order of the checksums of their coordinates. This order is random but the same in every
-    run.
+    run. The presses at one position count as at most one part of all counted presses, so that no part remains empty
+    beside a position with very many presses.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        part_count: Number of parts into which the presses are divided.
 
     Returns:
-        Number of earlier presses for each press, shape (n,).
+        Number of earlier presses for each press, shape (n,), and number of all counted presses.
     """
     rounded_position = np.round(contact[:, :2], 3) + 0.0  # the addition converts -0.0 into 0.0
     positions, position_of_press, presses_at_position = np.unique(
         rounded_position, axis=0, return_inverse=True, return_counts=True
     )
+    limited_counts = presses_at_position
+    while limited_counts.max() > max(1, limited_counts.sum() // part_count):
+        limited_counts = np.minimum(limited_counts, max(1, limited_counts.sum() // part_count))
     order = np.argsort([sha256_of(position.tobytes()) for position in positions])
-    ordered_counts = presses_at_position[order]
-    presses_before = np.empty_like(presses_at_position)
+    ordered_counts = limited_counts[order]
+    presses_before = np.empty_like(limited_counts)
     presses_before[order] = np.cumsum(ordered_counts) - ordered_counts  # the sum without the position itself
-    return np.asarray(presses_before[position_of_press.ravel()])
+    return np.asarray(presses_before[position_of_press.ravel()]), int(limited_counts.sum())
 
 
 def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Dataset:

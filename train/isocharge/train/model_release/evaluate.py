@@ -50,10 +50,11 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
 
     Returns:
         Errors by name. The position errors are in mm, and the force errors are in percent of the force. The coverages
-        of the 68 and 95 % intervals are fractions of the coordinates, 0 to 1. Further entries are the misfits that 1 %
-        and, if there are enough presses, 0.1 % of the good presses exceed. For simulated presses, the result also
-        contains the errors without noise, and the fractions of faults that cause an alarm. For measured presses, the
-        result also contains the number of presses.
+        of the 68 and 95 % intervals are fractions of the coordinates, 0 to 1. If the network always answers the same
+        force, there are no errors of the force, and the coverages are those of x and y. Further entries are the misfits
+        that 1 % and, if there are enough presses, 0.1 % of the good presses exceed. For simulated presses, the result
+        also contains the errors without noise, and the fractions of faults that cause an alarm. For measured presses,
+        the result also contains the number of presses.
     """
     if presses is None:
         test_presses = fitted.test
@@ -72,6 +73,10 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     all_errors = contact_errors(contact, std, test_presses.contact)
     # Too few presses are measured for the 99th percentiles.
     errors = {name: error for name, error in all_errors.items() if name not in ONLY_SIMULATED}
+    if fitted.is_force_constant:
+        n_plane = 2  # x and y
+        errors |= _coverages(contact[:, :n_plane], std[:, :n_plane], test_presses.contact[:, :n_plane])
+        errors = {name: error for name, error in errors.items() if not name.startswith("force_")}
     errors[HELD_PRESSES] = float(len(test_presses))
     return errors | _good_press_misfits(fitted, seed)
 
@@ -142,13 +147,17 @@ def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]
     """
     statistics = asdict(ContactErrorStatistics.of(contact, truth))
     del statistics["presses"]  # the number of presses is not an error
-    deviation = np.abs(contact - truth) / std  # in reported standard deviations
-    errors = {
-        **statistics,
-        "coverage_68": np.mean(deviation < 1.0),
-        "coverage_95": np.mean(deviation < WITHIN_95_PERCENT),
+    errors = {name: rounded(value) for name, value in statistics.items()}
+    return errors | _coverages(contact, std, truth)
+
+
+def _coverages(estimate: Array, std: Array, truth: Array) -> dict[str, float]:
+    """Return the fractions of true values in the 68 and 95 % intervals around the estimates, all of the same shape."""
+    deviation = np.abs(estimate - truth) / std  # in reported standard deviations
+    return {
+        "coverage_68": rounded(np.mean(deviation < 1.0)),
+        "coverage_95": rounded(np.mean(deviation < WITHIN_95_PERCENT)),
     }
-    return {name: rounded(value) for name, value in errors.items()}
 
 
 def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int) -> dict[str, float]:

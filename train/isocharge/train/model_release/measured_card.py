@@ -16,6 +16,12 @@ def measured_errors_section(errors: Mapping[str, float], heading_end: str, expla
         heading_end: Last words of the heading, after "measured presses".
         explanation: Paragraph about the meaning of the figures.
     """
+    force_rows = ""
+    if "force_rms_percent" in errors:
+        force_rows = f"""\
+| force, median | {errors["force_median_percent"]:g} % |
+| force, rms | {errors["force_rms_percent"]:g} % |
+"""
     return f"""## Errors on {errors[HELD_PRESSES]:.0f} measured presses {heading_end}
 
 {explanation}
@@ -24,9 +30,7 @@ def measured_errors_section(errors: Mapping[str, float], heading_end: str, expla
 | position, median | {errors["position_median_mm"]:g} mm |
 | position, rms | {errors["position_rms_mm"]:g} mm |
 | position, 95 % | {errors["position_p95_mm"]:g} mm |
-| force, median | {errors["force_median_percent"]:g} % |
-| force, rms | {errors["force_rms_percent"]:g} % |
-| coverage of the 68 % intervals | {100 * errors["coverage_68"]:.3g} % |
+{force_rows}| coverage of the 68 % intervals | {100 * errors["coverage_68"]:.3g} % |
 | coverage of the 95 % intervals | {100 * errors["coverage_95"]:.3g} % |
 """
 
@@ -47,10 +51,18 @@ def measured_card(metadata: ModelMetadata) -> str:
         for name, white, gain in zip(metadata.electrodes, white_noise, gain_noise, strict=True)
     )
     position_factor, force_factor = measured["std_factors"]
+    forces = f"{min_force:g} to {max_force:g} N"
+    constant_force = metadata.made_with.get("constant_force")
+    if constant_force is not None:
+        reason = "all presses had this force" if constant_force["is_known"] else "the forces were not measured"
+        forces = (
+            f"not estimated: every answer is {constant_force['force_N']:g} N with a standard deviation of "
+            f"{100 * constant_force['force_std']:.3g} %, because {reason}"
+        )
     error_source = f"""\
 The errors are those of {measured["folds"]} networks, each on the places on which it was not trained. The model
 learned the mean of their answers, whose errors are slightly smaller. The standard deviations were multiplied by
-{position_factor:g} for positions and {force_factor:g} for forces, so that the intervals contain 68 and 95 % of these \
+{position_factor:g} for positions and {force_factor:g} for forces, so that the 68 % intervals contain 68 % of these \
 presses.
 """
     return f"""# {metadata.name}, version {metadata.version}
@@ -64,7 +76,7 @@ was fitted to measured presses alone, without a simulator.
 | outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each), `misfit` |
 | fitted to | {measured["presses"]} presses at {measured["places"]} places, in `presses.csv` |
 | working area | {width:.4g} mm x {height:.4g} mm, the outline of the presses; corners in the metadata |
-| forces | {min_force:g} to {max_force:g} N |
+| forces | {forces} |
 | probes | {", ".join(metadata.probes)} |
 {noise_rows}
 

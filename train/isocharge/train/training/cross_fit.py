@@ -27,6 +27,7 @@ from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import PressError, cut
 from isocharge.common.measured_presses import MeasuredPresses, presses_text
 from isocharge.common.resumable_run import ResumableRun
+from isocharge.common.statistics import rms
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
 from isocharge.train.data.measured_checks import check_measured_presses
 from isocharge.train.data.measured_sensor import LEAST_RANGE, MeasuredSensor, PressedArea
@@ -74,15 +75,12 @@ presses."""
 PRESSES_FILE = "presses.csv"
 """Name of the file in the version folder with the presses on which the model was trained."""
 
+UNKNOWN_FORCE_N = 1.0
+"""Force that a model states if it was trained on presses without forces, N. Its standard deviation has the same
+size."""
+
 ONE_STD_COVERAGE = 0.6827
 """Probability that a Gaussian variable is within one standard deviation of its mean."""
-
-TWO_STD_COVERAGE = 0.95
-"""Probability that a Gaussian variable is within `TWO_STD_LIMIT` standard deviations of its mean."""
-
-TWO_STD_LIMIT = 1.96
-"""Half width of the interval that contains the fraction `TWO_STD_COVERAGE` of a Gaussian variable, in standard
-deviations."""
 
 
 def fit_presses(
@@ -97,10 +95,11 @@ def fit_presses(
 
     Several networks are trained for a cross-validation. One further network learns the mean outputs of these networks
     (distillation), and then learns misfits. A warning is logged if presses are left out. Another warning is logged if
-    all presses have nearly the same force.
+    all presses have nearly the same force, or if no press has a known force. The network then only learns x and y.
 
     Args:
-        presses: At least 500 presses at 50 places. Presses with an unknown place, force or charge are left out.
+        presses: At least 500 presses at 50 places. Presses with an unknown place or charge are left out, and presses
+            with an unknown force, unless all forces are unknown.
         name: Name of the sensor.
         config: Settings. The setting `steps` is the largest number of steps. The settings `noise` and `hold_out` are
             not used.
@@ -119,18 +118,23 @@ def fit_presses(
     settings = (config or FitConfig()).checked()
     training = _with_defaults_for_measured(settings.training, presses.charge_pC.shape[1])
     usable = usable_presses(presses)
+    force_std = constant_force_std(usable)  # None if the forces vary
     labelled = LabelledPresses(usable.contact, usable.charge_pC, measured=True)
     domain = PressedArea.of_contacts(labelled.contact)
     noise = ChannelNoise.estimate(labelled.charge, domain.to_unit(labelled.contact))
     with threads_and_seed(training.threads, training.seed):
         features = WhitenedFeatures.fit_signed(labelled.charge, noise.transition_charge(labelled.charge))
         # The first network will be returned. The other networks each belong to one fold of the cross-validation.
-        network, *fold_networks = (InverseNetwork(domain, features, settings.network) for _ in range(1 + N_FOLDS))
+        network, *fold_networks = (
+            InverseNetwork(domain, features, settings.network, force_std) for _ in range(1 + N_FOLDS)
+        )
         # For the cross-validation, train a network for each fold on the presses of all other folds.
         fold_of_press = folds_by_place(labelled.contact, N_FOLDS)
         steps = _train_fold_networks(fold_networks, labelled, fold_of_press, noise, training, run)
         contact, std = _cross_validated_contact(fold_networks, labelled.charge, fold_of_press)
         position_factor, force_factor = std_factors(contact, std, labelled.contact)
+        if force_std is not None:
+            force_factor = 1.0
 
         # Train the returned network: its contacts on the mean outputs of the other networks, then its misfits.
         distillation = _distillation_stage(network, fold_networks, labelled, noise, training)
@@ -145,6 +149,12 @@ def fit_presses(
         misfit=_cross_validated_misfit(labelled, domain, noise, fold_of_press),
     )
     made_with = _made_with(settings, labelled, steps, (position_factor, force_factor))
+    if force_std is not None:
+        made_with["constant_force"] = {
+            "force_N": float(f"{np.exp(domain.centre[2]):.4g}"),
+            "force_std": float(f"{force_std:.4g}"),
+            "is_known": bool(presses.placed.any()),
+        }
     return Fitted(
         network=fold_network(network.eval()).with_scaled_std(position_factor, force_factor),
         sensor=MeasuredSensor(name, usable.electrodes),
@@ -157,6 +167,7 @@ def fit_presses(
         provenance=Provenance(made_with=made_with, files={PRESSES_FILE: presses_text(usable).encode()}),
         requested_domain=domain,
         cross_validated=cross_validated,
+        is_force_constant=force_std is not None,
     )
 
 
@@ -201,7 +212,9 @@ def _made_with(
 def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     """Select the presses with known place, force and charges, and check that their number suffices for a training.
 
-    A warning is logged if presses are left out. Another warning is logged if all presses have nearly the same force.
+    If no press has a known force, every press gets the force `UNKNOWN_FORCE_N` with a standard deviation of the same
+    size. A warning is logged if presses are left out. Another warning is logged if all presses have nearly the same
+    force, or no press has a known force.
 
     Args:
         presses: All presses of a file.
@@ -219,6 +232,11 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
             "of the file"
         )
 
+    is_any_force_known = bool(np.isfinite(presses.contact[:, 2]).any())
+    if not is_any_force_known:
+        assumed_contact = presses.contact.copy()
+        assumed_contact[:, 2] = UNKNOWN_FORCE_N
+        presses = replace(presses, contact=assumed_contact, force_std=np.ones(len(presses)))
     is_complete = complete(presses)  # whether the place, the force and all charges of each press are known
     usable = presses[is_complete]
     rounded_places_mm = np.round(usable.contact[:, :2], 3)  # places within a micrometre count as the same place
@@ -233,18 +251,42 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     left_out_count = len(presses) - len(usable)
     if left_out_count:
         _log.warning("%d of %d presses are left out: an unknown place, force or charge", left_out_count, len(presses))
-    force = usable.contact[:, 2]
-    if force.max() < LEAST_RANGE * force.min():
-        _log.warning("all presses have a force of about %.3g N: the model can estimate no other force", force.mean())
+    if not is_any_force_known:
+        _log.warning(
+            "no press has a known force: the model learns x and y alone, and always states %g +- %g N",
+            UNKNOWN_FORCE_N,
+            UNKNOWN_FORCE_N,
+        )
+    elif constant_force_std(usable) is not None:
+        _log.warning(
+            "all presses have a force of about %.3g N: the model can estimate no other force, and learns x and y alone",
+            usable.contact[:, 2].mean(),
+        )
     return usable
+
+
+def constant_force_std(presses: MeasuredPresses) -> float | None:
+    """Return the relative standard deviation of the force of presses that all have nearly the same force.
+
+    The variance is the sum of that of the forces and of the mean of those that the presses state.
+
+    Args:
+        presses: Presses with known forces.
+
+    Returns:
+        The standard deviation, dimensionless; None if the forces vary.
+    """
+    force = presses.contact[:, 2]
+    if force.max() >= LEAST_RANGE * force.min():
+        return None
+    return float(np.hypot(np.std(np.log(force)), rms(presses.force_std)))
 
 
 def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]:
     """Compute the factors by which standard deviations must be multiplied to agree with the observed errors.
 
-    Two requirements determine two candidates for each factor. With the first candidate, the intervals of one standard
-    deviation contain 68 % of the true values. With the second candidate, the 95 % intervals contain 95 % of the true
-    values. The factor is the geometric mean of both candidates.
+    With these factors, the intervals of one standard deviation contain 68 % of the true values. If the errors have
+    longer tails than a normal distribution, the 95 % intervals contain fewer than 95 %.
 
     Args:
         contact: Contacts (x, y, F) that were estimated by networks that were not trained on these presses, shape (n,
@@ -256,19 +298,9 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
         Factors for the position and for the force.
     """
     deviation = np.abs(contact - truth) / std
-    return _std_factor(deviation[:, :2]), _std_factor(deviation[:, 2])
-
-
-def _std_factor(deviation: Array) -> float:
-    """Compute the factor by which standard deviations must be multiplied, as described for `std_factors`.
-
-    Args:
-        deviation: Absolute errors divided by their standard deviations, any shape.
-    """
-    # If the standard deviations were right, the first quantile would be 1 and the second would be `TWO_STD_LIMIT`.
-    one_std_quantile, two_std_quantile = np.quantile(deviation, [ONE_STD_COVERAGE, TWO_STD_COVERAGE])
-    # The two candidates for the factor are therefore `one_std_quantile` and `two_std_quantile / TWO_STD_LIMIT`.
-    return float(np.sqrt(one_std_quantile * two_std_quantile / TWO_STD_LIMIT))  # their geometric mean
+    position_factor = np.quantile(deviation[:, :2], ONE_STD_COVERAGE)
+    force_factor = np.quantile(deviation[:, 2], ONE_STD_COVERAGE)
+    return float(position_factor), float(force_factor)
 
 
 def _with_defaults_for_measured(config: TrainingConfig, n_electrode: int) -> TrainingConfig:

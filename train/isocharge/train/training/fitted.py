@@ -67,6 +67,8 @@ class Fitted:
         outside: Presses outside the working area; None if they were not simulated.
         yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
             or above the range of forces.
+        is_force_constant: Whether the network always answers the same force, because all presses have this force or no
+            press has a known force.
     """
 
     network: FoldedNetwork
@@ -83,6 +85,7 @@ class Fitted:
     cross_validated: Answers | None = None
     outside: OutsidePresses | None = None
     yield_force_N: float | None = None
+    is_force_constant: bool = False
 
     @property
     def misfit_noise(self) -> Noise:

@@ -27,7 +27,14 @@ from isocharge.common.perceptron import Layer, Perceptron
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.features import WhitenedFeatures
-from isocharge.train.training.folded_network import LOG_STD, MEAN, MISFIT_UNIT, N_CONTACT_ANSWERS, FoldedNetwork
+from isocharge.train.training.folded_network import (
+    LOG_FORCE,
+    LOG_STD,
+    MEAN,
+    MISFIT_UNIT,
+    N_CONTACT_ANSWERS,
+    FoldedNetwork,
+)
 from isocharge.train.training.folding import fold, linear_answer_map, log_std_limits
 from isocharge.train.training.torch_evaluation import evaluate, evaluate_features
 
@@ -45,6 +52,9 @@ N_TRAINING_ANGLES = 3
 
 TRAINING_ANGLES = slice(N_CONTACT_ANSWERS, N_CONTACT_ANSWERS + N_TRAINING_ANGLES)
 """Columns of the outputs of the contact perceptron that contain the angles of the correlations minus a right angle."""
+
+FORCE_OUTPUTS = [LOG_FORCE.start, LOG_STD.stop - 1]
+"""Outputs of the contact perceptron for ln F and for the logarithm of its standard deviation."""
 
 INITIAL_NONLINEAR_SIZE = 0.2
 """Factor by which the initial weights of an output are multiplied after its linear part was fitted."""
@@ -179,9 +189,13 @@ class InverseNetwork(nn.Module):
         domain: Contacts for which the network is trained.
         features: Whitened input features.
         config: Widths and activation of the hidden layers.
+        force_std: Relative standard deviation of the force if all presses have the same force. The network then always
+            answers the force in the middle of the domain with this standard deviation. None to learn the force.
     """
 
-    def __init__(self, domain: Domain, features: WhitenedFeatures, config: NetworkConfig) -> None:
+    def __init__(
+        self, domain: Domain, features: WhitenedFeatures, config: NetworkConfig, force_std: float | None = None
+    ) -> None:
         """Create the perceptrons with random weights.
 
         The following tensors are stored as buffers, because they are not trained: centre and scale of the unit
@@ -191,6 +205,7 @@ class InverseNetwork(nn.Module):
             domain: Contacts for which the network is trained.
             features: Whitened input features.
             config: Widths and activation of the hidden layers.
+            force_std: Relative standard deviation of a constant force; None to learn the force.
         """
         super().__init__()
         self.domain = domain
@@ -203,6 +218,11 @@ class InverseNetwork(nn.Module):
         self.misfit_vector = TrainablePerceptron(
             n_electrode, config.misfit_widths(n_electrode), n_electrode, activation
         )
+        self.output_factor = nn.Buffer(torch.ones(n_output))
+        self.output_offset = nn.Buffer(torch.zeros(n_output))
+        if force_std is not None:
+            self.output_factor[FORCE_OUTPUTS] = 0.0
+            self.output_offset[LOG_STD.stop - 1] = np.log(force_std / domain.scale[2])
         self.centre = nn.Buffer(as_tensor(domain.centre))
         self.scale = nn.Buffer(as_tensor(domain.scale))
         self.features_mean = nn.Buffer(as_tensor(features.mean))
@@ -251,7 +271,7 @@ class InverseNetwork(nn.Module):
             Means of the unit coordinates, logarithms of their standard deviations, and angles minus a right angle, each
             of shape (n, 3).
         """
-        outputs = self.contact(self.inputs(charge))
+        outputs = self.contact(self.inputs(charge)) * self.output_factor + self.output_offset
         mean = outputs[:, MEAN]
         return mean, limit_log_std(outputs[:, LOG_STD], mean, self.domain), outputs[:, TRAINING_ANGLES]
 
@@ -364,11 +384,16 @@ def _fold(network: InverseNetwork, perceptrons: Sequence[Perceptron[Array]], ans
 
 
 def _contact_to_numpy(network: InverseNetwork) -> Perceptron[Array]:
-    """Return the contact perceptron as NumPy arrays, without its outputs for the angles of the correlations."""
+    """Return the contact perceptron as NumPy arrays, without its outputs for the angles of the correlations.
+
+    A constant force is included in the last layer.
+    """
     perceptron = network.contact.to_numpy()
+    factor = _to_numpy(network.output_factor)[:N_CONTACT_ANSWERS]
+    offset = _to_numpy(network.output_offset)[:N_CONTACT_ANSWERS]
     weight, bias = perceptron.last
-    last = Layer(weight[:, :N_CONTACT_ANSWERS], bias[:N_CONTACT_ANSWERS])
-    return replace(perceptron, last=last, skip=perceptron.skip[:, :N_CONTACT_ANSWERS])
+    last = Layer(weight[:, :N_CONTACT_ANSWERS] * factor, bias[:N_CONTACT_ANSWERS] * factor + offset)
+    return replace(perceptron, last=last, skip=perceptron.skip[:, :N_CONTACT_ANSWERS] * factor)
 
 
 def _to_numpy(tensor: Tensor) -> Array:
