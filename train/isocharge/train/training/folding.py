@@ -124,7 +124,7 @@ def log_std_limits(domain: Domain) -> Array:
     log_force_limits = domain.centre[LOG_FORCE] + domain.scale[LOG_FORCE] * [-1.0, 1.0]
     limits = np.log(domain.scale) + np.array(UNIT_LOG_STD_RANGE)[:, None]
     limits[:, LOG_FORCE] += log_force_limits[:, None]
-    return limits
+    return np.asarray(limits)
 
 
 def _join_perceptrons(perceptrons: Sequence[Perceptron[Array]]) -> Perceptron[Array]:
