@@ -1,0 +1,80 @@
+"""Time and error of forward maps of films that are not axisymmetric.
+
+For each film and probe, the benchmark builds a forward map with two workers, computes the charges of 100,000 presses,
+and compares some of them with direct solves. The error of a charge is relative to the directly solved charge, or to a
+tenth of the largest charge of the press if this is larger.
+
+    python tests/benchmarks/bench_uneven_films.py [--probe circle:1.0] [--presses 20]
+"""
+
+import argparse
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from isocharge.simulate import ForwardMap, Sensor, Sweep, load_sensor, parse_probe, press, touch_charge
+
+TENSION = {"pretension": 0.75, "deviator": (0.25, 0.1)}
+MODULI = {"young": np.sqrt(3400.0 * 2400.0), "young_ratio": 3.4 / 2.4, "axis": np.deg2rad(20.0)}
+OVAL = {"oval": 0.01}
+FILMS = {
+    "pretension [1.0, 0.5, 0.1] MPa": TENSION,
+    "moduli 3.4 and 2.4 GPa at 20 degrees": MODULI,
+    "oval 0.01": OVAL,
+    "all three": TENSION | MODULI | OVAL,
+}
+PROBES = ("circle:1.0", "finger:6.0", "triangle:4.0")
+RADIUS_mm = 8.0
+FORCES_N = (0.05, 2.0)
+SAMPLES = 100_000
+
+
+def direct_errors(forward_map: ForwardMap, sensor: Sensor, count: int) -> np.ndarray:
+    """Compare the charges of random presses with direct solves, and return the largest error of each press."""
+    sweep = Sweep(RADIUS_mm, FORCES_N, samples=count, seed=7, sampling="random", orientation="random")
+    presses = sweep.over([forward_map.probe])
+    interpolated = forward_map.charges(presses.contact, presses.rotation)
+    errors = []
+    for (x, y, force), rotation, charge in zip(presses.contact.tolist(), presses.rotation, interpolated, strict=True):
+        solved = press(sensor.film, forward_map.probe.rotated(float(rotation)), (x, y), force)
+        expected = touch_charge(sensor, solved)
+        divisor = np.maximum(np.abs(expected), 0.1 * np.abs(expected).max())
+        errors.append((np.abs(charge - expected) / divisor).max())
+    return np.array(errors)
+
+
+def main() -> None:
+    """Print one row for each film and probe."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--probe", action="append", choices=PROBES, help="one of the probes; by default all")
+    parser.add_argument("--presses", type=int, default=20, help="presses that are compared with direct solves")
+    options = parser.parse_args()
+
+    built_in = load_sensor("four-25um-biaxial")
+    sweep = Sweep(RADIUS_mm, FORCES_N, samples=SAMPLES, orientation="random")
+    print(f"{'film':40}{'probe':16}{'solves':>8}{'map, s':>8}{'charges, s':>12}{'worst error, %':>16}{'rms, %':>8}")
+    with ProcessPoolExecutor(2) as executor:
+        for name, changes in FILMS.items():
+            sensor = replace(built_in, film=replace(built_in.film, **changes))
+            for notation in options.probe or PROBES:
+                probe = parse_probe(notation)
+                start = time.perf_counter()
+                forward_map = ForwardMap.build(sensor, probe, RADIUS_mm, FORCES_N, executor=executor)
+                map_s = time.perf_counter() - start
+                presses = sweep.over([probe])
+                start = time.perf_counter()
+                forward_map.charges(presses.contact, presses.rotation)
+                charges_s = time.perf_counter() - start
+                errors = 100.0 * direct_errors(forward_map, sensor, options.presses)
+                rms = np.sqrt(np.mean(errors**2))
+                print(
+                    f"{name:40}{notation:16}{forward_map.solves:>8}{map_s:>8.0f}{charges_s:>12.0f}"
+                    f"{errors.max():>16.3f}{rms:>8.3f}",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()
