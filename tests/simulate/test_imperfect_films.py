@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     Circle,
     Film,
@@ -40,7 +41,7 @@ def test_charges_of_imperfect_films_agree_with_scikit_fem(film, expected):
     np.testing.assert_allclose(charge, expected, rtol=8e-4)
 
 
-@pytest.mark.parametrize("distance", [10.3, 20.0])
+@pytest.mark.parametrize("distance", [10.3, 36.0])
 def test_deflection_of_an_oval_film_with_uneven_tension_agrees_with_greens_function(distance):
     """If T1 / T2 is the ratio of the squared half axes, Green's function of the disk holds in scaled coordinates.
 
@@ -70,11 +71,17 @@ def test_deflection_of_an_oval_film_with_uneven_tension_agrees_with_greens_funct
     np.testing.assert_allclose(deflection(solved, points), expected, rtol=tolerance)
 
 
-@pytest.mark.parametrize("at", [(0.0, 42.5), (43.5, 0.0)])
+@pytest.mark.parametrize("at", [(0.0, 42.5), (0.0, -42.9), (44.5, 0.0)])
 def test_presses_near_the_rim_of_an_oval_film_are_solved(at):
     """The half axes are 45.9 and 44.1 mm."""
     film = replace(SENSOR.film, pretension=1.0, oval=0.02)
     assert press(film, PROBE, at, 0.1).status == "converged"
+
+
+@pytest.mark.parametrize("at", [(0.0, 43.5), (45.2, 0.0)])
+def test_presses_beyond_the_rim_of_an_oval_film_raise_error(at):
+    with pytest.raises(SceneError, match="probe off the film"):
+        press(replace(SENSOR.film, pretension=1.0, oval=0.02), PROBE, at, 0.1)
 
 
 def test_sensor_file_stores_all_imperfections():

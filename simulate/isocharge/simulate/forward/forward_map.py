@@ -28,7 +28,7 @@ from isocharge.simulate.forward.readout_rules import ReadoutRules
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.theory import Theory, theory_for
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.placed_mesh import film_oval
+from isocharge.simulate.mesh.placed_mesh import distance_on_circular_film, film_oval
 from isocharge.simulate.mesh.placement import Placement, widest_smooth_layer
 from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.sensor.probe import Probe
@@ -482,7 +482,8 @@ class ForwardMap:
         nodal_fields = weights.astype(self.table.dtype) @ self.table  # in the precision of the table
         film = self.sensor.film
         mesh = template_for(self.probe, self.resolution, whole=not film.is_axisymmetric)
-        placement = Placement.of(mesh, self.probe, distance, film.radius, self.layer, rotation)
+        circular_distance = distance_on_circular_film(film, distance, direction)
+        placement = Placement.of(mesh, self.probe, circular_distance, film.radius, self.layer, rotation)
 
         # The stress refers to the direction of the press or, if the probe is not axisymmetric, to the probe.
         frame_angle = direction

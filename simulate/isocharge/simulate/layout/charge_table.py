@@ -31,7 +31,7 @@ from isocharge.simulate.forward.family import DIRECTION_PERIOD
 from isocharge.simulate.forward.readout import electrode_rule
 from isocharge.simulate.mechanics.theory import theory_for
 from isocharge.simulate.mesh.conformal_map import automorphism_onto, distance_coordinate
-from isocharge.simulate.mesh.placed_mesh import film_oval, from_oval, to_oval
+from isocharge.simulate.mesh.placed_mesh import distance_on_circular_film, film_oval, from_oval, to_oval
 from isocharge.simulate.numerics.interpolation import (
     barycentric_weights,
     chebyshev_nodes,
@@ -247,7 +247,8 @@ class _PressedFilm:
 
         # Compute the conformal map of each press, which transforms the edge of the probe into the circle |z| = r0.
         relative_radius = np.full(len(position), table.probe.radius / table.film.radius)
-        map_parameter, circle_radius = automorphism_onto(relative_distance, relative_radius)
+        circular_distance = distance_on_circular_film(table.film, np.abs(position), np.angle(position))
+        map_parameter, circle_radius = automorphism_onto(circular_distance / table.film.radius, relative_radius)
         return cls(table, position, direction, map_parameter, circle_radius, density)
 
     def square_rows(self, centres: Array, side: float) -> Array:
@@ -536,7 +537,7 @@ def _grid_points(film: Film, probe_radius: float, distance: float) -> Array:
         Points (x, y) on the film, row by row, shape (n_node, 2), mm.
     """
     # Create the grid in the plane of z, with a small gap on both sides of the circle |z| = r0.
-    relative_distance = np.array(distance / film.radius)
+    relative_distance = distance_on_circular_film(film, np.array(distance), 0.0) / film.radius
     relative_radius = np.array(probe_radius / film.radius)
     map_parameter, circle_radius = automorphism_onto(relative_distance, relative_radius)
     inner_radii = circle_radius * (1.0 - MARGIN) * np.linspace(0.0, 1.0, INNER_ROWS)

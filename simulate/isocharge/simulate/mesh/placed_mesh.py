@@ -253,7 +253,7 @@ def place(
     # Rotate the press, the probe and the axis of an oval film such that the press lies on the positive x axis.
     x, y = at
     direction = float(np.arctan2(y, x))
-    distance = np.array(np.hypot(x, y))
+    distance = distance_on_circular_film(film, np.array(np.hypot(x, y)), direction)
     placement = Placement.of(template, probe.rotated(-direction), distance, film.radius, layer)
     return PlacedMesh(template, placement, layer, complex(film_oval(film, direction)))
 
@@ -266,6 +266,23 @@ def film_oval(film: Film, direction: float | Array) -> Complexes:
         direction: Direction from the centre of the film to the press, any shape, rad.
     """
     return np.asarray(film.oval * np.exp(2j * (film.oval_axis - direction)))
+
+
+def distance_on_circular_film(film: Film, distance: Array, direction: float | Array) -> Array:
+    """Convert distances from the centre of an oval film into distances on the circular film that `to_oval` deforms.
+
+    Args:
+        film: The film. If its clamp is circular, the distances do not change.
+        distance: Distances from the centre, any shape, mm.
+        direction: Directions from the centre, a number or of the shape of `distance`, rad.
+
+    Returns:
+        Distances, shape of `distance`, mm.
+    """
+    if not film.oval:
+        return distance
+    points_on_x_axis = np.asarray(distance / film.radius, dtype=complex)  # rotated, in film radii
+    return film.radius * np.asarray(from_oval(points_on_x_axis, film_oval(film, direction)).real)
 
 
 def to_oval(points: Complexes, oval: complex | Complexes) -> Complexes:

@@ -12,7 +12,7 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.theory import ACCURACY, Theory, bending_length, check_strains, choose_theory
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import CLEARANCE
-from isocharge.simulate.mesh.placed_mesh import PlacedMesh, place
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh, distance_on_circular_film, place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
@@ -119,14 +119,13 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
             f"{probe.reach:.4g} mm"
         )
 
-    # Distance of the farthest point of the footprint from the centre of the film
-    farthest_distance = probe.farthest_distance(at)
-    if not farthest_distance < film.radius * (1.0 - 1e-6):
+    farthest = farthest_distance(film, probe, at)
+    if not farthest < film.radius * (1.0 - 1e-6):
         raise SceneError(
             f"probe off the film: centre ({at[0]:.4g}, {at[1]:.4g}) mm, farthest point of {probe.notation} "
-            f"{farthest_distance:.4g} mm from the film's centre, film radius {film.radius:.4g} mm"
+            f"{farthest:.4g} mm from the film's centre, film radius {film.radius:.4g} mm"
         )
-    rim_distance = film.radius - farthest_distance
+    rim_distance = film.radius - farthest
     min_rim_distance = MIN_RIM_DISTANCE * probe.reach
     is_curved_but_not_round = probe.topology.is_curved and not probe.topology.fills_circle
     if is_curved_but_not_round and rim_distance < min_rim_distance:
@@ -137,6 +136,26 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
         )
 
     check_strains(film, force)
+
+
+def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> float:
+    """Compute the distance from the centre of the film to the farthest point of the footprint, mm.
+
+    On an oval film, the distance is measured on the circular film that is deformed into the oval film. The footprint
+    lies on the film if the distance is less than the radius of the film.
+
+    Args:
+        film: The film.
+        probe: The probe.
+        at: Centroid (x, y) of the footprint, mm.
+    """
+    x, y = at
+    distance = np.hypot(x, y)
+    if not film.oval or distance == 0.0:
+        return probe.farthest_distance(at)
+    circular_distance = distance_on_circular_film(film, distance, float(np.arctan2(y, x)))
+    ratio = float(circular_distance / distance)
+    return probe.farthest_distance((ratio * x, ratio * y))
 
 
 def check_side_force(side_force: tuple[float, float], force: float) -> None:
@@ -331,7 +350,7 @@ def needs_second_mesh(case: LoadCase) -> bool:
     """
     radius = case.film.radius
     is_large = not case.probe.topology.fills_circle and case.probe.reach > RELIABLE_REACH * radius
-    is_near_rim = case.probe.farthest_distance(case.at) > RELIABLE_RADIUS * radius
+    is_near_rim = farthest_distance(case.film, case.probe, case.at) > RELIABLE_RADIUS * radius
     has_back_pressure = case.film.has_back_pressure
     return is_large or is_near_rim or has_back_pressure or case.accuracy < ACCURACY
 
@@ -343,10 +362,10 @@ def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
         case: The press.
         resolution: Fineness of the distorted mesh.
     """
+    rim_distance = case.film.radius - farthest_distance(case.film, case.probe, case.at)
     return SceneError(
-        f"press at ({case.at[0]:.4g}, {case.at[1]:.4g}) mm comes within "
-        f"{case.film.radius - case.probe.farthest_distance(case.at):.3g} mm of the rim, too near for a mesh of order "
-        f"{resolution.order} with {resolution.around} elements round the circle; press farther inside"
+        f"press at ({case.at[0]:.4g}, {case.at[1]:.4g}) mm comes within {rim_distance:.3g} mm of the rim, too near for "
+        f"a mesh of order {resolution.order} with {resolution.around} elements round the circle; press farther inside"
     )
 
 
@@ -370,7 +389,7 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
 
     # A footprint that is not circular is enclosed by a circle with a gap. If this circle does not fit on the film, the
     # mesh needs more elements around the circle.
-    enclosing_extent = probe.farthest_distance(case.at) + CLEARANCE * probe.reach
+    enclosing_extent = farthest_distance(film, probe, case.at) + CLEARANCE * probe.reach
     is_crowded = not probe.topology.fills_circle and enclosing_extent > film.radius
 
     # A better accuracy than the default `ACCURACY` requires a higher polynomial order. The factors are empirical.

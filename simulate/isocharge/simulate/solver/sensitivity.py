@@ -26,6 +26,8 @@ from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import Anisotropy
 from isocharge.simulate.mechanics.stress import stress_rotation
+from isocharge.simulate.mesh.placed_mesh import from_oval
+from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.solver.assembly import assembly
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
@@ -133,7 +135,14 @@ def _oval_imperfection(direction: complex) -> AddImperfection:
 
     def add_oval(solved: Equilibrium, value: float) -> Equilibrium:
         """Return the equilibrium of a film whose oval clamp has the parameter `value`."""
-        return replace(solved, mesh=replace(solved.mesh, oval=solved.mesh.oval + value * direction))
+        # The position of the probe does not change, so its position on the circular film does.
+        mesh = solved.mesh
+        radius = solved.film.radius
+        oval = mesh.oval + value * direction
+        relative_position = np.array(np.hypot(*solved.at) / radius, dtype=complex)
+        circular_distance = radius * from_oval(relative_position, oval).real
+        placement = Placement.of(mesh.template, mesh.placement.probe, circular_distance, radius, mesh.layer)
+        return replace(solved, mesh=replace(mesh, oval=oval, placement=placement))
 
     return add_oval
 
