@@ -32,6 +32,13 @@ DRAWN = """() => {
       (name) => Number(film.find(name).textContent.replace("\\u2212", "-"))) };
 }"""
 
+LATENCY = """() => {
+  const { film } = isocharge.page;
+  film.ages = [-56, -50, -40];
+  film.showHealth();
+  return film.find(".age").textContent;
+}"""
+
 
 @pytest.fixture
 def presses(film):
@@ -103,6 +110,8 @@ def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(start_st
     wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
     x, y, force = page.evaluate(DRAWN)["shown"]
     assert min(np.hypot(px - x, py - y) + abs(pressed - force) for px, py, pressed in PRESSES) < 0.3
+    latency = page.evaluate(LATENCY)
+    assert latency == "6 ms"  # the board's clock is 56 ms ahead
     page.get_by_role("button", name="Tare").click()
     wait_for(page, "isocharge.page.film.drawnKind === 'tare'")
     wait_for(page, "isocharge.page.film.drawnKind === 'contact'")

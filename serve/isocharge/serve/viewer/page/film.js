@@ -129,7 +129,7 @@ export class FilmView {
     const { counters, rate_Hz: rate, note, recording_failed: failed, film } = this.state, now_s = Date.now() / 1000;
     setText(this.find(".rate"), rate ? `${rate.toFixed(0)} Hz` : "–");
     setText(this.find(".latency"), this.latencies.length ? `${percentile(this.latencies, 0.5).toFixed(0)} µs` : "–");
-    setText(this.find(".age"), this.isReplay || !this.ages.length ? "–" : `${percentile(this.ages, 0.5).toFixed(0)} ms`);
+    setText(this.find(".age"), this.isReplay || !this.ages.length ? "–" : `${this.age.toFixed(0)} ms`);
     setText(this.find(".lost"), counters ? String(counters.lost) : "–");
     if (this.latencies.length > 2000) this.latencies.splice(0, this.latencies.length - 1000);
     const fresh = note && Math.abs(now_s - note.at) < NOTE_S ? note.text : "";
@@ -148,6 +148,12 @@ export class FilmView {
     }));
     for (const cell of list.querySelectorAll("dd")) setText(cell, (counters[cell.dataset.key] ?? 0).toLocaleString());
   }
+
+  /**
+   * Median of the latest times from a reading to its picture, ms. The clock of the board may be ahead of the server's.
+   * Then the shortest of the times is negative, and the clocks differ by at least its amount.
+   */
+  get age() { return percentile(this.ages, 0.5) - Math.min(...this.ages, 0); }
 
   /** From the reading to this picture: to the sending by the server's clock, from the arrival by this one's. */
   noteAge(sample, nowMs) {

@@ -1,11 +1,11 @@
 // The film from above, to scale: electrodes, working area, the touch with its trail, and a lens on its uncertainty.
 
-import { DASHES, fit, theme } from "./theme.js";
+import { fit, lineStyle, theme } from "./theme.js";
 
 /** Share of the presses at a place above which the place is shaded as a place without flags. */
 const UNNOTICED_SHARE = 0.5;
 
-const TRAIL_S = 1.6, LENS_MM = 1.0, SIGMAS_95 = 2.448, LENS_PX = 52;
+const HATCH_MM = 1.5, TRAIL_S = 1.6, LENS_MM = 1.0, SIGMAS_95 = 2.448, LENS_PX = 52;
 
 export class Plan {
   constructor(canvas, film) {
@@ -15,6 +15,7 @@ export class Plan {
     this.middle = film.radius_mm ? { x: 0, y: 0 } : middleOf(corners);
     this.reach = 1.16 * Math.max(...corners.map(([x, y]) => Math.hypot(x - this.middle.x, y - this.middle.y)));
     this.largest = film.force_range_N[1];
+    this.region = film.unnoticed ? unnoticedRegion(film.unnoticed) : [];
     this.base = document.createElement("canvas");
     this.isStale = true;
   }
@@ -57,7 +58,7 @@ export class Plan {
     this.toMillimetres(g);
     g.lineJoin = "round";
     if (film.radius_mm) { g.fillStyle = theme.film; circle(g, 0, 0, film.radius_mm); g.fill(); }
-    this.drawRegion(g);
+    if (this.region.length) this.drawRegion(g);
     g.lineWidth = px; g.strokeStyle = theme.line;
     this.drawGrid(g);
     g.fillStyle = theme.area; path(g, film.working_area_mm); g.fill();
@@ -78,32 +79,32 @@ export class Plan {
     }
   }
 
-  /** Shade the places where most presses are answered with a wrong contact and without a flag. */
-  /** Draw the part of the film where most presses are answered wrongly without a flag. */
-  drawRegion(g) { this.drawUnnoticed(g); }
+  /** Shade and hatch the part of the film where most presses are answered with a wrong contact and without a flag. */
+  drawRegion(g) {
+    this.drawUnnoticed(g, "1a");
+    g.save();
+    g.clip();
+    g.globalAlpha = 0.45;
+    g.strokeStyle = theme.warn; g.lineWidth = this.css;
+    const { reach, middle: { x, y } } = this;
+    for (let offset = -2 * reach; offset <= 2 * reach; offset += HATCH_MM) segment(g, x + offset - reach, y - reach, x + offset + reach, y + reach);
+    g.restore();
+  }
 
-  drawUnnoticed(g) {
-    const { unnoticed } = this.film;
-    if (!unnoticed) return;
-    const { from_mm, to_mm, share } = unnoticed, width = (to_mm - from_mm) / share.length;
+  /** @param opacity two hexadecimal digits */
+  drawUnnoticed(g, opacity) {
     g.beginPath();
-    share.forEach((sectors, ring) => sectors.forEach((value, sector) => {
-      if (value < UNNOTICED_SHARE) return;
-      const inner = from_mm + ring * width, step = 2 * Math.PI / sectors.length, start = sector * step, end = start + step;
-      g.moveTo(inner * Math.cos(start), inner * Math.sin(start));
-      g.arc(0, 0, inner + width, start, end);
-      g.arc(0, 0, inner, end, start, true);
-      g.closePath();
-    }));
-    g.fillStyle = `${theme.warn}40`; g.fill();
+    for (const polygon of this.region) addPolygon(g, polygon);
+    g.fillStyle = theme.warn + opacity; g.fill();
   }
 
   drawElectrode(g, name, k, px) {
     const outline = this.film.outlines_mm[name];
     if (!outline) return;
-    g.fillStyle = theme[`c${k % 6}`] + "30"; g.strokeStyle = theme[`c${k % 6}`]; g.lineWidth = 2 * px;
+    const { colour, dash } = lineStyle(k);
+    g.fillStyle = colour + "30"; g.strokeStyle = colour; g.lineWidth = 2 * px;
     for (const polygon of this.film.more_mm?.[name] ?? []) { path(g, polygon); g.fill(); }
-    path(g, outline); g.fill(); g.setLineDash(DASHES[k % 6].map((d) => d * px)); g.stroke(); g.setLineDash([]);
+    path(g, outline); g.fill(); g.setLineDash(dash.map((d) => d * px)); g.stroke(); g.setLineDash([]);
     const x = mean(outline, 0), y = mean(outline, 1);
     this.text(g, name, x, y, 15 * px, theme.ink, "center", "600");
   }
@@ -122,12 +123,12 @@ export class Plan {
     const thin = px / scale;
     g.fillStyle = theme.card; g.strokeStyle = theme.quiet; g.lineWidth = 1.2 * thin;
     circle(g, 0, 0, this.film.radius_mm); g.fill(); g.stroke();
-    this.drawUnnoticed(g);
+    this.drawUnnoticed(g, "40");
     g.fillStyle = theme.quiet;
     for (const outline of Object.values(this.film.outlines_mm)) { path(g, outline); g.fill(); }
     g.strokeStyle = theme.accent; g.strokeRect(-this.reach, -this.reach, 2 * this.reach, 2 * this.reach);
     g.restore();
-    const isShaded = this.film.unnoticed?.share.flat().some((value) => value >= UNNOTICED_SHARE);
+    const isShaded = this.region.length > 0;
     // Two lines beside the overview. The longer line is below the electrodes of the built-in sensors.
     const diameter = `Ø ${2 * this.film.radius_mm} mm`;
     const left = x + size + 6 * px;
@@ -249,4 +250,35 @@ function circle(g, x, y, radius) { g.beginPath(); g.arc(x, y, radius, 0, 2 * Mat
 
 function segment(g, x0, y0, x1, y1) { g.beginPath(); g.moveTo(x0, y0); g.lineTo(x1, y1); g.stroke(); }
 
-function path(g, points) { g.beginPath(); for (const [x, y] of points) g.lineTo(x, y); g.closePath(); }
+function path(g, points) { g.beginPath(); addPolygon(g, points); }
+
+function addPolygon(g, points) { points.forEach(([x, y], k) => { if (k) g.lineTo(x, y); else g.moveTo(x, y); }); g.closePath(); }
+
+/**
+ * Return the part of the film where the share of unnoticed presses is at least `UNNOTICED_SHARE`, as polygons. The shares
+ * belong to the middles of cells of rings and sectors, and are interpolated between these.
+ */
+function unnoticedRegion({ from_mm, to_mm, share }) {
+  const rings = [share[0], ...share, share.at(-1)], sectors = share[0].length, width = (to_mm - from_mm) / share.length;
+  const corner = (ring, sector) => {
+    const radius = Math.min(Math.max(from_mm + (ring - 0.5) * width, from_mm), to_mm), angle = 2 * Math.PI * (sector + 0.5) / sectors;
+    return { x: radius * Math.cos(angle), y: radius * Math.sin(angle), height: rings[ring][sector % sectors] - UNNOTICED_SHARE };
+  };
+  const polygons = [];
+  for (let ring = 0; ring + 1 < rings.length; ring++) {
+    for (let sector = 0; sector < sectors; sector++) {
+      const [a, b, c, d] = [corner(ring, sector), corner(ring + 1, sector), corner(ring + 1, sector + 1), corner(ring, sector + 1)];
+      polygons.push(partAbove([a, b, c]), partAbove([a, c, d]));
+    }
+  }
+  return polygons.filter((polygon) => polygon.length);
+}
+
+/** Return the part of a triangle with a height of 0 or more, as a polygon. */
+function partAbove(triangle) {
+  return triangle.flatMap((start, k) => {
+    const end = triangle[(k + 1) % 3], isAbove = start.height >= 0, share = start.height / (start.height - end.height);
+    const crossing = [start.x + share * (end.x - start.x), start.y + share * (end.y - start.y)];
+    return [...(isAbove ? [[start.x, start.y]] : []), ...(isAbove !== end.height >= 0 ? [crossing] : [])];
+  });
+}

@@ -1,7 +1,7 @@
 // The film under the touch in three dimensions, in plain WebGL: a sheet whose nodes gather round the probe.
 
 import { Deflection } from "./deflection.js";
-import { fit, onTheme, rgb, theme } from "./theme.js";
+import { fit, lineStyle, onTheme, rgb, theme } from "./theme.js";
 
 const VERTEX = `
 attribute vec3 place; attribute vec3 normal; attribute float depth;
@@ -142,7 +142,7 @@ export class Relief {
     this.line(closed(this.film.working_area_mm), theme.accent);
     this.film.electrodes.forEach((name, k) => {
       const outline = this.film.outlines_mm[name];
-      for (const polygon of outline ? [outline, ...this.film.more_mm?.[name] ?? []] : []) this.line(closed(polygon), theme[`c${k % 6}`]);
+      for (const polygon of outline ? [outline, ...this.film.more_mm?.[name] ?? []] : []) this.line(closed(polygon), lineStyle(k).colour);
     });
   }
 
@@ -181,7 +181,7 @@ export class Relief {
   sayCaption(touch) {
     const words = this.deflection
       ? `${touch ? `${this.deflection.at(touch.x, touch.y).toFixed(2)} mm deep under the probe; ` : ""}depth drawn ${STRETCH} times`
-      : "No deflection field for this film: the place alone. isocharge simulate deflection computes one.";
+      : "No deflection table beside this model: the place alone.";
     if (this.caption.textContent !== words) this.caption.textContent = words;
   }
 }

@@ -2,7 +2,7 @@
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const names = ["ground", "card", "ink", "quiet", "line", "fill", "touch", "accent", "film", "area", "warn", "deep", "flat",
-  "c0", "c1", "c2", "c3", "c4", "c5"];
+  "c0", "c1", "c2", "c3", "c4", "c5", "c6", "c7"];
 
 export const theme = {};
 
@@ -12,7 +12,13 @@ function read() {
 }
 
 /** Dashes that tell lines apart without their colours. */
-export const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3], [4, 2], [1, 2]];
+const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3], [4, 2], [1, 2], [12, 3], [9, 3, 2, 3, 2, 3]];
+
+/** Style of the lines of an electrode: the name of its colour, its colour and its dashes. Eight electrodes differ. */
+export function lineStyle(electrode) {
+  const k = electrode % DASHES.length;
+  return { name: `c${k}`, colour: theme[`c${k}`], dash: DASHES[k] };
+}
 
 export function onTheme(change) { dark.addEventListener("change", () => { read(); change(); }); }
 

@@ -1,6 +1,6 @@
 // Charges, force and misfit over time, by uPlot.
 
-import { DASHES, theme } from "./theme.js";
+import { lineStyle, theme } from "./theme.js";
 
 export const WINDOW_S = 10;
 const HEIGHT = 172, MISFIT_LIMIT = 5;
@@ -16,8 +16,10 @@ export class Traces {
 
   build() {
     for (const plot of Object.values(this.plots ?? {})) plot.destroy();
-    const colour = (k) => theme[`c${k % 6}`];
-    const charges = this.film.electrodes.map((label, k) => ({ label, stroke: colour(k), dash: DASHES[k % 6], width: 1.6 }));
+    const charges = this.film.electrodes.map((label, k) => {
+      const { colour, dash } = lineStyle(k);
+      return { label, stroke: colour, dash, width: 1.6 };
+    });
     this.plots = {
       charges: this.plot("charges", charges),
       force: this.plot("force", [{ label: "force", stroke: theme.touch, width: 1.8, fill: `${theme.touch}22` }], [0, 0.2]),

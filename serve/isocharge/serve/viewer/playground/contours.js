@@ -1,6 +1,6 @@
-// The charges of all presses with one force on a square grid, their isocharge curves, and the mirror region.
+// The charges of all presses with one force on a square grid, and their isocharge curves.
 
-const MIN_CHARGE_PC = 1e-3, LOCAL_REACH_MM = 1.05, LOCAL_COUNT = 7, MIN_ERROR_MM = 1;
+const MIN_CHARGE_PC = 1e-3, LOCAL_REACH_MM = 1.05, LOCAL_COUNT = 7;
 
 class ChargeGrid {
   /** Take a grid from -reach to reach mm in both axes, with the logarithms of the charges at three forces. */
@@ -98,36 +98,4 @@ function addSegment(segments, triangle) {
 /** Return the weights of three values in the quadratic interpolation at a point. */
 function lagrange(point, nodes) {
   return nodes.map((node, k) => nodes.reduce((product, other, j) => (j === k ? product : product * (point - other) / (node - other)), 1));
-}
-
-/**
- * The mirror region of a sensor under one force: presses outside of the working area whose charges are nearly those of a
- * press inside, so that the network answers with a place in the working area and without a flag.
- */
-class MirrorRegion {
-  constructor(sensor, grid, force) {
-    this.sensor = sensor;
-    this.grid = grid;
-    this.force = force;
-    this.cells = [];
-    this.nextRow = 0;
-  }
-
-  get isComplete() { return this.nextRow >= this.grid.count; }
-
-  /** Compute rows of the grid until a time in ms. */
-  fillUntil(deadline) {
-    if (!this.logs) this.logs = this.grid.electrodes.parts.map((_, electrode) => this.grid.logCharges(electrode, this.force));
-    while (!this.isComplete && performance.now() < deadline) {
-      const row = this.nextRow++;
-      for (let column = 0; column < this.grid.count; column++) {
-        const [x, y] = this.grid.place(row, column);
-        const charges = this.logs.map((table) => Math.exp(table[row * this.grid.count + column]));
-        if (Number.isNaN(charges[0]) || this.sensor.isInWorkingArea(x, y)) continue;
-        const answer = this.sensor.answer(charges);
-        const isFlagged = this.sensor.flags(answer).some((flag) => flag !== "stress");
-        if (!isFlagged && Math.hypot(answer.x - x, answer.y - y) > MIN_ERROR_MM) this.cells.push([x, y]);
-      }
-    }
-  }
 }

@@ -1,9 +1,9 @@
 // The playground: a press of the visitor, the charges that it gives, and what the network computes from them.
 
-import { DASHES, onTheme, theme } from "./theme.js";
+import { lineStyle, onTheme, theme } from "./theme.js";
 
 const GRID_STEP_MM = 0.75, GRID_REACH_MM = 24, FRAME_MS = 70, WORK_MS = 9, WRONG_STDS = 4, MAX_TRAIL = 80;
-const START = { x: 3, y: -2 }, START_FORCE_N = 0.5, START_NOISE = 1, KEY_STEP_MM = 0.5, MIRROR_FORCE_STEP = 1.25;
+const START = { x: 3, y: -2 }, START_FORCE_N = 0.5, START_NOISE = 1, KEY_STEP_MM = 0.5;
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const BAR_SCALES_PC = [250, 500, 1000, 2500, 5000, 10000];
 
@@ -14,7 +14,6 @@ class Playground {
     this.meanings = data.flags;
     this.sensors = sensors;
     this.grids = new Map();
-    this.mirrors = new Map();
     this.press = { ...START };
     this.force = START_FORCE_N;
     this.faults = { noise: START_NOISE, wrongGain: -1, dead: -1 };
@@ -128,34 +127,15 @@ class Playground {
     this.isNew = true;
   }
 
-  /** Draw a frame with new noise every `FRAME_MS`, and use the rest of the time for the grid and the mirror region. */
+  /** Draw a frame with new noise every `FRAME_MS`, and use the rest of the time for the grid. */
   tick(nowMs) {
     if (this.isNew || (this.faults.noise && nowMs - this.drawnMs > FRAME_MS)) this.update(nowMs);
-    const deadline = performance.now() + WORK_MS;
     const grid = this.grids.get(this.sensorIndex);
     if (!grid.isComplete) {
-      grid.fillUntil(deadline);
+      grid.fillUntil(performance.now() + WORK_MS);
       if (grid.isComplete) this.isNew = true;
-    } else {
-      const mirror = this.mirrorRegion(grid);
-      if (!mirror.isComplete) {
-        mirror.fillUntil(deadline);
-        if (mirror.isComplete) this.isNew = true;
-      }
     }
     requestAnimationFrame((now) => this.tick(now));
-  }
-
-  /** Return the mirror region of the chosen sensor, under the nearest of some forces. */
-  mirrorRegion(grid) {
-    const level = Math.round(Math.log(this.force) / Math.log(MIRROR_FORCE_STEP));
-    const key = `${this.sensorIndex} ${level}`;
-    if (!this.mirrors.has(key)) {
-      const [low, high] = this.sensor.description.force_range_N;
-      const force = Math.min(Math.max(MIRROR_FORCE_STEP ** level, low), high);
-      this.mirrors.set(key, new MirrorRegion(this.sensor, grid, force));
-    }
-    return this.mirrors.get(key);
   }
 
   update(nowMs) {
@@ -181,11 +161,11 @@ class Playground {
     const force = Math.min(Math.max(answer.force, low), high);
     const isDrawn = grid.isComplete && Number.isFinite(answer.force);
     const curves = isDrawn ? charges.map((charge, electrode) => grid.isocharge(electrode, charge, force)) : [];
+    const word = grid.isComplete ? "" : "computing the isocharge curves";
     const hasLens = isDrawn && kind !== "misfit";
     const lensCurves = hasLens ? localIsocharges(this.sensor, charges, { ...answer, force }) : [];
-    const mirror = grid.isComplete ? this.mirrorRegion(grid) : null;
     const sample = { ...answer, contact: true, otherX: null, otherY: null };
-    this.stage.draw({ press: this.press, sample, kind, trail: this.trail, curves, lensCurves, mirror: mirror?.isComplete ? mirror : null });
+    this.stage.draw({ press: this.press, sample, kind, trail: this.trail, curves, lensCurves, word });
   }
 
   showAnswer() {
@@ -265,13 +245,13 @@ class Playground {
     find("bars").replaceChildren(...this.sensor.description.electrodes.map((name, k) => {
       const bar = document.createElement("div");
       bar.className = "bar";
-      bar.innerHTML = `<b>${name}</b><div><i style="background: var(--c${k % 6})"></i></div><output></output>`;
+      bar.innerHTML = `<b>${name}</b><div><i style="background: var(--${lineStyle(k).name})"></i></div><output></output>`;
       return bar;
     }));
   }
 
   buildLegend() {
-    const line = (colour, dash = [], width = 2.4) => `<line x1="0" y1="9" x2="26" y2="9" stroke="${colour}" stroke-width="${width}" stroke-dasharray="${dash.join(" ")}"/>`;
+    const line = ({ colour, dash }) => `<line x1="0" y1="9" x2="26" y2="9" stroke="${colour}" stroke-width="2.4" stroke-dasharray="${dash.join(" ")}"/>`;
     const cross = `<path d="M13 0V18M4 9H22" stroke="${theme.ink}" stroke-width="2.4"/>`;
     const dot = `<circle cx="13" cy="9" r="7" fill="${theme.touch}"/>`;
     const ellipse = `<ellipse cx="13" cy="9" rx="10" ry="5" fill="none" stroke="${theme.ink}" stroke-width="1.8"/>`;
@@ -281,11 +261,11 @@ class Playground {
     const entries = [
       [cross, "your press"],
       [dot, "the network's answer; a larger dot is a larger force"],
-      [line(theme.c0, DASHES[0]) , `isocharge curve of ${first}: all places where a press of this force gives ${first} its charge`],
-      [line(theme.c1, DASHES[1]), `isocharge curve of ${second}, and so on. They cross at the contact`],
+      [line(lineStyle(0)), `isocharge curve of ${first}: all places where a press of this force gives ${first} its charge`],
+      [line(lineStyle(1)), `isocharge curve of ${second}, and so on. They cross at the contact`],
       [ellipse, "in the lens, 1 mm around the answer: 95 of 100 presses lie in this ellipse"],
       [area, "working area, for which the network was trained"],
-      [hatch, "mirror region: a press here is answered as a press in the working area, without a flag"],
+      [hatch, "mirror region: most presses here are answered as a press in the working area, without a flag"],
     ];
     find("legend").innerHTML = entries.map(([picture, words]) => `<svg viewBox="0 0 26 18" aria-hidden="true">${picture}</svg><span>${words}</span>`).join("");
   }

@@ -1,9 +1,9 @@
-// The film of the playground from above: the plan of the live page with isocharge curves, mirror region and press.
+// The film of the playground from above: the plan of the live page with isocharge curves and press.
 
-import { DASHES, theme } from "./theme.js";
+import { lineStyle, theme } from "./theme.js";
 import { Plan } from "./plan.js";
 
-const VIEW_MM = 24, LENS_REACH_MM = 1, CURVE_PX = 1.8, HATCH_MM = 1.5;
+const VIEW_MM = 24, LENS_REACH_MM = 1, CURVE_PX = 1.8;
 
 class Stage extends Plan {
   constructor(canvas, film) {
@@ -11,21 +11,14 @@ class Stage extends Plan {
     this.reach = VIEW_MM;
   }
 
-  /** The playground computes the mirror region for the chosen force, and `drawMirror` draws it. */
-  drawRegion() {}
-
-  /** @param view {{press, sample, kind, trail, curves, lensCurves, mirror}} what is drawn over the film */
+  /** @param view {{press, sample, kind, trail, curves, lensCurves, word}} what is drawn over the film */
   draw(view) {
     const g = this.drawBackground();
-    if (view.mirror) {
-      this.drawMirror(g, view.mirror);
-      this.drawWhole(g, this.css);
-      this.drawScale(g, this.css);
-    }
     view.curves.forEach((segments, electrode) => this.drawCurve(g, segments, electrode, CURVE_PX * this.css, this.css));
     this.lensCurves = view.lensCurves;
     this.drawTouch(g, view);
     this.drawPress(g, view.press);
+    if (view.word) this.drawWord(g, view.word);
   }
 
   /** Return the point of the film, mm, under a point of the window. */
@@ -36,36 +29,17 @@ class Stage extends Plan {
     return { x, y };
   }
 
-  drawMirror(g, { cells, grid }) {
-    g.save();
-    g.beginPath();
-    for (const [x, y] of cells) g.rect(x - grid.step / 2, y - grid.step / 2, grid.step, grid.step);
-    g.fillStyle = theme.warn;
-    g.globalAlpha = 0.1;
-    g.fill();
-    g.clip();
-    g.globalAlpha = 0.45;
-    g.strokeStyle = theme.warn;
-    g.lineWidth = this.css;
-    g.beginPath();
-    for (let offset = -2 * this.reach; offset <= 2 * this.reach; offset += HATCH_MM) {
-      g.moveTo(offset - this.reach, -this.reach);
-      g.lineTo(offset + this.reach, this.reach);
-    }
-    g.stroke();
-    g.restore();
-  }
-
   drawCurve(g, segments, electrode, width, dashUnit) {
     g.save();
-    g.strokeStyle = theme[`c${electrode % 6}`];
+    const { colour, dash } = lineStyle(electrode);
+    g.strokeStyle = colour;
     g.lineWidth = width;
     g.lineCap = "round";
     g.beginPath();
     for (const polyline of joined(segments)) {
       polyline.forEach(([x, y], k) => { if (k === 0) g.moveTo(x, y); else g.lineTo(x, y); });
     }
-    g.setLineDash(DASHES[electrode % 6].map((dash) => dash * dashUnit));
+    g.setLineDash(dash.map((length) => length * dashUnit));
     g.stroke();
     g.restore();
   }
