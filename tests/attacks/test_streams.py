@@ -5,6 +5,7 @@ import math
 import struct
 
 import pytest
+from cobs import cobs
 
 from attacks.faults import mutated
 from isocharge.serve import (
@@ -18,7 +19,6 @@ from isocharge.serve import (
     encode_frame,
     encode_text,
 )
-from isocharge.serve.frames.stuffing import cobs_encode
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.recognition.recognise import recognise
 
@@ -51,7 +51,7 @@ def stuffed(framing):
     keys = {"format": "described", "framing": framing, "length": 12, "checksum": "crc-8", "fields": fields}
     layout = device_from_table({"frames": keys}, "attack").frames
     escapes = {
-        "cobs": lambda data: cobs_encode(data) + b"\0",
+        "cobs": lambda data: cobs.encode(data) + b"\0",
         "slip": lambda data: data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0",
         "hdlc": lambda data: data.replace(b"}", b"}]").replace(b"~", b"}^") + b"~",
         "datagram": lambda data: data,

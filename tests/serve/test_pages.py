@@ -10,11 +10,11 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from cobs import cobs
 from msgspec.structs import fields
 
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame, device_from_table, encode_frame, flags
-from isocharge.serve.frames.stuffing import cobs_decode
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.contact_stages import TouchOffsetRule
 from isocharge.serve.live.device import CommonMode
@@ -60,7 +60,7 @@ def test_frame_of_the_documentation_is_read():
         bytes.fromhex(line) for line in re.search(r"```text\n(.*?)\n```", PAGES["frames.md"], re.DOTALL)[1].split("\n")
     )
     assert encode_frame(Frame(1, 5000, (850.0, 840.5, 846.25))) == after
-    assert cobs_decode(after[:-1]) == before
+    assert cobs.decode(after[:-1]) == before
 
 
 def test_described_frames_of_the_documentation_are_read():

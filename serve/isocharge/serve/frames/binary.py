@@ -10,8 +10,10 @@ zero byte.
 import binascii
 import struct
 
+from cobs import cobs
+
 from isocharge.serve.frames.frame import ChecksumError, Frame, StuffedParser
-from isocharge.serve.frames.stuffing import MAX_BLOCK, cobs_decode, cobs_encode
+from isocharge.serve.frames.stuffing import cobs_decode
 
 FORMAT = "binary frames of isocharge"
 """Description of the format, for the user."""
@@ -34,7 +36,7 @@ MAX_CHARGES = 255
 MAX_FRAME_LENGTH = HEADER.size + MAX_CHARGES * 4 + CRC.size
 """Length of the longest frame before byte stuffing, bytes."""
 
-MAX_STUFFED_LENGTH = MAX_FRAME_LENGTH + 1 + MAX_FRAME_LENGTH // MAX_BLOCK
+MAX_STUFFED_LENGTH: int = cobs.max_encoded_length(MAX_FRAME_LENGTH)
 """Length of the longest frame after byte stuffing, without its delimiter, bytes."""
 
 
@@ -49,7 +51,8 @@ def encode_frame(frame: Frame) -> bytes:
     charges = struct.pack(f"<{charge_count}f", *frame.values)
     body = header + charges
     crc = CRC.pack(crc16(body))
-    return cobs_encode(body + crc) + DELIMITER
+    stuffed: bytes = cobs.encode(body + crc)
+    return stuffed + DELIMITER
 
 
 def decode_frame(stuffed_frame: bytes) -> Frame:

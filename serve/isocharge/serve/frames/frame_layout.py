@@ -38,7 +38,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, field
 
 from isocharge.common.structs import Settings, WrongKey
-from isocharge.serve.frames.checksums import CHECKSUMS, Checksum, Crc
+from isocharge.serve.frames.checksums import CHECKSUMS, Checksum, crc_with_parameters
 from isocharge.serve.frames.frame import (
     FLAGS,
     SEQ,
@@ -72,7 +72,7 @@ HexadecimalNumber = Annotated[
 class CrcParameters(Settings, frozen=True):
     """Parameters of a cyclic redundancy check that has no name.
 
-    The keys have the same meanings as the attributes of `isocharge.serve.frames.checksums.Crc`.
+    The keys have the same meanings as the parameters of `isocharge.serve.frames.checksums.crc_with_parameters`.
     """
 
     width: Literal[8, 16, 24, 32]
@@ -96,14 +96,13 @@ class CrcParameters(Settings, frozen=True):
     @property
     def checksum(self) -> Checksum:
         """The checksum with these parameters."""
-        crc = Crc(
+        return crc_with_parameters(
             width=self.width,
             polynomial=int(self.polynomial, 16),
             start=int(self.start, 16),
             reflected=self.reflected,
             final=int(self.final, 16),
         )
-        return Checksum(crc, self.width // 8)
 
 
 class FrameSection(Settings, frozen=True, tag_field="format"):

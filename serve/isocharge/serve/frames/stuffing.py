@@ -1,8 +1,7 @@
 """Byte stuffing, which ensures that the delimiter between frames never occurs inside a frame.
 
-- COBS (Consistent Overhead Byte Stuffing, Cheshire and Baker 1999) ends each frame with a zero byte. Each zero byte in
-  the data is replaced by the distance to the next zero byte. An additional byte at the beginning contains the distance
-  to the first zero byte. The distance 255 stands for 254 bytes of data that are not followed by a zero byte.
+- COBS (Consistent Overhead Byte Stuffing, Cheshire and Baker 1999) ends each frame with a zero byte. The package `cobs`
+  replaces each zero byte in the data by the distance to the next zero byte.
 - SLIP (RFC 1055) and the asynchronous framing of HDLC (RFC 1662) separate frames by a reserved byte. If the reserved
   byte occurs in the data, two other bytes are sent in its place.
 """
@@ -10,8 +9,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-MAX_BLOCK = 254
-"""Largest number of data bytes that can follow one distance byte of COBS."""
+from cobs import cobs
 
 
 class Stuffing(NamedTuple):
@@ -29,64 +27,17 @@ class Stuffing(NamedTuple):
     decode: Callable[[bytes], bytes]
 
 
-def cobs_encode(data: bytes) -> bytes:
-    """Encode bytes with COBS, so that the result contains no zero byte.
-
-    The result is at most 1 + len(data) // 254 bytes longer than `data`.
-    """
-    *blocks_before_zeros, last_block = data.split(b"\0")
-    encoded = [_encode_block(block, ends_in_zero=True) for block in blocks_before_zeros]
-    encoded.append(_encode_block(last_block, ends_in_zero=False))
-    return b"".join(encoded)
-
-
-def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
-    """Encode a block of bytes without zeros, and the zero that may follow the block, with COBS.
-
-    The block is cut into pieces of at most `MAX_BLOCK` bytes. Before each piece, a distance byte contains the length of
-    the piece plus 1. The zero itself is not sent. A decoder adds a zero after each piece that has fewer than
-    `MAX_BLOCK` bytes, except after the last piece of a frame.
-
-    Args:
-        block: Bytes that contain no zero.
-        ends_in_zero: Whether a zero follows the block. It is False only for the last block of a frame.
-    """
-    encoded = bytearray()
-    rest = block
-    # Encode pieces of `MAX_BLOCK` bytes, after which the decoder adds no zero. If a zero follows the block, the last
-    # piece must be shorter, so that the decoder adds the zero. The last piece may be empty.
-    while len(rest) > MAX_BLOCK or (len(rest) == MAX_BLOCK and ends_in_zero):
-        encoded.append(MAX_BLOCK + 1)
-        encoded += rest[:MAX_BLOCK]
-        rest = rest[MAX_BLOCK:]
-    encoded.append(len(rest) + 1)
-    return bytes(encoded + rest)
-
-
-def cobs_decode(data: bytes) -> bytes:
-    """Decode bytes that `cobs_encode` has encoded.
-
-    The data consist of blocks. Each block begins with a distance byte, which is followed by `distance - 1` decoded
-    bytes. After the decoded bytes of each block, the decoder adds a zero. No zero is added after a block with the
-    distance 255 or after the last block.
+def cobs_decode(stuffed: bytes) -> bytes:
+    """Decode bytes that are encoded with COBS.
 
     Raises:
-        ValueError: If a distance points beyond the end, or `data` contains a zero.
+        ValueError: If a distance points beyond the end, or `stuffed` contains a zero.
     """
-    decoded = bytearray()
-    position = 0
-    while position < len(data):
-        distance = data[position]  # distance to the next distance byte
-        block = data[position + 1 : position + distance]
-        if len(block) != distance - 1 or 0 in block:
-            raise ValueError(f"byte {position} is {distance}, but {len(data) - position - 1} bytes or a zero follow")
-        decoded += block
-        position += distance
-        is_last_block = position >= len(data)
-        zero_follows = distance <= MAX_BLOCK and not is_last_block
-        if zero_follows:
-            decoded.append(0)
-    return bytes(decoded)
+    try:
+        decoded: bytes = cobs.decode(stuffed)
+    except cobs.DecodeError as error:
+        raise ValueError(f"the bytes are not encoded with COBS: {error}") from error
+    return decoded
 
 
 def _slip_encode(data: bytes) -> bytes:
@@ -135,7 +86,7 @@ def _hdlc_decode(stuffed: bytes) -> bytes:
 
 
 STUFFINGS = {
-    "cobs": Stuffing(b"\x00", cobs_encode, cobs_decode),
+    "cobs": Stuffing(b"\x00", cobs.encode, cobs_decode),
     "slip": Stuffing(b"\xc0", _slip_encode, _slip_decode),
     "hdlc": Stuffing(b"\x7e", _hdlc_encode, _hdlc_decode),
 }

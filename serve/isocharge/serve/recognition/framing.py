@@ -15,14 +15,14 @@ frames have the same length.
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from itertools import chain
+from itertools import chain, product
 from math import gcd
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isocharge.serve.frames.checksums import CHECKSUMS, Crc
+from isocharge.serve.frames.checksums import CHECKSUMS, crc_with_parameters
 from isocharge.serve.frames.frame_field import ByteOrder
 from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC
 from isocharge.serve.frames.stuffing import STUFFINGS, Stuffing
@@ -265,21 +265,6 @@ CRC_POLYNOMIALS = {
 }
 """Polynomials of cyclic redundancy checks that are tried without a name, by the size of the check in bytes."""
 
-
-def _crcs_of_size(size: int) -> list[Crc]:
-    """Return all cyclic redundancy checks without a name that have a given size in bytes.
-
-    For each polynomial, two checks are returned, one for each bit order. The initial value and the final value of all
-    checks are 0.
-    """
-    bit_count = 8 * size
-    polynomials = CRC_POLYNOMIALS[size]
-    return [Crc(bit_count, polynomial, 0, reflected, 0) for polynomial in polynomials for reflected in (False, True)]
-
-
-UNNAMED_CRCS = {size: _crcs_of_size(size) for size in CRC_POLYNOMIALS}
-"""Cyclic redundancy checks that are tried without a name, by their size in bytes."""
-
 MIN_CHECKED_FRAMES = 6
 """Smallest number of different frames from which a checksum is recognised."""
 
@@ -336,7 +321,7 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     # Number of constant bytes at the beginning of the frames, at most `MAX_FIRST_COVERED_BYTE`. It is the position of
     # the first False.
     leading_constant_count = int(np.argmin([*is_constant[:MAX_FIRST_COVERED_BYTE], False]))
-    for size in UNNAMED_CRCS:  # in bytes, from the widest to the narrowest
+    for size in CRC_POLYNOMIALS:  # in bytes, from the widest to the narrowest
         is_too_wide = size + 2 > length  # at least two bytes must remain
         last_bytes_are_constant = is_constant[-size:].all()  # a checksum would differ from frame to frame
         if is_too_wide or last_bytes_are_constant:
@@ -433,18 +418,19 @@ def _unnamed_checks(frames: list[bytes], size: int, order: ByteOrder) -> Iterato
         order: Byte order of the checksum.
     """
     digit_count = 2 * size  # hexadecimal digits of a number of this size
-    for crc in UNNAMED_CRCS[size]:
+    for polynomial, reflected in product(CRC_POLYNOMIALS[size], (False, True)):
+        crc = crc_with_parameters(8 * size, polynomial, start=0, reflected=reflected, final=0)
         difference_counts: Counter[int] = Counter()  # number of frames by the difference of their two checks
         for frame in frames:
-            computed_value = crc(frame[:-size])
+            computed_value = crc.compute(frame[:-size])
             sent_value = int.from_bytes(frame[-size:], order)
             difference_counts[computed_value ^ sent_value] += 1
         most_frequent_difference, fitting_count = difference_counts.most_common(1)[0]
         if fitting_count >= FITTING_SHARE * len(frames):
             parameters = {
-                "width": crc.width,
-                "reflected": crc.reflected,
-                "polynomial": f"{crc.polynomial:0{digit_count}X}",
+                "width": 8 * size,
+                "reflected": reflected,
+                "polynomial": f"{polynomial:0{digit_count}X}",
                 "final": f"{most_frequent_difference:0{digit_count}X}",
             }
             yield Check(size, order, {"checksum": parameters})
