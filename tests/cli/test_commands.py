@@ -254,11 +254,14 @@ BAD = [
     ),
     (("simulate", "sweep", SENSOR, "--cluster", "pigeon://1", "-o", "OUT"), 2, "InputError: cluster 'pigeon://1'"),
     (("simulate", "sweep", SENSOR, "--probe", "cube:1", "-o", "OUT"), 2, "SceneError: probe 'cube:1'"),
-    (("train", "fit", "-o", "OUT"), 2, "InputError: expected either a DATASET folder or --sensor"),
+    (("train", "fit", "-o", "OUT"), 2, "InputError: expected either a DATASET folder or a SENSOR"),
+    (("train", "fit", "pad.toml", "-o", "OUT"), 2, "SensorError: no sensor 'pad.toml'"),
+    (("train", "fit", SENSOR, "--sensor", SENSOR, "-o", "OUT"), 2, f"expected one sensor, got {SENSOR} and"),
     *(
         (("train", "fit", *words.split(), "--films", "-o", "OUT"), 2, message)
         for words, message in [
-            ("", "expected either a DATASET folder or --sensor"),
+            ("", "expected either a DATASET folder or a SENSOR"),
+            (f"{SENSOR} --probe rectangle:4x2", "--films: expected one probe"),
             ("presses", "--films: expected --sensor SENSOR alone, got presses"),
             ("--sensor four-25um-biaxial --radius auto", "--films: expected --radius in mm, got auto"),
             ("--sensor four-25um-biaxial --probe rectangle:4x2", "--films: expected one probe"),

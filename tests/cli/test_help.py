@@ -40,6 +40,12 @@ def test_the_help_begins_with_one_sentence_and_has_an_example_that_parses(path):
     assert all(context.params[parameter.name] for parameter in command.params if parameter.required)
 
 
+@pytest.mark.parametrize("path", COMMANDS)
+def test_a_command_with_a_model_has_the_option_that_the_error_of_a_missing_model_advises(path):
+    names = {name for parameter in COMMANDS[path].params for name in (parameter.name, *parameter.opts)}
+    assert "model" not in names or "--models" in names
+
+
 @pytest.mark.parametrize("words", [["--help"], ["serve", "--help"], ["train", "--help"], ["simulate", "--help"]])
 def test_help_above_the_commands_imports_none(words):
     code = (

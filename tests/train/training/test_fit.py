@@ -1,7 +1,5 @@
 """Training: it is reproducible, stops early, reports failures and continues after a kill; ranges of its settings."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +11,6 @@ from scipy.stats import multivariate_normal, norm
 from isocharge.common.errors import ConfigError, InputError, OutputExists, TrainingError
 from isocharge.common.progress import listening
 from isocharge.common.resumable_run import resume_parts
-from isocharge.serve import load_model
 from isocharge.simulate import Dataset, Domain, NoiseModel, Samples
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config
 from isocharge.train.training import descent
@@ -375,31 +372,6 @@ def test_a_killed_training_continues_only_with_its_own_presses_and_settings(data
     with listening(lambda *call: calls.append(call)), resume_parts(tmp_path / "it", identity) as run:
         assert torch.equal(weights(dataset, LONGER, run=run), whole)
     assert {title for title, *_ in calls} == {"training the misfit network"}
-
-
-def test_a_training_on_a_dataset_needs_no_solver(dataset_folder, tmp_path):
-    """The command runs in a new process, because other tests of this process have imported the solver."""
-    (tmp_path / "short.toml").write_text(
-        "[network]\nhidden = [8]\nmisfit_hidden = [8]\n"
-        "[training]\nsteps = 10\nmisfit_steps = 10\nmisfit_charges = 1000\n"
-    )
-    code = """import sys
-from isocharge.cli.main import main
-try:
-    main()
-finally:
-    unwanted = "isocharge.simulate.solver", "isocharge.simulate.mesh"
-    print(sorted(name for name in sys.modules if name.startswith(unwanted)))
-"""
-    words = ("train", "fit", dataset_folder, "--config", "short.toml", "-o", "models/m")
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=True, cwd=tmp_path
-    )
-    assert done.stdout.splitlines()[-1] == "[]"
-    assert "caution: PVDF yields beyond 0.86" in done.stderr
-    metadata = load_model(tmp_path / "models" / "m" / "1").metadata
-    assert metadata.yield_force_N == pytest.approx(0.866, abs=0.01)
-    assert metadata.unnoticed.to_mm == pytest.approx(42.8, abs=0.01)
 
 
 CONFIGS = Path(__file__).parents[3] / "train" / "configs"

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.options import JsonOption
+from isocharge.cli.shared.options import JsonOption, ModelsOption
 from isocharge.cli.shared.terminal import show, show_json, shown_progress
 from isocharge.serve import Model, Predictor, find_model, load_checked_model
 from isocharge.serve.benchmark import Timing, in_process_contenders, machine, press_charges, take_turns
@@ -24,6 +24,7 @@ def bench_command(
     seconds: Annotated[
         float, typer.Option("--seconds", min=0.1, max=86400.0, help="Time for all measurements, s.")
     ] = 10.0,
+    models: ModelsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Measure how fast a model computes contacts on this machine, and print the errors of the model.
@@ -33,7 +34,7 @@ def bench_command(
 
     Example: isocharge serve bench three-25um-biaxial --seconds 10
     """
-    loaded = load_checked_model(find_model(model))
+    loaded = load_checked_model(find_model(model, models))
     predictor = Predictor(loaded.folder)
     contenders = in_process_contenders(predictor, press_charges(predictor, loaded.golden.charge_pC))
     with shown_progress():

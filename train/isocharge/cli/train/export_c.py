@@ -1,13 +1,15 @@
 """`isocharge train export-c`: write a model and its signal chain as C99."""
 
-from isocharge.cli.shared.options import DeviceOption, ModelArgument, NewFolderOption
+from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption, NewFolderOption
 from isocharge.cli.shared.terminal import say, this_command
 from isocharge.common.files import refuse_existing
 from isocharge.serve import find_model, load_device
 from isocharge.train.export_c.folder import export_c
 
 
-def export_c_command(model: ModelArgument, output: NewFolderOption, device: DeviceOption = None) -> None:
+def export_c_command(
+    model: ModelArgument, output: NewFolderOption, device: DeviceOption = None, models: ModelsOption = None
+) -> None:
     """Write a model as C99 for a host without Python, or for a microcontroller.
 
     DIR contains the network (isocharge_model.h and isocharge_model.c) and a self-test with the golden vectors of the
@@ -18,6 +20,6 @@ def export_c_command(model: ModelArgument, output: NewFolderOption, device: Devi
     Example: isocharge train export-c four-25um-biaxial -o c
     """
     refuse_existing(output)
-    folder = export_c(find_model(model), output, load_device(device), command=this_command())
+    folder = export_c(find_model(model, models), output, load_device(device), command=this_command())
     file_names = sorted(path.name for path in folder.iterdir())
     say(f"{folder}: {', '.join(file_names)}")

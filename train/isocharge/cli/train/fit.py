@@ -12,7 +12,6 @@ from isocharge.cli.shared.options import (
     FreshOption,
     JsonOption,
     ModelsOption,
-    RadiusOption,
     parse_radius_mm,
     worker_count,
 )
@@ -27,7 +26,15 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, ModelError, SceneError
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve import MeasuredPresses
-from isocharge.simulate import Circle, FilmPrior, load_sensor, local_workers, parse_probe, read_dataset
+from isocharge.simulate import (
+    Circle,
+    FilmPrior,
+    built_in_sensors,
+    load_sensor,
+    local_workers,
+    parse_probe,
+    read_dataset,
+)
 from isocharge.simulate.sensor.probe import PROBE_HELP
 from isocharge.train import FitConfig, Fitted, TrainingData, fit, fit_presses, load_config, release
 from isocharge.train.training.cross_fit import presses_identity, usable_presses
@@ -48,10 +55,11 @@ def fit_command(
     dataset: Annotated[
         Path | None,
         typer.Argument(
-            metavar="DATASET|PRESSES.csv",
+            metavar="DATASET|PRESSES.csv|SENSOR",
             help="A dataset folder of `isocharge simulate sweep` or of measured presses, or a CSV file of measured "
             "presses with the columns x_mm, y_mm, force_N and the names of the electrodes (pC). The file needs three "
-            "or more presses with --sensor, 500 without. (default: --sensor)",
+            "or more presses with --sensor, 500 without. A SENSOR is the same as --sensor SENSOR alone. (default: "
+            "--sensor)",
         ),
     ] = None,
     sensor: Annotated[
@@ -70,7 +78,15 @@ def fit_command(
             "--probe", metavar="SHAPE", help=f"With --sensor: {PROBE_HELP} May be repeated. (default: {DEFAULT_PROBE})"
         ),
     ] = None,
-    radius: RadiusOption = DEFAULT_RADIUS_TEXT,
+    radius: Annotated[
+        str,
+        typer.Option(
+            "--radius",
+            metavar="MM|auto",
+            help="With --sensor: largest distance of a press from the film's centre, mm. With one film and no "
+            "PRESSES.csv, also auto: the working area, where the charges determine the position to 1 mm.",
+        ),
+    ] = DEFAULT_RADIUS_TEXT,
     films: Annotated[
         bool,
         typer.Option(
@@ -89,7 +105,7 @@ def fit_command(
 ) -> None:
     """Train a network on charges, measure its errors, and write a model folder: ONNX file, card, golden vectors.
 
-    The presses come from DATASET. With --sensor and no DATASET, presses are simulated first. The option --probe states
+    The presses come from DATASET. With a SENSOR and no DATASET, presses are simulated first. The option --probe states
     the probes of the simulated presses, and --radius states their largest distance from the centre.
 
     With measured presses and --sensor, the film is calibrated, as `isocharge train calibrate` does. If there is no
@@ -106,7 +122,7 @@ def fit_command(
     A run that was stopped leaves models/NAME/VERSION.part. The same command continues a stopped run and makes the same
     model.
 
-    Example: isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
+    Example: isocharge train fit three-25um-biaxial -o models/three-25um-biaxial
 
     Example: isocharge train fit presses.csv --sensor four-25um-biaxial -o models/rig
 
@@ -114,6 +130,11 @@ def fit_command(
     """
     notations = probe or [DEFAULT_PROBE]
     options = ReleaseOptions(output, version, fresh=fresh, json=json)
+    if dataset is not None and _is_sensor(dataset):
+        if sensor is not None:
+            raise InputError(f"expected one sensor, got {dataset} and --sensor {sensor}; leave one of them out")
+        sensor = str(dataset)
+        dataset = None
 
     # There are five cases, which depend on the given options and files.
 
@@ -161,6 +182,12 @@ def fit_command(
         with shown_progress():
             data = _read_or_simulate_data(dataset, sensor, notations, radius)
     _release_data_model(data, fit_config, options)
+
+
+def _is_sensor(argument: Path) -> bool:
+    """Return whether an argument is the name of a built-in sensor or a sensor file, and not a dataset or presses."""
+    is_built_in = str(argument) in built_in_sensors() and not argument.exists()
+    return is_built_in or argument.suffix.lower() == ".toml"
 
 
 def _release_films_model(film_prior: FilmPrior, radius_mm: float, options: ReleaseOptions) -> None:
@@ -245,7 +272,7 @@ def _read_or_simulate_data(dataset: Path | None, sensor: str | None, notations: 
             say(f"caution: PVDF yields beyond {data.yield_force_N:g} N, and a dent stays")
         return data
     if sensor is None:
-        raise InputError("expected either a DATASET folder or --sensor SENSOR, got neither")
+        raise InputError("expected either a DATASET folder or a SENSOR, got neither")
     described_sensor = load_sensor(sensor)
     probes = [parse_probe(notation) for notation in notations]
     warn_of_stress(described_sensor.film, probes, DEFAULT_FORCE_RANGE[1])
@@ -388,7 +415,7 @@ def _film_prior(
             f"--films: expected no --config, got {config}, whose settings are for a single film; leave it out"
         )
     if sensor is None:
-        raise InputError("expected either a DATASET folder or --sensor SENSOR, got neither; --films needs --sensor")
+        raise InputError("expected either a DATASET folder or a SENSOR, got neither; --films needs a SENSOR")
     if radius == "auto":
         raise InputError(
             "--films: expected --radius in mm, got auto, which is different for each film; give a number of mm"

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.measured_presses import read_press_file
-from isocharge.cli.shared.options import FreshOption, JsonOption, NewFolderOption
+from isocharge.cli.shared.options import FreshOption, JsonOption, ModelsOption, NewFolderOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.errors import InputError, ModelError
@@ -46,6 +46,7 @@ def report_command(
             "MODEL-student, if there is one)",
         ),
     ] = None,
+    models: ModelsOption = None,
     sensor: Annotated[
         str | None,
         typer.Option("--sensor", metavar="SENSOR", help="Sensor of PRESSES.csv. (default: the sensor of DATASET)"),
@@ -80,8 +81,8 @@ def report_command(
         raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
     loaded_datasets = [_read_dataset(path, sensor, probe) for path in datasets]
     model_names = model or [dataset.sensor.name for dataset in loaded_datasets]
-    model_folders = [find_model(name) for name in model_names]
-    student_folders = _find_students(student, model_names)  # small models, which are compared as well
+    model_folders = [find_model(name, models) for name in model_names]
+    student_folders = _find_students(student, model_names, models)  # small models, which are compared as well
 
     settings = QUICK if quick else Settings()
     with shown_progress():
@@ -103,7 +104,7 @@ def report_command(
         show_json(record)
 
 
-def _find_students(student_names: list[str] | None, model_names: list[str]) -> list[Path]:
+def _find_students(student_names: list[str] | None, model_names: list[str], models: Path | None) -> list[Path]:
     """Return the version folders of the small models to compare.
 
     Without names, the model NAME-student of each compared model NAME is returned if it exists.
@@ -111,16 +112,17 @@ def _find_students(student_names: list[str] | None, model_names: list[str]) -> l
     Args:
         student_names: Names or paths from `--student`; None for the models named MODEL-student that exist.
         model_names: Names or paths of the compared models.
+        models: Folder of models that is searched first.
 
     Raises:
         ModelError: If a model of `student_names` does not exist.
     """
     if student_names:
-        return [find_model(name) for name in student_names]
+        return [find_model(name, models) for name in student_names]
     folders = []
     for name in model_names:
         with suppress(ModelError):  # a model need not have a student
-            folders.append(find_model(f"{name}-student"))
+            folders.append(find_model(f"{name}-student", models))
     return folders
 
 

@@ -9,6 +9,7 @@ import typer
 
 from isocharge.cli.shared.forward_maps import shown_run
 from isocharge.cli.shared.terminal import say, show_json, this_command
+from isocharge.common.errors import IsochargeError, OutputError
 from isocharge.common.resumable_run import ResumableRun, resume_parts
 from isocharge.serve import ModelMetadata
 from isocharge.serve.model.model_folder import check_target
@@ -88,8 +89,8 @@ def train_and_release(
 ) -> None:
     """Train a network, release it as a version folder, and print its errors.
 
-    If the command is stopped, the state of the training is kept beside the version folder, and the same command
-    continues it.
+    If the command is stopped, or if the release is refused, the state of the training is kept beside the version
+    folder, and the same command continues it.
 
     Args:
         train: Function that trains the network and saves its state in the given run.
@@ -97,11 +98,21 @@ def train_and_release(
         version_folder: Folder to write, as `ReleaseOptions.check_version_folder` returned it.
         options: Options of the command.
         write_release: Function that writes the version folder.
+
+    Raises:
+        OutputError: If the release is refused after the training. The message states where the training is kept.
     """
     model_folder = version_folder.parent
     with shown_run(version_folder), resume_parts(version_folder, identity, fresh=options.fresh) as run:
         trained = train(run)
-        released = write_release(trained, model_folder, version=options.version, command=this_command())
+        try:
+            released = write_release(trained, model_folder, version=options.version, command=this_command())
+        except IsochargeError as error:  # an OutputError, because the run would be removed after an InputError
+            other_folder = model_folder.with_name("OTHER")
+            raise OutputError(
+                f"{error}; the finished training is kept in {run.folder}: mend the cause and repeat the command, or "
+                f"move that folder to {other_folder / run.folder.name} and repeat the command with -o {other_folder}"
+            ) from error
     if options.json:
         show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})
     say(f"{released.folder}: {_errors_sentence(released.metadata)}")
