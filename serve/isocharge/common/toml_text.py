@@ -1,7 +1,8 @@
 """Writing of settings as TOML. The module `isocharge.common.structs` reads TOML.
 
 The module uses no library that writes TOML. The library tomli-w cannot write comments, and writes each number of a list
-on a separate line. The library tomlkit is intended for changes of existing files.
+on a separate line. The library rtoml makes a section of each table inside a section, so that lines which a user appends
+to a section would belong to another table. The library tomlkit is intended for changes of existing files.
 """
 
 import json
