@@ -8,6 +8,8 @@ import pytest
 from pyarrow.parquet import ParquetFile, read_metadata, write_table
 
 from isocharge.common.tables import parquet_table
+from isocharge.serve import Predictor
+from isocharge.serve.prediction.table import BLOCK_ROWS
 
 COMMANDS = {
     "predict": ("serve", "predict", "four-25um-biaxial"),
@@ -85,3 +87,28 @@ def test_presses_of_a_parquet_file_are_named_by_their_rows(command, tmp_path):
     assert (code, err) == (1, "")
     assert out.split()[0] == "row"
     assert "(row 2)" in out
+
+
+def test_a_missing_column_of_a_training_is_named(refuses):
+    refuses("fit alone", b"force_N,A,B,C,D\n1,100,200,300,400\n", "add the column 'x_mm', 'y_mm'")
+
+
+def test_a_long_table_is_predicted_in_pieces(command, tmp_path, monkeypatch):
+    """The memory must not grow with the number of presses that the model computes at the same time."""
+    predict_batch = Predictor.predict_batch
+    sizes = []
+
+    def recorded(self, charge_pC):
+        sizes.append(len(charge_pC))
+        return predict_batch(self, charge_pC)
+
+    monkeypatch.setattr(Predictor, "predict_batch", recorded)
+    header = "A,B,C,D\n"
+    (tmp_path / "p.csv").write_text(header + "500,500,500,500\n" * (BLOCK_ROWS + 1))
+    (tmp_path / "empty.csv").write_text(header)
+    _, out, _ = command(*COMMANDS["predict"], tmp_path / "p.csv")
+    _, out_of_empty, _ = command(*COMMANDS["predict"], tmp_path / "empty.csv")
+    assert sizes == [BLOCK_ROWS, 1, 0]
+    names, *rows = out.splitlines()
+    assert out_of_empty.splitlines() == [names]
+    assert (len(rows), len(set(rows))) == (BLOCK_ROWS + 1, 1)

@@ -106,7 +106,12 @@ def _read_electrode_charges(table: NumberTable, electrodes: tuple[str, ...], war
 
 
 def write_contacts(
-    contacts: Contacts, out: TextIO, validity: Validity | None = None, charge_pC: Array | None = None
+    contacts: Contacts,
+    out: TextIO,
+    validity: Validity | None = None,
+    charge_pC: Array | None = None,
+    *,
+    has_header: bool = True,
 ) -> None:
     """Write contacts as CSV with one row for each press.
 
@@ -119,6 +124,7 @@ def write_contacts(
             separated by blanks.
         charge_pC: Charges of the presses, shape (n, electrodes), pC. If the charges and `validity` are given, a press
             whose charges do not exceed the noise has the force 0, and its other cells are empty.
+        has_header: Whether the header is written. It is omitted for the second and each further part of a table.
     """
     is_touch = np.ones(len(contacts.x_mm), dtype=bool)  # whether each press is a touch; without charges, all are
     if validity is not None and charge_pC is not None:
@@ -127,7 +133,8 @@ def write_contacts(
     writer = csv.writer(out, lineterminator="\n")
     names = Contacts._fields[:N_WITHOUT_CORRELATION]
     header = names if validity is None else (*names, "flags")
-    writer.writerow(header)
+    if has_header:
+        writer.writerow(header)
 
     # The rows are converted in blocks, so that the texts of a large table are not all in memory at the same time.
     rows = np.column_stack(contacts)
@@ -167,13 +174,13 @@ def _contact_rows(contact_values: Singles, is_touch: Booleans, validity: Validit
 def blocks(rows: Array) -> Iterator[Array]:
     """Yield successive blocks of `BLOCK_ROWS` rows of an array. The last block may have fewer rows.
 
-    The caller converts only one block at a time to Python numbers, because Python numbers need five times as much
-    memory as an array.
+    An array without rows is one empty block. The caller processes only one block at a time, because the model and
+    Python numbers need a hundred times as much memory as the array.
 
     Args:
         rows: Array of shape (n, ...).
     """
-    for start in range(0, len(rows), BLOCK_ROWS):
+    for start in range(0, max(len(rows), 1), BLOCK_ROWS):
         yield rows[start : start + BLOCK_ROWS]
 
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.common.errors import DatasetError, PressError
+from isocharge.common.errors import DatasetError, PressError, cut, shown
 from isocharge.common.files import sha256_of
-from isocharge.common.measured_presses import MeasuredPresses
+from isocharge.common.measured_presses import CONTACT, MeasuredPresses
 from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor, parse_probe
 from isocharge.train.data.channel_noise import Noise
 
@@ -344,8 +344,9 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
         probe: Probe with which the presses were made.
 
     Raises:
-        PressError: If fewer than `FEWEST_MEASURED` presses remain.
+        PressError: If a column is missing, or fewer than `FEWEST_MEASURED` presses remain.
     """
+    check_known_columns(presses)
     complete_presses = presses[complete(presses)]
     count = len(complete_presses)
     check_enough(count, len(presses), sensor.name)
@@ -360,6 +361,22 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
 def complete(presses: MeasuredPresses) -> Booleans:
     """Return whether each press has a known place, a known force and a known charge of every electrode, shape (n,)."""
     return presses.placed & np.isfinite(presses.charge_pC).all(axis=1)
+
+
+def check_known_columns(presses: MeasuredPresses) -> None:
+    """Raise an error if the place, the force or a charge is unknown for all presses.
+
+    Raises:
+        PressError: If a column is missing or empty. The message names the column.
+    """
+    columns = presses.columns
+    unknown = [name for name in (*CONTACT, *presses.electrodes) if np.isnan(columns[name]).all()]
+    if unknown:
+        names = cut(", ".join(map(shown, unknown)))
+        raise PressError(
+            f"expected presses with known place, force and charges, got a file without the column {names}, or with "
+            f"only empty cells in it; add the column {names}"
+        )
 
 
 def check_enough(count: int, total_count: int, sensor: str) -> None:

@@ -21,6 +21,7 @@ from isocharge.train.data.presses import (
     SOLVER,
     LabelledPresses,
     check_enough,
+    check_known_columns,
     complete,
     draw_contacts,
     held_out,
@@ -124,9 +125,10 @@ def _usable_presses(rig: Rig, domain: Domain) -> MeasuredPresses:
         The usable presses, with charges in the order of the sensor's electrodes.
 
     Raises:
-        PressError: If too few presses remain.
+        PressError: If a column is missing, or too few presses remain.
     """
     presses = rig.presses.of_electrodes(rig.sensor.electrode_names, rig.sensor.name)
+    check_known_columns(presses)
     is_incomplete = ~complete(presses)
     is_outside = ~is_incomplete & domain.is_outside(presses.contact)  # so that each press counts for one reason only
     is_usable = ~(is_incomplete | is_outside)

@@ -36,6 +36,7 @@ from isocharge.train.data.presses import (
     FEWEST,
     FEWEST_POSITIONS,
     LabelledPresses,
+    check_known_columns,
     complete,
     folds_by_place,
     presses_sha256,
@@ -237,6 +238,7 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
         assumed_contact = presses.contact.copy()
         assumed_contact[:, 2] = UNKNOWN_FORCE_N
         presses = replace(presses, contact=assumed_contact, force_std=np.ones(len(presses)))
+    check_known_columns(presses)
     is_complete = complete(presses)  # whether the place, the force and all charges of each press are known
     usable = presses[is_complete]
     rounded_places_mm = np.round(usable.contact[:, :2], 3)  # places within a micrometre count as the same place
