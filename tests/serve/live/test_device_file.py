@@ -215,6 +215,9 @@ def test_setting_for_other_electrodes_is_refused(device):
         (("C_pC", "A_pC", "B_pC"), {}, [2, 3, 1]),
         (("charge.C", "charge.A", "charge.B"), {}, [2, 3, 1]),
         (("x", "y", "z"), {}, [1, 2, 3]),
+        (("c", "a", "b"), {}, [2, 3, 1]),
+        (("C [pC]", "a_pC", "charge.b"), {}, [2, 3, 1]),
+        (("ch3", "ch2", "ch1"), {}, [3, 2, 1]),
         (("x", "y", "z"), {"A": "z", "B": "y", "C": "x"}, [3, 2, 1]),
         (("x", "y", "z"), {"A": "3", "B": "ch2", "C": "x"}, [3, 2, 1]),
         ((), {"A": "3", "B": "ch2", "C": "ch1"}, [3, 2, 1]),
@@ -230,6 +233,9 @@ def test_channel_of_each_electrode(names, channels, picked):
     ("names", "channels", "message"),
     [
         (("x", "y"), {}, r"\[channels\] A = "),
+        (("A_nC", "B_nC", "C_nC"), {}, "A_nC' is in nC: convert it to pC"),
+        (("A", "B", "z"), {}, r"\[channels\] A = "),
+        (("A", "B", "c", "C", "raw.A"), {}, r"\[channels\] A = "),
         (("x", "y", "z"), {"A": "zz"}, r'^board\.toml: \[channels\] A = "zz": no channel .* have x, y, z, or 1 to'),
         *(((), {"A": name}, "no channel is called that") for name in ("0", "4", "ch0", "ch4", "ch", "", "-1")),
         *(((), {"A": name}, "no channel is called that") for name in ("1.0", "99999", "²")),
@@ -238,7 +244,7 @@ def test_channel_of_each_electrode(names, channels, picked):
 def test_unknown_channels_are_refused(names, channels, message):
     picker = ChannelPicker(ELECTRODES, {"A": "1", "B": "2", "C": "3"} | channels if channels else {}, "m", "board.toml")
     with pytest.raises(ChargeError, match=message):
-        picker.pick(Frame(0, 0, (1.0, 2.0, 3.0)[: len(names) or 3], names=names))
+        picker.pick(Frame(0, 0, (1.0,) * (len(names) or 3), names=names))
 
 
 def test_tare_error_states_the_offset_for_the_device_file():

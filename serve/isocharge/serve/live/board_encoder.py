@@ -87,7 +87,9 @@ class BoardEncoder:
 
         # Find the index of each electrode's channel in a frame. All frames have the same channels, so that any frame
         # can be used.
-        picker = ChannelPicker(electrodes, device.channels, "the sensor", device.where)
+        picker = ChannelPicker(
+            electrodes, device.channels, "the sensor", device.where, has_gain=device.gain is not None
+        )
         zeros = (0.0,) * len(self._frames.channels)
         frame_of_zeros = Frame(0, 0, zeros, names=self._frames.names)
         self._channel_indices = picker.channel_indices(frame_of_zeros)

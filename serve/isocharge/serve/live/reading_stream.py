@@ -6,6 +6,7 @@ assigned to the electrodes, and the signal chain computes the touch charges.
 The touch charges do not depend on a model of the film, unless the signal chain estimates warming.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from json import dumps
 from operator import itemgetter
@@ -15,6 +16,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError, NoFramesError, TareError, cut, shown
+from isocharge.common.tables.header_advice import OTHER_UNITS, header_advice
+from isocharge.common.tables.number_table import CHARGE_RULE
 from isocharge.serve.flags import RECONNECTED
 from isocharge.serve.frames.frame import SATURATED_BIT, Frame, Parser, SequenceGaps
 from isocharge.serve.frames.frame_layout import FrameLayout
@@ -30,19 +33,28 @@ MAX_CHANNEL_DIGITS = 4
 BYTES_TO_RECOGNISE = 8192
 """If a stream contains no intact frame in more than this number of bytes, an error is raised."""
 
+_UNIT = re.compile(rf"_(?:{'|'.join(OTHER_UNITS['pC'])})$")
+
 
 class ChannelPicker:
     """Selector of the values in a frame that belong to the electrodes.
 
     The section `[channels]` of the device file states the name or the number of the channel of each electrode. If the
     device file has no section `[channels]`, a channel belongs to the electrode with the same name. The name of a
-    channel may have a prefix or a suffix, as in `A_pC` or `charge.A`. If an electrode has no channel with its name,
-    the channels are assigned by their order: the first channel belongs to the first electrode, and so on. An
-    assignment by order requires as many channels as electrodes.
+    channel may have a prefix or a suffix, as in `A_pC` or `charge.A`, and may differ by case. If no channel has the
+    name of an electrode, or nearly so, the channels are assigned by their order, or by their numbers if all names are
+    numbers such as `ch2`: the first channel belongs to the first electrode, and so on. An assignment by order requires
+    as many channels as electrodes.
     """
 
     def __init__(
-        self, electrodes: tuple[str, ...], channels: Mapping[str, str], reader: str, where: str = "device file"
+        self,
+        electrodes: tuple[str, ...],
+        channels: Mapping[str, str],
+        reader: str,
+        where: str = "device file",
+        *,
+        has_gain: bool = False,
     ) -> None:
         """Store which channel the device file assigns to each electrode.
 
@@ -52,7 +64,9 @@ class ChannelPicker:
                 `[channels]`.
             reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
             where: Name of the device file, for messages.
+            has_gain: Whether the device file states the gain, so that names of channels may contain any unit.
         """
+        self._has_gain = has_gain
         self._electrodes = electrodes
         self._channels = channels
         self._reader = reader
@@ -91,16 +105,26 @@ class ChannelPicker:
         """
         if self._channels:
             return tuple(self._assigned_index(electrode, frame) for electrode in self._electrodes)
-        index_of_electrode = {electrode_of(name): index for index, name in enumerate(frame.names)}
-        if all(electrode in index_of_electrode for electrode in self._electrodes):  # assigned by their names
-            return tuple(index_of_electrode[electrode] for electrode in self._electrodes)
-        if len(frame.values) == len(self._electrodes):  # assigned by their order
-            return tuple(range(len(frame.values)))
+        names = frame.names
+        if self._has_gain:
+            names = tuple(_UNIT.sub("", name) for name in names)
+        indices = [_channels_of_electrode(electrode, names) for electrode in self._electrodes]
+        if all(len(indices_of_electrode) == 1 for indices_of_electrode in indices):  # assigned by their names
+            return tuple(indices_of_electrode[0] for indices_of_electrode in indices)
+
+        # Names of which some are those of electrodes, or nearly so, must not be assigned by their order.
+        absent_columns = dict.fromkeys(self._electrodes, CHARGE_RULE.meaning)
+        advice = list(header_advice(names, absent_columns))
+        has_electrode_names = any(indices) or bool(advice)
+        if len(frame.values) == len(self._electrodes) and not has_electrode_names:  # assigned by their order
+            numbers = [number for name in channel_names(frame) if (number := channel_number(name)) is not None]
+            order = range(len(frame.values))
+            return tuple(sorted(order, key=numbers.__getitem__) if len(numbers) == len(order) else order)
         example_keys = ", ".join(f'{electrode} = "..."' for electrode in self._electrodes)
         raise ChargeError(
             f"{self._reader} expects {len(self._electrodes)} charges {self._electrodes}, frame {frame.seq} has "
-            f"{len(frame.values)} {channel_names(frame)}; choose the model of this sensor, or say in the device file "
-            f"which is which: [channels] {example_keys}"
+            f"{len(frame.values)} {channel_names(frame)}{''.join(f'; {sentence}' for sentence in advice)}; choose the "
+            f"model of this sensor, or say in the device file which is which: [channels] {example_keys}"
         )
 
     def _assigned_index(self, electrode: str, frame: Frame) -> int:
@@ -143,7 +167,7 @@ def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> 
         ChargeError: If an electrode has no channel.
     """
     if isinstance(device.frames, FrameLayout):
-        picker = ChannelPicker(electrodes, device.channels, reader, device.where)
+        picker = ChannelPicker(electrodes, device.channels, reader, device.where, has_gain=device.gain is not None)
         picker.channel_indices(device.frames.frame_of_zeros())  # raises an error if an electrode has no channel
         return
     missing = [name for name in electrodes if name not in device.channels]
@@ -189,13 +213,26 @@ def channel_number(name: str) -> int | None:
     return None
 
 
+def _channels_of_electrode(electrode: str, names: tuple[str, ...]) -> list[int]:
+    """Return the indices of the channels with the name of an electrode. Case matters only if both cases occur.
+
+    Args:
+        electrode: Name of the electrode.
+        names: Names of the channels.
+    """
+    electrodes = [electrode_of(name) for name in names]
+    equal = [index for index, name in enumerate(electrodes) if name == electrode]
+    return equal or [index for index, name in enumerate(electrodes) if name.casefold() == electrode.casefold()]
+
+
 def electrode_of(name: str) -> str:
     """Extract the name of the electrode from the name of a channel.
 
-    For example, the function returns `A` if the channel is called `A`, `A_pC`, `charge.A` or `charge_raw_pC.A`.
+    For example, the function returns `A` if the channel is called `A`, `A_pC`, `A [pC]`, `charge.A` or
+    `charge_raw_pC.A`.
     """
     _, _, last_part = name.rpartition(".")
-    return last_part.removesuffix("_pC")
+    return re.sub(r"_pC|\s*[\[(]\s*pC\s*[\])]", "", last_part)
 
 
 class TimedReading(NamedTuple):
@@ -248,7 +285,9 @@ class ReadingStream:
         self._device = device
         self._electrodes = electrodes
         self._settings = chain or device.chain(electrodes)
-        self._picker = ChannelPicker(electrodes, device.channels, reader, device.where)
+        self._picker = ChannelPicker(
+            electrodes, device.channels, reader, device.where, has_gain=device.gain is not None
+        )
         self._misfit = misfit
         self._chain = self._new_chain()
         self._pending_flags: tuple[str, ...] = ()  # flags that the next frame gets
