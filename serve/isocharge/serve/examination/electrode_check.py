@@ -31,9 +31,6 @@ RELEASED_SHARE = 0.3
 The share is not small, because a leaking amplifier returns to rest slowly.
 """
 
-REST_UPDATE = 0.2
-"""Weight of a new block in the rest level while nothing presses, dimensionless. The rest level follows a slow drift."""
-
 NORMALISATION_STEPS = 20
 """Number of times that the changes are divided by the means of their rows and columns."""
 
@@ -42,6 +39,9 @@ MIN_ADVANTAGE = 1.1
 
 PRESS_TIMEOUT_S = 60.0
 """Time to wait for each press, s."""
+
+PRESS_ATTEMPTS = 3
+"""Number of times that a press near the same electrode is asked for, if the press is late or unclear."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,19 @@ def _turned_places(electrodes: list[str], assumed_electrodes: list[str]) -> int 
     return None
 
 
+class UnclearPressError(PressCheckError):
+    """Presses do not distinguish the channels.
+
+    Attributes:
+        rows: Indices of the electrodes near which the film must be pressed again.
+    """
+
+    def __init__(self, message: str, rows: tuple[int, ...]) -> None:
+        """Store the message and the indices of the electrodes."""
+        super().__init__(message)
+        self.rows = rows
+
+
 def check_electrodes(
     port: Port,
     device: Device,
@@ -135,11 +148,13 @@ def check_electrodes(
 ) -> ElectrodeCheck:
     """For each electrode, ask the user for a press near it, and find the channel that changes most under this press.
 
+    A press that is late or unclear is asked for again.
+
     Args:
         port: The open port.
         device: Format of the frames.
         channels: Assumed channel of each electrode, by the name of the electrode.
-        ask: Function that is called with a sentence that asks the user for a press.
+        ask: Function that is called with a sentence that asks the user to wait or to press.
         timeout_s: Time to wait for each press, s.
 
     Returns:
@@ -152,16 +167,24 @@ def check_electrodes(
     electrodes = list(channels)
     channel_names = list(channels.values())
     blocks = _BlockReader(port, device, channel_names)  # reads the port, and computes medians over short blocks of time
-    measured_changes = []
-    for electrode in electrodes:
-        ask(f"press near electrode {electrode}, as close to it as you can, and let go")
-        measured_changes.append(_wait_for_press(blocks, electrode, timeout_s))
-    changes = np.array(measured_changes)  # shape (electrodes, channels)
+    presses = _PressReader(blocks, ask, timeout_s)
+    changes = np.array([presses.press_near(electrode) for electrode in electrodes])  # shape (electrodes, channels)
+    attempts = 1
+    while True:
+        try:
+            columns = assign_channels(changes, electrodes)  # column of the channel that belongs to each electrode
+            break
+        except UnclearPressError as error:
+            if attempts == PRESS_ATTEMPTS:
+                raise
+            ask(str(error))
+            for row in error.rows:
+                changes[row] = presses.press_near(electrodes[row])
+        attempts += 1
 
     # A channel is inverted if its value falls under the press near its own electrode.
     found_channels = {}
     inverted_channels = []
-    columns = assign_channels(changes, electrodes)  # column of the channel that belongs to each electrode
     for press, column in enumerate(columns):
         channel = channel_names[column]
         found_channels[electrodes[press]] = channel
@@ -186,7 +209,7 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
         Column of the channel for each electrode.
 
     Raises:
-        PressCheckError: If two presses change the same channel most, or a press changes two channels almost equally.
+        UnclearPressError: If two presses change the same channel most, or a press changes two channels almost equally.
     """
     normalised = np.abs(changes) + 1e-30  # a channel that never changes must not cause a division by zero
     for _ in range(NORMALISATION_STEPS):
@@ -198,15 +221,17 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
     for row, column in enumerate(columns):
         other_changes = np.delete(normalised[row], column)  # empty if there is only one channel
         if other_changes.size and normalised[row, column] < MIN_ADVANTAGE * other_changes.max():
-            raise PressCheckError(
+            raise UnclearPressError(
                 f"the press near electrode {electrodes[row]} changes two channels by almost the same amount; press "
-                "closer to the electrode, with a thinner probe, and try again"
+                "closer to the electrode, with a thinner probe, and try again",
+                (row,),
             )
         if column in columns[:row]:
-            earlier_electrode = electrodes[columns.index(column)]
-            raise PressCheckError(
-                f"the presses near electrodes {earlier_electrode} and {electrodes[row]} change the same channel most; "
-                "press closer to each electrode, and try again"
+            earlier_row = columns.index(column)
+            raise UnclearPressError(
+                f"the presses near electrodes {electrodes[earlier_row]} and {electrodes[row]} change the same channel "
+                "most; press closer to each electrode, and try again",
+                (earlier_row, row),
             )
     return columns
 
@@ -306,85 +331,138 @@ class _BlockReader:
                 yield values
 
 
-def _wait_for_press(blocks: _BlockReader, electrode: str, timeout_s: float) -> Array:
-    """Wait for a press that begins and ends, and return the change of the channels at its peak.
+class _PressReader:
+    """Reader of presses, each of which the user is asked for.
 
-    Each block contains the median of each channel over a short time. The change of a channel is the difference between
-    a block and the rest level. The press begins when the change of a channel is much larger than the noise. Before the
-    press begins, the rest level is updated in order to follow a slow drift. The press ends when the changes have become
-    small again.
-
-    Args:
-        blocks: Source of the blocks.
-        electrode: Electrode near which the press is expected, for the error message.
-        timeout_s: Longest time to wait, s.
-
-    Returns:
-        Change of each channel in the block with the largest total change, shape (channels,), in the unit of the board.
-
-    Raises:
-        PressCheckError: If the press does not begin and end within `timeout_s`.
+    Each block contains the median and the noise of each channel over a short time. The rest level is the mean of the
+    latest quiet blocks before a press. After a press, the rest level before this press is used until the channels are
+    quiet again, so that the next press may follow at once.
     """
-    deadline_s = time.monotonic() + timeout_s
-    rest_level, noise = _wait_for_rest(blocks, electrode, deadline_s, timeout_s)
-    largest_change = np.zeros_like(rest_level)
-    is_pressed = False
-    while (block := blocks.next_block(deadline_s)) is not None:
-        level, _block_noise = block  # the noise at rest is used instead, because a press changes the noise of a block
-        change = level - rest_level
-        if np.any(np.abs(change) > CHANGE_SIGMAS * noise):
-            is_pressed = True
-        if not is_pressed:
-            rest_level = rest_level + REST_UPDATE * change
-            continue
 
-        total_change = np.abs(change).sum()
-        if total_change > np.abs(largest_change).sum():
-            largest_change = change
-        is_released = total_change < RELEASED_SHARE * np.abs(largest_change).sum()
-        if is_released:
-            return largest_change
+    def __init__(self, blocks: _BlockReader, ask: Callable[[str], None], timeout_s: float) -> None:
+        """Store the arguments. The rest level is unknown.
 
-    # No block came before the deadline. Either the press did not end, or it did not begin.
-    if is_pressed:
-        raise _restless_error(electrode, timeout_s)
-    raise _missing_press_error(electrode, timeout_s)
+        Args:
+            blocks: Source of the blocks.
+            ask: Function that is called with a sentence that asks the user to wait or to press.
+            timeout_s: Longest time to wait for the rest or for a press, s.
+        """
+        self._blocks = blocks
+        self._ask = ask
+        self._timeout_s = timeout_s
+        self._recent_blocks: deque[tuple[Array, Array]] = deque(maxlen=REST_BLOCKS)
+        self._rest: tuple[Array, Array] | None = None  # rest level and noise; None if they are not known
+        self._released_change = 0.0  # smallest total change of a press before the channels are quiet again
 
+    def press_near(self, electrode: str) -> Array:
+        """Ask for a press, wait until it has begun and ended, and return the change of the channels at its peak.
 
-def _wait_for_rest(blocks: _BlockReader, electrode: str, deadline_s: float, timeout_s: float) -> tuple[Array, Array]:
-    """Wait until the channels are quiet in `REST_BLOCKS` consecutive blocks.
+        Args:
+            electrode: Electrode near which the press is expected.
 
-    A block contains the level (median) and the noise of each channel over a short time. The channels are quiet if the
-    level of each channel varies by at most half of the change that begins a press.
+        Returns:
+            Change of each channel in the block with the largest total change, shape (channels,), in the unit of the
+            board.
 
-    Args:
-        blocks: Source of the blocks.
-        electrode: Electrode near which the next press is expected, for the error message.
-        deadline_s: Time on the monotonic clock until which the function waits, s.
-        timeout_s: Time to wait for the press, s, for the error message.
+        Raises:
+            PressCheckError: If no press begins and ends in time, in `PRESS_ATTEMPTS` attempts.
+        """
+        errors = []
+        for attempt in range(PRESS_ATTEMPTS):
+            if attempt == PRESS_ATTEMPTS - 1:
+                self._rest = None  # a press may have been taken for the rest
+            try:
+                return self._wait_for_press(electrode)
+            except PressCheckError as error:
+                self._ask(str(error))
+                errors.append(error)
+        raise errors[0]
 
-    Returns:
-        Rest level and noise of each channel, both of shape (channels,), in the unit of the board. The noise is the
-        standard deviation of a single frame.
+    def _wait_for_press(self, electrode: str) -> Array:
+        """Wait for a press that begins and ends, and return the change of the channels at its peak.
 
-    Raises:
-        PressCheckError: If the channels are not quiet before the deadline.
-    """
-    recent_blocks: deque[tuple[Array, Array]] = deque(maxlen=REST_BLOCKS)
-    while (block := blocks.next_block(deadline_s)) is not None:
-        recent_blocks.append(block)
-        levels = np.array([level for level, _block_noise in recent_blocks])  # shape (blocks, channels)
-        noise = np.median([block_noise for _level, block_noise in recent_blocks], axis=0)
+        The change of a channel is the difference between a block and the rest level. The press begins when the change
+        of a channel is much larger than the noise. The press ends when the changes have become small again.
+
+        Args:
+            electrode: Electrode near which the press is expected.
+
+        Raises:
+            PressCheckError: If the press does not begin and end in time.
+        """
+        self._rest = self._rest or self._wait_for_rest(electrode)
+        rest_level, noise = self._rest
+        self._ask(f"press near electrode {electrode}, as close to it as you can, and let go")
+        deadline_s = time.monotonic() + self._timeout_s
+        largest_change = np.zeros_like(rest_level)
+        largest_total = 0.0
+        while (block := self._blocks.next_block(deadline_s)) is not None:
+            change = block[0] - rest_level
+            total_change = float(np.abs(change).sum())
+            if largest_total == 0.0:
+                quiet = self._quiet_level(block)
+                if quiet is not None and total_change <= max(self._released_change, CHANGE_SIGMAS * float(noise.sum())):
+                    self._rest = rest_level, noise = quiet
+                    self._released_change = 0.0
+                    continue
+                is_large = bool(np.any(np.abs(change) > CHANGE_SIGMAS * noise))  # the noise at rest, not of this block
+                if not is_large or total_change <= self._released_change:
+                    continue
+            if total_change > largest_total:
+                largest_change = change
+                largest_total = total_change
+            if total_change < RELEASED_SHARE * largest_total:
+                self._released_change = RELEASED_SHARE * largest_total
+                self._recent_blocks.clear()
+                return largest_change
+
+        # No block came before the deadline. Either the press did not end, or it did not begin.
+        if largest_total > 0.0:
+            raise _restless_error(electrode, self._timeout_s)
+        raise _missing_press_error(electrode, self._timeout_s)
+
+    def _wait_for_rest(self, electrode: str) -> tuple[Array, Array]:
+        """Ask the user to wait until the channels are quiet, and return their rest level and their noise.
+
+        Args:
+            electrode: Electrode near which the next press is expected, for the error message.
+
+        Raises:
+            PressCheckError: If the channels are not quiet in time.
+        """
+        self._ask("wait, and do not touch the film, until the rest level is known")
+        self._released_change = 0.0
+        deadline_s = time.monotonic() + self._timeout_s
+        while (block := self._blocks.next_block(deadline_s)) is not None:
+            quiet = self._quiet_level(block)
+            if quiet is not None:
+                return quiet
+
+        # No block came before the deadline. Either the channels were not quiet, or no frames came.
+        if self._recent_blocks:
+            raise _restless_error(electrode, self._timeout_s)
+        raise _missing_press_error(electrode, self._timeout_s)
+
+    def _quiet_level(self, block: tuple[Array, Array]) -> tuple[Array, Array] | None:
+        """Add a block, and return the rest level and the noise if the channels are quiet in `REST_BLOCKS` blocks.
+
+        The channels are quiet if the level of each channel varies by at most half of the change that begins a press.
+
+        Args:
+            block: Level (median) and noise of each channel, both of shape (channels,).
+
+        Returns:
+            Rest level and noise of a single frame, both of shape (channels,), in the unit of the board; None if the
+            channels are not quiet.
+        """
+        self._recent_blocks.append(block)
+        levels = np.array([level for level, _block_noise in self._recent_blocks])  # shape (blocks, channels)
+        noise = np.median([block_noise for _level, block_noise in self._recent_blocks], axis=0)
         variation = np.ptp(levels, axis=0)  # largest minus smallest level of each channel
-        change_of_press = CHANGE_SIGMAS * noise  # smallest change that counts as the beginning of a press
-        is_quiet = bool(np.all(variation <= 0.5 * change_of_press))
-        if len(recent_blocks) == REST_BLOCKS and is_quiet:
-            return levels.mean(axis=0), noise
-
-    # No block came before the deadline. Either the channels were not quiet, or no frames came.
-    if recent_blocks:
-        raise _restless_error(electrode, timeout_s)
-    raise _missing_press_error(electrode, timeout_s)
+        is_quiet = bool(np.all(variation <= 0.5 * CHANGE_SIGMAS * noise))
+        if len(self._recent_blocks) < REST_BLOCKS or not is_quiet:
+            return None
+        return levels.mean(axis=0), noise
 
 
 def _restless_error(electrode: str, timeout_s: float) -> PressCheckError:
