@@ -203,7 +203,8 @@ def test_warning_about_an_implausible_contact_is_logged_once(models, film, caplo
     assert predictor.flags(predictor.predict([9e9, 9e9, 9e9])) == ("outside", "beyond")
     predictor.predict([9e9, 9e9, 9e9])
     (message,) = caplog.messages
-    assert message.startswith("linear/1: the charges [9000000000.0, ")
+    assert message.startswith("linear/1: the charges A = 9e+09, B = 9e+09, C = 9e+09 pC ")
+    assert "--check-electrodes` whether wires are swapped" in message
     assert "1.125e+07 N cannot be a measurement" in message
 
 

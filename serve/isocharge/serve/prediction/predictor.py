@@ -19,7 +19,7 @@ import onnxruntime as ort
 from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Singles
-from isocharge.common.errors import ChargeError, ModelError, shown
+from isocharge.common.errors import ChargeError, ModelError
 from isocharge.serve.model.model_folder import Model, find_model, load_model
 from isocharge.serve.model.session import (
     N_WITHOUT_CORRELATION,
@@ -221,12 +221,15 @@ class Predictor:
         if self._has_warned:
             return
         self._has_warned = True
+        charges = np.ravel(np.asarray(charge_pC, float))
+        pairs = zip(self.metadata.electrodes, charges, strict=True)
         log.warning(
             "%s: the charges %s pC are far from those of any press in the training, and the contact (%.2f, %.2f) mm, "
-            "%.6g N cannot be a measurement; check unit, gain and tare. Further contacts of this kind are not logged; "
+            "%.6g N cannot be a measurement; check the unit, the gain and the tare, and with `isocharge serve doctor "
+            "--check-electrodes` whether wires are swapped. Further contacts of this kind are not logged; "
             "Predictor.flags reports each of them",
             self.metadata.label,
-            shown(charge_pC),
+            ", ".join(f"{electrode} = {charge:.4g}" for electrode, charge in pairs),
             contact.x_mm,
             contact.y_mm,
             contact.force_N,
