@@ -25,7 +25,7 @@ from serial.tools.list_ports_common import ListPortInfo
 from boards import TcpBoard, interrupt, taps
 from isocharge.cli.serve.records import write_records
 from isocharge.common.errors import InputError
-from isocharge.serve import Predictor, Recording, Script, VirtualSensor
+from isocharge.serve import Predictor, Recording, Script, VirtualSensor, load_device
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 
 
@@ -324,6 +324,35 @@ def test_doctor_lists_the_ports_and_what_they_send(resting, run, monkeypatch):
 def test_doctor_refuses_with_the_reason(resting, run, words, message):
     with resting() as sensor, pytest.raises(InputError, match=re.escape(message)):
         run("doctor", "--port", sensor.url, "--seconds", 0.5, *words)
+
+
+def test_doctor_writes_no_file_of_which_the_unit_is_missing(command, tmp_path):
+    """The command that is completed with the unit can then write the file, and the file is valid."""
+    path = tmp_path / "board.toml"
+    port = PseudoPort()
+    stop = threading.Event()
+
+    def send():
+        number = 0
+        while not stop.wait(0.005):
+            number += 1
+            port.write_whole(b"%d,%d,%d\n" % (300 + number % 5, 300 + number % 3, 300 + number % 7))
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        words = ("serve", "doctor", "--port", port.url, "--seconds", 0.6, "--write", path)
+        code, out, err = command(*words)
+        assert (code, path.exists()) == (1, False)
+        assert "--pc-per-unit NUMBER" in out
+        assert "is not written, because the charge of one unit is missing" in err
+        code, _, err = command(*words, "--pc-per-unit", 0.1)
+        assert code == 0, err
+    finally:
+        stop.set()
+        sender.join()
+        port.close()
+    assert load_device(path).gain.pC_per_unit == 0.1
 
 
 ISOCHARGE = f"{sys.executable} -m isocharge.cli"

@@ -2,20 +2,23 @@
 
 import json
 import re
-from dataclasses import asdict
+import struct
+from dataclasses import asdict, replace
 from functools import partial
 
 import numpy as np
 import pytest
 
 from isocharge.cli.serve.doctor import report_lines
-from isocharge.common.errors import DeviceError
+from isocharge.common.errors import DeviceError, NoFramesError
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text
 from isocharge.serve.examination.channel_health import measure_channel_health
 from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
-from isocharge.serve.port.serial_line import Request
+from isocharge.serve.live.device import ANY_BOARD
+from isocharge.serve.live.reading_stream import ReadingStream
+from isocharge.serve.port.serial_line import TELNET_ADVICE, Request
 
 RATE_HZ = 200.0
 FOUR = ("A", "B", "C", "D")
@@ -81,7 +84,7 @@ def test_check_of_a_channel_without_a_number():
     report = examine_received(received(lambda _: b"A:nan,B:1.5,C:2.5\n"))
     assert [(c.name, c.offset_pC) for c in report.channels] == [("A", None), ("B", 1.5), ("C", 2.5)]
     assert report.channels[0].unusable == report.good == 400
-    assert "400 values of channel A are not numbers" in missing(report)
+    assert "channel A is nan in 400 frames" in missing(report)
     assert "channel B is dead: every value is 1.5" in missing(report)
     assert {("A", "?"), ("B", "1.50")} <= {tuple(line.split()[:2]) for line in report_lines(report)}
     json.dumps(asdict(report), allow_nan=False)
@@ -198,18 +201,79 @@ def test_proposed_file_has_the_request():
     assert (frames["request"], frames["request_Hz"], frames["echo"]) == ("3F 0A", 50.0, True)
 
 
+@pytest.mark.parametrize("number", [b"nan", b"ovf", b"1e30"])
+@pytest.mark.parametrize("electrodes", [(), ("A", "B")])
+def test_value_that_is_no_charge_is_named_with_its_channel(number, electrodes):
+    board = lambda k: b"%s,%d\n" % (number if k % 20 == 7 else b"%d" % (3 + k % 5), k % 7)  # noqa: E731
+    report = examine_received(received(board), electrodes=electrodes)
+    assert f"channel 1 is {number.decode().replace('ovf', 'nan')} in 20 frames" in missing(report).replace("+", "")
+    assert "cable" not in missing(report)
+    assert report.device["channels"] == {"A": "1", "B": "2"}
+
+
+def test_line_that_is_not_read_is_shown():
+    board = lambda k: b'{"A":%s,"B":%d}\n' % (b"null" if k % 20 == 7 else b"3", k % 7)  # noqa: E731
+    assert """the line '{"A":null,"B":""" in missing(examine_received(received(board)))
+
+
 @pytest.mark.parametrize(
-    ("gain", "lines"),
+    ("names", "channels", "message"),
     [
-        ({}, ["[gain]", "offset = 305", "# pC_per_unit = ?"]),
-        ({"pC_per_unit": 0.5}, ["[gain]", "pC_per_unit = 0.5"]),
+        ("A_nC B_nC C_nC", {"A": "A_nC", "B": "B_nC", "C": "C_nC"}, "state the charge of one nC in pC"),
+        ("c b a", {"A": "a", "B": "b", "C": "c"}, ""),
+        ("A B z", None, "('A', 'B', 'z')"),
+        ("x y z", {"A": "x", "B": "y", "C": "z"}, ""),
     ],
 )
-def test_device_text_has_lines_to_fill_in(gain, lines):
+def test_channels_are_proposed_by_their_names(names, channels, message):
+    rng = np.random.default_rng(0)
+
+    def board(_):
+        return ",".join(f"{name}:{rng.normal():.3f}" for name in names.split()).encode() + b"\n"
+
+    report = examine_received(received(board), electrodes=("A", "B", "C"))
+    assert (report.device.get("channels"), report.works) == (channels, not message)
+    assert message in missing(report)
+
+
+def i16_frame(number):
+    """Return a frame of small negative and positive integers, whose sign bytes are 0xFF."""
+    return bytes([0xAA, 0x55, number % 256]) + struct.pack("<3h", -number % 7 - 9, -5, 300)
+
+
+I16_FRAMES = {
+    "format": "described",
+    "sync": "AA 55",
+    "length": 9,
+    "fields": [{"name": "seq", "type": "u8"}, *({"name": name, "type": "i16"} for name in "ABC")],
+}
+
+
+@pytest.mark.parametrize(
+    ("board", "table"),
+    [(charges(), {}), (charges(noise=1.0), {"leak": {"tau_s": 9.0}}), (i16_frame, {"frames": I16_FRAMES})],
+)
+@pytest.mark.parametrize("is_telnet", [False, True])
+def test_serial_server_with_the_telnet_protocol_is_recognised(board, table, is_telnet):
+    """A serial server doubles each byte 0xFF, and begins with commands."""
+    sent = lambda k: b"\xff\xfd\x03\xff\xfb\x01" * (k == 0) + board(k).replace(b"\xff", b"\xff\xff")  # noqa: E731
+    data = replace(received(sent if is_telnet else board), url="tcp://127.0.0.1:4001")
+    report = examine_received(data, device=device_from_table(table, "test") if table else ANY_BOARD)
+    assert (report.missing == (TELNET_ADVICE,)) == is_telnet
+
+
+def test_stream_states_that_a_serial_server_uses_the_telnet_protocol():
+    frames = [encode_frame(Frame(0xFF00 + number, 0, (1.0, 2.0, 3.0))) for number in range(256)]
+    stream = ReadingStream(("A", "B", "C"), device_from_table({"frames": {"format": "binary"}}, "test"))
+    with pytest.raises(NoFramesError, match="raw TCP"):
+        [list(stream.feed(Chunk(frame.replace(b"\xff", b"\xff\xff"), 0.0, 0))) for frame in frames * 2]
+
+
+@pytest.mark.parametrize("gain", [{}, {"pC_per_unit": 0.5}])
+def test_device_text_describes_the_board(gain):
     board = lambda k: b"%d,%d,0\n" % (303 + k % 5, 307 - k % 5)  # noqa: E731
     text = device_text(examine_received(received(board), electrodes=("A", "B"), gain=gain))
-    assert all(f"\n{line}" in text for line in lines)
-    assert ("= ?" in text) == (not gain)
+    assert ("\npC_per_unit = 0.5" in text) == bool(gain)
     assert re.search(r"\n# text: 3 columns without names; 20[01] frames per second\n", text)
     assert "channels that no electrode uses: 3" in text
 

@@ -132,6 +132,10 @@ def doctor_command(
         show("\n".join(report_lines(examination)))
     if metadata and unnoticed and examination.good and not json:
         show(f"{metadata.label}: {unnoticed.summary}")
+    is_unit_missing = device is None and examination.unit != "pC"
+    if write is not None and examination.good and is_unit_missing and not examination.touch:
+        say(f"{write} is not written, because the charge of one unit is missing: add the option that is named above")
+        raise typer.Exit(1)
     found_channels = None
     if check_wiring and examination.good and not examination.touch:
         wiring = _check_wiring(examination, electrodes)
@@ -312,7 +316,7 @@ def report_lines(examination: Examination) -> Iterator[str]:
     elif examination.unit != "pC":
         yield f"the channels are {examination.unit}, not pC"
     if examination.channels:
-        unit = UNIT_SYMBOLS[examination.unit]
+        unit = UNIT_SYMBOLS.get(examination.unit, examination.unit)
         yield f"channel    offset {unit}   noise {unit}  drift {unit}/s  50 Hz {unit}  60 Hz {unit}"
     for channel in examination.channels:
         yield _channel_line(channel, examination.unit)

@@ -36,6 +36,7 @@ class ChannelHealth:
             is too short to estimate it.
         span_pC: Difference between the largest and the smallest value.
         unusable: Number of values that are not finite, or whose magnitude is larger than any charge of a film.
+        unusable_value: The first of these values as a text, such as "nan"; empty if all values are usable.
     """
 
     name: str
@@ -45,6 +46,7 @@ class ChannelHealth:
     hum_pC: tuple[float | None, float | None] = (None, None)
     span_pC: float | None = None
     unusable: int = 0
+    unusable_value: str = ""
 
 
 def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz: float) -> ChannelHealth:
@@ -65,8 +67,9 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
     """
     is_usable = np.abs(charge_pC) <= LARGEST_PC  # false for NaN
     unusable_count = int(np.count_nonzero(~is_usable))
+    unusable_value = f"{charge_pC[~is_usable][0]:g}" if unusable_count else ""
     if unusable_count == is_usable.size:
-        return ChannelHealth(name, unusable=unusable_count)
+        return ChannelHealth(name, unusable=unusable_count, unusable_value=unusable_value)
     usable_pC = charge_pC[is_usable]
     usable_times_s = times_s[is_usable]
 
@@ -85,6 +88,7 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
         hum_pC=(hum_50_Hz_pC, hum_60_Hz_pC),
         span_pC=float(np.ptp(usable_pC)),  # largest minus smallest value
         unusable=unusable_count,
+        unusable_value=unusable_value,
     )
 
 

@@ -3,13 +3,15 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from isocharge.common.errors import shown
+from isocharge.common.errors import ChargeError, shown
 from isocharge.common.printable_text import printable
 from isocharge.serve.examination.channel_health import MAINS_HZ, ChannelHealth
 from isocharge.serve.examination.held_press import HeldPress
 from isocharge.serve.examination.listening import Capture
 from isocharge.serve.live.device import Device
 from isocharge.serve.live.fading import section_text
+from isocharge.serve.live.reading_stream import ChannelPicker
+from isocharge.serve.port.serial_line import TELNET_ADVICE
 from isocharge.serve.signal_chain.tare import TareRule
 
 CLEAN_SHARE = 0.99
@@ -43,6 +45,7 @@ class BoardFindings:
         unit: Unit of the channels: "pC", "counts" or "V".
         held_press: Press that was held during the check; None if no press was held.
         touch_sentence: Sentence about a touch of the film, which should be at rest; empty if there was no touch.
+        uses_telnet: Whether more bytes are frames without the escapes of the telnet protocol.
     """
 
     capture: Capture
@@ -53,6 +56,7 @@ class BoardFindings:
     unit: str
     held_press: HeldPress | None
     touch_sentence: str
+    uses_telnet: bool
 
 
 def missing_sentences(findings: BoardFindings) -> Iterator[str]:
@@ -70,6 +74,9 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
             "no bytes were received: check the power and the cable; if the board sends only after a request, state the "
             "request with --request"
         )
+        return
+    if findings.uses_telnet:
+        yield TELNET_ADVICE
         return
     if not capture.frames and capture.parser.unread_line:
         yield (
@@ -89,9 +96,17 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
     yield from _transmission_sentences(capture)
     yield from _channel_count_sentences(findings)
     if findings.unit != "pC":
-        yield GAIN_REQUESTS[findings.unit]
+        yield GAIN_REQUESTS.get(findings.unit) or (
+            f"the names of the channels state {findings.unit}: state the charge of one {findings.unit} in pC with "
+            "--pc-per-unit NUMBER"
+        )
     tare_rule = findings.device.tare or TareRule()  # the defaults if the device file has no tare
     for channel in findings.channels:
+        if channel.unusable:
+            yield (
+                f"channel {printable(channel.name)} is {channel.unusable_value} in {channel.unusable} frames, which is "
+                "not a charge: check the amplifier and the wire of this channel"
+            )
         if channel.span_pC == 0.0:
             yield f"channel {printable(channel.name)} is dead: every value is {channel.offset_pC:g}"
         if findings.unit == "pC":  # the limits of noise, offset, drift and hum are in pC
@@ -105,11 +120,13 @@ def _transmission_sentences(capture: Capture) -> Iterator[str]:
         capture: The frames, with the share of intact bytes and the gaps in the frame numbers.
     """
     if capture.intact_share < CLEAN_SHARE:
-        damaged_share = 1.0 - capture.intact_share
-        yield (
-            f"{damaged_share:.1%} of the bytes do not belong to good frames: check the cable, and whether the baud "
-            "rate of the board is exact"
-        )
+        damaged = f"{1.0 - capture.intact_share:.1%} of the bytes do not belong to good frames"
+        if capture.parser.unread_line:
+            damaged += (
+                f", such as the line {shown(capture.parser.unread_line)}: send a number for each channel, "
+                "and nan for a channel without a value; if the line is damaged"
+            )
+        yield f"{damaged}: check the cable, and whether the baud rate of the board is exact"
     if capture.gaps.lost:
         yield f"{capture.gaps.lost} frames were lost: send fewer frames per second, or use a faster link"
 
@@ -117,7 +134,8 @@ def _transmission_sentences(capture: Capture) -> Iterator[str]:
 def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
     """Yield a sentence if the board has more or fewer channels than the model has electrodes.
 
-    No sentence is needed without a model, or if the device file assigns a channel to every electrode.
+    No sentence is needed without a model, or if the device file assigns a channel to every electrode. If the names of
+    the channels are nearly those of the electrodes, the sentence names the difference.
 
     Args:
         findings: Results of the port check.
@@ -127,7 +145,14 @@ def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
         return
     channel_count = len(findings.channels)
     has_every_electrode_a_channel = set(electrodes) <= set(findings.device.channels)
-    if channel_count == len(electrodes) or has_every_electrode_a_channel:
+    if has_every_electrode_a_channel:
+        return
+    try:
+        ChannelPicker(electrodes, {}, "the model", has_gain=True).named_indices(findings.capture.frames[-1])
+    except ChargeError as error:
+        yield str(error)
+        return
+    if channel_count == len(electrodes):
         return
     used_channels = f"{channel_count} channels"
     if findings.unused_channels:
@@ -152,8 +177,6 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
     noise_pC = channel.noise_pC or 0.0
     offset_pC = channel.offset_pC or 0.0
     drift_pC_per_s = channel.drift_pC_per_s or 0.0
-    if channel.unusable:
-        yield f"{channel.unusable} values of channel {name} are not numbers, or impossibly large"
     if noise_pC > rule.noise_limit_pC:
         yield (
             f"channel {name} has a noise of {noise_pC:.3g} pC rms, but a tare needs less than "

@@ -6,7 +6,7 @@ the settings that are still missing.
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,13 +17,14 @@ from isocharge.common.printable_text import printable
 from isocharge.serve.examination.channel_health import ChannelHealth, measure_channel_health
 from isocharge.serve.examination.held_press import HeldPress, find_held_press
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
-from isocharge.serve.examination.missing import BoardFindings, held_press_sentences, missing_sentences
+from isocharge.serve.examination.missing import CLEAN_SHARE, BoardFindings, held_press_sentences, missing_sentences
 from isocharge.serve.examination.proposal import Proposal, propose, unit_of
 from isocharge.serve.examination.touch_search import find_touch
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
 from isocharge.serve.live.reading_stream import ReadingStream, channel_index
-from isocharge.serve.port.serial_line import Request
+from isocharge.serve.port.serial_line import Request, without_telnet
+from isocharge.serve.port.source import has_speed
 from isocharge.serve.recognition.recognise import recognise
 
 RIGHT_BAUD_SHARE = 0.5
@@ -119,23 +120,39 @@ def examine(
     """
 
     def has_frames(received_at_baud: ReceivedData) -> bool:
-        return _are_most_bytes_frames(received_at_baud, device)
+        return _intact_share(received_at_baud, device) > RIGHT_BAUD_SHARE
 
     received = listen(url, bauds, seconds, request or device.request, has_frames, wait)
     return examine_received(received, device=device, electrodes=electrodes, gain=gain)
 
 
-def _are_most_bytes_frames(received: ReceivedData, device: Device) -> bool:
-    """Return whether most of the bytes belong to frames, which shows that the baud rate is right.
+def _intact_share(received: ReceivedData, device: Device) -> float:
+    """Return the share of the bytes that belong to frames. A large share shows that the baud rate is right.
 
     Args:
-        received: Bytes that were received at the baud rate.
+        received: The bytes.
         device: Settings of the board. For `ANY_BOARD`, the format of the frames is recognised from the bytes.
     """
     if device is ANY_BOARD:
         frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
         device = device_from_table({"frames": frames or {}}, "board")
-    return read_frames(received, device).intact_share > RIGHT_BAUD_SHARE
+    return read_frames(received, device).intact_share
+
+
+def _uses_telnet(received: ReceivedData, device: Device, intact_share: float) -> bool:
+    """Return whether a serial server uses the telnet protocol, so that more bytes are frames without its escapes.
+
+    Args:
+        received: The bytes.
+        device: Settings of the board, or `ANY_BOARD`.
+        intact_share: Share of the bytes that belong to frames.
+    """
+    data = b"".join(received.data)
+    unescaped = without_telnet(data)
+    if has_speed(received.url) or unescaped == data or intact_share >= CLEAN_SHARE:
+        return False
+    chunks = [chunk._replace(data=without_telnet(chunk.data)) for chunk in received.chunks]
+    return _intact_share(replace(received, chunks=chunks), device) > intact_share
 
 
 def _proposed_device(proposal: Proposal, *, is_gain_stated: bool) -> Device:
@@ -180,6 +197,7 @@ def examine_received(
     """
     # Without a device file (`ANY_BOARD`), the format of the frames and the settings are proposed from the bytes.
     is_proposed = device is ANY_BOARD
+    given_device = device
     if is_proposed:
         proposal = propose(received, electrodes, gain or {})
         device = _proposed_device(proposal, is_gain_stated=bool(gain))
@@ -203,7 +221,15 @@ def examine_received(
     # measured on a touched film are wrong.
     table = _completed_table(proposal.table, held_press, without_offsets=is_proposed and bool(touch_sentence))
     findings = BoardFindings(
-        capture, channels, unused_channels, device, proposal.electrodes, unit, held_press, touch_sentence
+        capture,
+        channels,
+        unused_channels,
+        device,
+        proposal.electrodes,
+        unit,
+        held_press,
+        touch_sentence,
+        uses_telnet=_uses_telnet(received, given_device, capture.intact_share),
     )
     electrode_names = proposal.electrodes or tuple(electrode_at_position.values())
     is_at_rest = bool(electrode_at_position) and not touch_sentence

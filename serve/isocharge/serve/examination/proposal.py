@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.errors import ChargeError
 from isocharge.serve.examination.held_press import find_held_press
 from isocharge.serve.examination.listening import Capture, ReceivedData, read_frames
 from isocharge.serve.frames.binary import FORMAT as BINARY
 from isocharge.serve.live.device import device_from_table
-from isocharge.serve.live.reading_stream import electrode_of
+from isocharge.serve.live.reading_stream import ChannelPicker, electrode_of, stated_unit
 from isocharge.serve.recognition.recognise import recognise
 from isocharge.serve.signal_chain.tare import TareRule
 
@@ -160,12 +161,12 @@ def _recognise_frames(received: ReceivedData) -> dict[str, Any] | None:
 
 
 def unit_of(capture: Capture) -> str:
-    """Return the unit of the values of a board whose gain is unknown: "pC", "counts" or "V".
+    """Return the unit of the values of a board whose gain is unknown: "pC", "counts", "V", or a unit in the names.
 
     The unit is guessed from the names and the values of the channels. The first rule that applies determines the unit.
 
-    - The unit is pC for binary frames of isocharge, if all names end in `_pC`, or if all values are small and never
-      change.
+    - The unit is the unit that all names of channels state, such as nC for `A_nC`.
+    - The unit is pC for binary frames of isocharge, or if all values are small and never change.
     - The unit is counts if all values are whole numbers.
     - The unit is volts if all names end in `V`, or if all values are small and have little noise.
     - The unit of all other values is assumed to be pC.
@@ -173,8 +174,10 @@ def unit_of(capture: Capture) -> str:
     Args:
         capture: The frames that were received. Without frames, the result is "pC".
     """
-    names_state_pC = all(name.endswith("_pC") for name in capture.names)
-    if not capture.frames or capture.parser.format == BINARY or names_state_pC:
+    units = {stated_unit(name) for name in capture.names}
+    if len(units) == 1 and units != {""}:
+        return units.pop()
+    if not capture.frames or capture.parser.format == BINARY:
         return "pC"
     values, _times_s = capture.values()  # shape (frames, channels)
     finite_rows = values[np.isfinite(values).all(axis=1)]  # frames in which all values are finite
@@ -209,18 +212,21 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
     Returns:
         Position of the channel in the frame by the name of the electrode; empty if there are too few channels.
     """
-    # The name of a channel may contain the name of an electrode, such as `A_pC` for A.
+    frame = capture.frames[-1]
     names = capture.names
-    named_positions = {electrode_of(channel): position for position, channel in enumerate(names)}
-    if electrodes and set(electrodes) <= set(named_positions):
-        return {electrode: named_positions[electrode] for electrode in electrodes}
+    if not electrodes:
+        # Without a model, use the names in the channels if they are single letters. Otherwise use A, B, C, ...
+        letters = tuple(electrode_of(names[position]).upper() for position in _varying_channels(values))
+        electrodes = letters if set(letters) <= set(ELECTRODES) else tuple(ELECTRODES[: len(letters)])
+    try:
+        # A unit in the names does not matter, because the gain is requested if it is missing.
+        named_positions = ChannelPicker(electrodes, {}, "the model", has_gain=True).named_indices(frame)
+    except ChargeError:  # the names are nearly those of electrodes, which is reported later
+        return {}
+    if named_positions is not None:
+        return dict(zip(electrodes, named_positions, strict=True))
 
     candidates = _varying_channels(values)
-    if not electrodes:
-        # Without a model, use the names in the channels if they are single capital letters. Otherwise use A, B, C, ...
-        channel_electrodes = tuple(electrode_of(names[position]) for position in candidates)
-        are_usual_names = set(channel_electrodes) <= set(ELECTRODES)
-        electrodes = channel_electrodes if are_usual_names else tuple(ELECTRODES[: len(candidates)])
     has_channel_for_each = len(names) == len(electrodes)
     if len(candidates) < len(electrodes) and has_channel_for_each:
         candidates = list(range(len(names)))  # keeps a channel that never changes, which is reported later
@@ -233,14 +239,15 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
 def _varying_channels(values: Array) -> list[int]:
     """Return the positions of the channels whose values vary, except channels with much less noise than the others.
 
-    A channel with a value that is not finite is left out, too. If no channel remains, all positions are returned.
+    A channel of which most values are not finite is left out, too. If no channel remains, all positions are returned.
 
     Args:
         values: Values of all channels, shape (n, channels).
     """
     noise_at_position = {}  # noise of each channel that varies
     for position, column in enumerate(values.T):
-        if np.isfinite(column).all() and np.ptp(column) > 0.0:
+        finite_values = column[np.isfinite(column)]
+        if 2 * len(finite_values) > len(column) and np.ptp(finite_values) > 0.0:
             noise_at_position[position] = estimate_noise(column)
     if not noise_at_position:
         channel_count = values.shape[1]

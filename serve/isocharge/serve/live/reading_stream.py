@@ -7,7 +7,7 @@ The touch charges do not depend on a model of the film, unless the signal chain 
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from json import dumps
 from operator import itemgetter
 from typing import NamedTuple
@@ -23,6 +23,7 @@ from isocharge.serve.frames.frame import SATURATED_BIT, Frame, Parser, SequenceG
 from isocharge.serve.frames.frame_layout import FrameLayout
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.port.device_clock import DeviceClock, ReadingTime
+from isocharge.serve.port.serial_line import TELNET_ADVICE, without_telnet
 from isocharge.serve.port.source import Chunk
 from isocharge.serve.signal_chain.chain import Chain, Reading, SignalChain
 from isocharge.serve.signal_chain.thermal import Misfit
@@ -33,7 +34,7 @@ MAX_CHANNEL_DIGITS = 4
 BYTES_TO_RECOGNISE = 8192
 """If a stream contains no intact frame in more than this number of bytes, an error is raised."""
 
-_UNIT = re.compile(rf"_(?:{'|'.join(OTHER_UNITS['pC'])})$")
+_UNIT = re.compile(rf"(?:_({(units := '|'.join(('pC', *OTHER_UNITS['pC'])))})|\s*[\[(]\s*({units})\s*[\])])$")
 
 
 class ChannelPicker:
@@ -105,24 +106,49 @@ class ChannelPicker:
         """
         if self._channels:
             return tuple(self._assigned_index(electrode, frame) for electrode in self._electrodes)
+        indices = self.named_indices(frame)
+        if indices is not None:
+            return indices
+        if len(frame.values) != len(self._electrodes):
+            raise self._assignment_error(frame)
+        numbers = [number for name in channel_names(frame) if (number := channel_number(name)) is not None]
+        order = range(len(frame.values))
+        return tuple(sorted(order, key=numbers.__getitem__) if len(numbers) == len(order) else order)
+
+    def named_indices(self, frame: Frame) -> tuple[int, ...] | None:
+        """Return, for each electrode, the index of the channel with its name in `frame.values`.
+
+        The result is None if no channel has the name of an electrode, or nearly so.
+
+        Raises:
+            ChargeError: If the names of the channels are those of some electrodes only, or nearly those of electrodes,
+                or if they state a unit other than pC and the gain is not known.
+        """
         names = frame.names
-        if self._has_gain:
-            names = tuple(_UNIT.sub("", name) for name in names)
+        advice = [] if self._has_gain else _unit_advice(names)
         indices = [_channels_of_electrode(electrode, names) for electrode in self._electrodes]
-        if all(len(indices_of_electrode) == 1 for indices_of_electrode in indices):  # assigned by their names
+        if all(len(indices_of_electrode) == 1 for indices_of_electrode in indices) and not advice:
             return tuple(indices_of_electrode[0] for indices_of_electrode in indices)
 
         # Names of which some are those of electrodes, or nearly so, must not be assigned by their order.
-        absent_columns = dict.fromkeys(self._electrodes, CHARGE_RULE.meaning)
-        advice = list(header_advice(names, absent_columns))
-        has_electrode_names = any(indices) or bool(advice)
-        if len(frame.values) == len(self._electrodes) and not has_electrode_names:  # assigned by their order
-            numbers = [number for name in channel_names(frame) if (number := channel_number(name)) is not None]
-            order = range(len(frame.values))
-            return tuple(sorted(order, key=numbers.__getitem__) if len(numbers) == len(order) else order)
+        absent = [name for name, found in zip(self._electrodes, indices, strict=True) if len(found) != 1]
+        unused = [name for index, name in enumerate(names) if [index] not in indices]
+        advice = advice or list(header_advice(unused, dict.fromkeys(absent, CHARGE_RULE.meaning)))
+        if any(indices) or advice:
+            raise self._assignment_error(frame, advice)
+        return None
+
+    def _assignment_error(self, frame: Frame, advice: Iterable[str] = ()) -> ChargeError:
+        """Return the error for a frame whose channels cannot be assigned to the electrodes.
+
+        Args:
+            frame: The frame.
+            advice: Sentences about single channels.
+        """
+        number = "a frame" if frame.seq is None else f"frame {frame.seq}"
         example_keys = ", ".join(f'{electrode} = "..."' for electrode in self._electrodes)
-        raise ChargeError(
-            f"{self._reader} expects {len(self._electrodes)} charges {self._electrodes}, frame {frame.seq} has "
+        return ChargeError(
+            f"{self._reader} expects {len(self._electrodes)} charges {self._electrodes}, {number} has "
             f"{len(frame.values)} {channel_names(frame)}{''.join(f'; {sentence}' for sentence in advice)}; choose the "
             f"model of this sensor, or say in the device file which is which: [channels] {example_keys}"
         )
@@ -228,11 +254,29 @@ def _channels_of_electrode(electrode: str, names: tuple[str, ...]) -> list[int]:
 def electrode_of(name: str) -> str:
     """Extract the name of the electrode from the name of a channel.
 
-    For example, the function returns `A` if the channel is called `A`, `A_pC`, `A [pC]`, `charge.A` or
+    For example, the function returns `A` if the channel is called `A`, `A_pC`, `A [nC]`, `charge.A` or
     `charge_raw_pC.A`.
     """
     _, _, last_part = name.rpartition(".")
-    return re.sub(r"_pC|\s*[\[(]\s*pC\s*[\])]", "", last_part)
+    return _UNIT.sub("", last_part)
+
+
+def stated_unit(name: str) -> str:
+    """Return the unit in the name of a channel, such as nC for `A_nC`; empty if the name states no unit.
+
+    A final `_C` is no unit, because C may be the name of an electrode.
+    """
+    match = _UNIT.search(name)
+    return (match[1] or match[2]) if match is not None and match[1] != "C" else ""
+
+
+def _unit_advice(names: tuple[str, ...]) -> list[str]:
+    """Return advice for the first channel whose name states a unit other than pC; empty without such a channel."""
+    for name in names:
+        unit = stated_unit(name)
+        if unit not in ("", "pC"):
+            return [f"channel {shown(name)} is in {unit}: convert it to pC, or state the charge of a unit in [gain]"]
+    return []
 
 
 class TimedReading(NamedTuple):
@@ -291,6 +335,7 @@ class ReadingStream:
         self._misfit = misfit
         self._chain = self._new_chain()
         self._pending_flags: tuple[str, ...] = ()  # flags that the next frame gets
+        self._unrecognised = b""  # the bytes before the first frame
 
     @property
     def warming_ratio(self) -> Array | float:
@@ -338,8 +383,9 @@ class ReadingStream:
         if chunk.outage_s > 0.0:
             self._reconnect()
         frames = self.parser.feed(chunk.data)
-        if not frames:
-            _check_recognised(self.parser)
+        if not self.parser.counts.frames:
+            self._unrecognised += chunk.data
+            self._check_recognised()
         times = self.clock.read(chunk, [frame.t_us for frame in frames], self.parser.t_us_modulus)
         return list(zip(frames, times, strict=True))
 
@@ -384,7 +430,25 @@ class ReadingStream:
         Raises:
             NoFramesError: If the whole stream has contained no intact frame.
         """
-        _check_recognised(self.parser, max_bytes=-1)  # raises an error without a frame, even if no bytes have arrived
+        self._check_recognised(max_bytes=-1)  # raises an error without a frame, even if no bytes have arrived
+
+    def _check_recognised(self, max_bytes: int = BYTES_TO_RECOGNISE) -> None:
+        """Raise an error if the parser has found no intact frame in more than `max_bytes` bytes.
+
+        Raises:
+            NoFramesError: If more than `max_bytes` bytes have arrived, and none of them belonged to an intact frame.
+        """
+        counts = self.parser.counts
+        if counts.frames or counts.bytes_dropped <= max_bytes:
+            return
+        unescaped = without_telnet(self._unrecognised)
+        uses_telnet = unescaped != self._unrecognised and self._device.parser().feed(unescaped)
+        line = f", such as {shown(self.parser.unread_line)}" if self.parser.unread_line else ""
+        raise NoFramesError(
+            f"no intact frame among the first {counts.bytes_dropped} bytes ({counts.crc_errors} with a wrong CRC, "
+            f"{counts.malformed} of another form{line}); {self.parser.format}: "
+            f"{TELNET_ADVICE if uses_telnet else 'check baud rate and device'}"
+        )
 
     def _reconnect(self) -> None:
         """Discard the state of the parser, the gap counter, the clock and the tare after an outage of the port.
@@ -397,18 +461,3 @@ class ReadingStream:
         self.clock.reset()
         self.tare()
         self._pending_flags = (RECONNECTED,)
-
-
-def _check_recognised(parser: Parser, max_bytes: int = BYTES_TO_RECOGNISE) -> None:
-    """Raise an error if the parser has found no intact frame in more than `max_bytes` bytes.
-
-    Raises:
-        NoFramesError: If more than `max_bytes` bytes have arrived, and none of them belonged to an intact frame.
-    """
-    counts = parser.counts
-    if counts.frames == 0 and counts.bytes_dropped > max_bytes:
-        line = f", such as {shown(parser.unread_line)}" if parser.unread_line else ""
-        raise NoFramesError(
-            f"no intact frame among the first {counts.bytes_dropped} bytes ({counts.crc_errors} with a wrong CRC, "
-            f"{counts.malformed} of another form{line}); {parser.format}: check baud rate and device"
-        )
