@@ -14,6 +14,7 @@ The package `simulate` writes the file, and the live page of `serve` shows the d
 """
 
 import base64
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,6 +31,9 @@ from isocharge.common.structs import Finite, Positive, WrongKey, read_json
 
 VERSION = 1
 """Version of the file format."""
+
+DEFLECTION_FILE = "deflection.json"
+"""Name of the file with the deflection field, in the folder of a dataset and in the version folder of a model."""
 
 FILM_KEYS = ("radius_mm", "thickness_um", "young_GPa", "poisson", "pretension_MPa")
 """Properties of a film on which its deflection depends."""
@@ -86,15 +90,20 @@ class DeflectionField:
             "deflection": base64.b64encode(steps.tobytes()).decode(),
         }
 
+    def to_bytes(self) -> bytes:
+        """Return the file in which the deflection field is stored."""
+        return json.dumps(self.to_json()).encode()
+
 
 def is_same_film(film: Any, properties: Mapping[str, float]) -> bool:
     """Return whether the properties of a film are equal to expected properties, except for rounding errors.
 
     Args:
-        film: The film as a sensor file describes it. If it is not a table, the result is False.
+        film: The film as a sensor file describes it. If it is not a table, or has further properties such as an oval
+            clamp or a closed back, the result is False.
         properties: Expected properties, with the keys `FILM_KEYS`.
     """
-    if not isinstance(film, Mapping):
+    if not isinstance(film, Mapping) or not film.keys() <= set(FILM_KEYS):
         return False
     film_properties = {"pretension_MPa": 0.0, **film}  # the pretension is 0 if the file omits it
     return all(_is_close(film_properties.get(key), properties[key]) for key in FILM_KEYS)

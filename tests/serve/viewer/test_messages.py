@@ -34,8 +34,10 @@ from isocharge.serve.viewer.messages import (
     coalesce,
     confirmed_number,
     describe_film,
+    find_deflection_field,
     samples_message,
 )
+from kept import ROOT
 
 
 def parse(text, kind=LiveRequest | ReplayRequest):
@@ -251,6 +253,13 @@ def test_page_decodes_the_samples_of_the_server(record):
     assert expected.items() <= first.items()
     assert bin(first["bits"]).count("1") == 2
     assert {"contact": False, "x": None, "bits": 0}.items() <= second.items()
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "models").iterdir() if path.is_dir()))
+def test_every_released_model_has_a_deflection_field(name):
+    metadata = load_model(ROOT / "models" / name / "1").metadata
+    field = find_deflection_field(ROOT / "models" / name / "1", metadata)
+    assert field.fits(metadata.sensor["film"])
 
 
 def test_page_interpolates_the_deflection_field():

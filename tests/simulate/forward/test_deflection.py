@@ -2,15 +2,18 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
+from isocharge.cli.shared.forward_maps import write_deflection
 from isocharge.common.deflection_field import read_deflection_field
 from isocharge.common.errors import InputError
 from isocharge.simulate import Circle, deflection, load_sensor, press
 from isocharge.simulate.forward.deflection import deflection_field
+from isocharge.simulate.sensor.sensor_file import film_to_dict, sensor_to_toml
 
 FILM = load_sensor("three-25um-biaxial").film
 PROBE = Circle(1.0)
@@ -18,7 +21,7 @@ PROBE = Circle(1.0)
 
 @pytest.fixture(scope="module")
 def field():
-    return deflection_field(FILM, PROBE, (0.2, 1.0), distances=3)
+    return deflection_field(FILM, PROBE, (0.2, 1.0), distances=5)
 
 
 def interpolated(field, x_mm, y_mm, distance_mm, force_N):
@@ -54,7 +57,37 @@ def test_deflection_file_round_trip(field, tmp_path):
     read = read_deflection_field(path)
     assert np.abs(read.deflection_mm - field.deflection_mm).max() < 1e-4 * field.deflection_mm.max()
     film = {"radius_mm": 45, "thickness_um": 25.0, "young_GPa": 3.0, "poisson": 0.34}
-    assert [read.fits(other) for other in (film, film | {"thickness_um": 110.0}, None)] == [True, False, False]
+    assert [read.fits(other) for other in (film, film | {"thickness_um": 110.0}, film | {"oval": 0.1}, None)] == [
+        True,
+        False,
+        False,
+        False,
+    ]
+
+
+def test_deflection_json_is_written_for_a_film_without_an_included_table(tmp_path, monkeypatch, capsys, command):
+    def quick_field(film, probe):
+        return deflection_field(film, probe, (1.0,), distances=2)
+
+    monkeypatch.setattr("isocharge.simulate.forward.deflection.deflection_field", quick_field)
+    path = tmp_path / "deflection.json"
+    large_probe = Circle(30.0)  # leaves the film off the centre
+    for film, probe in [
+        (FILM, PROBE),
+        (replace(FILM, young_ratio=1.2), PROBE),
+        (replace(FILM, radius=44.0), large_probe),
+    ]:
+        write_deflection(tmp_path, film, [probe])
+        assert not path.exists()
+    assert "cannot draw this film in relief" in capsys.readouterr().err
+
+    sensor = load_sensor("three-25um-biaxial")
+    own_sensor = tmp_path / "own.toml"
+    own_film = replace(FILM, thickness=0.03)
+    own_sensor.write_text(sensor_to_toml(replace(sensor, film=own_film)), "utf-8")
+    words = "--radius", "3", "--force", "1", "1", "--samples", "5", "--workers", "1", "-o", tmp_path / "presses"
+    assert command("simulate", "sweep", own_sensor, *words)[0] == 0
+    assert read_deflection_field(tmp_path / "presses" / "deflection.json").fits(film_to_dict(own_film))
 
 
 @pytest.mark.parametrize(

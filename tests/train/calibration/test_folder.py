@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tests.train.calibration.conftest import rig
 
+from isocharge.common.deflection_field import read_deflection_field
 from isocharge.common.errors import ModelError, PressError
 from isocharge.common.statistics import rms
 from isocharge.serve import Predictor, load_model, read_presses, write_presses
@@ -185,6 +186,8 @@ def test_folder_of_a_killed_process_is_repaired_and_locked(film, problem, interr
 def test_next_calibration_is_the_next_version(film, interrupted, command):
     _, _, folder = film
     assert command(*CALIBRATE, folder.parent / "presses.csv", "-o", interrupted)[0] == 0
+    calibrated_film = load_model(interrupted).metadata.sensor["film"]
+    assert read_deflection_field(interrupted / "2" / "deflection.json").fits(calibrated_film)
     assert (interrupted / "calibration.json").read_bytes() == (interrupted / "2" / "calibration.json").read_bytes()
     assert (interrupted / "1" / "model.onnx").read_bytes() == (folder / "1" / "model.onnx").read_bytes()
     assert Predictor(interrupted).metadata.version == 2

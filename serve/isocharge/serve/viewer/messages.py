@@ -48,7 +48,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct, to_builtins
 
-from isocharge.common.deflection_field import DeflectionField, read_deflection_field
+from isocharge.common.deflection_field import DEFLECTION_FILE, DeflectionField, read_deflection_field
 from isocharge.common.errors import InputError, RequestError
 from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, WrongKey, convert
@@ -341,16 +341,12 @@ def confirmed_number(data: bytes) -> int:
     return int.from_bytes(data, "little")
 
 
-DEFLECTION_FILE = "deflection.json"
-"""Name of the file with the deflection field in a version folder."""
-
-
 def find_deflection_field(version_folder: Path, metadata: ModelMetadata) -> DeflectionField | None:
     """Return the deflection field of the film for which a model was trained, or None if no such field is available.
 
     The deflection field describes the shape of the pressed film, which the page draws. If the version folder of the
     model contains a deflection field, the function returns this field. Otherwise, the function searches the deflection
-    fields that are included in isocharge. These belong to the films of the released models.
+    fields that are included in isocharge.
 
     Args:
         version_folder: Folder of the version of the model.
@@ -362,7 +358,17 @@ def find_deflection_field(version_folder: Path, metadata: ModelMetadata) -> Defl
     path = version_folder / DEFLECTION_FILE
     if path.is_file():
         return read_deflection_field(path)
-    film = metadata.sensor.get("film")
+    return included_deflection_field(metadata.sensor.get("film"))
+
+
+def included_deflection_field(film: Any) -> DeflectionField | None:
+    """Return the deflection field of a film that is included in isocharge, or None if there is none for this film.
+
+    The included fields belong to the films of the released models.
+
+    Args:
+        film: The film as a sensor file describes it.
+    """
     with as_file(files("isocharge.serve.viewer") / "fields") as folder:
         for field_path in sorted(folder.glob("*.json")):
             field = read_deflection_field(field_path)

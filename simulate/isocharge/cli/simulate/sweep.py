@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from isocharge.cli.shared.forward_maps import executor_for, shown_run, sweep_radius, warn_of_stress
+from isocharge.cli.shared.forward_maps import executor_for, shown_run, sweep_radius, warn_of_stress, write_deflection
 from isocharge.cli.shared.options import (
     ClusterOption,
     ForceRangeOption,
@@ -118,6 +118,7 @@ def sweep_command(
         largest_distance = sweep_radius(radius, film_sensor, probes, force)
         sweep = Sweep(largest_distance, force, samples, seed, orientation.value, sampling.value)
         run_sweep(folder, film_sensor, probes, sweep, executor=executor, fresh=fresh)
+    write_deflection(folder, film_sensor.film, probes)
     if table is not None:
         write_presses(table, _presses(read_dataset(folder)))
 

@@ -3,12 +3,13 @@
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.deflection_field import DeflectionField, points_mm
+from isocharge.common.deflection_field import FILM_KEYS, DeflectionField, points_mm
 from isocharge.common.progress import track
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor_file import film_to_dict
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
+from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.press import press
 
 RINGS = 20
@@ -20,11 +21,14 @@ ANGLES = 13
 FORCES = (0.05, 0.3, 2.0)
 """Forces of the presses in the table, N."""
 
-MAX_DISTANCE = 16.0 / 45.0
+MAX_DISTANCE = 0.8
 """Largest distance of a press in the table from the centre of the film, in film radii, dimensionless."""
 
-DISTANCES = 5
+DISTANCES = 7
 """Number of distances of the presses in the table from the centre of the film."""
+
+ACCURACY = 1e-2
+"""Accuracy of the charges in the solves, dimensionless. A picture of the film needs no accurate mesh."""
 
 INNER_RADIUS = 0.999999
 """Largest radius of the points at which the deflection is computed, in film radii, dimensionless.
@@ -42,7 +46,7 @@ def deflection_field(
     table contains the deflection on rings around the probe.
 
     Args:
-        film: Film on which the probe presses.
+        film: Axisymmetric film on which the probe presses.
         probe: The circular probe.
         forces: Forces of the presses in ascending order, N.
         distances: Number of distances of the presses from the centre, from 0 to `MAX_DISTANCE`, at least 2.
@@ -66,10 +70,11 @@ def deflection_field(
     for distance_index, distance in enumerate(track(press_distances, "solving the film", distances)):
         equilibrium: Equilibrium | None = None
         for force_index, force in enumerate(forces):
-            equilibrium = press(film, probe, (distance, 0.0), force, start=equilibrium)
+            equilibrium = press(film, probe, (distance, 0.0), force, SolveSettings(ACCURACY), start=equilibrium)
             deflections[force_index, distance_index] = _deflection_on_rings(equilibrium, distance, rings)
+    properties = film_to_dict(film)
     return DeflectionField(
-        film=film_to_dict(film),
+        film={key: properties[key] for key in FILM_KEYS},
         probe_radius_mm=probe.radius,
         force_N=forces,
         distance_mm=tuple(press_distances),

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from isocharge.cli.shared.forward_maps import write_deflection
 from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.options import JsonOption, ModelsOption, StressLimitOption, refuse
 from isocharge.cli.shared.probe_option import ProbeOption
@@ -210,6 +211,8 @@ def _write(result: CalibrationResult, folder: Path) -> None:
     """Write the model of a calibrated film, and print the name of its version folder."""
     say("making the model of this film, and measuring its errors")
     version = write_calibration(result, folder, this_command())
+    sensor, probe = result.film
+    write_deflection(version, sensor.film, [probe])
     say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
 
 

@@ -181,7 +181,7 @@ def fit_command(
         # Case 5, a dataset folder or --sensor alone: train a network on the dataset, or on presses simulated here.
         with shown_progress():
             data = _read_or_simulate_data(dataset, sensor, notations, radius)
-    _release_data_model(data, fit_config, options)
+    _release_data_model(data, fit_config, options, dataset if measured_file is None else None)
 
 
 def _is_sensor(argument: Path) -> bool:
@@ -235,13 +235,16 @@ def _release_presses_model(
     train_and_release(train, presses_identity(presses, fit_config), version_folder, options, release)
 
 
-def _release_data_model(data: TrainingData, fit_config: FitConfig, options: ReleaseOptions) -> None:
+def _release_data_model(
+    data: TrainingData, fit_config: FitConfig, options: ReleaseOptions, dataset: Path | None
+) -> None:
     """Train a network on the training data of a known sensor, and release it.
 
     Args:
         data: Presses of the sensor for training and test.
         fit_config: Settings of the training.
         options: Folder and version of the model.
+        dataset: Dataset folder of the training data; None if there is none.
     """
     version_folder = options.check_version_folder(data.sensor.electrode_names)
 
@@ -249,7 +252,7 @@ def _release_data_model(data: TrainingData, fit_config: FitConfig, options: Rele
         """Train the network, and save the state of the training in the run."""
         return fit(data, fit_config, run=run)
 
-    train_and_release(train, fit_identity(data, fit_config), version_folder, options, release)
+    train_and_release(train, fit_identity(data, fit_config), version_folder, options, release, dataset)
 
 
 def _read_or_simulate_data(dataset: Path | None, sensor: str | None, notations: list[str], radius: str) -> TrainingData:

@@ -7,12 +7,16 @@ from typing import Annotated, Any, Protocol, TypeVar
 
 import typer
 
-from isocharge.cli.shared.forward_maps import shown_run
+from isocharge.cli.shared.forward_maps import shown_run, write_deflection
 from isocharge.cli.shared.terminal import say, show_json, this_command
+from isocharge.common.deflection_field import DEFLECTION_FILE, read_deflection_field
 from isocharge.common.errors import IsochargeError, OutputError
+from isocharge.common.files import write_whole
 from isocharge.common.resumable_run import ResumableRun, resume_parts
 from isocharge.serve import ModelMetadata
 from isocharge.serve.model.model_folder import check_target
+from isocharge.simulate import parse_probe
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.train import Release
 
 Trained = TypeVar("Trained")
@@ -86,6 +90,7 @@ def train_and_release(
     version_folder: Path,
     options: ReleaseOptions,
     write_release: WriteRelease[Trained],
+    dataset: Path | None = None,
 ) -> None:
     """Train a network, release it as a version folder, and print its errors.
 
@@ -98,6 +103,8 @@ def train_and_release(
         version_folder: Folder to write, as `ReleaseOptions.check_version_folder` returned it.
         options: Options of the command.
         write_release: Function that writes the version folder.
+        dataset: Dataset folder of the training, whose file with the deflection of the film is copied if there is one.
+            If it is None, the deflection is computed.
 
     Raises:
         OutputError: If the release is refused after the training. The message states where the training is kept.
@@ -113,9 +120,26 @@ def train_and_release(
                 f"{error}; the finished training is kept in {run.folder}: mend the cause and repeat the command, or "
                 f"move that folder to {other_folder / run.folder.name} and repeat the command with -o {other_folder}"
             ) from error
+    _add_deflection(released, dataset)
     if options.json:
         show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})
     say(f"{released.folder}: {_errors_sentence(released.metadata)}")
+
+
+def _add_deflection(released: Release, dataset: Path | None) -> None:
+    """Add the file with the deflection of the film to a released model, unless its sensor has no description.
+
+    Args:
+        released: The released model.
+        dataset: Dataset folder of the training; None to compute the deflection.
+    """
+    if dataset is not None:
+        path = dataset / DEFLECTION_FILE
+        if path.is_file():
+            write_whole(released.folder / DEFLECTION_FILE, read_deflection_field(path).to_bytes())
+    elif "film" in released.metadata.sensor:
+        probes = [parse_probe(notation) for notation in released.metadata.probes]
+        write_deflection(released.folder, sensor_from_dict(released.metadata.sensor).film, probes)
 
 
 def _errors_sentence(metadata: ModelMetadata) -> str:

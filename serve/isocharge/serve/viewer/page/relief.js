@@ -181,7 +181,7 @@ export class Relief {
   sayCaption(touch) {
     const words = this.deflection
       ? `${touch ? `${this.deflection.at(touch.x, touch.y).toFixed(2)} mm deep under the probe; ` : ""}depth drawn ${STRETCH} times`
-      : "No deflection table beside this model: the place alone.";
+      : "No deflection.json beside this model: the place alone.";
     if (this.caption.textContent !== words) this.caption.textContent = words;
   }
 }
