@@ -118,7 +118,7 @@ def recording_picture(traces: dict[str, Array], title: str) -> Figure:
     flags = [flag for flag in MEANINGS if flag in traces]
     flag_height = 0.1 * (1 + len(flags))  # grows with the number of rows of flags
     figure = new_figure(12.0, 8.6)
-    figure.suptitle(f"{title}: {len(traces['timestamp'])} records")
+    figure.suptitle(f"{title}: {len(traces['timestamp'])} records; thin lines: ± 2 standard deviations")
     heights = (1.0, 1.0, 0.8, flag_height)
     charge_axes, position_axes, force_axes, flag_axes = figure.subplots(4, 1, sharex=True, height_ratios=heights)
 
@@ -136,7 +136,7 @@ def recording_picture(traces: dict[str, Array], title: str) -> Figure:
         flag_axes.plot(flag_time_s, np.full(len(flag_time_s), row), "|", color=INK)
 
     charge_axes.set_ylabel("touch charge, pC")
-    position_axes.set_ylabel("position, mm; thin: ± 2 standard deviations")
+    position_axes.set_ylabel("position, mm")
     force_axes.set_ylabel("force, N")
     flag_axes.set(yticks=range(len(flags)), yticklabels=flags, ylim=(-0.7, max(len(flags), 1) - 0.3))
     flag_axes.set_xlabel(f"time since {datetime.fromtimestamp(start_s, UTC):%Y-%m-%d %H:%M:%S} UTC, s")
