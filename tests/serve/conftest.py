@@ -24,6 +24,7 @@ from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import HttpServer
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
+from isocharge.serve.record.record import field_names
 
 NAMES = ("A", "B", "C", "D")
 """Names of the electrodes."""
@@ -248,29 +249,7 @@ def fill_disk(monkeypatch):
 @pytest.fixture
 def contract():
     """Names of the fields of a prediction record, in their order."""
-    return [
-        "timestamp",
-        "t_device_us",
-        "seq",
-        "x_mm",
-        "y_mm",
-        "force_N",
-        "x_std_mm",
-        "y_std_mm",
-        "force_std_N",
-        "misfit",
-        "xy_correlation",
-        "xF_correlation",
-        "yF_correlation",
-        "contact",
-        "charge_pC",
-        "charge_raw_pC",
-        "tare_pC",
-        "flags",
-        "latency_us",
-        "model",
-        "frame_id",
-    ]
+    return list(field_names())
 
 
 @pytest.fixture

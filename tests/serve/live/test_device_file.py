@@ -1,5 +1,7 @@
 """Tests of the device file: its settings, their effects, and files that are refused."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from isocharge.serve import (
     encode_frame,
     load_device,
 )
+from isocharge.serve.frames.formats import Frames
 from isocharge.serve.frames.frame_layout import SyncParser
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import ANY_BOARD, with_settings
@@ -22,6 +25,9 @@ from isocharge.serve.signal_chain.chain import SignalChain
 from isocharge.serve.signal_chain.stages import Gain
 
 ELECTRODES = ("A", "B", "C")
+FORMATS = ", ".join(section.__struct_config__.tag for section in get_args(Frames))
+"""Names of all frame formats, as messages list them."""
+
 FULL = """
 name = "bench board 3"
 [frames]
@@ -160,7 +166,7 @@ WRONG = [
     ("[leak]\n", "key 'leak.tau_s' is missing"),
     ("[leak]\non = false\ntau_s = 0\n", r"leak\.tau_s: expected a positive number"),
     ("[saturation]\n", "key 'saturation.limit_pC' is missing"),
-    ('[frames]\nformat = "morse"\n', r"frames\.format: expected one of auto, text, binary, described, got 'morse'"),
+    ('[frames]\nformat = "morse"\n', rf"frames\.format: expected one of {FORMATS}, got 'morse'"),
     ('[frames]\nformat = "binary"\ncolumns = ["A"]\n', r"unknown key 'frames\.columns'; known are format"),
     ('[frames]\nformat = "text"\ncolumns = ["A", 2]\n', r"frames\.columns\[1\]: expected a text, got 2"),
     ('[frames]\nformat = "described"\nsync = "55"\n', r"key 'frames\.length' is missing"),

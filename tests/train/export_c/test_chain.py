@@ -14,6 +14,7 @@ from isocharge.serve.frames.frame import T_US_MODULUS, Frame
 from isocharge.serve.port.device_clock import DeviceClock
 from isocharge.serve.port.source import Chunk
 from isocharge.serve.signal_chain.chain import SignalChain
+from isocharge.train.export_c import folder
 from isocharge.train.export_c.folder import device_header
 
 BITS = {TARE: 1, SATURATED: 2, NEGATIVE: 4, THERMAL: 8, BLIND: 16, INVALID: 32}
@@ -215,6 +216,18 @@ def test_second_tare_does_not_fail(build, restless_frames):
 def test_tare_that_is_too_long_for_c_is_refused():
     with pytest.raises(DeviceError, match=r"board: tare.frames: expected a whole number from 1 to 10000.*got 50000"):
         device_header(device_from_table({"tare": {"frames": 50_000, "patience": 0}}, "board"), ("A", "B", "C"))
+
+
+def test_stage_without_code_in_c_is_refused_by_its_name(monkeypatch):
+    monkeypatch.setattr(folder, "C_SECTIONS", folder.C_SECTIONS - {"hum"})
+    board = device_from_table({"hum": {}}, "board")
+    with pytest.raises(DeviceError, match="board: hum: this stage does not exist"):
+        device_header(board, ("A", "B", "C"))
+
+
+def test_sections_that_only_the_host_executes_are_named_in_a_warning(caplog):
+    device_header(device_from_table({"track": {}, "touch_offset": {}}, "board"), ("A", "B", "C"))
+    assert "board: track, touch_offset: not exported" in caplog.text
 
 
 FLOAT32 = st.floats(width=32, allow_nan=False)

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.timeout(900)  # the fixture `report` runs every method 
 NAME = "three-25um-biaxial"
 SMALL = replace(QUICK, presses=128, learn_from=600, steps=30, batch=64, seconds=1e-3, draws=2, limited=64, shapes=())
 PICTURES = {"latency", "throughput", "memory", "maps", "force", "calibration", "noise", "effects"}
-METHODS = {
+METHODS = {  # further methods may be registered
     "evaluated model",
     "evaluated model, contact only",
     "three-25um-biaxial-student",
@@ -91,7 +91,7 @@ def test_folder_contains_record_page_and_all_pictures(report):
 def test_every_method_is_in_the_table_and_none_is_better_than_the_bayes_limit(report):
     _, section, page = report
     methods = {entry["name"]: entry for entry in section["methods"]}
-    assert set(methods) == METHODS
+    assert set(methods) >= METHODS
     for name, entry in methods.items():
         row = rf"^\| {re.escape(name)}.* \| {entry['errors']['position_rms_mm']:.3g} \|"
         assert re.search(row, page.replace("**", ""), re.MULTILINE)

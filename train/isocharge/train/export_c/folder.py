@@ -3,16 +3,17 @@
 The folder is written completely or not at all.
 """
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from msgspec.structs import asdict
+from msgspec import structs
 
 from isocharge.common.errors import DeviceError
 from isocharge.common.files import new_folder, refuse_existing, write_whole
-from isocharge.serve.live.device import ANY_BOARD, Device
+from isocharge.serve.live.device import ANY_BOARD, Device, DeviceSections
 from isocharge.serve.live.reading_stream import check_channels
 from isocharge.serve.model.model_folder import load_model
 from isocharge.serve.signal_chain.chain import Chain
@@ -20,6 +21,8 @@ from isocharge.serve.signal_chain.hum import MIN_SQUARED_STEP
 from isocharge.train.export_c.c_text import c_comment, c_double, c_doubles, source_text
 from isocharge.train.export_c.model_source import model_header, model_source, self_test
 from isocharge.train.model_release.onnx_graph import read_graph
+
+log = logging.getLogger(__name__)
 
 MAX_TARE_FRAMES = 10_000
 """Largest number of frames of a tare in C, which limits the memory that the C program needs."""
@@ -29,6 +32,13 @@ SWITCHES = {"HUM": "HUM", "TARE": "TARE_ON", "LEAK": "LEAK", "TOUCH": "TOUCH", "
 
 C_NAMES = {"frequency_Hz": "HZ"}
 """Names in C of the settings whose name in C is not simply their name in capital letters."""
+
+
+C_SECTIONS = frozenset({"frames", "channels", "gain", "saturation", "hum", "tare", "leak", "touch", "common_mode"})
+"""Sections of a device file that a signal chain in C needs or that do not change its charges."""
+
+HOST_SECTIONS = frozenset({"track", "follow", "touch_offset"})
+"""Sections of a device file that process the contacts after the signal chain, and that only the host executes."""
 
 
 def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
@@ -42,8 +52,8 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
         DeviceError: If the device file is for other electrodes, if its tare is too long for C, or if it uses a stage
             that does not exist in C.
     """
+    _check_exists_in_c(device)
     chain = device.chain(electrodes)
-    _check_exists_in_c(device.where, chain)
     # A chain without zeros subtracts nothing, and a chain without gains reads charges in pC.
     zero = np.zeros(len(electrodes)) if chain.zero is None else chain.zero
     gain_pC = np.ones(len(electrodes)) if chain.gain_pC is None else chain.gain_pC
@@ -103,7 +113,7 @@ def _stage_settings(chain: Chain) -> dict[str, dict[str, Any]]:
     stages = {"HUM": chain.hum, "TARE": chain.tare, "LEAK": leak, "TOUCH": chain.touch, "THERMAL": chain.thermal}
     settings_by_prefix: dict[str, dict[str, Any]] = {}
     for prefix, stage in stages.items():
-        settings = {} if stage is None else asdict(stage)
+        settings = {} if stage is None else structs.asdict(stage)
         settings.pop("pC_per_K", None)  # a chain in C has no pyroelectric charges
         settings_by_prefix[prefix] = settings
     if leak is not None:
@@ -115,29 +125,34 @@ def _stage_settings(chain: Chain) -> dict[str, dict[str, Any]]:
     return settings_by_prefix
 
 
-def _check_exists_in_c(where: str, chain: Chain) -> None:
-    """Raise an error if a signal chain cannot be exported to C.
+def _check_exists_in_c(device: Device) -> None:
+    """Raise an error if the signal chain of a board cannot be exported to C, and warn of sections that C ignores.
 
     Args:
-        where: Path of the device file, for the error messages.
-        chain: The signal chain.
+        device: The board.
 
     Raises:
-        DeviceError: If the tare is too long for the memory of the C program, or the chain has a stage that does not
-            exist in C.
+        DeviceError: If the tare is too long for the memory of the C program, or the device file has a stage that does
+            not exist in C.
     """
-    if chain.tare is not None and not 1 <= chain.tare.frames <= MAX_TARE_FRAMES:
+    where = device.where
+    if device.tare is not None and not 1 <= device.tare.frames <= MAX_TARE_FRAMES:
         raise DeviceError(
             f"{where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES} for a signal chain in C, which "
-            f"stores all frames of the tare, got {chain.tare.frames}"
+            f"stores all frames of the tare, got {device.tare.frames}"
         )
-    has_pyroelectric_charges = isinstance(chain.warming_ratios, np.ndarray)  # otherwise, it is the default 1.0
-    if chain.memory is not None or has_pyroelectric_charges:
-        key = "common_mode.pC_per_K" if has_pyroelectric_charges else "memory"
+    names = [section.name for section in structs.fields(DeviceSections) if section.name != "name"]
+    unknown = [name for name in names if name not in C_SECTIONS and getattr(device, name) is not None]
+    refused = [name for name in unknown if name not in HOST_SECTIONS]
+    if device.common_mode is not None and device.common_mode.pC_per_K is not None:
+        refused.append("common_mode.pC_per_K")
+    if refused:
         raise DeviceError(
-            f"{where}: {key}: this stage does not exist in the signal chain in C; remove it from the device file, or "
-            "run `isocharge serve stream` on a host"
+            f"{where}: {', '.join(refused)}: this stage does not exist in the signal chain in C; remove it from the "
+            "device file, or run `isocharge serve stream` on a host"
         )
+    if unknown:
+        log.warning("%s: %s: not exported, because only `isocharge serve stream` does this", where, ", ".join(unknown))
 
 
 def _c_literal(value: Any) -> str:
