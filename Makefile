@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test types tests test-all attack docs bench soak release report paper proto clean
+.PHONY: demo test types tests test-all size attack docs bench soak release report paper proto clean
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 COMPILED_ONCE := PYTHONDONTWRITEBYTECODE=
@@ -29,6 +29,10 @@ tests: $(VENV)/installed
 
 test-all: docs
 	$(BIN)/python -m pytest -m "slow or not slow"
+
+# Modules, nodes of the syntax tree and numeric constants of each package; a test compares them with their limits.
+size:
+	$(PYTHON) .ci/size.py
 
 # More than a million bad inputs for every reader; ten minutes on two cores.
 attack: $(VENV)/installed
