@@ -15,7 +15,7 @@ from isocharge.simulate.layout.case import NO_NUISANCES
 from isocharge.simulate.plots.film import draw_layout
 
 result = design(DesignCase(load_sensor("three-25um-biaxial"), electrodes=3, radius=8.0, nuisances=NO_NUISANCES))
-figure, pair = plt.subplots(1, 2, figsize=(11.0, 5.0), layout="constrained", sharex=True, sharey=True)
+figure, pair = plt.subplots(1, 2, figsize=(11.0, 5.4), layout="compressed", sharex=True, sharey=True)
 layouts = ((result.case.sensor, result.errors_before), (result.sensor, result.errors_after))
 largest = layouts[0][1].noise_alone.max()
 for axes, (sensor, errors) in zip(pair, layouts, strict=True):
