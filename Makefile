@@ -77,8 +77,8 @@ release: $(VENV)/installed
 
 # Speed against error of the released models, on fresh presses: report/report.md. Nothing else should run meanwhile.
 report: $(VENV)/installed
-	$(BIN)/isocharge simulate sweep three-25um-biaxial --samples 24000 -o build/three-25um-biaxial
-	$(BIN)/isocharge simulate sweep four-25um-biaxial --radius auto --samples 24000 -o build/four-25um-biaxial
+	$(BIN)/isocharge simulate sweep three-25um-biaxial --samples 3000 -o build/three-25um-biaxial
+	$(BIN)/isocharge simulate sweep four-25um-biaxial --radius auto --samples 3000 -o build/four-25um-biaxial
 	$(BIN)/isocharge train report build/three-25um-biaxial build/four-25um-biaxial -o report
 
 # The figures and numbers of Mirbagheri et al. (2007), ours beside them: paper/paper.md; five minutes on two cores.

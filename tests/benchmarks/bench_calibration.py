@@ -34,10 +34,10 @@ from isocharge.serve.benchmark import machine
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from isocharge.simulate.plots.figure import new_figure
 from isocharge.train import CalibrationProblem, calibrate
-from isocharge.train.baselines.gauss_newton import GaussNewton
 from isocharge.train.calibration.contact_error import ContactSensitivity, fisher_information
 from isocharge.train.calibration.quantities import NORMAL_95
 from isocharge.train.data.presses import draw_contacts
+from isocharge.train.report.gauss_newton import GaussNewton
 
 SENSORS = "four-25um-biaxial,three-25um-biaxial,four-25um-uniaxial"
 COUNTS = (1, 3, 5, 8, 15, 30)

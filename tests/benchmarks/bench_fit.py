@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from shared import arguments, print_results
@@ -24,13 +25,12 @@ from sklearn.ensemble import HistGradientBoostingRegressor
 from sklearn.multioutput import MultiOutputRegressor
 from sklearn.neighbors import KNeighborsRegressor
 from sklearn.neural_network import MLPRegressor
+from sklearn_rivals import SubsetProcess, log_charge_regressor
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.simulate import Circle, Domain, Sweep, load_sensor, noise_model
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
-from isocharge.train.baselines.learned import SubsetProcess, log_charge_regressor
-from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fit import contact_stage, threads_and_seed

@@ -10,15 +10,15 @@ the cache folder.
 from typing import Any
 
 import numpy as np
+from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
+from scipy.stats import norm
 from shared import arguments, print_results
 
 from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
-from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
 from isocharge.train.model_release.evaluate import alarm_threshold
-from isocharge.train.report.measures import interval_coverage
 
 RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
 MARGIN_mm = 0.01
@@ -93,6 +93,24 @@ def errors_over_limit(case: ModelCase, count: int) -> dict[str, Any]:
         "force_rms_percent": errors.force_rms_percent,
         "force_over_bayes": errors.force_rms_percent / limit.force_rms_percent,
     }
+
+
+def interval_coverage(estimate: np.ndarray, std: np.ndarray, truth: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """Compute the fraction of true values that lie in the central intervals of normal distributions.
+
+    Args:
+        estimate: Estimated contacts (x, y, F), shape (n, 3), mm and N: the means of the distribution.
+        std: Standard deviations of the estimates, shape (n, 3), mm and N.
+        truth: True contacts (x, y, F), shape (n, 3), mm and N.
+        levels: Nominal probabilities of the intervals, shape (n_level,), 0 to 1.
+
+    Returns:
+        Fractions for x, y and F, shape (n_level, 3). They equal the levels if the standard deviations are correct.
+    """
+    standardised_error = np.abs(estimate - truth) / std
+    half_width = norm.ppf(0.5 + 0.5 * levels)  # in standard deviations, shape (n_level,)
+    is_inside = standardised_error[None] <= half_width[:, None, None]  # shape (n_level, n, 3)
+    return np.asarray(np.mean(is_inside, axis=1))
 
 
 def coverage(case: ModelCase, count: int) -> dict[str, Any]:

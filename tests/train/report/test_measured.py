@@ -58,7 +58,9 @@ def test_errors_equal_those_of_serve_check_on_the_held_out_presses(section, pres
     position_rms_mm = np.sqrt(np.mean(check.errors.position_error_mm**2))
     force_rms_percent = 100.0 * np.sqrt(np.mean(check.errors.error[:, 2] ** 2))
     released = section["methods"][0]["errors"]
-    assert section["presses"]["test"] == len(held_out_presses)
+    assert section["test_presses"] == len(held_out_presses)
+    assert section["limits"] == {}
+    assert {method["library"] for method in section["methods"]} == {"Predictor", "NumPy"}
     assert released["position_rms_mm"] == pytest.approx(position_rms_mm, rel=1e-3)
     assert released["force_rms_percent"] == pytest.approx(force_rms_percent, rel=1e-3)
     assert released["position_median_mm"] > 0.3  # it is 0.07 mm on simulated presses of the described film

@@ -1,4 +1,4 @@
-"""`isocharge train report`: compare a model with other methods by error, speed and memory."""
+"""`isocharge train report`: compare a model with other methods by error and speed."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -7,11 +7,11 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.measured_presses import read_press_file
-from isocharge.cli.shared.options import FreshOption, JsonOption, ModelsOption, NewFolderOption
+from isocharge.cli.shared.options import JsonOption, ModelsOption, NewFolderOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.errors import InputError, ModelError
-from isocharge.common.resumable_run import prepare_target
+from isocharge.common.files import refuse_existing
 from isocharge.serve import find_model
 from isocharge.simulate import Dataset, load_sensor, parse_probe, read_dataset
 from isocharge.train.data.presses import dataset_of
@@ -56,27 +56,24 @@ def report_command(
         bool,
         typer.Option(
             "--quick",
-            help="Write a trial report from little data in half a minute; its results are not meaningful. (default: "
-            "all data)",
+            help="Write a trial report in half a minute; its results are not meaningful. (default: a full report)",
         ),
     ] = False,
-    fresh: FreshOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Compare a model with other methods: error (mm, % of force) against time (us), throughput and memory (bytes).
+    """Compare a model with other methods: error (mm, % of force) against time (us).
 
     All methods predict the same presses with noise. If DATASET was measured, the methods are tested on a fifth of its
     presses, to which no method was fitted. In this case, no noise is added to the charges, and all results that need a
     simulation are left out. The option --probe states the probe with which the presses of PRESSES.csv were made.
 
-    The report takes some minutes for a dataset of 24,000 presses. Durations are measured, so do not run other programs
-    at the same time. If the report is interrupted, the results so far remain in DIR.part, and the same command
-    continues it. The option --json prints report.json.
+    The report takes about a minute for each dataset. Durations are measured, so do not run other programs at the same
+    time. The option --json prints report.json.
 
     Example: isocharge train report presses -o report
     """
     # Find the datasets and, for each of them, the model to compare.
-    prepare_target(output)
+    refuse_existing(output)
     if model and len(model) != len(datasets):
         raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
     loaded_datasets = [_read_dataset(path, sensor, probe) for path in datasets]
@@ -92,13 +89,12 @@ def report_command(
             settings,
             students=student_folders,
             command=this_command(),
-            fresh=fresh,
         )
 
-    # Print the verdicts, with one section of the report for each dataset.
     for section in record["datasets"]:
-        for sentence in section["verdict"]["sentences"]:
-            say(f"{section['sensor']}: {sentence}")
+        for method in section["methods"]:
+            error_mm = method["errors"].get("position_rms_mm", "no estimate")
+            say(f"{section['sensor']}: {method['name']}: {error_mm} mm rms, {method['single_press_us']} us")
     say(str(output / "report.md"))
     if json:
         show_json(record)

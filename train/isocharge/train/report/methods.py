@@ -1,232 +1,148 @@
-"""Fits of the compared methods, and measurements of their errors and durations on the same presses."""
+"""Methods of a report: triangulation, least squares on a charge map, and models.
 
-import pickle
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+Every function in `METHOD_BUILDERS` adds a method to all reports. Models are added by their folders.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from itertools import cycle
+from pathlib import Path
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, TrainingError
-from isocharge.common.progress import track
-from isocharge.serve.benchmark import Contender, Timing, take_turns
-from isocharge.train.baselines.compared_methods import ComparedMethod, FittingTask
-from isocharge.train.baselines.networks import OnnxContact, StoredModel
+from isocharge.serve import Predictor
+from isocharge.serve.model.session import N_WITHOUT_CORRELATION
+from isocharge.simulate import ChargeMap, Domain, NoiseModel, Triangulation
 from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.report.case import Settings
-from isocharge.train.report.measures import ContactErrors, MethodRecord, round_significant, with_pareto_fronts
-
-SINGLE_PRESSES = 64
-"""Number of different presses that are predicted in turn when single predictions are timed."""
-
-MAX_BATCH_SECONDS = 0.1
-"""Estimated duration of a batch, s, above which a smaller batch is timed."""
-
-BATCH_REDUCTION = 64
-"""Factor by which the size of a batch is divided if its prediction would take longer than `MAX_BATCH_SECONDS`."""
+from isocharge.train.report.gauss_newton import GaussNewton
 
 
 @dataclass(frozen=True)
-class FittedMethod:
-    """A fitted method with its estimates for the test presses.
+class FittingTask:
+    """Presses and conditions to which a method is fitted.
 
     Attributes:
-        method: The fitted method.
-        estimate: Estimated contacts (x, y, F) of the test presses, shape (n, 3), mm and N. Presses without an estimate
-            are NaN.
-        fit_seconds: Duration of fitting, s.
+        presses: Presses of the dataset. Simulated presses have no noise.
+        domain: Contacts that can occur. Their positions are uniformly distributed over a disk, and their forces are
+            log-uniform.
+        noise: Noise of the charges when the method is used.
+        charge_map: Simulated map from contacts to charges; None if the presses were measured.
+        seed: Seed of random choices.
     """
 
-    method: ComparedMethod
-    estimate: Array
-    fit_seconds: float
+    presses: LabelledPresses
+    domain: Domain
+    noise: NoiseModel
+    charge_map: ChargeMap | None = None
+    seed: int = 0
 
 
-def fit_all(
-    methods: Sequence[ComparedMethod], task: FittingTask, test: LabelledPresses
-) -> tuple[list[FittedMethod], dict[str, str]]:
-    """Fit all methods, and estimate the contacts of the test presses with each of them.
+@dataclass(frozen=True)
+class Method:
+    """A fitted method.
 
-    If a method cannot be fitted to measured presses, the reason is recorded, and the next method is fitted. If a method
-    cannot be fitted to simulated presses, an error is raised.
+    Attributes:
+        name: Name in the table and in the picture.
+        library: Library that computes the estimates.
+        estimate: Function from charges, shape (n, n_electrode), pC, to contacts (x, y, F), shape (n, 3), mm and N. A
+            contact without an estimate is NaN.
+        single_call: Function from the charges of one press, shape (n_electrode,), pC, to a function without arguments
+            that estimates the contact of this press. None if `estimate` is the fastest way to estimate one contact.
+    """
+
+    name: str
+    library: str
+    estimate: Callable[[Array], Array]
+    single_call: Callable[[Array], Callable[[], object]] | None = None
+
+    def call_for(self, charge: Array) -> Callable[[], object]:
+        """Return a function without arguments that estimates the contact of one press, to measure its duration.
+
+        Args:
+            charge: Charges of the press, shape (n_electrode,), pC.
+        """
+        if self.single_call is None:
+            return partial(self.estimate, charge[None])
+        return self.single_call(charge)
+
+
+def triangulation(task: FittingTask) -> Method | None:
+    """Return the triangulation of the paper, which intersects the contours of the charges.
 
     Args:
-        methods: The methods to fit.
-        task: The presses and conditions to which the methods are fitted.
-        test: The test presses, with the noise in their charges.
+        task: Conditions. Without a charge map, there are no contours, and None is returned.
+    """
+    if task.charge_map is None:
+        return None
+    contours = Triangulation(task.charge_map)
+    return Method("triangulation", "NumPy", lambda charge: contours.locate_with_force(charge).contact)
+
+
+def least_squares(task: FittingTask) -> Method:
+    """Return the search for the contact with the smallest squared residuals of the charges.
+
+    Args:
+        task: Presses and conditions. Without a charge map, a series is fitted to the presses.
+
+    Raises:
+        DatasetError: If the series cannot be fitted to the presses.
+        TrainingError: If there are too few presses.
+    """
+    search = GaussNewton(task.domain, task.noise, task.charge_map, task.seed)
+    search.fit(task.presses.charge, task.presses.contact)
+    return Method("least squares, Gauss-Newton", "NumPy", search.predict)
+
+
+METHOD_BUILDERS: tuple[Callable[[FittingTask], Method | None], ...] = (triangulation, least_squares)
+"""Functions that fit the methods of all reports. A function returns None if its method needs a missing charge map."""
+
+
+def fit_methods(task: FittingTask) -> tuple[list[Method], list[str]]:
+    """Fit all methods of `METHOD_BUILDERS`.
+
+    Args:
+        task: Presses and conditions of the fits.
 
     Returns:
-        The fitted methods; and, by the name of the method, the reasons why other methods cannot be fitted to the
-        measured presses.
+        The fitted methods; and the reasons why other methods could not be fitted to measured presses.
 
     Raises:
         DatasetError: If a method cannot be fitted to simulated presses.
-        TrainingError: If the training of a network on simulated presses fails.
+        TrainingError: If there are too few simulated presses for a method.
     """
-    fitted_methods = []
-    failure_reasons = {}
-    for method in track(methods, "fitting methods"):
-        start = time.perf_counter()
+    methods = []
+    failure_reasons = []
+    for build_method in METHOD_BUILDERS:
         try:
-            fitted_method = method.fit(task)
+            method = build_method(task)
         except (DatasetError, TrainingError) as error:
-            if not task.train.measured:
+            if not task.presses.measured:
                 raise
-            failure_reasons[method.name] = str(error)
+            failure_reasons.append(f"{build_method.__name__}: {error}")
             continue
-        fit_seconds = time.perf_counter() - start
-        test_inputs = _test_inputs(fitted_method, test)
-        estimate = fitted_method.regressor.predict(test_inputs)
-        fitted_methods.append(FittedMethod(fitted_method, estimate, fit_seconds))
-    return fitted_methods, failure_reasons
+        if method is not None:
+            methods.append(method)
+    return methods, failure_reasons
 
 
-def measure_methods(
-    fitted_methods: Sequence[FittedMethod],
-    test: LabelledPresses,
-    settings: Settings,
-    posterior_mean: Array | None = None,
-) -> list[MethodRecord]:
-    """Measure the errors, durations and sizes of all methods.
-
-    The methods take turns in short periods of timing. If the speed of the machine changes, the change therefore affects
-    all methods in the same way.
+def model_method(folder: Path) -> Method:
+    """Return the model in a version folder as a method.
 
     Args:
-        fitted_methods: The fitted methods with their estimates.
-        test: The test presses, with the noise in their charges.
-        settings: Settings of the report: the time for timing and the size of a batch.
-        posterior_mean: Posterior means (x, y, F) of the first m test presses, shape (m, 3), mm and N, whose error is
-            the Bayes limit. None if the limit was not computed.
-
-    Returns:
-        The records of the methods, in the order of `fitted_methods`.
+        folder: Version folder of the model.
     """
-    methods = [fitted_method.method for fitted_method in fitted_methods]
-    method_count = len(methods)
-    single_contenders = [Contender(method.name, 1, _single_press_call(method, test)) for method in methods]
-    batch_contenders = [_batch_contender(method, test, settings.batch) for method in methods]
-    total_seconds = 2 * method_count * settings.seconds  # for single presses and for batches
-    timings = take_turns([*single_contenders, *batch_contenders], total_seconds)
-    # The timings are in the order of the contenders: those of single presses, then those of batches.
-    single_timings = timings[:method_count]
-    batch_timings = timings[method_count:]
+    predictor = Predictor(folder)
 
-    records = []
-    for fitted_method, single_timing, batch_timing in zip(fitted_methods, single_timings, batch_timings, strict=True):
-        records.append(_method_record(fitted_method, test.contact, posterior_mean, single_timing, batch_timing))
-    return with_pareto_fronts(records)
+    def estimate(charge: Array) -> Array:
+        """Estimate contacts (x, y, F), shape (n, 3), mm and N."""
+        answers = predictor.predict_batch(charge)
+        return np.stack([answers.x_mm, answers.y_mm, answers.force_N], axis=1).astype(float)
 
+    def single_call(charge: Array) -> Callable[[], object]:
+        """Return a function that computes the complete answer to one press."""
+        answer = np.zeros(N_WITHOUT_CORRELATION, np.float32)  # overwritten by every call
+        return partial(predictor.predict_into, charge.astype(np.float32), answer)
 
-def _test_inputs(method: ComparedMethod, test: LabelledPresses) -> Array:
-    """Return the inputs of a method, shape (n, n_input): charges of the test presses, and forces if needed."""
-    return method.inputs(test.charge, test.contact[:, 2])
-
-
-def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callable[[], object]:
-    """Return a function without arguments that predicts one press.
-
-    Each call predicts the next of the first `SINGLE_PRESSES` presses. After the last of these presses, the first press
-    follows again. For ONNX networks, the arrays for the input and the outputs are given to the runtime before the
-    timing, as in `Predictor`.
-
-    Args:
-        method: Fitted method.
-        test: Presses that are predicted one after the other.
-    """
-    inputs = _test_inputs(method, test)[:SINGLE_PRESSES]
-    regressor = method.regressor
-    calls: list[Callable[[], object]]
-    if isinstance(regressor, OnnxContact | StoredModel):
-        calls = [regressor.single_press_function(press_input) for press_input in inputs]
-    else:
-        # `predict` expects a batch, so each press becomes a batch of one press, shape (1, n_input).
-        calls = [partial(regressor.predict, press_input[None]) for press_input in inputs]
-    cyclic_calls = cycle(calls)
-    return lambda: next(cyclic_calls)()  # takes the function of the next press, and calls it
-
-
-def _batch_contender(method: ComparedMethod, test: LabelledPresses, batch_size: int) -> Contender:
-    """Return the prediction of a batch that will be timed in order to measure the throughput of a method.
-
-    The duration of a small batch is measured first. If the whole batch would take longer than `MAX_BATCH_SECONDS`, the
-    returned prediction is that of the small batch.
-
-    Args:
-        method: The fitted method.
-        test: The test presses; they are repeated if the batch is larger.
-        batch_size: Number of presses in the whole batch.
-    """
-    inputs = _test_inputs(method, test)
-    repeated_rows = np.arange(batch_size) % len(inputs)
-    batch = inputs[repeated_rows]
-    small_batch = batch[: max(1, batch_size // BATCH_REDUCTION)]
-
-    start = time.perf_counter()
-    method.regressor.predict(small_batch)
-    small_batch_seconds = time.perf_counter() - start
-    estimated_seconds = small_batch_seconds * batch_size / len(small_batch)
-    timed_batch = small_batch if estimated_seconds > MAX_BATCH_SECONDS else batch
-    return Contender(method.name, len(timed_batch), partial(method.regressor.predict, timed_batch))
-
-
-def _method_record(
-    fitted_method: FittedMethod, truth: Array, posterior_mean: Array | None, single_timing: Timing, batch_timing: Timing
-) -> MethodRecord:
-    """Return the record of a method with its errors, durations and memory.
-
-    The record of a method that is given the true force contains no force error.
-
-    Args:
-        fitted_method: Fitted method and its estimates of the contacts.
-        truth: True contacts, shape (n, 3), mm and N.
-        posterior_mean: Posterior means (x, y, F) of the first m presses, shape (m, 3), mm and N, for the ratio of the
-            error to the Bayes limit. None if the means were not computed.
-        single_timing: Durations of predictions of one press.
-        batch_timing: Durations of predictions of a batch of presses.
-    """
-    errors = ContactErrors.compute(fitted_method.estimate, truth)
-    if fitted_method.method.given_force:
-        errors = replace(errors, force_rms_percent=None, force_median_percent=None)
-    error_ratio = None
-    if posterior_mean is not None:
-        error_ratio = bayes_ratio(fitted_method.estimate, posterior_mean, truth)
-    return MethodRecord(
-        method=fitted_method.method,
-        errors=errors,
-        bayes_ratio=error_ratio,
-        single_timing=single_timing,
-        batch_timing=batch_timing,
-        memory_bytes=_serialised_bytes(fitted_method.method),
-        fit_seconds=fitted_method.fit_seconds,
-    )
-
-
-def bayes_ratio(estimate: Array, posterior_mean: Array, truth: Array) -> float | None:
-    """Compute the position error of a method divided by the Bayes limit on the same presses.
-
-    Args:
-        estimate: Contacts (x, y, F) estimated by the method, shape (n, 3), mm and N.
-        posterior_mean: Posterior means of the first m presses, shape (m, 3), mm and N.
-        truth: True contacts, shape (n, 3), mm and N.
-
-    Returns:
-        The ratio of the root-mean-square position errors over the first m presses; None if there is no estimate.
-    """
-    count = len(posterior_mean)
-    method_error = ContactErrors.compute(estimate[:count], truth[:count]).position_rms_mm
-    bayes_error = ContactErrors.compute(posterior_mean, truth[:count]).position_rms_mm
-    if method_error is None or bayes_error is None:
-        return None
-    return round_significant(method_error / bayes_error)
-
-
-def _serialised_bytes(method: ComparedMethod) -> int:
-    """Return the size of the ONNX file of a network, or the size of the pickle of another regressor, in bytes."""
-    regressor = method.regressor
-    if isinstance(regressor, OnnxContact | StoredModel):
-        return len(regressor.graph)
-    return len(pickle.dumps(regressor, protocol=pickle.HIGHEST_PROTOCOL))
+    return Method(f"network `{predictor.metadata.label}`", "Predictor", estimate, single_call)

@@ -9,14 +9,16 @@ charges.
 
 import numpy as np
 from scipy.spatial import cKDTree
-from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.decomposition import PCA
+from sklearn.pipeline import Pipeline
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import ChargeMap, Domain, NoiseModel
 from isocharge.simulate.identifiability.nearest_contact import explain
-from isocharge.train.baselines.learned import whitening
+from isocharge.train.data.channel_noise import BOTH_SIGNS, MIN_TRANSITION_RATIO, usual_size
 from isocharge.train.data.charge_field import ChargeField
-from isocharge.train.data.presses import LabelledPresses, split_by_position
+from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses, split_by_position
 
 N_STARTS = 600
 """Number of presses among which the start of each search is chosen."""
@@ -37,8 +39,48 @@ VALIDATION_FRACTION = 0.1
 """Fraction of the positions whose presses are used to choose the degree of the charge series."""
 
 
-class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """Regressor that searches for the contact whose charges agree best with the measured charges.
+def whitening() -> Pipeline:
+    """Return a transformer that computes whitened logarithms of charges, shape (n, n_electrode), pC."""
+    return Pipeline([("logarithms", Logarithms()), ("whitening", PCA(whiten=True))])
+
+
+class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+    """Transformer that computes ln(max(Q, 1 pC)), or asinh(2 Q / usual size) if the charges have both signs."""
+
+    def fit(self, charge: Array, target: object = None) -> "Logarithms":
+        """Determine whether the charges have both signs and, if they do, compute the scale of the transformation.
+
+        The charges of an electrode have both signs if more than the fraction `BOTH_SIGNS` of them is not positive. A
+        smaller fraction can be due to noise alone. If at least one electrode has charges of both signs, the charges of
+        all electrodes are transformed to asinh(Q / scale). This function is linear for charges far below the scale and
+        logarithmic for charges far above it. Otherwise, the scale is None, and the charges are transformed to
+        logarithms.
+
+        Args:
+            charge: Charges, shape (n, n_electrode), pC.
+            target: Not used; it is an argument of every transformer of scikit-learn.
+
+        Returns:
+            This transformer.
+        """
+        del target
+        is_not_positive = charge <= 0.0
+        not_positive_fraction = is_not_positive.mean(axis=0)  # one value for each electrode
+        any_has_both_signs = (not_positive_fraction > BOTH_SIGNS).any()
+        self.scale_ = None
+        if any_has_both_signs:
+            self.scale_ = MIN_TRANSITION_RATIO * usual_size(charge)  # shape (n_electrode,), pC
+        return self
+
+    def transform(self, charge: Array) -> Array:
+        """Transform charges, shape (n, n_electrode), pC. The result has the same shape."""
+        if self.scale_ is None:
+            return np.asarray(np.log(np.maximum(charge, LOWEST_CHARGE)))
+        return np.asarray(np.arcsinh(charge / self.scale_))
+
+
+class GaussNewton:
+    """Method that searches for the contact whose charges agree best with the measured charges.
 
     Args:
         domain: Contacts that can occur.

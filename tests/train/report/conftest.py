@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import Domain, noise_model
-from isocharge.train.baselines.compared_methods import FittingTask
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
+from isocharge.train.report.methods import FittingTask
 
 DOMAIN = Domain(8.0, (0.05, 2.0))
 
@@ -43,8 +43,8 @@ class KnownMap:
         contact = draw_contacts(np.random.default_rng(seed), DOMAIN, count)
         return LabelledPresses(contact, self.charges(contact))
 
-    def task(self, quick=True):
-        return FittingTask(self.presses(3000, 1), self.presses(500, 2), DOMAIN, noise_model("reference"), quick=quick)
+    def task(self):
+        return FittingTask(self.presses(3000, 1), DOMAIN, noise_model("reference"))
 
 
 @pytest.fixture(scope="session", params=[3, 4])
