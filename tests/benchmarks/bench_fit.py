@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
+from bayes.limit import BayesProblem, bayes_estimate
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from shared import arguments, print_results

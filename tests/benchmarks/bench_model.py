@@ -10,7 +10,7 @@ the cache folder.
 from typing import Any
 
 import numpy as np
-from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
+from bayes.limit import BayesProblem, bayes_estimate
 from scipy.stats import norm
 from shared import arguments, print_results
 

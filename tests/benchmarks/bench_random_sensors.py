@@ -15,6 +15,7 @@ import time
 from typing import Any
 
 import numpy as np
+from bayes.limit import BayesProblem, bayes_estimate
 from shared import arguments, print_results
 
 from isocharge.common.contact_errors import ContactErrorStatistics
@@ -33,7 +34,6 @@ from isocharge.simulate import (
     noise_model,
 )
 from isocharge.train import LabelledPresses, TrainingData, fit
-from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
 
 NOISE = noise_model("reference")
 LARGEST_RATIO = 1.08

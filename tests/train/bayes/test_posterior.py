@@ -4,13 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from bayes.limit import BayesProblem, bayes_estimate, bayes_limit
+from bayes.posterior import Cells, Posterior
 from scipy import stats
 
 from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.common.errors import ChargeError, InputError
 from isocharge.simulate import Circle, Domain, ForwardMap, NoiseModel, noise_model
-from isocharge.train import BayesProblem, bayes_estimate, bayes_limit
-from isocharge.train.bayes.posterior import Cells, Posterior
 from isocharge.train.data.presses import draw_contacts
 
 REFERENCE = noise_model("reference")

@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bayes.limit import BayesProblem, bayes_estimate
 
 from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.common.statistics import rms
 from isocharge.serve import MeasuredPresses, Predictor
 from isocharge.simulate import Circle, Domain, ForwardMap, Sweep, load_sensor, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
-from isocharge.train import BayesProblem, FitConfig, NetworkConfig, TrainingConfig, bayes_estimate, fit, release
+from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, release
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.rig.corrected_film import correct_film

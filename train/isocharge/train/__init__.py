@@ -24,7 +24,6 @@ with require("train"):
 
 if TYPE_CHECKING:
     from isocharge.common.contact_errors import ContactErrorStatistics
-    from isocharge.train.bayes.limit import BayesProblem, bayes_estimate, bayes_limit
     from isocharge.train.calibration.calibrate import calibrate
     from isocharge.train.calibration.contact_error import ProposedPress, next_presses
     from isocharge.train.calibration.folder import read_earlier, write_calibration
@@ -49,7 +48,6 @@ else:  # hidden from type checkers, which would otherwise accept every misspelt 
     __getattr__ = lazy_names(__name__, "train")
 
 __all__ = [
-    "BayesProblem",
     "CalibrationProblem",
     "CalibrationResult",
     "ContactErrorStatistics",
@@ -69,8 +67,6 @@ __all__ = [
     "Teacher",
     "TrainingConfig",
     "TrainingData",
-    "bayes_estimate",
-    "bayes_limit",
     "calibrate",
     "evaluate",
     "fit",

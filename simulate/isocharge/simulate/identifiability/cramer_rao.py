@@ -4,8 +4,7 @@ Let J = d(Q)/d(x, y, ln F, ...) be the matrix of the derivatives of the charges 
 information that one reading provides about each charge (`NoiseModel.information`). The Fisher information is the matrix
 J' diag(i) J. The covariance of an unbiased estimate is at least the inverse of the Fisher information (Kay 1993,
 chapter 3). An estimator that uses a prior distribution may have smaller errors where the charges provide little
-information. The errors of such estimators have another lower limit, the Bayes limit, which the package isocharge.train
-computes.
+information. The errors of such estimators have another lower limit, the Bayes limit.
 """
 
 from dataclasses import dataclass

@@ -12,13 +12,13 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
 import numpy as np
+from bayes.posterior import Posterior
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.simulate import ChargeSpline, ForwardMap, NoiseModel, Probe, Sensor, Sweep, noise_model
-from isocharge.train.bayes.posterior import Posterior
 
 N_PRESSES = 4000
 """Number of presses of `bayes_limit`.

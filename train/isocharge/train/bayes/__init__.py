@@ -1,1 +1,0 @@
-"""Computation of the Bayes limit, the smallest mean squared error that any estimator of contacts can reach."""
