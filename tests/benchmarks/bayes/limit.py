@@ -5,27 +5,18 @@ noise and the range of presses.
 
 Example:
     problem = BayesProblem(load_sensor("three-25um-biaxial"), Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
-    print(bayes_limit(problem).position_rms_mm)
+    contact, std = bayes_estimate(problem, charge)
 """
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
-import numpy as np
 from bayes.posterior import Posterior
 
 from isocharge.common.arrays import Array
-from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
-from isocharge.simulate import ChargeSpline, ForwardMap, NoiseModel, Probe, Sensor, Sweep, noise_model
-
-N_PRESSES = 4000
-"""Number of presses of `bayes_limit`.
-
-With this number, the statistical error of the rms error is a few percent. The ratio of the rms errors of two estimators
-on the same presses has a smaller statistical error.
-"""
+from isocharge.simulate import ChargeSpline, ForwardMap, NoiseModel, Probe, Sensor, noise_model
 
 
 @dataclass(frozen=True)
@@ -92,35 +83,3 @@ def bayes_estimate(
     spline = used_map if isinstance(used_map, ChargeSpline) else ChargeSpline.of(used_map)
     posterior = Posterior(spline, problem.noise, problem.radius)  # raises an error for zero noise or a small map
     return posterior.mean_and_std(charge, executor)
-
-
-def bayes_limit(
-    problem: BayesProblem,
-    presses: int = N_PRESSES,
-    seed: int = 0,
-    *,
-    charge_map: ForwardMap | ChargeSpline | None = None,
-    executor: Executor | None = None,
-) -> ContactErrorStatistics:
-    """Compute the Bayes limit of a problem.
-
-    Presses are drawn from the prior of the problem, and noise is added to their charges. The limit is the error of the
-    posterior means that are computed from these charges.
-
-    Args:
-        problem: Sensor, probe, prior and noise.
-        presses: Number of presses.
-        seed: Seed of presses and noise.
-        charge_map: Map from contacts to charges; None to simulate this map. See `bayes_estimate`.
-        executor: Executor for the solves and integrals; None for this process.
-
-    Returns:
-        Statistics of the errors of the posterior means.
-    """
-    used_map = charge_map or problem.forward_map(executor)
-    sweep = Sweep(problem.radius, problem.force_range, samples=presses, seed=seed, sampling="random")
-    contact = sweep.contacts()
-    noise_rng = np.random.default_rng([seed, 1])  # so that the noise does not depend on the contacts
-    noisy_charge = problem.noise.add(used_map.charges(contact), noise_rng)
-    estimate, _ = bayes_estimate(problem, noisy_charge, charge_map=used_map, executor=executor)
-    return ContactErrorStatistics.of(estimate, contact)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from bayes.limit import BayesProblem, bayes_estimate, bayes_limit
+from bayes.limit import BayesProblem, bayes_estimate
 from bayes.posterior import Cells, Posterior
 from scipy import stats
 
@@ -205,11 +205,14 @@ def problem(sensor):
     return BayesProblem(sensor, Circle(1.0))
 
 
-def test_the_limit_is_computed_without_a_new_map(problem, spline, monkeypatch):
+def test_the_error_of_the_posterior_mean_is_computed_without_a_new_map(problem, spline, monkeypatch):
     monkeypatch.setattr(ForwardMap, "build", None)  # the map is given
-    limit = bayes_limit(problem, 40, seed=5, charge_map=spline)
+    contact = draw_contacts(np.random.default_rng(5), spline.domain, 40)
+    charge = REFERENCE.add(spline.charges(contact), np.random.default_rng(6))
+    estimate, std = bayes_estimate(problem, charge, charge_map=spline)
+    limit = ContactErrorStatistics.of(estimate, contact)
     assert 0.05 < limit.position_median_mm < limit.position_rms_mm < 0.4
-    assert limit.presses == 40
+    assert std.shape == (40, 3)
 
 
 def test_errors_of_two_contacts():
