@@ -95,7 +95,8 @@ def _table_lines(sections: Sequence[Section]) -> Iterator[str]:
     yield "|" + "---|" * TEXT_COLUMNS + "--:|" * (len(HEADER) - TEXT_COLUMNS)
     for section in sections:
         if section.limits:
-            yield _table_line([section.sensor, "*Cramér-Rao limit*", "", *_error_cells(section.limits), "", ""])
+            limit_cells = _error_cells(section.limits)
+            yield _table_line([section.sensor, "*Cramér-Rao limit, unbiased*", "", *limit_cells, "", ""])
         for record in sorted(section.methods, key=_position_error):
             name = record.name
             if record.answered < 1.0:
@@ -154,7 +155,7 @@ def _draw_panel(axes: Axes, section: Section) -> None:
         axes.plot(record.single_press_us, error_mm, ls="", label=label, **style)
     if section.limits:
         limit_mm = section.limits["position_rms_mm"]
-        axes.axhline(limit_mm, color=INK, ls=":", label=f"Cramér-Rao limit, {limit_mm:.3g} mm")
+        axes.axhline(limit_mm, color=INK, ls=":", label=f"Cramér-Rao limit, unbiased, {limit_mm:.3g} mm")
     axes.set(xscale="log", xlabel="time of one prediction, median, us", ylabel="position error, rms, mm")
     axes.set_title(section.sensor)
     axes.set_ylim(0.0, 1.2 * max(map(_position_error, answered), default=1.0))
