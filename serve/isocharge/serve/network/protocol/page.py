@@ -35,6 +35,10 @@ pre { background: color-mix(in srgb, currentColor 7%, transparent); border-radiu
   white-space: pre-wrap; overflow-wrap: anywhere; font-size: .85rem }
 .refused { border-left: 4px solid #c2410c; padding-left: 1rem }
 @media (prefers-color-scheme: dark) { a { color: #7fb0ff } }
+@media (max-width: 40rem) {
+  dl { grid-template-columns: 1fr } dd { margin-bottom: .5rem }
+  table { font-size: .7rem } th, td { white-space: normal; padding-right: .4rem }
+}
 """
 
 
