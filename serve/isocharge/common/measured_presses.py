@@ -58,6 +58,7 @@ _TEMPERATURE_RULE = ColumnRule(
     "unknown",
     MIN_TEMPERATURE_C,
     MAX_TEMPERATURE_C,
+    meaning=ColumnMeaning(unit="C"),
 )
 
 PRESS_RULES = {

@@ -45,6 +45,7 @@ def write(tmp_path):
         ("Position x [mm],y [mm],force_N,A,B,C", r"rename 'Position x \[mm\]' to 'x_mm'; rename 'y \[mm\]' to 'y_mm'"),
         ("x,y,force_N,A,B,C", "rename 'x' to 'x_mm'; rename 'y' to 'y_mm'"),
         ("x_cm,y_mm,force_N,A,B,C", "column 'x_cm' is in cm: convert it to mm"),
+        ("x_mm y_mm force_N A B C,C", "missing: 'A', 'B'$"),
         (
             "X_MM,y_mm,Force_N,A,B,C",
             "column 'X_MM' differs from column 'x_mm' only by case: rename it to 'x_mm'; column",
@@ -120,6 +121,10 @@ TEXT = f"# Größe\nx_mm,y_mm,force_N,A,B,C\n{ROW}"
         (b"PK\x03\x04\xff\xff", "a workbook of a spreadsheet or a zip file: save the sheet as CSV"),
         (b"PAR1\x15\x04\x15\xff", "the file is Parquet: rename it so that its name ends in .parquet"),
         (b"\x1f\x8b\x08\x00", "the file is compressed"),
+        (b"\x89HDF\r\n\x1a\n\0", "the file is HDF5: write its columns as CSV"),
+        (b"MATLAB 5.0 MAT-file, Platform: GLNXA64 \0\1IM\0", "the file is a MAT-file of MATLAB: .*writetable"),
+        (b"TDSm\x0e\0\0\0i\x12\0\0\n", "the file is TDMS of LabVIEW: write the columns as CSV"),
+        (b"abc\0\1\2\0\0", "null characters and is not text: write its columns as CSV"),
     ],
 )
 @pytest.mark.parametrize("read", [read_presses, read_charge_file])

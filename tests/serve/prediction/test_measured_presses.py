@@ -104,6 +104,14 @@ def test_selection_of_presses_by_index_and_mask(read):
     assert ([press.lines for press in presses], len(presses[:0])) == ([(2,), (3,), (4,)], 0)
 
 
+def test_presses_with_semicolons_decimal_commas_and_a_row_of_units(read):
+    header = f"{HEADER},force_std,temperature_C".replace(",", ";")
+    presses = read(f"{header}\nmm;mm;N;pC;pC;pC;-;°C\n2;-6;0,2;502,3;244,8;215,8;0,01;21,5\n")
+    assert presses.contact.tolist() == [[2.0, -6.0, 0.2]]
+    assert presses.charge_pC.tolist() == [[502.3, 244.8, 215.8]]
+    assert (presses.temperature_C.tolist(), presses.lines) == ([21.5], (3,))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -130,8 +138,13 @@ def test_selection_of_presses_by_index_and_mask(read):
         (f"{HEADER}\n1,2,3,,,\n", "line 2: expected a charge of one electrode or more, got none; fill it in"),
         (f"{HEADER}\n1,2,3,4,5\n", "line 2: expected 6 cells as in the header, got 5"),
         (f"{HEADER}\n1,2,3,4,5,6,7\n", "line 2: expected 6 cells as in the header, got 7"),
-        (f"{HEADER}\n1,2,3,4,5,6".replace(",", ";"), r"separated by ';': save the file .*tr ',;' '\.,' < FILE > NEW"),
-        (f'{HEADER}\n1,2,"0,5",4,5,6\n', "column 'force_N': .*got '0,5'; write a decimal point"),
+        (f"{HEADER}\n1,2,3,4,5,6".replace(",", " "), r"if blanks separate the columns, .*tr -s ' ' ';' < FILE > NEW"),
+        (f'{HEADER}\n1.5,2,"0,5",4,5,6\n', "column 'force_N': .*got '0,5'; write a decimal point"),
+        (f"{HEADER}\nmm,mm,mN,pC,pC,pC\n1,2,3,4,5,6\n", "line 2, column 'force_N': expected the unit N, got 'mN'"),
+        (
+            f"{HEADER},force_std\nmm,mm,N,pC,pC,pC,%\n1,2,3,4,5,6,1\n",
+            "column 'force_std': expected the unit -, got '%'",
+        ),
     ],
 )
 def test_wrong_press_files_are_refused(read, text, message):

@@ -1,4 +1,4 @@
-"""The page in headless Chromium, against a virtual sensor: what is drawn is where and as hard as it is pressed."""
+"""The start page and the live page in headless Chromium: the live page draws each press where and as hard as it is."""
 
 import contextlib
 import re
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Script, VirtualSensor
+from isocharge.serve.network.protocol.page import page as start_page
 
 RATE_HZ, PRESS_S, PAUSE_S = 200.0, 1.5, 0.9
 PRESSES = [(0.0, 0.0, 1.0), (6.0, 2.0, 0.5), (-5.0, 3.0, 2.0), (2.0, -6.0, 0.2), (5.0, -3.5, 0.1)]
@@ -140,3 +141,19 @@ def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(start_st
         wait_for(page, f"document.documentElement.scrollWidth === {width}")
         plan = page.locator(".plan canvas").bounding_box()
         assert plan["y"] + plan["height"] <= height  # the film is seen without scrolling
+
+
+def test_start_page_shows_all_columns_on_a_desktop_and_on_a_phone(chromium, store):
+    html = (
+        start_page(store)
+        .replace("linear/", "eight-25um-biaxial-student/")
+        .replace("A, B, C<", "A, B, C, D, E, F, G, H<")
+    )
+    page = chromium.new_page()
+    page.set_content(html)
+    for width in (1280, 390):
+        page.set_viewport_size({"width": width, "height": 844})
+        boxes = [cell.bounding_box() for cell in page.locator("td, dd").all()]
+        assert all(box["x"] + box["width"] <= width for box in boxes)
+        assert min(cell.bounding_box()["width"] for cell in page.locator("dd").all()) > 300
+    page.close()

@@ -186,7 +186,7 @@ def test_folder_of_a_killed_process_is_repaired_and_locked(film, problem, interr
 def test_next_calibration_is_the_next_version(film, interrupted, command):
     _, _, folder = film
     assert command(*CALIBRATE, folder.parent / "presses.csv", "-o", interrupted)[0] == 0
-    calibrated_film = load_model(interrupted).metadata.sensor["film"]
+    calibrated_film = load_model(interrupted / "2").metadata.sensor["film"]
     assert read_deflection_field(interrupted / "2" / "deflection.json").fits(calibrated_film)
     assert (interrupted / "calibration.json").read_bytes() == (interrupted / "2" / "calibration.json").read_bytes()
     assert (interrupted / "1" / "model.onnx").read_bytes() == (folder / "1" / "model.onnx").read_bytes()

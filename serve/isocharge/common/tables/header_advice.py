@@ -114,14 +114,15 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
 def _is_named(words: frozenset[str], meaning: ColumnMeaning) -> bool:
     """Return whether the words in the name of a column mean the expected column.
 
-    An electrode requires all words of its name. Any other column requires at least one of its words.
+    An electrode requires all words of its name, and no other words except general words. Any other column
+    requires at least one of its words.
 
     Args:
         words: Words in the name of the column in the file.
         meaning: Meaning of the expected column.
     """
     if meaning.noun == "electrode":
-        return bool(meaning.words) and meaning.words <= words
+        return bool(meaning.words) and meaning.words <= words <= meaning.words | GENERAL_WORDS
     return bool(meaning.words & words)
 
 
