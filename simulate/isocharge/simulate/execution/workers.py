@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 from isocharge.common.errors import InputError, WorkersLost
@@ -151,23 +150,19 @@ def local_workers(count: int) -> Iterator[Executor | None]:
         yield None
         return
 
-    # The start method "spawn" is used, because a fork would copy locks that other threads hold. A worker ends when the
-    # end of the pipe in this process is closed, which the operating system also does if this process is killed.
+    # The start method "spawn" is used, because a fork would copy locks that other threads hold.
     context = multiprocessing.get_context("spawn")
-    worker_end, parent_end = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_initialise_worker, initargs=(worker_end,))
+    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_initialise_worker)
     try:
         yield pool
     except BaseException:  # includes KeyboardInterrupt; running jobs are not completed
-        _abandon(pool, parent_end)
+        _abandon(pool)
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-        parent_end.close()
-        worker_end.close()
 
 
-def _abandon(pool: ProcessPoolExecutor, parent_end: Connection) -> None:
+def _abandon(pool: ProcessPoolExecutor) -> None:
     """End the workers of a process pool although they are still computing, and wait until the pool has ended.
 
     The method `ProcessPoolExecutor.shutdown` is not sufficient, because it waits until the running jobs are completed.
@@ -181,11 +176,11 @@ def _abandon(pool: ProcessPoolExecutor, parent_end: Connection) -> None:
 
     Args:
         pool: Process pool whose results are no longer needed.
-        parent_end: End of the pipe that keeps the workers running.
     """
     internals: Any = pool  # access to private attributes, which mypy does not know
     manager: threading.Thread | None = internals._executor_manager_thread
     job_queue = internals._call_queue
+    workers = list(internals._processes.values())
     pool.shutdown(wait=False, cancel_futures=True)
     if manager is None:
         return  # no job was submitted, so there are no workers
@@ -194,7 +189,8 @@ def _abandon(pool: ProcessPoolExecutor, parent_end: Connection) -> None:
     _wait_until(lambda: not internals._cancel_pending_futures or not manager.is_alive())
 
     # End the workers, and wait until the manager has noticed that they ended.
-    parent_end.close()
+    for worker in workers:
+        worker.terminate()
     _wait_until(lambda: not manager.is_alive())
 
     # If a job is still being sent, close the reading end of its pipe in this process, so that the sending fails.
@@ -211,24 +207,23 @@ def _wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(POLL_INTERVAL_s)
 
 
-def _initialise_worker(worker_end: Connection) -> None:
+def _initialise_worker() -> None:
     """Prepare a new worker process.
 
-    The worker ignores interrupts, because the parent process handles interrupts. The worker ends when the parent
-    process closes its end of the pipe.
-
-    Args:
-        worker_end: End of the pipe in the worker.
+    The worker ignores interrupts, because the parent process handles interrupts. The worker ends if the parent process
+    ends.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    threading.Thread(target=_end_with_parent, args=(worker_end,), daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _end_with_parent(worker_end: Connection) -> None:
-    """Wait until the parent process closes its end of the pipe, and end this process."""
-    worker_end.poll(None)  # the parent sends no data, so this returns only when its end is closed
-    os._exit(1)
+def _end_with_parent() -> None:
+    """Wait until the parent process ends, also if it is killed, and end this process."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 @contextmanager
