@@ -133,7 +133,7 @@ class CsvTable(NumberTable):
             if not self._is_mark_certain:
                 self._find_decimal_mark(line_number, needed_cells, cells)
             for name, cell in needed_cells.items():
-                number = _number(cell.translate(self._mark_changes))
+                number = _number(cell.translate(self._mark_changes) if self._mark_changes else cell)
                 if number is None:
                     self._refuse_cell(line_number, name, rules[name], cell)
                 numbers.append(number)
