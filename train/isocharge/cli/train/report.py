@@ -93,7 +93,7 @@ def report_command(
 
     for section in record["datasets"]:
         for method in section["methods"]:
-            error_mm = method["errors"].get("position_rms_mm", "no estimate")
+            error_mm = method["errors"].get("position_rms_mm", float("nan"))
             say(f"{section['sensor']}: {method['name']}: {error_mm} mm rms, {method['single_press_us']} us")
     say(str(output / "report.md"))
     if json:
