@@ -184,6 +184,20 @@ def test_decimal_commas(rows, notation):
     assert [frame.values for frame in feed(*lines)] == rows
 
 
+@pytest.mark.parametrize("line", ["A:4,3", "A = -4,3 pC", ">A:1000:4,3§pC|g", ">A:4,3"])
+def test_decimal_comma_of_a_single_number(line):
+    _, values = names_and_values(line)
+    assert abs(values[-1]) == 4.3
+
+
+@pytest.mark.parametrize("message", ["OK", "the tare is done", "ready ; go"])
+@pytest.mark.parametrize("is_after_header", [False, True])
+def test_message_does_not_replace_the_header(message, is_after_header):
+    header = ["b,a,c,d"] if is_after_header else []
+    frames = feed(*header, message, "1,2,3,4", "2,3,4,5", "3,4,5,6", message, "4,5,6,7")
+    assert [frame.names for frame in frames] == [("b", "a", "c", "d") if is_after_header else ()] * 4
+
+
 @settings(derandomize=True, max_examples=20)
 @given(st.lists(st.tuples(*[st.integers(-0x4000, 0x3FFF)] * 3), min_size=12, max_size=12))
 def test_hexadecimal_numbers_of_fixed_length_are_signed_near_zero(rows):

@@ -38,7 +38,7 @@ from isocharge.serve.frames.frame import (
     DelimitedParser,
     Frame,
 )
-from isocharge.serve.frames.text_lines import Line, Skeleton, clean_text, header_names, parse_line, split_columns
+from isocharge.serve.frames.text_lines import Line, Skeleton, clean_text, header_names, parse_line
 
 MAX_LINE_LENGTH = 4096
 """Length of the longest line that is parsed, bytes."""
@@ -210,7 +210,8 @@ class TextParser(DelimitedParser):
             return self._recognise_layout(line, size) if layout is None else self._reject(size)
         if layout is None:
             self._headers.append(text)
-            is_plain_header = all(column[0].isalpha() for column in split_columns(text))
+            columns = text.replace(",", " ").replace(";", " ").split()
+            is_plain_header = all(column[0].isalpha() for column in columns)
             return [] if is_plain_header else self._reject(size)
         if all(layout.names) or not layout.name_unnamed(header_names(text, layout.example)):
             return self._reject(size)

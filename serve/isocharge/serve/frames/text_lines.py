@@ -218,13 +218,15 @@ def _has_decimal_commas(text: str) -> bool:
     """Return whether the commas between digits are decimal commas, as in `3,1;-2,0` and `A: 3,1 pC, B: -2,0 pC`.
 
     They are separators if a number has a decimal point or two commas, if a comma stands before a sign, beside a blank
-    or before a name, if the line has brackets, or if nothing else separates two numbers.
+    or before a name, if the line has brackets, or if nothing else separates two numbers. In `A:4,3`, the comma is a
+    decimal comma, because a name belongs to one number.
     """
     runs = re.findall(r"[0-9]+(?:[.,][0-9]+)*", re.sub(_TIME, "", text))
     are_decimal = all("." not in run and run.count(",") <= 1 for run in runs)
+    has_one_name = re.fullmatch(r"[^:=]+[:=]\s*[-+]?[0-9]+,[0-9]+\D*", text) is not None
     return (
         are_decimal
-        and len(runs) > 1
+        and (len(runs) > 1 or has_one_name)
         and any("," in run for run in runs)
         and re.search(r"[\[({]|[0-9],[-+.]|,[0-9]+\s*[:=]|,0[xX]|[0-9]\s*,\s+[-+.0-9]|[0-9]\s+,", text) is None
     )
@@ -414,28 +416,31 @@ def _value(number: str) -> float:
     return float(number.replace(",", "."))
 
 
-def split_columns(text: str) -> list[str]:
-    """Divide a line into columns, which are separated by commas, semicolons, tabs or blanks."""
-    return [column for column in re.split(r"[,;\s]+", text) if column]
+def _separator(text: str) -> str | None:
+    """Return the mark that separates the columns of a text; None if only blanks separate them."""
+    return next((mark for mark in "\t;," if mark in text), None)
 
 
 def header_names(header: str, line: Line) -> tuple[str, ...]:
     """Return the names that a header states for the numbers without names in a line.
 
     The result is empty if the text is no header of the line. A column of the header is a name, which begins with a
-    letter. Columns of the line that contain a text, and a label before the first column, are ignored.
+    letter. Columns of the line that contain a text, and a label before the first column, are ignored. Words with only
+    blanks between them, such as `the tare is done`, are no header of a line with another separator.
 
     Args:
         header: A line without numbers.
         line: The line.
     """
     starts = [start for start, name in zip(line.starts, line.names, strict=True) if not name]
-    columns = split_columns(header)
+    separator = _separator(header)  # None: blanks
+    line_separator = "\t" if "\t" in line.text else _separator(line.skeleton.replace("\t", ""))
+    if separator is None and line_separator is not None:
+        return ()
+    columns = [column for column in header.split(separator) if column.strip()]
     if len(columns) != len(starts):
-        separator = next((mark for mark in "\t;," if mark in header), None)  # None: blanks
-        columns = header.split(separator)
-        first_column = 0 if separator is None else -1  # the part before the first separator is the first column
-        indices = [len(line.text[:start].split(separator)) + first_column for start in starts]
+        first_column = 0 if line_separator is None else -1  # the part before the first separator is the first column
+        indices = [len(line.text[:start].split(line_separator)) + first_column for start in starts]
         columns = [columns[index] for index in indices if index < len(columns)]
     names = tuple(column.rpartition(":")[2].strip(" \"'") for column in columns)
     are_names = all(re.match(r"[^\W\d]", name) for name in names)
