@@ -13,6 +13,12 @@ void bridge_predict(const float *charge_pC, int count, int times, float *contact
 #endif
 }
 
+void bridge_flags(const float *contact, int count, unsigned *flags)
+{
+    for (int row = 0; row < count; ++row)
+        flags[row] = isocharge_flags(contact + 7 * row);
+}
+
 void bridge_chain(const double *value, const double *t_s, const double *dt_s, const int *limited, const int *tare,
                   int count, double *charge_pC, double *tare_pC, int *contact, unsigned *flags)
 {

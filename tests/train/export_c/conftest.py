@@ -53,6 +53,13 @@ class Exported:
         self.library.bridge_predict(_pointer(charges), len(charges), 1, _pointer(contacts))
         return contacts
 
+    def flags(self, contacts):
+        """Return the bits of the flags of contacts, shape (n,), from contacts of shape (n, 7)."""
+        rows = np.ascontiguousarray(contacts, dtype=np.float32)
+        flags = np.empty(len(rows), np.uint32)
+        self.library.bridge_flags(_pointer(rows), len(rows), _pointer(flags))
+        return flags
+
     def chain(self, values, t_s, dt_s, limited=None, tare=None):
         """Process frames with the signal chain.
 

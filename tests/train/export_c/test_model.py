@@ -4,8 +4,14 @@ import subprocess
 
 import numpy as np
 import pytest
+from msgspec import structs
+from tests.train.random_networks import random_network
 
 from isocharge.common.activations import TANH
+from isocharge.serve import find_model, load_model, write_model
+from isocharge.serve.prediction.contact import Contacts, Validity
+from isocharge.train.export_c.model_source import FLAG_BITS
+from isocharge.train.model_release.onnx_graph import write_graph
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
@@ -36,6 +42,46 @@ def test_self_test_fails_if_a_weight_is_changed(exports, compile_c, tmp_path):
     done = subprocess.run([program], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "expected" in done.stdout
+
+
+def test_self_test_fails_if_a_limit_of_the_flags_is_changed(exports, compile_c, tmp_path):
+    for name in ("self_test.c", "isocharge_model.c", "isocharge_model.h"):
+        text = (exports[0] / name).read_text()
+        (tmp_path / name).write_text(text.replace("MIN_FORCE_N 0.05f", "MIN_FORCE_N 1e9f"))
+    program = compile_c("gcc", tmp_path, tmp_path / "self_test", "self_test.c", "isocharge_model.c")
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "flags: expected 0, got 256" in done.stdout
+
+
+LIMITS = {
+    "round area": {},
+    "no yield": {"yield_force_N": None},
+    "area beside the centre": {"working_area_mm": ((2.0, 1.0), (9.0, 2.0), (8.0, 7.0), (5.0, 3.0), (3.0, 8.0))},
+    "larger misfits": {"errors": {"misfit_p999": 7.0}},
+}
+"""Changes of the metadata of a model."""
+
+
+@pytest.mark.parametrize("changes", LIMITS.values(), ids=LIMITS)
+def test_flags_in_c_are_those_of_python(changes, build, tmp_path):
+    released = load_model(find_model("four-25um-biaxial")).metadata
+    more_errors = {"errors": {**released.errors, **changes.get("errors", {})}}
+    metadata = structs.replace(released, name="limits", version=1, **{**changes, **more_errors})
+    graph = write_graph(random_network(4, (4, 4), (4, 4)), metadata.to_props())
+    model = write_model(tmp_path / "limits", graph, metadata, np.full((4, 4), 800.0, np.float32), "card")
+
+    random = np.random.default_rng(0)
+    contacts = np.zeros((3000, 10), np.float32)
+    contacts[:, :2] = random.normal(0.0, 12.0, (3000, 2))
+    contacts[:, 2] = random.exponential(1.5, 3000)
+    contacts[:, 6] = random.exponential(2.5, 3000)
+    contacts[0] = np.nan
+    contacts[1, :3] = 1e30
+    expected = Validity.of(metadata).batch_flags(Contacts(*contacts.T))
+    flags = build(model).flags(contacts[:, :7])
+    assert flags.tolist() == [sum(FLAG_BITS[word] for word in words) for words in expected]
+    assert {word for words in expected for word in words} >= set(FLAG_BITS) - {"stress"}
 
 
 TANH_TEST = """

@@ -46,11 +46,11 @@ def c_array(name: str, values: NDArray[Any]) -> str:
 
     Args:
         name: Name of the array.
-        values: Array of any shape, written row by row; int8 numbers become `signed char`, all others `float`.
+        values: Array of any shape, written row by row; int8 numbers become `signed char`, uint32 numbers `unsigned`,
+            and all others `float`.
     """
-    is_int8 = values.dtype == np.int8
-    number_type = "signed char" if is_int8 else "float"
-    as_text = str if is_int8 else c_float
+    number_type = {"int8": "signed char", "uint32": "unsigned"}.get(values.dtype.name, "float")
+    as_text = c_float if number_type == "float" else str
     literals = ", ".join(as_text(value) for value in values.ravel())
     # While the lines are broken, a comma follows the last number, too. The last number then counts with the same length
     # as the other numbers. The last comma is removed afterwards. Lines are not broken after a minus sign.

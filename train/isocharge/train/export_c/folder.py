@@ -232,7 +232,7 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
         "isocharge_model.c": model_source(metadata, network),
         "isocharge_device.h": device_header(device, metadata.electrodes),
         **{name: source_text(name) for name in (*BOARD_SOURCES, "host_example.c")},
-        "self_test.c": self_test(loaded.golden),
+        "self_test.c": self_test(loaded.golden, metadata),
         "README.md": source_text(
             "README.md",
             label=metadata.label,

@@ -14,6 +14,7 @@ digits of the logarithm are then correct. On the left-hand side, the logarithms 
 lost in the sums.
 """
 
+import math
 from itertools import cycle, islice, pairwise
 
 import numpy as np
@@ -21,8 +22,10 @@ import numpy as np
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.charge_features import ChargeFeatures
 from isocharge.serve import Contact, ModelMetadata
+from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
 from isocharge.serve.model.golden import Golden
 from isocharge.serve.model.session import CORRELATION, N_WITHOUT_CORRELATION
+from isocharge.serve.prediction.contact import Contacts, Validity
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
 from isocharge.train.export_c.layer_source import LayerSource, find_blocks
 from isocharge.train.training.folded_network import (
@@ -32,6 +35,9 @@ from isocharge.train.training.folded_network import (
     POSITION,
     FoldedNetwork,
 )
+
+FLAG_BITS = {OUTSIDE: 0x100, BEYOND: 0x200, MISFIT: 0x400, STRESS: 0x800}
+"""Bits of the flags that the C function `isocharge_flags` returns."""
 
 
 def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
@@ -54,9 +60,34 @@ def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         fields=", ".join(f'"{name}"' for name in Contact._fields[:n_number]),
         numbers=n_number,
         all=source_text("isocharge_all.h") if network.n_angle else "",
+        **_validity_literals(Validity.of(metadata)),
         low=f"{features.low_pC:g}" if is_logarithmic else "LOW",
         high=f"{features.high_pC:g}" if is_logarithmic else "HIGH (isocharge_model.c)",
     )
+
+
+def _validity_literals(validity: Validity) -> dict[str, object]:
+    """Return the limits of a model as C literals, by the names of their placeholders in `isocharge_model.h`.
+
+    Args:
+        validity: The working area and the limits of the model.
+    """
+    squared_distance_mm2, implausible_force_N = validity.implausible_limits
+    numbers = {
+        "min_force": validity.force_range_N[0],
+        "max_force": validity.force_range_N[1],
+        "misfit_limit": validity.misfit_limit,
+        "centre_x": validity.centre_mm[0],
+        "centre_y": validity.centre_mm[1],
+        "beyond_mm": math.sqrt(squared_distance_mm2),
+        "beyond_N": implausible_force_N,
+    }
+    has_yield_force = math.isfinite(validity.yield_force_N)
+    return {name: c_float(value) for name, value in numbers.items()} | {
+        "corner_count": len(validity.corners_mm),
+        "corners": ", ".join(c_float(coordinate) for coordinate in validity.corners_mm.ravel()),
+        "yield_force": c_float(validity.yield_force_N) if has_yield_force else "HUGE_VALF",
+    }
 
 
 def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
@@ -168,16 +199,20 @@ def _correlations_source(network: FoldedNetwork) -> str:
     return f"\n{text}"
 
 
-def self_test(golden: Golden) -> str:
-    """Return the text of `self_test.c`, which contains golden vectors and their tolerances.
+def self_test(golden: Golden, metadata: ModelMetadata) -> str:
+    """Return the text of `self_test.c`, which contains golden vectors, their tolerances and their flags.
 
     Args:
         golden: Golden vectors of the model.
+        metadata: Metadata of the model.
     """
     # The correlations are sorted to the end, as in a `Contact`, because False comes before True. The sort is stable, so
     # the other names keep their order.
     names = sorted(golden.outputs, key=lambda name: name == CORRELATION)
     answers = np.concatenate([golden.outputs[name] for name in names], axis=1)
+    no_correlations = np.zeros((len(answers), len(Contact._fields) - N_WITHOUT_CORRELATION))
+    contacts = Contacts(*np.hstack([answers[:, :N_WITHOUT_CORRELATION], no_correlations]).T)
+    flags = [sum(FLAG_BITS[flag] for flag in words) for words in Validity.of(metadata).batch_flags(contacts)]
     floors = np.array([floor for name in names for floor in golden.floors[name]], np.float32)
     return source_text(
         "self_test.c",
@@ -188,6 +223,7 @@ def self_test(golden: Golden) -> str:
         floors=c_array("FLOOR", floors),
         charges=c_array("CHARGE_PC", golden.charge_pC),
         contacts=c_array("CONTACT", answers),
+        flags=c_array("FLAGS", np.array(flags, np.uint32)),
     )
 
 

@@ -37,6 +37,8 @@ static void print_flags(unsigned flags)
     } WORDS[] = {
         {ISOCHARGE_INVALID, "invalid"},   {ISOCHARGE_TARE, "tare"},       {ISOCHARGE_SATURATED, "saturated"},
         {ISOCHARGE_NEGATIVE, "negative"}, {ISOCHARGE_THERMAL, "thermal"}, {ISOCHARGE_BLIND, "blind"},
+        {ISOCHARGE_OUTSIDE, "outside"},   {ISOCHARGE_BEYOND, "beyond"},   {ISOCHARGE_MISFIT, "misfit"},
+        {ISOCHARGE_STRESS, "stress"},
     };
     const char *between = "";
 
@@ -65,7 +67,7 @@ static void print_record(const isocharge_frame *frame, const isocharge_clock *cl
             printf("\"%s\": 0.0, ", FIELD[k]);
         else
             printf("\"%s\": null, ", FIELD[k]);
-    print_flags(reading->flags);
+    print_flags(reading->flags | (reading->contact ? isocharge_flags(contact) : 0));
 }
 
 /* Take a frame through clock, chain and network; 0 if the stream cannot go on. */

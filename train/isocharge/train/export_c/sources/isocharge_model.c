@@ -44,4 +44,39 @@ void isocharge_predict(const float charge_pC[ISOCHARGE_ELECTRODES], float contac
     answers_of(charge_pC, answers);
     contact_of(answers, contact);
 }
+
+/* Whether a ray from the point to the right crosses an odd number of edges of the working area. */
+static int inside_area(float x, float y)
+{
+    static const float corner[2 * ISOCHARGE_AREA_CORNERS] = ISOCHARGE_AREA_MM;
+    const float *start = corner + 2 * (ISOCHARGE_AREA_CORNERS - 1);
+    int inside = 0;
+
+    for (int i = 0; i < ISOCHARGE_AREA_CORNERS; ++i) {
+        const float *end = corner + 2 * i;
+
+        if ((start[1] > y) != (end[1] > y) && x < start[0] + (y - start[1]) * (end[0] - start[0]) / (end[1] - start[1]))
+            inside = !inside;
+        start = end;
+    }
+    return inside;
+}
+
+unsigned isocharge_flags(const float contact[7])
+{
+    const float x = contact[0], y = contact[1], force = contact[2], misfit = contact[6];
+    const float from_centre_x = x - ISOCHARGE_CENTRE_X_MM, from_centre_y = y - ISOCHARGE_CENTRE_Y_MM;
+    const float squared_distance = from_centre_x * from_centre_x + from_centre_y * from_centre_y;
+    unsigned flags = 0;
+
+    if (force < ISOCHARGE_MIN_FORCE_N || force > ISOCHARGE_MAX_FORCE_N || !inside_area(x, y))
+        flags |= ISOCHARGE_OUTSIDE;
+    if (squared_distance > ISOCHARGE_BEYOND_MM * ISOCHARGE_BEYOND_MM || force > ISOCHARGE_BEYOND_N)
+        flags |= ISOCHARGE_BEYOND;
+    if (misfit > ISOCHARGE_MISFIT_LIMIT)
+        flags |= ISOCHARGE_MISFIT;
+    if (force > ISOCHARGE_YIELD_FORCE_N)
+        flags |= ISOCHARGE_STRESS;
+    return flags;
+}
 $all

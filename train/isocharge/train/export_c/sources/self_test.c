@@ -11,6 +11,7 @@
 $floors
 $charges
 $contacts
+$flags
 int main(void)
 {
     static const char *const field[] = ISOCHARGE_CONTACT_FIELDS;
@@ -29,6 +30,11 @@ int main(void)
                 ++wrong;
             }
             worst = apart > worst ? apart : worst;
+        }
+        if (isocharge_flags(CONTACT + row * $numbers) != FLAGS[row]) {
+            printf("vector %d: flags: expected %u, got %u\n", row, FLAGS[row],
+                   isocharge_flags(CONTACT + row * $numbers));
+            ++wrong;
         }
     }
     printf("%s: %d golden vectors, %d wrong numbers, largest difference %.1e of %.1e allowed\n", ISOCHARGE_MODEL,
