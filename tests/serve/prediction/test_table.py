@@ -119,6 +119,8 @@ def test_table_with_only_a_header_has_no_presses():
         ("A;B;C\n1.064,5;832,7;1\n", r"column 'A': .* got '1\.064,5'; write a decimal comma, as in .*'832,7'"),
         ("A;B;C\n2,5;2.5;1\n", r"line 2, column 'B': .* got '2\.5'; write a decimal comma, as in .*'A': '2,5'"),
         ("A;B;C\npC;nC;pC\n1;2;3\n", "line 2, column 'B': expected the unit pC, got 'nC'; convert the column"),
+        ("pC;nC;pC\nA;B;C\n1;2;3\n", "line 1, column 'B': expected the unit pC, got 'nC'; convert the column"),
+        ("A;B;C\nA;B;C\n1;2;3\n", "line 2, column 'A': expected a charge in pC, got 'A'"),
         ("A;B;C\n1;2;3\npC;pC;pC\n", "line 3, column 'A': expected a charge in pC, got 'pC'"),
         ("A,B,C\n1,2,3\n\n4,,6\n", "presses.csv, line 4, column 'B': expected a charge in pC, got an empty cell"),
         ("A,B,C\n1,2,x\n", "line 2, column 'C': expected a charge in pC, got 'x'"),

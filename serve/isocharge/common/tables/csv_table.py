@@ -98,7 +98,13 @@ class CsvTable(NumberTable):
             raise error_class(f"{where}: {_null_advice(first_lines[0])}")
         self._separator, header_line = _find_header(first_lines, names)
         self._rows = _numbered_rows(chain(first_lines, checked_lines), names, self._separator, where, error_class)
-        header = next((cells for line_number, cells in self._rows if line_number >= header_line), None)
+        self._rows_above: list[tuple[int, list[str]]] = []  # rows above the header, which may state units
+        header = None
+        for line_number, cells in self._rows:
+            if line_number >= header_line:
+                header = cells
+                break
+            self._rows_above.append((line_number, cells))
         if header is None:
             raise error_class(f"{where}: empty; expected {expected}")
         super().__init__(header, names, where, error_class, expected)
@@ -122,14 +128,17 @@ class CsvTable(NumberTable):
         # The arrays of the module `array` need less memory than lists. "q" are 64-bit integers, "d" are 64-bit floats.
         line_numbers = array("q")
         numbers = array("d")  # the numbers of the first row, then the numbers of the second row, and so on
+        for line_number, cells in self._rows_above:
+            if len(cells) == len(self.header):
+                self._is_row_of_units(line_number, cells, rules)  # refuses other units
         for line_number, cells in self._rows:
             if len(line_numbers) == max_rows:  # this row is one row too many
                 self._refuse_row_count(max_rows)
             self._check_cell_count(line_number, cells)
-            needed_cells = {name: cells[column_index].strip() for name, column_index in column_indices.items()}
-            if not line_numbers and self._is_row_of_units(line_number, needed_cells, rules):
+            if not line_numbers and self._is_row_of_units(line_number, cells, rules):
                 continue
             line_numbers.append(line_number)
+            needed_cells = {name: cells[column_index].strip() for name, column_index in column_indices.items()}
             if not self._is_mark_certain:
                 self._find_decimal_mark(line_number, needed_cells, cells)
             for name, cell in needed_cells.items():
@@ -178,24 +187,23 @@ class CsvTable(NumberTable):
             f"thousands{command}"
         )
 
-    def _is_row_of_units(
-        self, line_number: int, needed_cells: Mapping[str, str], rules: Mapping[str, ColumnRule]
-    ) -> bool:
+    def _is_row_of_units(self, line_number: int, cells: list[str], rules: Mapping[str, ColumnRule]) -> bool:
         """Return whether a row states the units of the requested columns, and check the units.
 
         Args:
             line_number: Number of the line.
-            needed_cells: Cells of the requested columns, by the names of the columns.
+            cells: Cells of the row.
             rules: Rules of the requested columns, which contain the units.
 
         Raises:
             error_class: If the row states another unit than that of a column.
         """
-        given_units = {name: cell.strip(" []()°") for name, cell in needed_cells.items()}
+        given_units = {name: cells[self.header.index(name)].strip(" []()°") for name in rules}
         expected_units = {name: rule.meaning.unit for name, rule in rules.items()}
         has_unit = any(
-            unit and unit in (expected_units[name], *OTHER_UNITS.get(expected_units[name], ()))
+            unit in (expected_units[name], *OTHER_UNITS.get(expected_units[name], ()))
             for name, unit in given_units.items()
+            if unit and unit not in self.header  # an electrode may be called C
         )
         if not has_unit:
             return False
