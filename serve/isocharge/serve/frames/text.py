@@ -78,6 +78,7 @@ class Layout:
         skeletons: Text between the numbers of each line of a frame.
         names: Names of all values; empty for a value without a name.
         unnamed: Indices of the values that have no names in the lines. A header or a device file may name them.
+        first_name: The first name that is not the name of a clock; empty without such a name.
         columns: Meanings of the values as frame counter, clock or channels.
     """
 
@@ -101,6 +102,7 @@ class Layout:
     def set_names(self, names: Sequence[str]) -> None:
         """Store the names of all values, and find the columns of the frame counter, the clock and the channels."""
         self.names = tuple(names)
+        self.first_name = next((name for name in names if name not in TIMES_US), "")
         scales = (1.0,) * len(self.names)  # values in text have no scale
         self.columns = Columns(self.names, scales)
 
@@ -311,33 +313,29 @@ class TextParser(DelimitedParser):
             if values is not None:
                 if len(layout.skeletons) == 1:
                     return self._frame_of_values(layout, values, size)
-                return self._read_cycle_line(layout, skeleton.names, values, size)
+                return self._read_cycle_line(layout, skeleton, values, size)
         return None
 
-    def _read_cycle_line(
-        self, layout: Layout, names: tuple[str, ...], values: tuple[float, ...], size: int
-    ) -> list[Frame]:
+    def _read_cycle_line(self, layout: Layout, skeleton: Skeleton, values: tuple[float, ...], size: int) -> list[Frame]:
         """Store the values of one line of a cycle. A cycle is a sequence of lines that together contain one frame.
 
-        A line is identified by its first name. The names of clocks are ignored, because every line of a cycle may
-        contain the clock. A line begins a new cycle in two cases: if its name comes first in the layout, or if the
-        present cycle already contains its name. In the second case, some lines were lost.
+        A line begins a new cycle in two cases: if its name comes first in the layout, or if the present cycle already
+        contains its name. In the second case, some lines were lost.
 
         Args:
             layout: The recognised layout.
-            names: Names of the values.
+            skeleton: Skeleton of the line, with the names of the values.
             values: Values of the line.
             size: Number of bytes of the line.
 
         Returns:
             A list with the frame if the line completes the cycle, otherwise an empty list.
         """
-        line_name = next(name for name in names if name not in TIMES_US)
-        first_line_name = next(name for name in layout.names if name not in TIMES_US)
-        begins_cycle = line_name == first_line_name or line_name in self._cycle_values
+        line_name = skeleton.line_name
+        begins_cycle = line_name == layout.first_name or line_name in self._cycle_values
         if begins_cycle:
             self._drop_cycle()  # an earlier cycle, if it is unfinished
-        self._cycle_values.update(zip(names, values, strict=True))
+        self._cycle_values.update(zip(skeleton.names, values, strict=True))
         self._cycle_byte_count += size
         is_complete = len(self._cycle_values) == len(layout.names)
         if not is_complete:

@@ -355,6 +355,8 @@ class Skeleton:
 
     Attributes:
         names: Name of each number; empty for a number without a name.
+        line_name: The first name, by which a line of a cycle is identified. The names of clocks are ignored, because
+            every line of a cycle may contain the clock.
     """
 
     def __init__(self, lines: Sequence[Line]) -> None:
@@ -367,6 +369,7 @@ class Skeleton:
             lines: Lines with the same skeleton, at least one.
         """
         self.names = lines[0].names
+        self.line_name = next((name for name in self.names if name not in TIMES_US), "")
         skeleton = lines[0].skeleton
         patterns = {_CODES[kind]: pattern for kind, pattern in _PATTERNS.items()}
         self._match = re.compile("".join(patterns.get(part) or re.escape(part) for part in skeleton)).fullmatch
