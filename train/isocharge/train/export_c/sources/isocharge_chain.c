@@ -294,8 +294,10 @@ static real track_thermal_drift(isocharge_chain *chain, const real charge_pC[N],
         estimate_pC2 = (real)(ISOCHARGE_THERMAL_NOISE * ISOCHARGE_THERMAL_NOISE) / curvature;
         chain->blind = estimate_pC2 > (real)(ISOCHARGE_THERMAL_BLIND_PC * ISOCHARGE_THERMAL_BLIND_PC);
     }
-    if (chain->blind)
+    if (chain->blind) {
+        chain->drift_pC2 = predicted_pC2;
         return 0;
+    }
     change_pC = smaller(larger(-slope / (2 * curvature), -20), 20);
     gain = predicted_pC2 / (predicted_pC2 + estimate_pC2);
     chain->drift_pC2 = (1 - gain) * predicted_pC2;
