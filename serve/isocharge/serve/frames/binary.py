@@ -36,7 +36,7 @@ MAX_CHARGES = 255
 MAX_FRAME_LENGTH = HEADER.size + MAX_CHARGES * 4 + CRC.size
 """Length of the longest frame before byte stuffing, bytes."""
 
-MAX_STUFFED_LENGTH: int = cobs.max_encoded_length(MAX_FRAME_LENGTH)
+MAX_STUFFED_LENGTH = MAX_FRAME_LENGTH + 1 + MAX_FRAME_LENGTH // 254
 """Length of the longest frame after byte stuffing, without its delimiter, bytes."""
 
 
