@@ -110,6 +110,7 @@ class TareStage(OffsetStage):
         self._rule = rule
         self._follows_drift = follows_drift
         self._tare: Tare | None = None
+        self._previous_frame: tuple[Array, float] | None = None  # charges, pC, and time since the frame before it, s
         self._latest_pC = np.empty((0, n_electrode))  # charges of the latest frames, from which the tare is measured
         self._searched_frames = 0  # number of frames since the beginning of the search
         self._is_search_limited = True  # whether the search ends with an error after too many frames
@@ -122,7 +123,8 @@ class TareStage(OffsetStage):
     def step(self, frame: ChainFrame) -> None:
         """Subtract the tare, which is the charge at rest. While there is no tare, search for a tare.
 
-        While nothing touches the film, the tare follows a slow drift.
+        While nothing touches the film, the tare follows a slow drift. It follows each frame only after the later stages
+        have found that the frame has no contact. The first frame of a touch therefore does not change the tare.
 
         The later stages skip a frame without a tare.
 
@@ -134,8 +136,9 @@ class TareStage(OffsetStage):
         """
         if self._tare is not None:
             if self._follows_drift and self._rule is not None:
-                if not frame.was_contact:
-                    self._tare = follow_drift(self._rule, self._tare, frame.charge_pC, frame.dt_s)
+                if self._previous_frame is not None and not frame.was_contact:
+                    self._tare = follow_drift(self._rule, self._tare, *self._previous_frame)
+                self._previous_frame = (frame.charge_pC, frame.dt_s)
                 # The charge out of contact decays, but the charge of a finger that is leaving the film does not.
                 frame.base_relax_s = self._rule.relax_s
                 frame.is_base_held = True
@@ -154,6 +157,7 @@ class TareStage(OffsetStage):
         Unlike the first search for a tare, the new search does not end with an error.
         """
         self._tare = None
+        self._previous_frame = None
         self._latest_pC = self._latest_pC[:0]  # without any frame
         self._searched_frames = 0
         self._is_search_limited = False

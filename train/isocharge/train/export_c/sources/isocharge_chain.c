@@ -314,13 +314,6 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
 
 #if TARE_FOLLOWS
     const real kept = EXP(-dt_s / (real)ISOCHARGE_TARE_RELAX_S);
-    if (!chain->contact) {
-        EACH(k)
-        {
-            const real apart = quiet_pC[k] - chain->tare_pC[k];
-            chain->tare_pC[k] += (1 - kept) * within(apart, (real)ISOCHARGE_TARE_NOISE_LIMIT_PC);
-        }
-    }
     if (chain->base_pC < 0)
         decay = kept;
 #endif
@@ -365,6 +358,15 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
         reading->flags |= ISOCHARGE_BLIND;
 #else
     (void)dt_s;
+#endif
+#if TARE_FOLLOWS
+    if (!chain->contact) {
+        EACH(k)
+        {
+            const real apart = quiet_pC[k] - chain->tare_pC[k];
+            chain->tare_pC[k] += (1 - kept) * within(apart, (real)ISOCHARGE_TARE_NOISE_LIMIT_PC);
+        }
+    }
 #endif
     reading->contact = chain->contact;
     reading->flags |= (chain->saturated ? ISOCHARGE_SATURATED : 0u) | (chain->below ? ISOCHARGE_NEGATIVE : 0u);
