@@ -96,24 +96,6 @@ def write_graph(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
     return bytes(model.SerializeToString())
 
 
-def write_contact_graph(network: FoldedNetwork) -> bytes:
-    """Write an ONNX file of a network whose only answers are x, y and ln F.
-
-    Args:
-        network: The network.
-
-    Returns:
-        The ONNX file, with the input `charge_pC` [n, n_electrode] and the output `contact` [n, 3], both float32.
-    """
-    builder = GraphBuilder()
-    answers = _add_answers(builder, network)
-    position, log_force = builder.split(answers, {"plane": 2, "log_force": 1})
-    force = builder.add("Exp", log_force)
-    builder.add("Concat", position, force, to="contact", axis=1)
-    model = _make_model(builder, "contact", network.features.n_electrode, {"contact": 3})
-    return bytes(model.SerializeToString())
-
-
 def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     """Return the ONNX model of a network, without metadata.
 
@@ -160,7 +142,19 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     outputs = dict(OUTPUTS)
     if not network.n_angle:
         del outputs[CORRELATION]
-    return _make_model(builder, "isocharge", n_electrode, outputs, producer_name="isocharge")
+    declared_inputs = _declare({INPUT: n_electrode})
+    graph = helper.make_graph(builder.nodes, "isocharge", declared_inputs, _declare(outputs), builder.constants)
+    opset = helper.make_opsetid("", OPSET)
+    return helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="isocharge")
+
+
+def _declare(widths: Mapping[str, int]) -> list[onnx.ValueInfoProto]:
+    """Return the declarations of float32 tensors [n, width].
+
+    Args:
+        widths: Width of each tensor by its name.
+    """
+    return [helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["n", width]) for tensor, width in widths.items()]
 
 
 def _add_answers(builder: GraphBuilder, network: FoldedNetwork) -> str:
@@ -215,34 +209,6 @@ def _add_perceptron(builder: GraphBuilder, inputs: str, perceptron: Perceptron[A
     output_layer = perceptron.last
     skip_and_bias = builder.add("Gemm", inputs, builder.constant(perceptron.skip), builder.constant(output_layer.bias))
     return builder.add("Gemm", hidden_outputs, builder.constant(output_layer.weight), skip_and_bias)
-
-
-def _make_model(
-    builder: GraphBuilder, name: str, n_electrode: int, outputs: Mapping[str, int], **attributes: Any
-) -> onnx.ModelProto:
-    """Return a model with the input `charge_pC` [n, n_electrode] and outputs [n, width], all float32.
-
-    Args:
-        builder: Builder with the nodes and constants of the graph.
-        name: Name of the graph.
-        n_electrode: Number of charges.
-        outputs: Width of each output by its name.
-        **attributes: Further arguments of `onnx.helper.make_model`.
-    """
-
-    def declare(widths: Mapping[str, int]) -> list[onnx.ValueInfoProto]:
-        """Return the declarations of float32 tensors [n, width].
-
-        Args:
-            widths: Width of each tensor by its name.
-        """
-        return [
-            helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["n", width]) for tensor, width in widths.items()
-        ]
-
-    graph = helper.make_graph(builder.nodes, name, declare({INPUT: n_electrode}), declare(outputs), builder.constants)
-    opset = helper.make_opsetid("", OPSET)
-    return helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, **attributes)
 
 
 def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:

@@ -13,7 +13,6 @@ length is not smooth. Therefore, the perceptron learns the vector instead of the
 several thousand, so it is compressed by the function asinh.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -355,32 +354,8 @@ def fold_network(network: InverseNetwork) -> FoldedNetwork:
     # The contact perceptron estimates the unit coordinates directly, so they are neither rotated nor shifted.
     answer_map = linear_answer_map(network.domain, np.eye(3), np.zeros(3), charge_features.n_electrode)
     perceptrons = [_contact_to_numpy(network), network.misfit_vector.to_numpy()]
-    return replace(_fold(network, perceptrons, answer_map), log_std_limits=log_std_limits(network.domain))
-
-
-def fold_contact_mean(network: InverseNetwork) -> FoldedNetwork:
-    """Fold the contact perceptron of a trained network without its standard deviations.
-
-    The answers of the folded network are x and y in mm, and ln F. The outputs for the standard deviations get weights
-    of zero.
-    """
-    weights_of_means = np.diag(network.domain.scale)
-    weights_of_log_stds = np.zeros((3, 3))
-    answer_map = Layer(np.vstack([weights_of_means, weights_of_log_stds]), network.domain.centre)
-    return _fold(network, [_contact_to_numpy(network)], answer_map)
-
-
-def _fold(network: InverseNetwork, perceptrons: Sequence[Perceptron[Array]], answer_map: Layer[Array]) -> FoldedNetwork:
-    """Fold perceptrons of a network into one perceptron.
-
-    Args:
-        network: Network whose features and whitening are used.
-        perceptrons: Perceptrons of the network with the same inputs.
-        answer_map: Linear map from the outputs of all perceptrons, one after the other, to the answers.
-    """
-    mean = _to_numpy(network.features_mean)
-    matrix = _to_numpy(network.whitening)
-    return FoldedNetwork(network.features.charge_features, fold(perceptrons, mean, matrix, answer_map))
+    layers = fold(perceptrons, _to_numpy(network.features_mean), _to_numpy(network.whitening), answer_map)
+    return FoldedNetwork(charge_features, layers, log_std_limits(network.domain))
 
 
 def _contact_to_numpy(network: InverseNetwork) -> Perceptron[Array]:
