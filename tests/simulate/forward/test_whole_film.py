@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.simulate import Circle, Resolution, SolveSettings, load_sensor, press, touch_charge
+from isocharge.common.errors import SceneError
+from isocharge.simulate import Circle, Domain, Resolution, SolveSettings, load_sensor, press, touch_charge
+from isocharge.simulate.forward.family import check_family
 from isocharge.simulate.forward.whole_film import COARSE_ERROR, outermost_distance
+from isocharge.simulate.solver.load_case import check_press
 from whole_films import whole_film_map_solved_once
 
 SENSOR = load_sensor("four-25um-biaxial")
@@ -33,3 +36,15 @@ def test_coarse_map_agrees_with_direct_solves_up_to_the_clamp(pretension):
 
 def test_coarse_map_leaves_a_gap_of_more_than_the_probe_radius_to_the_clamp():
     assert outermost_distance(SENSOR.film, Circle(1.5)) == pytest.approx(45.0 - 1.5 - 1.8)
+
+
+@pytest.mark.parametrize("changes", [{"oval": 0.05}, {"oval": 0.05, "oval_axis": 1.6}, {"oval": -0.05}])
+def test_presses_on_an_oval_film_stay_inside_the_shorter_axis(changes):
+    film = replace(SENSOR.film, **changes)
+    outermost = outermost_distance(film, Circle(1.0))
+    assert outermost == pytest.approx(0.95 * 45.0 - 2.2)
+    check_family(film, Circle(1.0), Domain(outermost, (0.1, 1.0)))
+    for angle in np.linspace(0.0, np.pi, 9):
+        check_press(film, Circle(1.0), (outermost * np.cos(angle), outermost * np.sin(angle)), 1.0)
+    with pytest.raises(SceneError, match="probe off the film"):
+        check_family(film, Circle(1.0), Domain(43.0, (0.1, 1.0)))

@@ -41,10 +41,8 @@ In a frame that rotates with the probe, the orientation changes only the directi
 film. The rim is far from the probe. A few harmonics of the orientation therefore describe the stress.
 """
 
-
 DIRECTION_PERIOD = np.pi
 """Rotation of a film that is not axisymmetric, after which its properties are the same again, rad."""
-
 
 DIRECTIONS = 7
 """Smallest number of directions, within half a turn, on a film that is not axisymmetric.
@@ -360,7 +358,7 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
     """Raise an error if no forward map can be built for a film, a probe and a domain.
 
     Only the outermost press with the largest force is checked. If the outermost press with the largest force can exist,
-    all other presses of the domain can exist, too.
+    all other presses of the domain can exist, too. On an oval film, the outermost press lies on the shorter semi-axis.
 
     Args:
         film: Film of the forward map.
@@ -382,7 +380,18 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
             f"radius: presses up to {radius:.4g} mm from the centre with {probe.notation}, which reaches "
             f"{probe.reach:.4g} mm, leave the film of radius {film.radius:.4g} mm"
         )
-    check_press(film, probe, (radius, 0.0), max_force)
+    check_press(film, probe, nearest_to_clamp(film, radius), max_force)
+
+
+def nearest_to_clamp(film: Film, distance: float) -> tuple[float, float]:
+    """Return the position (x, y), mm, that is nearest to the clamp of all positions at a distance from the centre.
+
+    Args:
+        film: The film.
+        distance: Distance from the centre of the film, mm.
+    """
+    angle = film.oval_axis + 0.5 * math.pi if film.oval > 0.0 else film.oval_axis  # of the shorter semi-axis
+    return distance * math.cos(angle), distance * math.sin(angle)
 
 
 Reading = Callable[[Equilibrium, Surface], Array]

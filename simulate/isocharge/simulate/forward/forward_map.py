@@ -1,12 +1,13 @@
 """Forward map, which computes the charges of many presses from a few solved presses.
 
 All presses with one probe form a family with two coordinates: the distance from the centre of the film, and the force.
-If the probe is not axisymmetric, its orientation is a third coordinate. Presses in other directions from the centre are
-obtained by a rotation of the film. In a frame that moves with the probe, the stress at the nodes of the mesh is a
-smooth function of the coordinates of the family. Presses are solved at Chebyshev nodes in the distance and in the
-logarithm of the force, and at evenly spaced orientations. For every other press, the stress field is interpolated. The
-charges are integrals of the interpolated field over the electrodes. The positions of the electrodes therefore do not
-affect the accuracy of the interpolation. When a map is built, its charges are compared with those of direct solves.
+If the probe is not axisymmetric, its orientation is a further coordinate. If the film is not axisymmetric, the
+direction from the centre is a further coordinate. Otherwise, presses in other directions are obtained by a rotation of
+the film. In a frame that moves with the probe, the stress at the nodes of the mesh is a smooth function of the
+coordinates of the family. Presses are solved at Chebyshev nodes in the distance and in the logarithm of the force, and
+at evenly spaced orientations and directions. For every other press, the stress field is interpolated. The charges are
+integrals of the interpolated field over the electrodes. The positions of the electrodes therefore do not affect the
+accuracy of the interpolation. When a map is built, its charges are compared with those of direct solves.
 """
 
 from concurrent.futures import Executor
@@ -21,7 +22,14 @@ from isocharge.common.errors import SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain, as_contacts, differences
-from isocharge.simulate.forward.family import CheckPress, Family, check_family, node_counts, spread_check_presses
+from isocharge.simulate.forward.family import (
+    CheckPress,
+    Family,
+    check_family,
+    nearest_to_clamp,
+    node_counts,
+    spread_check_presses,
+)
 from isocharge.simulate.forward.press_chunk import PressChunk
 from isocharge.simulate.forward.readout import ReadoutPoints, contact_charge, touch_charge
 from isocharge.simulate.forward.readout_rules import ReadoutRules
@@ -48,7 +56,8 @@ CHARGE_FLOOR = 0.1
 EVEN_FIELD = np.zeros(1, dtype=bool)
 """Value of the argument `is_odd` for a single even field.
 
-The stress under a press on an isotropic round film is such a field.
+The stress under a press on an axisymmetric film is such a field. The argument has no effect for other films, which are
+meshed completely.
 """
 
 SKIP_RATIO = 10.0
@@ -68,7 +77,7 @@ class ForwardMap:
     Attributes:
         sensor: Sensor whose charges are computed.
         probe: Probe that presses the film.
-        family: Distances, forces and orientations of the solved presses.
+        family: Distances, forces, directions and orientations of the solved presses.
         theory: Terms of the film theory that the solves include.
         resolution: Fineness of the mesh of the solves.
         layer: Width of the thin rings of the mesh at the rim, in film radii.
@@ -126,7 +135,7 @@ class ForwardMap:
             theory = theory_for(sensor, probe, force_range, settings.accuracy)
         layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
         settings = replace(settings, theory=theory, layer=layer)
-        resolution = needed_resolution(film, probe, (radius, 0.0), middle_force, settings)
+        resolution = needed_resolution(film, probe, nearest_to_clamp(film, radius), middle_force, settings)
         template = template_for(probe, resolution, whole=not film.is_axisymmetric)
         layer = min(layer, widest_smooth_layer(template, probe, radius, film.radius))
         settings = replace(settings, resolution=resolution, layer=layer)
@@ -295,12 +304,12 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_force, n_electrode), pC. Charges that are not needed are zero.
         """
-        # Integrate all fields of the stacked map for chunks of presses. All fields are even with respect to a
-        # reflection in the direction of the press, because they are stresses of a film without imperfections.
+        # Integrate all fields of the stacked map for chunks of presses. All fields have the symmetry
+        # of the stress.
         complex_position = position[:, 0] + 1j * position[:, 1]
         stacked_map = self._stacked_forces
         first_force = stacked_map.family.force[0]
-        is_odd = np.zeros(self.family.force.size, dtype=bool)
+        is_odd = EVEN_FIELD.repeat(self.family.force.size)
         orientation = np.zeros(1)  # the probe keeps its orientation for all presses
         chunk_size = max(1, CHUNK_SIZE // self.family.force.size)  # a press of the stacked map has n_force fields
         charges = []

@@ -42,7 +42,7 @@ NODE_COUNT = NodeCount(distances=10, forces=4)
 
 def outermost_distance(film: Film, probe: Probe) -> float:
     """Return the largest distance of a press from the centre (mm) for which the coarse map is valid; see `RIM_GAP`."""
-    return film.radius - (1.0 + RIM_GAP) * probe.reach
+    return (1.0 - abs(film.oval)) * film.radius - (1.0 + RIM_GAP) * probe.reach
 
 
 def whole_film_map(

@@ -27,7 +27,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
-from isocharge.simulate.forward.family import DIRECTION_PERIOD
+from isocharge.simulate.forward.family import DIRECTION_PERIOD, DIRECTIONS, nearest_to_clamp
 from isocharge.simulate.forward.readout import electrode_rule
 from isocharge.simulate.mechanics.theory import theory_for
 from isocharge.simulate.mesh.conformal_map import automorphism_onto, distance_coordinate
@@ -86,9 +86,6 @@ N_DISTANCES = 5
 
 N_DISTANCES_WIDE = 8
 """Number of solved distances if the largest distance of a press is above `WIDE_RADIUS`."""
-
-N_DIRECTIONS = 7
-"""Number of solved directions within half a turn, if the film is not axisymmetric."""
 
 GAUSS_RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
 """Integration rules of squares in ascending order of the distance between the square and the press.
@@ -150,8 +147,7 @@ class ChargeTable:
         # All presses are solved with the mesh that the outermost press needs.
         film = sensor.film
         basic_settings = SolveSettings(theory=theory_for(sensor, probe, (force, force)), layer=layer_for(film, force))
-        outermost_press = (radius, 0.0)
-        resolution = needed_resolution(film, probe, outermost_press, force, basic_settings)
+        resolution = needed_resolution(film, probe, nearest_to_clamp(film, radius), force, basic_settings)
         settings = replace(basic_settings, resolution=resolution)
 
         # The distances are Chebyshev nodes in `distance_coordinate`, whose inverse is `tanh`.
@@ -159,7 +155,7 @@ class ChargeTable:
         n_distance = N_DISTANCES_WIDE if is_wide else N_DISTANCES
         largest_coordinate = float(distance_coordinate(radius / film.radius))
         distance = film.radius * np.tanh(chebyshev_nodes(n_distance, 0.0, largest_coordinate))
-        n_direction = 1 if film.is_axisymmetric else N_DIRECTIONS
+        n_direction = 1 if film.is_axisymmetric else DIRECTIONS
         direction = DIRECTION_PERIOD * np.arange(n_direction) / n_direction
         presses = list(product(distance.tolist(), direction.tolist()))
         solve = partial(_stress_at, film, sensor.surface, probe, force, settings)
