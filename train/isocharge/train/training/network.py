@@ -302,8 +302,8 @@ class InverseNetwork(nn.Module):
 def limit_log_std(log_std: Tensor, mean: Tensor, domain: Domain) -> Tensor:
     """Limit the logarithms of the standard deviations as a folded network does (`log_std_limits`).
 
-    The gradient is not zero beyond the limits, but that at the limit. A training therefore leaves a limit as soon as
-    the errors require it.
+    Beyond a limit, the gradient of the result is not zero, but the same as within the limits. A training therefore
+    leaves a limit as soon as the errors require it.
 
     Args:
         log_std: Logarithms of the standard deviations of the unit coordinates, shape (n, 3).
