@@ -272,6 +272,15 @@ def received(address, *datagrams):
         return [port.read(10.0).data for datagram in datagrams if datagram]
 
 
+def test_binary_datagrams_that_waited_are_not_joined(address):
+    """A datagram of another length would otherwise make the frames of the other datagrams unreadable."""
+    with Port(f"udp://127.0.0.1:{address[1]}") as port, socket.socket(type=socket.SOCK_DGRAM) as board:
+        for data in (b"\0" * 12, b"\0" * 5, b"\0" * 12):
+            board.sendto(data, address)
+        chunks = iter(port)
+        assert [len(next(chunks).data) for _ in range(3)] == [12, 5, 12]
+
+
 TEXT = (b'{"A": 1}', b"A:1\tB:2", "1 µC".encode())
 BYTES = (b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f")
 

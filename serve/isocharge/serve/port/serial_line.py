@@ -320,6 +320,7 @@ class UdpSocket:
             self._socket.close()
             raise
         self._board_ends_lines = False  # whether a datagram of the board has ended with a line feed
+        self._is_text = False  # whether the latest datagram is valid UTF-8 without control characters
         self._peer: tuple[str, int] | None = None  # sender of the latest datagram, to which answers are sent
 
     def reset_input_buffer(self) -> None:
@@ -342,12 +343,17 @@ class UdpSocket:
         while self._is_ready(max(0.0, deadline_s - time.monotonic())):
             data, self._peer = self._socket.recvfrom(MAX_READ_BYTES)
             if data:
+                is_utf8 = data.decode("utf-8", "replace").encode() == data  # decoding replaces invalid bytes
+                self._is_text = is_utf8 and _CONTROL_CHARACTER.search(data) is None
                 return self._with_line_feed(data)
         return b""
 
     def receive_waiting(self) -> bytes:
-        """Return the next datagram if it has already arrived, and otherwise empty bytes."""
-        return self.receive(0.0)
+        """Return the next datagram if it has already arrived and the latest datagram is text, otherwise empty bytes.
+
+        Datagrams of binary frames must not be joined, because the beginning of a datagram is the beginning of a frame.
+        """
+        return self.receive(0.0) if self._is_text else b""
 
     def write(self, data: bytes) -> None:
         """Send bytes to the sender of the latest datagram. If no datagram was received yet, nothing is sent."""
@@ -367,15 +373,11 @@ class UdpSocket:
         """Return a datagram of text with a line feed at its end.
 
         If this datagram or an earlier datagram of the board ends with a line feed, the datagram is returned unchanged.
-        A datagram is text if it is valid UTF-8 without control characters. Other datagrams are returned unchanged.
+        A datagram that is no text is also returned unchanged.
 
         Args:
             data: The datagram.
         """
         if data.endswith(b"\n"):
             self._board_ends_lines = True
-        has_control_characters = _CONTROL_CHARACTER.search(data) is not None
-        if self._board_ends_lines or has_control_characters:
-            return data
-        is_utf8 = data.decode("utf-8", "replace").encode() == data  # decoding replaces invalid bytes
-        return data + b"\n" if is_utf8 else data
+        return data + b"\n" if self._is_text and not self._board_ends_lines else data
