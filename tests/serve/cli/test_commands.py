@@ -346,6 +346,7 @@ def test_doctor_writes_no_file_of_which_the_unit_is_missing(command, tmp_path):
         assert (code, path.exists()) == (1, False)
         assert "--pc-per-unit NUMBER" in out
         assert "is not written, because the charge of one unit is missing" in err
+        assert json.loads(command(*words, "--json")[1])["unit"] == "counts"
         code, _, err = command(*words, "--pc-per-unit", 0.1)
         assert code == 0, err
     finally:

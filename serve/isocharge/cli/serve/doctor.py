@@ -132,12 +132,9 @@ def doctor_command(
         show("\n".join(report_lines(examination)))
     if metadata and unnoticed and examination.good and not json:
         show(f"{metadata.label}: {unnoticed.summary}")
-    is_unit_missing = device is None and examination.unit != "pC"
-    if write is not None and examination.good and is_unit_missing and not examination.touch:
-        say(f"{write} is not written, because the charge of one unit is missing: add the option that is named above")
-        raise typer.Exit(1)
+    is_unit_missing = write is not None and device is None and examination.unit != "pC"
     found_channels = None
-    if check_wiring and examination.good and not examination.touch:
+    if check_wiring and examination.good and not examination.touch and not is_unit_missing:
         wiring = _check_wiring(examination, electrodes)
         found_channels = wiring.found
         examination = replace(examination, device=corrected_table(examination.device, wiring))
@@ -155,6 +152,9 @@ def doctor_command(
     if examination.touch:
         not_written = "" if write is None else f"{write} is not written, because "
         say(f"{not_written}the film was touched: take the finger away, and try again")
+        raise typer.Exit(1)
+    if is_unit_missing:
+        say(f"{write} is not written, because the charge of one unit is missing: add the option that is named above")
         raise typer.Exit(1)
     if write is not None:
         _write_device_file(write, examination, model or "MODEL")
@@ -359,7 +359,7 @@ def _channel_line(channel: ChannelHealth, unit: str) -> str:
 
     Args:
         channel: Health of the channel.
-        unit: Unit of the channel: "pC", "counts" or "V".
+        unit: Unit of the channel: "pC", "counts", "V", or a unit in its name, such as "nC".
     """
     # The attributes are named after pC, but their values have the unit of the channel. The hum has two amplitudes, at
     # 50 Hz and at 60 Hz. A value that was not measured is None.
