@@ -396,7 +396,5 @@ def _file_response(path: Path) -> Response:
     response = response_of(200, CONTENT_TYPES[path.suffix], path.read_bytes())
     response.headers.append((b"content-security-policy", CONTENT_SECURITY_POLICY))
     response.headers.append((b"cache-control", b"no-cache"))
-    for name, value in PAGE_HEADERS:
-        if name != b"content-security-policy":  # the live page has its own policy, which was added above
-            response.headers.append((name, value))
+    response.headers.extend(PAGE_HEADERS)
     return response

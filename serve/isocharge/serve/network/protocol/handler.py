@@ -85,7 +85,7 @@ def token_page(error: TokenError) -> Response:
     """Return the page that asks a browser for the token, with the status 401."""
     refusal = error_response(error)
     response = response_of(refusal.status, b"text/html; charset=utf-8", TOKEN_PAGE.encode(), refusal.error)
-    response.headers.extend(PAGE_HEADERS[1:])
+    response.headers.extend(PAGE_HEADERS)
     response.headers.append((b"content-security-policy", TOKEN_PAGE_POLICY))
     response.headers.append((b"www-authenticate", b"Bearer"))
     return response

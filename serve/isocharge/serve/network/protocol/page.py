@@ -53,13 +53,12 @@ CONTENT_SECURITY_POLICY = (
 """Content security policy of the start page. It allows only the style sheet in the page itself."""
 
 PAGE_HEADERS = (
-    (b"content-security-policy", CONTENT_SECURITY_POLICY),
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),
     (b"referrer-policy", b"no-referrer"),
     (b"cross-origin-resource-policy", b"same-origin"),
 )
-"""Headers of every page."""
+"""Headers of every page, in addition to its content security policy."""
 
 TOKEN_SCRIPT = """
 const key = "isocharge token", form = document.querySelector("form"), field = document.querySelector("input");

@@ -24,7 +24,7 @@ from isocharge.serve.network.protocol.inference import (
     read_object,
     write_answer,
 )
-from isocharge.serve.network.protocol.page import PAGE_HEADERS, card, page
+from isocharge.serve.network.protocol.page import CONTENT_SECURITY_POLICY, PAGE_HEADERS, card, page
 from isocharge.serve.network.protocol.response import Response, compress, json_response, response_of
 
 Json = dict[str, Any]
@@ -208,13 +208,18 @@ def _show_page(request: Request) -> Response:
     host = request.headers.get(b"host", b"").decode("latin-1")
     has_token = b"authorization" in request.headers  # the token was checked if the server has one
     text = page(service.store, f"{service.scheme}://{host}", has_token=has_token)
-    response = response_of(200, b"text/html; charset=utf-8", text.encode())
-    response.headers.extend(PAGE_HEADERS)
-    return response
+    return _page_response(b"text/html; charset=utf-8", text)
 
 
 def _show_card(request: Request) -> Response:
-    response = response_of(200, b"text/plain; charset=utf-8", card(request.loaded.model).encode())
+    """Return the card of a model."""
+    return _page_response(b"text/plain; charset=utf-8", card(request.loaded.model))
+
+
+def _page_response(content_type: bytes, text: str) -> Response:
+    """Return the response that contains a page, with the headers that restrict what browsers do with the page."""
+    response = response_of(200, content_type, text.encode())
+    response.headers.append((b"content-security-policy", CONTENT_SECURITY_POLICY))
     response.headers.extend(PAGE_HEADERS)
     return response
 
