@@ -44,48 +44,31 @@ def foreign_kind(name: str, head: bytes) -> str:
 
     Args:
         name: Path of the file, or - for the standard input.
-        head: First bytes of the file.
-    """
-    kind_and_advice = _kind_and_advice(name, head)
-    return "" if kind_and_advice is None else "; ".join(kind_and_advice)
-
-
-def _kind_and_advice(name: str, head: bytes) -> tuple[str, str] | None:
-    """Return the kind of a file that does not come from a board, and advice on how to use the file.
-
-    Args:
-        name: Path of the file, or - for the standard input.
         head: First bytes of the file. They are compared with the beginnings of known kinds of files.
-
-    Returns:
-        Kind and advice, as parts of a sentence; None if the bytes may come from a board.
     """
     quoted_name = shlex.quote(name)  # for the commands in the advice
     text = head.removeprefix(codecs.BOM_UTF8).lstrip()
     first_line, _line_feed, _next_lines = text.partition(b"\n")
     if first_line.startswith(RECORDING_START):
-        return "a recording", f"play it with: isocharge serve replay {quoted_name}"
+        return f"a recording; play it with: isocharge serve replay {quoted_name}"
     if first_line.startswith(b"{") and all(key in first_line for key in RECORD_KEYS):
         return (
-            "records of `serve stream`",
-            "records hold results; record the board with `isocharge serve stream MODEL --port PORT --record touch.rec` "
-            "and play it with `isocharge serve replay touch.rec`",
+            "records of `serve stream`; records hold results; record the board with `isocharge serve stream MODEL "
+            "--port PORT --record touch.rec` and play it with `isocharge serve replay touch.rec`"
         )
     if head.startswith(MCAP_START):
         return (
-            "an MCAP file",
-            "MCAP files hold results, and isocharge only writes them; play the recording that was made beside it with "
-            "`isocharge serve replay touch.rec`",
+            "an MCAP file; MCAP files hold results, and isocharge only writes them; play the recording that was made "
+            "beside it with `isocharge serve replay touch.rec`"
         )
     if head.startswith(PARQUET_START):
-        return "a Parquet file", f"compute its contacts with: isocharge serve predict MODEL {quoted_name}"
+        return f"a Parquet file; compute its contacts with: isocharge serve predict MODEL {quoted_name}"
     if _is_table_of_presses(name, first_line):
         return (
-            "a table of presses",
-            f"compute its contacts with: isocharge serve predict MODEL {quoted_name}; if a board has sent these lines, "
-            f"use: isocharge serve stream MODEL --port - < {quoted_name}",
+            f"a table of presses; compute its contacts with: isocharge serve predict MODEL {quoted_name}; if a board "
+            f"has sent these lines, use: isocharge serve stream MODEL --port - < {quoted_name}"
         )
-    return None
+    return ""
 
 
 def _is_table_of_presses(name: str, first_line: bytes) -> bool:
