@@ -404,14 +404,14 @@ def _find_header(lines: list[str], names: Collection[str]) -> tuple[str, int]:
         with suppress(InputError):  # the error is raised again when the table is read
             for line_number, cells in _numbered_rows(lines, names, separator, "", InputError):
                 texts = {cell.strip() for cell in cells if cell.strip()}
-                other_texts = texts.difference(names)
-                has_number = any(_number(text.replace(",", ".")) is not None for text in other_texts)
-                name_count = 0 if has_number else len(texts - other_texts)
+                numbers = {text for text in texts if _number(text.replace(",", ".")) is not None}
+                has_number = bool(numbers.difference(names))
+                name_count = 0 if has_number else len(texts.intersection(names))
                 score = (name_count, -line_number, len(cells))
                 if score > best_score:
                     best_score = score
                     best_separator = separator
-                if has_number and all(_number(text.replace(",", ".")) is not None for text in texts):
+                if has_number and numbers == texts:
                     break
     return best_separator, -best_score[1]
 

@@ -302,7 +302,7 @@ class Parser(ABC):
 
     Attributes:
         counts: Counters since the parser was created.
-        unread_line: Latest line of text that has not the layout of the frames; empty without such a line.
+        unread_line: Latest line of text that does not have the layout of the frames; empty without such a line.
     """
 
     def __init__(self, format: str, seq_modulus: int = SEQ_MODULUS, t_us_modulus: int = T_US_MODULUS) -> None:

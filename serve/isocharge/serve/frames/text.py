@@ -241,8 +241,8 @@ class TextParser(DelimitedParser):
             The frames of all equal cycles; an empty list if no layout is recognised yet.
         """
         self._collected_lines.append((line.text, line.skeleton, size))
-        cycle_length = self._repeated_cycle_length(line) if len(line.numbers) <= MAX_VALUES else 0
         repeats = MESSAGE_REPEATS if line.is_prose else RECOGNITION_REPEATS
+        cycle_length = self._repeated_cycle_length(repeats) if len(line.numbers) <= MAX_VALUES else 0
         repeated_lines = self._collected_lines[-repeats * cycle_length :] if cycle_length > 0 else []
         parsed_lines = [self._with_meanings(parse_line(text)) for text, _, _ in repeated_lines]
         cycles = _frame_cycles(parsed_lines, cycle_length)
@@ -268,14 +268,14 @@ class TextParser(DelimitedParser):
             frames += self._reject(repeated_size) if frames_of_line is None else frames_of_line
         return frames
 
-    def _repeated_cycle_length(self, line: Line) -> int:
+    def _repeated_cycle_length(self, repeats: int) -> int:
         """Return the number of lines in a cycle, or 0 if the collected lines do not repeat regularly.
 
         A cycle is a sequence of lines that repeats. It is recognised if the last lines consist of several equal cycles.
         Lines are equal if their skeletons are equal.
 
         Args:
-            line: The last of the collected lines.
+            repeats: Number of equal cycles that are needed.
         """
         *earlier_skeletons, last_skeleton = [skeleton for _, skeleton, _ in self._collected_lines]
         if last_skeleton not in earlier_skeletons:
@@ -286,7 +286,6 @@ class TextParser(DelimitedParser):
         cycle_length = latest_skeletons_first.index(last_skeleton) + 1
 
         # Compare the last lines with repetitions of the first cycle among them.
-        repeats = MESSAGE_REPEATS if line.is_prose else RECOGNITION_REPEATS
         recent_skeletons = [*earlier_skeletons, last_skeleton][-repeats * cycle_length :]
         is_repeated = recent_skeletons == recent_skeletons[:cycle_length] * repeats
         return cycle_length if is_repeated else 0

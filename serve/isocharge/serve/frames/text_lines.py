@@ -437,7 +437,7 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
     """
     starts = [start for start, name in zip(line.starts, line.names, strict=True) if not name]
     separator = _separator(header)  # None: blanks
-    line_separator = "\t" if "\t" in line.text else _separator(line.skeleton.replace("\t", ""))
+    line_separator = "\t" if "\t" in line.text else _separator(line.skeleton.removesuffix(_CODES["end"]))
     if separator is None and line_separator is not None:
         return ()
     columns = [column for column in header.split(separator) if column.strip()]

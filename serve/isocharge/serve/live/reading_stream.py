@@ -34,7 +34,10 @@ MAX_CHANNEL_DIGITS = 4
 BYTES_TO_RECOGNISE = 8192
 """If a stream contains no intact frame in more than this number of bytes, an error is raised."""
 
-_UNIT = re.compile(rf"(?:_({(units := '|'.join(('pC', *OTHER_UNITS['pC'])))})|\s*[\[(]\s*({units})\s*[\])])$")
+_UNITS = "|".join(["pC", *OTHER_UNITS["pC"]])
+
+_UNIT = re.compile(rf"(?:_({_UNITS})|\s*[\[(]\s*({_UNITS})\s*[\])])$")
+"""Unit at the end of the name of a channel, such as `_nC` or `[nC]`."""
 
 
 class ChannelPicker:
