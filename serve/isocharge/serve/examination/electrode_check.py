@@ -402,7 +402,8 @@ class _PressReader:
             if largest_total == 0.0:
                 quiet = self._quiet_level(block)
                 if quiet is not None and total_change <= max(self._released_change, CHANGE_SIGMAS * float(noise.sum())):
-                    self._rest = rest_level, noise = quiet
+                    rest_level, noise = quiet
+                    self._rest = quiet
                     self._released_change = 0.0
                     continue
                 is_large = bool(np.any(np.abs(change) > CHANGE_SIGMAS * noise))  # the noise at rest, not of this block

@@ -42,7 +42,7 @@ class BoardFindings:
         unused_channels: Names of the other channels.
         device: Settings of the board.
         electrodes: Electrodes of the model; empty for any model.
-        unit: Unit of the channels: "pC", "counts" or "V".
+        unit: Unit of the channels: "pC", "counts", "V", or a unit in their names, such as "nC".
         held_press: Press that was held during the check; None if no press was held.
         touch_sentence: Sentence about a touch of the film, which should be at rest; empty if there was no touch.
         uses_telnet: Whether more bytes are frames without the escapes of the telnet protocol.

@@ -50,7 +50,8 @@ class Examination:
         lost: Number of lost frames according to the frame numbers; None if frames have no numbers.
         repeated: Number of repeated frames according to the frame numbers; None if frames have no numbers.
         device_clock: Whether the frames contain the time of a clock of the device.
-        unit: Unit of the channels: "pC", or "counts" or "V" if the charge of one unit is not known.
+        unit: Unit of the channels: "pC", or "counts", "V" or a unit in their names, such as "nC", if the charge of one
+            unit is not known.
         channels: Health of each channel that is used; empty without frames.
         unused: Channels that no electrode uses.
         held: Sentence about a press that was held during the check; empty if there was none.
@@ -301,7 +302,7 @@ def _touch_sentence(
         device: Settings of the board, with its gain.
         electrode_at_position: Name of the electrode by the position of its channel in the frame.
         held_press: The held press; None if there was none.
-        unit: Unit of the channels: "pC", "counts" or "V".
+        unit: Unit of the channels: "pC", "counts", "V", or a unit in their names, such as "nC".
     """
     if not capture.frames or not electrode_at_position:
         return ""

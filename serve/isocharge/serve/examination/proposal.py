@@ -212,21 +212,20 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
     Returns:
         Position of the channel in the frame by the name of the electrode; empty if there are too few channels.
     """
-    frame = capture.frames[-1]
     names = capture.names
+    candidates = _varying_channels(values)
     if not electrodes:
         # Without a model, use the names in the channels if they are single letters. Otherwise use A, B, C, ...
-        letters = tuple(electrode_of(names[position]).upper() for position in _varying_channels(values))
+        letters = tuple(electrode_of(names[position]).upper() for position in candidates)
         electrodes = letters if set(letters) <= set(ELECTRODES) else tuple(ELECTRODES[: len(letters)])
     try:
         # A unit in the names does not matter, because the gain is requested if it is missing.
-        named_positions = ChannelPicker(electrodes, {}, "the model", has_gain=True).named_indices(frame)
+        named_positions = ChannelPicker(electrodes, {}, "the model", has_gain=True).named_indices(capture.frames[-1])
     except ChargeError:  # the names are nearly those of electrodes, which is reported later
         return {}
     if named_positions is not None:
         return dict(zip(electrodes, named_positions, strict=True))
 
-    candidates = _varying_channels(values)
     has_channel_for_each = len(names) == len(electrodes)
     if len(candidates) < len(electrodes) and has_channel_for_each:
         candidates = list(range(len(names)))  # keeps a channel that never changes, which is reported later
