@@ -419,7 +419,7 @@ def test_start_page_links_each_model_to_its_card(ask, store):
         assert body.startswith(b"# The linear film")
     assert all(f"<code>{name}</code>" in page for name in ("contact", "flags"))
     (store.get("linear").model.folder / "card.md").unlink()
-    assert refusal(ask("GET", "/v2/models/linear/card"))[0] == 404
+    assert refusal(ask("GET", "/v2/models/linear/card"))[1].startswith("linear/2: this model has no card")
     store.unload("linear")
     assert "No model is loaded" in ask("GET", "/")[2].decode()
 

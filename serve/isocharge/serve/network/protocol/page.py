@@ -226,4 +226,4 @@ def card(model: Model) -> str:
     try:
         return read_whole(path, MAX_CARD_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ModelNotFound(f"{model.folder.name}: this model has no card that can be read ({error})") from error
+        raise ModelNotFound(f"{model.metadata.label}: this model has no card that can be read ({error})") from error
