@@ -75,6 +75,7 @@ class Layout:
     """Arrangement of the values of a frame in one line, or in a cycle of several lines.
 
     Attributes:
+        example: One of the lines, with which headers are compared.
         skeletons: Text between the numbers of each line of a frame.
         names: Names of all values; empty for a value without a name.
         unnamed: Indices of the values that have no names in the lines. A header or a device file may name them.
@@ -277,7 +278,8 @@ class TextParser(DelimitedParser):
         Args:
             repeats: Number of equal cycles that are needed.
         """
-        *earlier_skeletons, last_skeleton = [skeleton for _, skeleton, _ in self._collected_lines]
+        skeletons = [skeleton for _, skeleton, _ in self._collected_lines]
+        *earlier_skeletons, last_skeleton = skeletons
         if last_skeleton not in earlier_skeletons:
             return 0
 
@@ -286,7 +288,7 @@ class TextParser(DelimitedParser):
         cycle_length = latest_skeletons_first.index(last_skeleton) + 1
 
         # Compare the last lines with repetitions of the first cycle among them.
-        recent_skeletons = [*earlier_skeletons, last_skeleton][-repeats * cycle_length :]
+        recent_skeletons = skeletons[-repeats * cycle_length :]
         is_repeated = recent_skeletons == recent_skeletons[:cycle_length] * repeats
         return cycle_length if is_repeated else 0
 

@@ -108,7 +108,7 @@ class DeviceClock:
         elapsed_s = self._enter_chunk(chunk)
         share_s = 0.0 if is_first_chunk else elapsed_s / len(t_us)
         times = []
-        for n_later, reading_us in zip(range(len(t_us) - 1, -1, -1), t_us, strict=True):
+        for n_later, reading_us in zip(reversed(range(len(t_us))), t_us, strict=True):
             if reading_us is None:
                 before_arrival_s = n_later * share_s
                 clock_s = self._monotonic_s - before_arrival_s
