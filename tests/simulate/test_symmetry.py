@@ -96,7 +96,7 @@ def test_mirrored_press_has_mirrored_charges(probe, film):
 
 SCALES = {
     "smaller and softer": (0.2, 1e-3),
-    "other units": (1e3, 1e-6),  # forces stay in newtons
+    "larger and stiffer": (10.0, 1e2),
 }
 
 

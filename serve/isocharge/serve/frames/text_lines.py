@@ -287,7 +287,7 @@ def _names(tokens: list[_Token]) -> list[str]:
     if len(channels) > 1 and named == channels[:1] and names[named[0]] != SEQ:
         names[named[0]] = ""
     if tokens and tokens[0].content == ">" and len(names) == 2:  # `>name:time:value`
-        names = [_NAMES_OF_TIMES["uptime"], next(token.content for token in tokens if token.kind == "key")]
+        names = [_NAMES_OF_TIMES["uptime"], next((token.content for token in tokens if token.kind == "key"), "")]
     return names
 
 

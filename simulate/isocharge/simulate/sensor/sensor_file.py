@@ -294,12 +294,12 @@ def film_to_dict(film: Film) -> dict[str, Any]:
         "oval_axis_deg": tidy(float(np.rad2deg(film.oval_axis))),
         "back_volume_mm3": None if film.back_volume is None else tidy(film.back_volume),
         "static_pressure_Pa": tidy(film.static_pressure * PASCAL_PER_MPA),
-        "ring_expansion_ppm_per_K": tidy(PPM * film.ring_expansion),
     }
     default_of_key: dict[str, Any] = {field.name: field.default for field in msgspec.structs.fields(FilmTable)}
     if film.expansion is not None:
         optional["expansion_ppm_per_K"] = [tidy(PPM * coefficient) for coefficient in film.expansion]
         del default_of_key["ring_expansion_ppm_per_K"]  # a film that expands is always written with its ring
+    optional["ring_expansion_ppm_per_K"] = tidy(PPM * film.ring_expansion)
     return {
         "radius_mm": tidy(film.radius),
         "thickness_um": tidy(film.thickness * 1e3),

@@ -282,7 +282,7 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
     if is_outside.any():
         first_outside = np.argmax(is_outside)
         x, y = points[first_outside]
-        raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {rim_distance[first_outside]:.4g} mm")
+        raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {film.radius:.4g} mm")
     return equilibrium.mesh.locate(_to_press_frame(equilibrium, points))
 
 
