@@ -367,14 +367,15 @@ class _PressReader:
         Raises:
             PressCheckError: If no press begins and ends in time, in `PRESS_ATTEMPTS` attempts.
         """
-        errors = []
+        errors: list[PressCheckError] = []
         for attempt in range(PRESS_ATTEMPTS):
+            if errors:
+                self._ask(str(errors[-1]))
             if attempt == PRESS_ATTEMPTS - 1:
                 self._rest = None  # a press may have been taken for the rest
             try:
                 return self._wait_for_press(electrode)
             except PressCheckError as error:
-                self._ask(str(error))
                 errors.append(error)
         raise errors[0]
 
