@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SensorError
-from isocharge.simulate import Calibration, Circle, Electrode, Piezo, Sensor, load_sensor, press, touch_charge
+from isocharge.simulate import Calibration, Circle, Electrode, Film, Piezo, Sensor, load_sensor, press, touch_charge
 
 SQUARE = Electrode.of_square("D", (0.0, 0.0), 3.0)
 TRACED = SQUARE.with_trace(((0.0, 0.0), (9.0, 0.0), (9.0, 5.0)), 0.5)
@@ -91,6 +91,10 @@ def test_invalid_electrodes_raise_error(three, corners, message):
         (
             {"electrodes": (Electrode.of_square("C", (40.0, 25.0), 3.0),)},
             r"'C' lies outside the film: centre \(40\.0, 25\.0\) mm, half side 1\.5 mm, film radius 45\.0 mm$",
+        ),
+        (
+            {"film": Film(45.0, 0.025, 3000.0, 0.34, oval=0.05), "calibration": Calibration(shift=(0.0, -31.5))},
+            r"'A' lies outside the film: centre \(0\.0, -41\.5\) mm, half side 1\.5 mm, film radius 42\.75 mm$",
         ),
         ({"calibration": Calibration(shift=(0.0, -35.0))}, r"'A' lies outside the film: centre \(0\.0, -45\.0\) mm"),
         ({"calibration": Calibration(shift=(np.nan, 0.0))}, r"'A' lies outside the film: centre \(nan, -10\.0\) mm"),

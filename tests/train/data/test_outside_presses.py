@@ -55,4 +55,5 @@ def test_unnoticed_shares_are_those_of_the_places():
 def test_a_narrow_ring_or_few_presses_leave_no_presses_outside():
     assert OutsidePresses.of(Domain(10.0, FORCES_N), INSIDE) is None
     assert OutsidePresses.of(Domain(39.5, FORCES_N), INSIDE, presses(16_000, 39.5, 40.0)) is None
-    assert OutsidePresses.of(Domain(10.0, FORCES_N), INSIDE, OUTSIDE[:10]) is None
+    for count in (1, 10):
+        assert OutsidePresses.of(Domain(10.0, FORCES_N), INSIDE, OUTSIDE[:count]) is None

@@ -42,13 +42,16 @@ NODE_COUNT = NodeCount(distances=10, forces=4)
 
 def outermost_distance(film: Film, probe: Probe) -> float:
     """Return the largest distance of a press from the centre (mm) for which the coarse map is valid; see `RIM_GAP`."""
-    return (1.0 - abs(film.oval)) * film.radius - (1.0 + RIM_GAP) * probe.reach
+    return film.inner_radius - (1.0 + RIM_GAP) * probe.reach
 
 
 def whole_film_map(
     sensor: Sensor, probe: Probe, force_range: tuple[float, float], *, executor: Executor | None = None
 ) -> ForwardMap:
-    """Build a coarse forward map of nearly the whole film. The solves take about 3 s of CPU time.
+    """Build a coarse forward map of nearly the whole film.
+
+    The solves of an axisymmetric film take about 3 s of CPU time. Any other film takes much longer, because it is
+    solved in several directions, and meshed completely.
 
     The error of the interpolation is not computed. The attribute `error` of the map is the constant `COARSE_ERROR`.
 

@@ -34,7 +34,7 @@ from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 MAX_SEARCH_RADIUS = 0.9
-"""Largest search radius in units of the film radius, dimensionless.
+"""Largest search radius in units of `Film.inner_radius`, dimensionless.
 
 A forward map with a larger radius needs a finer mesh.
 """
@@ -346,7 +346,7 @@ def search_radius(sensor: Sensor, probe: Probe) -> float:
     """
     corners = [sensor.calibration.place(np.array(electrode.corners)) for electrode in sensor.electrodes]
     outermost = float(np.hypot(*np.concatenate(corners).T).max())
-    return min(outermost, MAX_SEARCH_RADIUS * sensor.film.radius - probe.reach)
+    return min(outermost, MAX_SEARCH_RADIUS * sensor.film.inner_radius - probe.reach)
 
 
 def map_to_search(

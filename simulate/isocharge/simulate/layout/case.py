@@ -319,7 +319,7 @@ class DesignCase:
         half_side = 0.5 * self.square_side
         corner_x, corner_y = (np.abs(positions) + half_side).T
         corner_distance = np.hypot(corner_x, corner_y)
-        clearances = [self.sensor.film.radius - self.rim - corner_distance]
+        clearances = [self.sensor.film.inner_radius - self.rim - corner_distance]
 
         for electrode in self.kept_electrodes:
             lower_left_corners, upper_right_corners = electrode.boxes

@@ -108,9 +108,8 @@ def random_layouts(case: DesignCase) -> tuple[Array, list[Integers]]:
         InputError: If the squares do not fit on the grid.
     """
     # The grid extends to the distance up to which a square is useful, but not into the rim of the film.
-    film_radius = case.sensor.film.radius
-    useful_radius = case.radius + GRID_EXTENT * film_radius
-    allowed_radius = film_radius - case.rim - 0.5 * case.square_side
+    useful_radius = case.radius + GRID_EXTENT * case.sensor.film.radius
+    allowed_radius = case.sensor.film.inner_radius - case.rim - 0.5 * case.square_side
     grid_radius = min(useful_radius, allowed_radius)
     grid = square_grid(grid_radius, grid_radius / GRID_STEPS)
     allowed_grid = grid[case.clearance(grid) >= 0.0]

@@ -107,6 +107,11 @@ class Film:
     expansion: tuple[float, float] | None = None
     ring_expansion: float = ALUMINIUM_EXPANSION
 
+    @property
+    def inner_radius(self) -> float:
+        """Radius of the largest circle around the centre of the film that does not cross the clamp, mm."""
+        return self.radius * (1.0 - abs(self.oval))
+
     def rim_distance(self, angle: Array) -> Array:
         """Return the distance of the rim from the centre of the film in given directions, mm.
 

@@ -463,14 +463,15 @@ def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -
 
     Args:
         electrode: Electrode at its nominal position.
-        film: Film with the radius of the rim.
+        film: Film with the distance of its rim.
         calibration: Shift and rotation of the electrodes on the film.
 
     Raises:
         SensorError: If a part of the electrode lies on or beyond the rim.
     """
     placed_corners = calibration.place(np.concatenate(electrode.collecting_polygons))  # shape (n, 2), mm
-    if np.linalg.norm(placed_corners, axis=1).max() < film.radius:
+    corner_angle = np.arctan2(placed_corners[:, 1], placed_corners[:, 0])
+    if (np.linalg.norm(placed_corners, axis=1) < film.rim_distance(corner_angle)).all():
         return
 
     # Describe the position and the size of the electrode in the error message.
@@ -483,9 +484,10 @@ def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -
         farthest = np.linalg.norm(placed_corners - centre, axis=1).max()
         extent = f"corners up to {_short_text(farthest)} mm from it"
     hint = "; end its traces before the rim" if electrode.more else ""
+    rim_distance = float(film.rim_distance(np.arctan2(y, x)))  # in the direction of the electrode
     raise SensorError(
         f"electrode {electrode.name!r} lies outside the film: centre ({_short_text(x)}, {_short_text(y)}) mm, "
-        f"{extent}, film radius {_short_text(film.radius)} mm{hint}"
+        f"{extent}, film radius {_short_text(rim_distance)} mm{hint}"
     )
 
 

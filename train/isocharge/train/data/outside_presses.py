@@ -73,7 +73,7 @@ class OutsidePresses:
         beyond = presses[presses.distance > domain.radius]
         beyond = beyond[rng.permutation(len(beyond))]
         pool = beyond
-        if outside is not None:
+        if outside is not None and len(outside) >= N_NEIGHBOURS:  # the density of fewer presses is unknown
             # Of the presses beyond the working area, choose as many as make the density of both groups equal.
             inner, outer = outside.distance.min(), outside.distance.max()
             density = len(outside) / (outer**2 - inner**2)
