@@ -4,7 +4,7 @@ For each film and probe, the benchmark builds a forward map with two workers, co
 and compares some of them with direct solves. The error of a charge is relative to the directly solved charge, or to a
 tenth of the largest charge of the press if this is larger.
 
-    python tests/benchmarks/bench_uneven_films.py [--probe circle:1.0] [--presses 20]
+    python tests/benchmarks/bench_uneven_films.py [--film "oval 0.01"] [--probe circle:1.0] [--presses 20]
 """
 
 import argparse
@@ -48,6 +48,7 @@ def direct_errors(forward_map: ForwardMap, sensor: Sensor, count: int) -> np.nda
 def main() -> None:
     """Print one row for each film and probe."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--film", action="append", choices=FILMS, help="one of the films; by default all")
     parser.add_argument("--probe", action="append", choices=PROBES, help="one of the probes; by default all")
     parser.add_argument("--presses", type=int, default=20, help="presses that are compared with direct solves")
     options = parser.parse_args()
@@ -56,8 +57,8 @@ def main() -> None:
     sweep = Sweep(RADIUS_mm, FORCES_N, samples=SAMPLES, orientation="random")
     print(f"{'film':40}{'probe':16}{'solves':>8}{'map, s':>8}{'charges, s':>12}{'worst error, %':>16}{'rms, %':>8}")
     with ProcessPoolExecutor(2) as executor:
-        for name, changes in FILMS.items():
-            sensor = replace(built_in, film=replace(built_in.film, **changes))
+        for name in options.film or FILMS:
+            sensor = replace(built_in, film=replace(built_in.film, **FILMS[name]))
             for notation in options.probe or PROBES:
                 probe = parse_probe(notation)
                 start = time.perf_counter()
