@@ -33,6 +33,8 @@ def ask(url, method="POST", path="/v2/models/linear/infer", body=BODY):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_server_answers_until_sigterm_or_sighup(start, number):
+    if signal.getsignal(number) == signal.SIG_IGN:  # as SIGHUP under `nohup`, which the server would inherit
+        signal.signal(number, signal.SIG_DFL)
     process = start("--port", 0, "--grpc-port", 0)
     url, grpc_url = process.stdout.readline().strip(), process.stdout.readline().strip()
     assert ask(url)[0] == 200
