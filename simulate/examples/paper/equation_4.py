@@ -210,7 +210,7 @@ def _rows_of_cubic(films: list[list[ChargeForce]]) -> list[Row]:
 def _rows_of_line(films: list[list[ChargeForce]]) -> list[Row]:
     """Return the rows about the films whose charge is linear in the force."""
     slack = [row[0] for row in films]
-    off = "; ".join(f"{film.um} {100 * film.bent:.0f} %" for film in slack)
+    line_differences = "; ".join(f"{film.um} {100 * film.bent:.0f} %" for film in slack)
     forces = FINE[FINE <= LINEAR_N + 1e-9]
     paper_percent = 100.0 * distance_from_line(forces, normalised(CUBICS[0], forces))
     exponents = "; ".join(f"{film.um} " + ", ".join(f"{film.exponent(f):.2f}" for f in SHOWN_N) for film in slack)
@@ -226,7 +226,7 @@ def _rows_of_line(films: list[list[ChargeForce]]) -> list[Row]:
         Row(
             "a thicker film is more linear",
             "linearity is enhanced, nonlinearity remains",
-            f"differences from a line up to {LINEAR_N:g} N without pretension: {off}",
+            f"differences from a line up to {LINEAR_N:g} N without pretension: {line_differences}",
             "between F^(2/3) and F^2, the exponent is 1 at a thickness of some hundred um",
         ),
         Row(
