@@ -2,6 +2,7 @@
 
 import contextlib
 import re
+import signal
 import socket
 import time
 
@@ -14,24 +15,8 @@ from isocharge.serve.network.protocol.page import page as start_page
 RATE_HZ, PRESS_S, PAUSE_S = 200.0, 1.5, 0.9
 PRESSES = [(0.0, 0.0, 1.0), (6.0, 2.0, 0.5), (-5.0, 3.0, 2.0), (2.0, -6.0, 0.2), (5.0, -3.5, 0.1)]
 
-DRAWN = """() => {
-  const film = isocharge.page.film, plan = film.plan, canvas = plan.canvas;
-  const g = canvas.getContext("2d"), { data } = g.getImageData(0, 0, canvas.width, canvas.height);
-  const lens = plan.lens ?? { x: 1e9, y: 1e9, size: 0 }, mm = plan.pixel, css = canvas.width / canvas.clientWidth;
-  let [count, x, y, left, right, top, bottom] = [0, 0, 0, Infinity, 0, Infinity, 0];
-  for (let j = 0; j < canvas.height; j++) for (let i = 0; i < canvas.width; i++) {
-    const at = 4 * (j * canvas.width + i);
-    if (data[at] < 150 || data[at + 2] > 90 || data[at + 1] > 150) continue;
-    const [u, v] = [(i - canvas.width / 2) * mm, (canvas.height / 2 - j) * mm];
-    if (Math.hypot(u - lens.x, v - lens.y) < 1.05 * lens.size) continue;
-    count++; x += i; y += j;
-    [left, right, top, bottom] = [Math.min(left, i), Math.max(right, i), Math.min(top, j), Math.max(bottom, j)];
-  }
-  return { kind: film.drawnKind, count,
-    x: (x / count + 0.5 - canvas.width / 2) * mm, y: (canvas.height / 2 - y / count - 0.5) * mm,
-    width: (right - left + 1) / css, height: (bottom - top + 1) / css, shown: [".x b", ".y b", ".force b"].map(
-      (name) => Number(film.find(name).textContent.replace("\\u2212", "-"))) };
-}"""
+SHOWN = """[".x b", ".y b", ".force b"].map(
+  (name) => Number(isocharge.page.film.find(name).textContent.replace("\\u2212", "-")))"""
 
 LATENCY = """() => {
   const { film } = isocharge.page;
@@ -42,15 +27,22 @@ LATENCY = """() => {
 
 
 @pytest.fixture
-def presses(film):
+def sensor(film):
+    """A sensor that nothing touches, so that the tare at the start of a stream is right however late the stream starts."""
+    nowhere = np.full(round(RATE_HZ), np.nan)
+    with VirtualSensor(film.charges, Script(nowhere, nowhere, np.zeros_like(nowhere), RATE_HZ)) as sensor:
+        yield sensor
+
+
+@pytest.fixture
+def presses():
     """Presses that stand still, with pauses that are long enough for a tare, played again and again."""
     pause, press = np.zeros(round(PAUSE_S * RATE_HZ)), np.ones(round(PRESS_S * RATE_HZ))
     force_N = np.concatenate([np.concatenate([pause, force * press]) for _, _, force in PRESSES])
     places = [
         np.concatenate([np.concatenate([pause * np.nan, place[axis] * press]) for place in PRESSES]) for axis in (0, 1)
     ]
-    with VirtualSensor(film.charges, Script(*places, force_N, RATE_HZ)) as sensor:
-        yield sensor
+    return Script(*places, force_N, RATE_HZ)
 
 
 @pytest.fixture
@@ -61,13 +53,13 @@ def free_port():
 
 
 @pytest.fixture
-def start_stream(presses, models, free_port, start_command, tmp_path, monkeypatch):
+def start_stream(sensor, models, free_port, start_command, tmp_path, monkeypatch):
     """Start `serve stream --live`, on the same port again and again."""
     monkeypatch.chdir(tmp_path)
 
     def start():
         process = start_command(
-            *("serve", "stream", "linear", "--models", models, "--port", presses.url, "--output", "none"),
+            *("serve", "stream", "linear", "--models", models, "--port", sensor.url, "--output", "none"),
             *("--live", f"127.0.0.1:{free_port}"),
         )
         while "live page" not in (line := process.stderr.readline()):
@@ -98,18 +90,23 @@ def open_page(chromium, free_port):
 
 
 def wait_for(page, expression, timeout_s=40.0):
-    """As `wait_for_function`, which the page's own policy forbids."""
+    """Return the expression's first true value, as `wait_for_function` does, which the page's own policy forbids."""
     end = time.monotonic() + timeout_s
-    while not page.evaluate(expression):
+    while not (value := page.evaluate(expression)):
         assert time.monotonic() < end, expression
         page.wait_for_timeout(20)
+    return value
 
 
-def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(start_stream, open_page, tmp_path):
+def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(
+    start_stream, open_page, sensor, film, presses, tmp_path
+):
     start_stream()
     page = open_page()
-    wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
-    x, y, force = page.evaluate(DRAWN)["shown"]
+    wait_for(page, "isocharge.page.film.drawnKind === 'none'")
+    sensor.use(film.charges, presses)
+    # The kind and the numbers are read at once: a press that ends in between takes its numbers away.
+    x, y, force = wait_for(page, f"isocharge.page.film.drawnKind === 'contact' && {SHOWN}")
     assert min(np.hypot(px - x, py - y) + abs(pressed - force) for px, py, pressed in PRESSES) < 0.3
     latency = page.evaluate(LATENCY)
     assert latency == "6 ms"  # the board's clock is 56 ms ahead
@@ -141,6 +138,18 @@ def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(start_st
         wait_for(page, f"document.documentElement.scrollWidth === {width}")
         plan = page.locator(".plan canvas").bounding_box()
         assert plan["y"] + plan["height"] <= height  # the film is seen without scrolling
+
+
+def test_live_page_takes_the_numbers_away_when_the_frames_stop(start_stream, open_page, sensor, film):
+    process = start_stream()
+    page = open_page()
+    wait_for(page, "isocharge.page.film.drawnKind === 'none'")
+    one = np.ones(round(RATE_HZ))
+    sensor.use(film.charges, Script(2.0 * one, one, one, RATE_HZ))
+    wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
+    process.send_signal(signal.SIGSTOP)
+    shown = wait_for(page, f"isocharge.page.film.drawnKind === 'silent' && {{shown: {SHOWN}}}")["shown"]
+    assert np.all(np.isnan(shown))
 
 
 def test_start_page_shows_all_columns_on_a_desktop_and_on_a_phone(chromium, store):

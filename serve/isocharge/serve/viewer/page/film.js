@@ -76,10 +76,13 @@ export class FilmView {
   draw(nowMs, heavy) {
     const kind = this.kind(nowMs), { history } = this, sample = history.latest;
     const word = { tare: "taring: leave the film alone", none: sample ? "no touch" : "", silent: "no data", ended: "ended" }[kind];
-    if (this.isNew || kind !== this.drawnKind) this.plan.draw({ sample, kind, trail: history.trail, now: sample?.t ?? 0, word });
+    if (this.isNew || kind !== this.drawnKind) {
+      this.plan.draw({ sample, kind, trail: history.trail, now: sample?.t ?? 0, word });
+      this.showValues(sample, kind);
+    }
     if (heavy.relief) this.relief.draw({ sample, kind });
     if (heavy.traces && this.isNew) this.traces.draw();
-    if (this.isNew) { this.showValues(sample, kind); this.noteAge(sample, nowMs); }
+    if (this.isNew) this.noteAge(sample, nowMs);
     this.isNew = heavy.traces ? false : this.isNew;
     if (kind !== this.spokenKind && nowMs - this.spokenMs > SPOKEN_MS) this.showSlow(nowMs);
     this.drawnKind = kind;
