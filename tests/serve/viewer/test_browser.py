@@ -28,7 +28,7 @@ LATENCY = """() => {
 
 @pytest.fixture
 def sensor(film):
-    """A sensor that nothing touches, so that the tare at the start of a stream is right however late the stream starts."""
+    """A sensor that nothing touches, so that the first tare is right however late the stream starts."""
     nowhere = np.full(round(RATE_HZ), np.nan)
     with VirtualSensor(film.charges, Script(nowhere, nowhere, np.zeros_like(nowhere), RATE_HZ)) as sensor:
         yield sensor
