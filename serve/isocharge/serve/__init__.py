@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from isocharge.common.measured_presses import MeasuredPresses, read_presses, write_presses
 from isocharge.common.versions import version_attribute
+from isocharge.serve.asgi import asgi_app
 from isocharge.serve.examination.port_check import Examination, examine
 from isocharge.serve.frames.binary import BinaryParser, encode_frame
 from isocharge.serve.frames.formats import AutoParser
@@ -69,6 +70,7 @@ __all__ = [
     "TouchStream",
     "Validity",
     "VirtualSensor",
+    "asgi_app",
     "check_golden",
     "check_presses",
     "device_from_table",

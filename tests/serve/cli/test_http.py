@@ -31,10 +31,26 @@ def ask(url, method="POST", path="/v2/models/linear/infer", body=BODY):
     return answer.status, content
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_server_answers_until_sigterm_or_sighup(start, number):
-    if signal.getsignal(number) == signal.SIG_IGN:  # as SIGHUP under `nohup`, which the server would inherit
-        signal.signal(number, signal.SIG_DFL)
+def test_sighup_loads_all_models_again(start, film, tmp_path):
+    """A version that cannot be loaded is reported, and the other models are still loaded."""
+    film.write(tmp_path)
+    process = start("--port", 0, folder=tmp_path)
+    url = process.stdout.readline().strip()
+    film.write(tmp_path, version=2)
+    film.write(tmp_path, name="other")
+    (film.write(tmp_path, name="broken") / "golden.json").unlink()
+    process.send_signal(signal.SIGHUP)
+    lines = [process.stderr.readline() for _ in range(3)]
+    assert lines[0] == "serving linear/1; Ctrl-C stops\n"
+    assert lines[1].startswith(f"refused: {tmp_path}/broken/1/golden.json: missing")
+    assert lines[2] == "serving linear/1, linear/2, other/1; Ctrl-C stops\n"
+    assert ask(url)[1]["model_version"] == "2"
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=30) == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_server_answers_until_sigterm(start, number):
     process = start("--port", 0, "--grpc-port", 0)
     url, grpc_url = process.stdout.readline().strip(), process.stdout.readline().strip()
     assert ask(url)[0] == 200

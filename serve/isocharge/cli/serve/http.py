@@ -2,8 +2,10 @@
 
 import logging
 import os
+import signal
+import threading
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -18,13 +20,14 @@ from isocharge.cli.shared.live_page import (
     given_tls,
     given_token,
 )
-from isocharge.cli.shared.terminal import announce, say, write_stderr
+from isocharge.cli.shared.terminal import announce, on_signal, say, unless_hung_up, write_stderr
+from isocharge.common.errors import IsochargeError
 from isocharge.common.extras import require
 from isocharge.common.writer_queue import WriterQueue
 from isocharge.serve.network.address import Address, Tls, Token, check_exposure
 from isocharge.serve.network.browser_check import BrowserCheck
-from isocharge.serve.network.http import HttpServer
-from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.http import Application, HttpServer
+from isocharge.serve.network.model_store import ModelStore, open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.traffic import RequestLog, Traffic
 
@@ -68,7 +71,7 @@ def http_command(
 
     Charges are in pC, positions in mm, and forces in N. Prints the address as soon as the server answers requests. The
     server has a page for people at `/`, a description for programs at `/openapi.json`, and metrics for Prometheus at
-    `/metrics`. After Ctrl-C, the server answers all requests that have begun, and stops.
+    `/metrics`. SIGHUP loads all models again. After Ctrl-C, the server answers all requests that have begun, and stops.
 
     Example: isocharge serve http --port 8000
     """
@@ -90,14 +93,46 @@ def http_command(
             _report(traffic, "warning", "refused", reason)
         scheme = "https" if tls else "http"
         handler = Handler(store, traffic=traffic, token=secret, browser_check=browser_check, scheme=scheme)
-        server = HttpServer(handler, address, tls=tls)
+        server = HttpServer(Application(handler), address, handler.limits, traffic, tls=tls)
         with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:  # empty without gRPC
-            labels = [loaded.metadata.label for loaded in store.loaded_versions()]
-            _report(traffic, "info", "serving", ", ".join(labels))
+            _report(traffic, "info", "serving", _labels(store))
             announce(server.url)
             if grpc_url:
                 announce(grpc_url)
-            server.run()
+            with _signals(server, store, traffic):
+                server.run()
+
+
+def _labels(store: ModelStore) -> str:
+    """Return the labels of all loaded models, separated by commas."""
+    return ", ".join(loaded.metadata.label for loaded in store.loaded_versions())
+
+
+@contextmanager
+def _signals(server: HttpServer, store: ModelStore, traffic: Traffic) -> Iterator[None]:
+    """Context manager in which SIGTERM and Ctrl-C stop the server, and SIGHUP loads all models again.
+
+    If SIGHUP arrives because the terminal of the command was closed, the server stops, too.
+    """
+
+    def load_all() -> None:
+        threading.Thread(target=_load_all, args=(store, traffic), name="load").start()
+
+    with ExitStack() as stack:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            stack.enter_context(on_signal(number, server.stop))
+        stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(load_all, server.stop)))
+        yield
+
+
+def _load_all(store: ModelStore, traffic: Traffic) -> None:
+    """Load all models of the repositories again. Models that cannot be loaded are reported, and stay as they were."""
+    for name in sorted({row["name"] for row in store.index()}):
+        try:
+            store.load(name)
+        except IsochargeError as error:
+            _report(traffic, "warning", "refused", str(error))
+    _report(traffic, "info", "serving", _labels(store))
 
 
 @contextmanager

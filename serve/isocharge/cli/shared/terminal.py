@@ -230,7 +230,16 @@ def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[Non
         signal.signal(number, previous_handler)
 
 
-def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
+def _interrupt() -> None:
+    """Stop the command as Ctrl-C does.
+
+    Raises:
+        KeyboardInterrupt: Always.
+    """
+    raise KeyboardInterrupt
+
+
+def unless_hung_up(act: Callable[[], object], stop: Callable[[], object] = _interrupt) -> Callable[[], object]:
     """Return a handler of SIGHUP that calls `act`, or stops the command if its terminal has been closed.
 
     The user sends SIGHUP to request the action. The system sends the same signal when the terminal is closed. If a
@@ -238,17 +247,18 @@ def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
     closed.
 
     Args:
-        act: Function that the handler calls while the terminal is open. If the terminal has been closed, the handler
-            raises KeyboardInterrupt instead, as Ctrl-C does.
+        act: Function that the handler calls while the terminal is open.
+        stop: Function that the handler calls if the terminal has been closed. By default, it raises KeyboardInterrupt.
     """
     terminals = [descriptor for descriptor in STANDARD_DESCRIPTORS if os.isatty(descriptor)]
 
     def act_or_stop() -> None:
         """Call `act`, or stop the command if its terminal has been closed."""
         is_open = all(map(os.isatty, terminals))
-        if not is_open:
-            raise KeyboardInterrupt
-        act()
+        if is_open:
+            act()
+        else:
+            stop()
 
     return act_or_stop
 

@@ -2,14 +2,11 @@
 
 import http.client
 import json
-import os
 import re
-import resource
 import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
-from pathlib import Path
 from threading import Event
 
 import numpy as np
@@ -148,15 +145,13 @@ def test_headers_above_the_limit_are_refused(limited, head, end, piece):
 def test_body_above_the_limit_is_refused(limited):
     """The first body states its length, the second body has no end, and the others state lengths that are too large."""
     server = limited(body_bytes=1000, body_seconds=0.3)
-    status, error = refused(exchange(server, infer(LAST, bytes(1001))))
-    assert status == 413
-    assert "at most 1000 bytes" in error
+    assert b"at most 1000 bytes" in exchange(server, infer(LAST, bytes(1001)))
     chunks = b"100\r\n" + bytes(256) + b"\r\n"
-    endless = b"POST / HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n" + chunks * 10_000
-    assert set(statuses(exchange(server, endless))) <= {413}  # no answer arrives if the connection was reset
+    endless = b"POST /v2/repository/index HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n" + chunks * 10_000
+    assert set(statuses(exchange(server, endless))) <= {413, 408}  # 408 if the client sends longer than 0.3 s
     for declared in (10**6, 10**18, 10**30):
         head = b"POST / HTTP/1.1\r\nContent-Length: %d\r\n\r\n{" % declared
-        assert refused(exchange(server, head))[0] in (400, 408, 413)
+        assert refused(exchange(server, head))[0] in (400, 408)
 
 
 @pytest.mark.parametrize(
@@ -172,7 +167,7 @@ def test_body_above_the_limit_is_refused(limited):
 def test_incomplete_request_gets_408_after_the_deadline(limited, sent, limits, status):
     data = exchange(limited(**limits), sent)
     assert statuses(data) == status
-    assert status != [408] or "waited too long for the end of the" in refused(data)[1]
+    assert status != [408] or "waited too long for the rest of the request" in refused(data)[1]
 
 
 def test_slow_bytes_do_not_extend_the_deadline(limited):
@@ -200,25 +195,6 @@ def test_slow_clients_delay_no_other_client(limited):
         assert [is_well(server) for _ in range(5)] == [True] * 5
 
 
-def test_idle_connections_that_take_all_descriptors_are_replaced(server):
-    with ExitStack() as stack:
-        for _ in range(5):
-            stack.enter_context(connect(server))
-        wait_until(lambda: len(server._connections) == 5)
-        clients = [stack.enter_context(socket.socket()) for _ in range(4)]
-        limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-        stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, limits)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (clients[-1].fileno() + 1, limits[1]))
-        with suppress(OSError):
-            while True:
-                stack.callback(os.close, os.dup(0))
-        for client in clients:
-            client.settimeout(10.0)
-            client.connect(server._socket.getsockname())
-            client.sendall(infer())
-            assert statuses(client.recv(1000)) == [200]
-
-
 def test_client_that_does_not_read_is_disconnected(limited):
     server = limited(body_seconds=0.3)
     body = json.dumps({"inputs": [TENSOR | {"shape": [4096, 3], "data": TENSOR["data"] * 4096}]}).encode()
@@ -227,53 +203,45 @@ def test_client_that_does_not_read_is_disconnected(limited):
     assert is_well(server)
 
 
-@pytest.fixture
-def unread(limited):
-    """Return a connection whose client reads no answers and has 0.3 s, and the same connection in the server."""
-    server = limited(header_seconds=0.3, body_seconds=0.3, idle_seconds=0.3)
-    with connect(server) as connection:
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        wait_until(lambda: server._connections)
-        (served,) = server._connections
-        served._transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
-        yield connection, served
-
-
-def test_load_does_not_remove_the_deadline_of_a_client_that_does_not_read(unread):
-    """The load arrives in the same piece as the requests whose answers are not read."""
-    connection, served = unread
-    requests = b"GET /openapi.json HTTP/1.1\r\n\r\n" * 100 + LOAD
-    assert len(requests) < 4096
-    connection.sendall(requests)
-    wait_until(lambda: served not in served._connections)
-
-
-def test_half_closed_client_that_does_not_read_is_disconnected(unread):
-    """The unread answers are too few to block the connection, and the next request is incomplete."""
-    connection, served = unread
-    while not served._transport.get_write_buffer_size():
-        connection.sendall(b"GET /openapi.json HTTP/1.1\r\n\r\n")
-        time.sleep(0.001)
-    connection.sendall(b"GET /v2")
-    connection.shutdown(socket.SHUT_WR)
-    wait_until(lambda: served not in served._connections)
-
-
 @pytest.mark.parametrize("protocol", ["h2c", "websocket"])
-@pytest.mark.parametrize("piece", [1 << 20, 7])
-def test_upgrade_header_is_ignored(server, protocol, piece):
-    """HTTP allows a server to ignore the header (RFC 9110, 7.8). This request and the next request are answered."""
-    upgrade = f"Connection: Upgrade, HTTP2-Settings\r\nUpgrade: {protocol}\r\nHTTP2-Settings: AAMAAABkAAQAAP__\r\n"
-    bodiless = b"GET /v2 HTTP/1.1\r\nHost: localhost\r\n%s\r\n" % upgrade.encode()
-    requests = infer(upgrade.encode()) + bodiless + infer(b"Connection: close, upgrade\r\nUpgrade: h2c\r\n")
-    assert statuses(exchange(server, requests, piece)) == [200] * 3
+def test_upgrade_of_a_request_without_body_is_ignored(server, protocol):
+    """HTTP allows a server to ignore the header (RFC 9110, 7.8). With a body, the error states what to do."""
+    upgrade = f"Connection: close, Upgrade\r\nUpgrade: {protocol}\r\n".encode()
+    assert statuses(exchange(server, b"GET /v2 HTTP/1.1\r\nHost: localhost\r\n%s\r\n" % upgrade)) == [200]
+    answer = exchange(server, infer(upgrade))
+    assert statuses(answer) == [400]
+    assert b"set the client to HTTP/1.1" in answer
 
 
-@pytest.mark.parametrize("requests", [[LOAD], [infer()], [LOAD, infer(), LOAD], [infer()] * 1000])
+@pytest.mark.parametrize("requests", [[LOAD], [infer()], [LOAD, infer(), LOAD], [infer()] * 90])
 def test_half_closed_connection_receives_its_responses(server, requests):
     with connect(server) as connection, ThreadPoolExecutor(1) as threads:
         threads.submit(lambda: (send(connection, b"".join(requests)), connection.shutdown(socket.SHUT_WR)))
         assert statuses(everything(connection)) == [200] * len(requests)
+
+
+def test_requests_that_wait_for_an_earlier_response_are_limited(server):
+    """Otherwise, a client could fill the memory with requests whose responses it does not read."""
+    answer = exchange(server, LOAD + infer() * 3000)
+    assert 429 in statuses(answer)
+    assert len(statuses(answer)) <= 102
+    assert is_well(server)
+
+
+@pytest.mark.parametrize("endless", [b"0\r\n" + b"a: b\r\n" * 9000, b"0\r\na: " + b"b" * 50_000, b"1;" + b"x" * 50_000])
+def test_trailers_and_chunk_extensions_have_the_limit_of_headers(server, endless):
+    head = b"POST %s HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n3\r\nabc\r\n" % INFER.encode()
+    with connect(server) as connection:
+        connection.sendall(head)
+        time.sleep(0.2)  # the bytes after the latest part of the body count
+        send(connection, endless)
+        assert statuses(everything(connection)) == [431]
+
+
+def test_many_small_chunks_are_one_body(server):
+    head = b"POST %s HTTP/1.1\r\nHost: localhost\r\n%sTransfer-Encoding: chunked\r\n\r\n" % (INFER.encode(), LAST)
+    chunks = b"".join(b"1\r\n%c\r\n" % byte for byte in BODY)
+    assert statuses(exchange(server, head + chunks + b"0\r\n\r\n", 100)) == [200]
 
 
 def test_expect_100_continue(server):
@@ -307,19 +275,6 @@ def slow_load(store, monkeypatch):
     monkeypatch.setattr(store, "load", lambda name: (began.set(), go_on.wait(60), load(name)))
     yield began, go_on
     go_on.set()
-
-
-@pytest.mark.parametrize("requests_before", [[], [infer()], [LOAD, infer()]])
-def test_malformed_request_is_refused_after_the_answer_to_an_earlier_load(server, slow_load, requests_before):
-    """The malformed request arrives in one piece with the load, whose answer is computed in another thread."""
-    began, go_on = slow_load
-    with connect(server) as connection:
-        connection.sendall(b"".join([LOAD, *requests_before, b"NONSENSE\r\n\r\n"]))
-        assert began.wait(30)
-        go_on.set()
-        answers = everything(connection)
-    assert statuses(answers) == [200] * (1 + len(requests_before)) + [400]
-    assert b"connection: close" in answers
 
 
 def test_loading_a_model_delays_no_other_request(server, slow_load):
@@ -362,31 +317,3 @@ def test_server_with_tls_and_token(store, start_http, tls_files, trusted, certif
         client.request("POST", INFER, BODY, {"Authorization": "Bearer sesame"})
         assert client.getresponse().read().startswith(b'{"model_name":"linear"')
     client.close()
-
-
-def open_files():
-    return len(list(Path("/proc/self/fd").iterdir()))
-
-
-def test_number_of_unfinished_tls_handshakes_is_limited(store, start_http, tls_files, trusted):
-    """The time of handshakes is limited, too. A client that finishes its handshake is still served."""
-    handler = Handler(store, ServerLimits(connections=20, header_seconds=1.0))
-    server = start_http(handler, tls=Tls(tls_files / "both.pem"))
-    hello = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"
-
-    def is_answered():
-        with trusted.wrap_socket(connect(server), server_hostname="127.0.0.1") as secure:
-            secure.sendall(infer(LAST))
-            return statuses(everything(secure)) == [200]
-
-    assert is_answered()  # the server has now opened all files that it needs
-    before = open_files()
-    with ExitStack() as stack:
-        half = [stack.enter_context(connect(server)) for _ in range(60)]
-        for number, connection in enumerate(half):
-            send(connection, hello[: number % 11])
-        assert is_answered()  # the oldest handshake is cancelled
-        wait_until(lambda: open_files() - before <= 60 + 20)
-        assert not any(b"HTTP" in everything(connection) for connection in half)
-        assert is_answered()
-    wait_until(lambda: open_files() <= before)

@@ -293,6 +293,8 @@ def _infer(request: Request) -> Response:
     responses to inferences, because the asyncio client of Triton does not decompress other responses.
     """
     loaded = request.loaded
+    if not request.body and b"upgrade" in request.headers:  # uvicorn discards the body of a request for an upgrade
+        raise RequestError("Upgrade: this server reads no body after this header; set the client to HTTP/1.1")
     header_length = request.headers.get(b"inference-header-content-length")
     # `answer_inference` calls `read` and `write_answer`, because it measures the duration of these steps.
     read = partial(read_infer, request.body, header_length, loaded, request.service.limits.batch)
