@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from isocharge.serve import (
-    Chain,
     Chunk,
     Frame,
     PressWatch,
@@ -14,9 +13,8 @@ from isocharge.serve import (
     device_from_table,
     encode_frame,
 )
-from isocharge.serve.signal_chain.chain import SignalChain
-from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.simulate import load_amplifier
+from stage_runner import StageRunner
 
 RATE_HZ = 200.0
 
@@ -34,12 +32,18 @@ def undo(measurement, charge_pC, seed, *, hum=True):
     output = measurement(charge_pC)
     gain = measurement.gain * (1 + 0.002 * rng.uniform(-1, 1, 3))
     tau = measurement.leak_time * (1 + 0.005 * rng.uniform(-1, 1, 3))
-    chain = SignalChain(Chain(gain_pC=1 / gain, limit_pC=1499.9, hum=HumRule() if hum else None, tau_s=tau), 3)
+    sections = {
+        "gain": {"pC_per_unit": dict(zip("ABC", (1 / gain).tolist(), strict=True))},
+        "saturation": {"limit_pC": 1499.9},
+        "hum": {"on": hum},
+        "leak": {"tau_s": dict(zip("ABC", tau.tolist(), strict=True))},
+    }
+    chain = StageRunner(**sections)
     charges, contact = [], []
     for k, row in enumerate(output):
         reading = chain.advance(row, k / RATE_HZ, 1 / RATE_HZ)
         charges.append(np.full(3, np.nan) if reading.charge_pC is None else reading.charge_pC)
-        contact.append(reading.contact)
+        contact.append(reading.is_contact)
     return np.array(charges), np.array(contact)
 
 
@@ -87,7 +91,7 @@ def steady_presses(level, seed, table, tau_error=0.0, press_s=1.2):
     stream, watch = ReadingStream(names, device_from_table(table, "test")), PressWatch(names)
     taken, reasons = [], []
     for k, row in enumerate(measurement(clean)):
-        for reading in stream.feed(Chunk(encode_frame(Frame(k, 5000 * k, tuple(row))), 1e9 + k / RATE_HZ, 0)):
+        for reading in stream.frames(Chunk(encode_frame(Frame(k, 5000 * k, tuple(row))), 1e9 + k / RATE_HZ, 0)):
             watched = watch.feed(reading)
             if watched.press is not None:
                 taken.append(watched.press.charge_pC)

@@ -27,6 +27,7 @@ from isocharge.serve import (
     load_model,
     read_charges,
 )
+from isocharge.serve.live.device import create_stages
 from isocharge.serve.model.charge_series import read_charges as read_charge_series
 from isocharge.serve.model.film_charges import read_film_charges
 from isocharge.serve.model.film_directions import read_film_directions
@@ -109,7 +110,7 @@ def _write(folder):
 def _load_device(path):
     device = load_device(path)
     device.parser().feed(b"\xa5\x5a123456")
-    device.chain(("A", "B", "C", "D"))
+    create_stages(device.setup(("A", "B", "C", "D")))
 
 
 def _read_charges(path):
@@ -195,7 +196,7 @@ def test_tables_with_junk(attack, model):
 
 
 def read_device(value, where):
-    device_from_table(value, where).chain(("A", "B", "C"))
+    create_stages(device_from_table(value, where).setup(("A", "B", "C")))
 
 
 @pytest.fixture

@@ -21,8 +21,10 @@ import numpy as np
 from shared import options, print_results
 
 from isocharge.serve import Contact, Predictor
+from isocharge.serve.frames.frame import Frame
+from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.tracking.contact_mixture import contact_mixture
-from isocharge.serve.tracking.tracker import Tracker
+from isocharge.serve.tracking.tracker import Tracker, TrackRule
 from isocharge.simulate import Circle, ForwardMap, noise_model
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
@@ -157,7 +159,7 @@ def main() -> None:
     mixture = contact_mixture(predictor)
     if mixture is None:
         raise SystemExit(f"{asked.model}: no charges.npz: its map does not fold; give the model of the lines above")
-    tracker = Tracker(mixture=mixture)
+    tracker = Tracker(Setup(metadata.electrodes, {TrackRule: TrackRule()}, predictor=predictor))
     radius = mixture.charges.radius_mm
     sensor = sensor_from_dict(dict(metadata.sensor))
     forward_map = ForwardMap.build(sensor, Circle(1.0), radius + MAP_MARGIN_mm, metadata.force_range_N)
@@ -175,13 +177,14 @@ def main() -> None:
         reports = []
         start_s = time.thread_time()
         for contact, t_s, frame_charge in zip(contacts, slide.t_s.tolist(), charge, strict=True):
-            tracked, *_ = tracker.update(contact, t_s, (), frame_charge)
-            reports.append((tracked, tracker.other))
+            frame = Frame(None, None, (), clock_s=t_s, charge_pC=frame_charge, contact=contact)
+            tracker.step(frame)
+            reports.append((frame.tracking.tracked, frame.tracking.other))
         tracking_s += time.thread_time() - start_s
         frame_count += len(reports)
-        for frame in np.flatnonzero(is_counted(slide)):
-            tracked, other = reports[frame]
-            counted_frames.append(examine_frame(film, tracked, other, slide.contact[frame], slide.side[frame]))
+        for number in np.flatnonzero(is_counted(slide)):
+            tracked, other = reports[number]
+            counted_frames.append(examine_frame(film, tracked, other, slide.contact[number], slide.side[number]))
 
     is_known = np.array([frame.is_known for frame in counted_frames])
     is_right = np.array([frame.is_right for frame in counted_frames])

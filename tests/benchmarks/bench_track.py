@@ -27,6 +27,8 @@ from shared import options, print_results
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve import Contact, Predictor
+from isocharge.serve.frames.frame import Frame
+from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.tracking.tracker import Tracker
 from isocharge.simulate import Circle, ForwardMap, noise_model
 from isocharge.simulate.plots.figure import new_figure
@@ -178,8 +180,11 @@ def track(contacts: list[list[Contact]], dt_s: float) -> TrackedPaths:
     std = []
     begin_s = time.thread_time()
     for path in contacts:
-        tracker = Tracker()
-        tracked = [tracker.update(contact, frame * dt_s)[0] for frame, contact in enumerate(path)]
+        tracker = Tracker(Setup(()))
+        frames = [Frame(None, None, (), clock_s=number * dt_s, contact=contact) for number, contact in enumerate(path)]
+        for frame in frames:
+            tracker.step(frame)
+        tracked = [frame.tracking.tracked for frame in frames]
         position.append([complex(contact.x_mm, contact.y_mm) for contact in tracked])
         std.append([(contact.x_std_mm, contact.y_std_mm) for contact in tracked])
     duration_s = time.thread_time() - begin_s

@@ -16,17 +16,9 @@ from msgspec.structs import fields
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame, device_from_table, encode_frame, flags
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.live.contact_stages import TouchOffsetRule
-from isocharge.serve.live.device import CommonMode
+from isocharge.serve.live.device import STAGES
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.signal_chain.contact import TouchRule
-from isocharge.serve.signal_chain.hum import HumRule
-from isocharge.serve.signal_chain.leak import LeakRule
-from isocharge.serve.signal_chain.memory import MemoryRule
-from isocharge.serve.signal_chain.tare import TareRule
-from isocharge.serve.tracking.film_follower import FollowRule
-from isocharge.serve.tracking.tracker import TrackRule
 
 SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
@@ -178,9 +170,7 @@ def test_every_key_of_the_device_file_is_explained_and_exists():
 
 def test_every_default_of_a_stage_is_the_rule_s():
     """Numbers in the tables are those of the code."""
-    rules = {"hum": HumRule, "tare": TareRule, "leak": LeakRule, "memory": MemoryRule, "touch": TouchRule}
-    rules |= {"track": TrackRule, "follow": FollowRule, "common_mode": CommonMode}
-    rules["touch_offset"] = TouchOffsetRule
+    rules = {stage.section: stage.rule_class for stage in STAGES}
     section = PAGES["device_file.md"].partition("The stages.")[2].partition("\n#")[0]
     assert section.count("| `") > 15
     for line in section.splitlines():

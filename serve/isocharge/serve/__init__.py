@@ -18,9 +18,8 @@ from isocharge.serve.frames.formats import AutoParser
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.frames.text_lines import encode_text
 from isocharge.serve.live.device import Device, device_from_table, load_device
-from isocharge.serve.live.reading_stream import ReadingStream
 from isocharge.serve.live.steady_press import PressWatch
-from isocharge.serve.live.stream import Policy, TouchStream, stream
+from isocharge.serve.live.stream import Policy, ReadingStream, TouchStream, stream
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import (
     Model,
@@ -38,14 +37,12 @@ from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses
 from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
 from isocharge.serve.record.record import PredictionRecord
-from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.virtual_sensor.script import Faults, Script, wander
 from isocharge.serve.virtual_sensor.sensor import VirtualSensor
 
 __all__ = [
     "AutoParser",
     "BinaryParser",
-    "Chain",
     "Chunk",
     "Contact",
     "Contacts",

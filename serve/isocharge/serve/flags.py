@@ -1,5 +1,7 @@
 """Names of the flags that the field `flags` of a record can contain, and the meaning of each flag."""
 
+from collections.abc import Iterable
+
 TARE = "tare"
 OUTSIDE = "outside"
 BEYOND = "beyond"
@@ -17,20 +19,26 @@ STRESS = "stress"
 FILM = "film"
 
 MEANINGS = {
-    TARE: "no tare yet, so no contact either",
-    OUTSIDE: "the position is outside the working area, or the force outside the range, that the model was trained for",
-    BEYOND: "more than three times as far or as hard as the model knows: the numbers are no measurement",
-    MISFIT: "the charges fit no single contact: misfit above the larger of 5 and the 99.9 % quantile of good presses",
+    RECONNECTED: "the first frame after the port was away; the film is tared again",
     GAP: "frames are missing before this one",
     REPEAT: "this frame has the number of the one before",
     RESTART: "the frame numbers went back: the device was restarted",
+    INVALID: "the device sent a charge that is not a number; nothing was computed",
+    TARE: "no tare yet, so no contact either",
     SATURATED: "an amplifier is at its limit, or was in this press: the device says so, or the device file's limit",
     NEGATIVE: "the charges are well below zero: an amplifier that inverts (see `[gain]`), or the end of a long press",
     THERMAL: "the film has warmed or cooled in this press by 10 pC or more on every electrode; it was subtracted",
     BLIND: "temperature is inseparable from force at this position: nothing was subtracted",
-    RECONNECTED: "the first frame after the port was away; the film is tared again",
-    INVALID: "the device sent a charge that is not a number; nothing was computed",
+    OUTSIDE: "the position is outside the working area, or the force outside the range, that the model was trained for",
+    BEYOND: "more than three times as far or as hard as the model knows: the numbers are no measurement",
+    MISFIT: "the charges fit no single contact: misfit above the larger of 5 and the 99.9 % quantile of good presses",
     STRESS: "the press stresses the film beyond 45 MPa, where PVDF yields: a dent stays",
     FILM: "no pretension explains the last touches (a wrong gain, warm fingers): the film is not followed now",
 }
-"""Meaning of each flag."""
+"""Meaning of each flag, in the order in which a record contains the flags."""
+
+
+def in_order(flags: Iterable[str]) -> tuple[str, ...]:
+    """Return each of the flags once, in the order of `MEANINGS`."""
+    present = set(flags)
+    return tuple(flag for flag in MEANINGS if flag in present)

@@ -17,7 +17,7 @@ from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.live.device import ANY_BOARD
-from isocharge.serve.live.reading_stream import ReadingStream
+from isocharge.serve.live.stream import ReadingStream
 from isocharge.serve.port.serial_line import TELNET_ADVICE, Request
 
 RATE_HZ = 200.0
@@ -266,7 +266,7 @@ def test_stream_states_that_a_serial_server_uses_the_telnet_protocol():
     frames = [encode_frame(Frame(0xFF00 + number, 0, (1.0, 2.0, 3.0))) for number in range(256)]
     stream = ReadingStream(("A", "B", "C"), device_from_table({"frames": {"format": "binary"}}, "test"))
     with pytest.raises(NoFramesError, match="raw TCP"):
-        [list(stream.feed(Chunk(frame.replace(b"\xff", b"\xff\xff"), 0.0, 0))) for frame in frames * 2]
+        [list(stream.frames(Chunk(frame.replace(b"\xff", b"\xff\xff"), 0.0, 0))) for frame in frames * 2]
 
 
 @pytest.mark.parametrize("gain", [{}, {"pC_per_unit": 0.5}])

@@ -84,7 +84,7 @@ SLIP_JUNK = st.binary(min_size=1, max_size=12).map(lambda data: data.replace(b"\
 
 def binary(make=BinaryParser, lead=b""):
     floats = st.lists(st.floats(width=32, allow_nan=False), max_size=8).map(tuple)
-    frames = st.builds(Frame, seq=SEQ, t_us=T_US, values=floats, flags=st.integers(0, 255))
+    frames = st.builds(Frame, seq=SEQ, t_us=T_US, values=floats, bits=st.integers(0, 255))
     return Format(make, encode_frame, frames, PIECES, lead)
 
 

@@ -106,13 +106,13 @@ def test_binary_frame_has_the_documented_layout():
     seq_and_time = struct.pack("<H", 0x1234) + struct.pack("<I", 0x89ABCDEF)
     count_and_flags = bytes([3, 1])
     charges = struct.pack("<fff", 1.0, -2.5, 848.25)
-    frame = Frame(seq=0x1234, t_us=0x89ABCDEF, values=(1.0, -2.5, 848.25), flags=1)
+    frame = Frame(seq=0x1234, t_us=0x89ABCDEF, values=(1.0, -2.5, 848.25), bits=1)
     assert encode_frame(frame) == piece(version + seq_and_time + count_and_flags + charges)
 
 
 @pytest.mark.parametrize("count", [0, 1, 60, 61, 62, 255])
 def test_binary_frames_round_trip(count):
-    frame = Frame(0x0101, 0x01010101, struct.unpack("<f", b"long") * count, flags=1)  # no zeros
+    frame = Frame(0x0101, 0x01010101, struct.unpack("<f", b"long") * count, bits=1)  # no zeros
     assert len(encode_frame(frame)) <= MAX_STUFFED_LENGTH + 1
     assert BinaryParser().feed(encode_frame(frame)) == [frame]
 

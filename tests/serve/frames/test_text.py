@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.serve import AutoParser, Frame, encode_frame, encode_text
+from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import SequenceGaps
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_lines import TEXT_FORMATS, Skeleton, clean_text, parse_line
-from isocharge.serve.port.device_clock import DeviceClock
 from isocharge.serve.port.source import Chunk
 
 README_OF_TELEPLOT = [
@@ -385,8 +385,8 @@ def test_clock_in_text_that_wraps(name, unit, modulus):
     for number in range(200):
         sent = (start + 5 * number * unit) % modulus
         frames = feed(f"{name}:{sent:.6f},A:1", parser=parser)
-        times = clock.read(Chunk(b"", 0.0, 0), [frame.t_us for frame in frames], parser.t_us_modulus)
-        times_us += [time.device_us for time in times]
+        clock.stamp(Chunk(b"", 0.0, 0), frames, parser.t_us_modulus)
+        times_us += [frame.device_us for frame in frames]
     assert clock.restarts == 0
     step_us = 5 * unit if name == "t_us" else 5000.0
     np.testing.assert_allclose(np.diff(times_us), step_us, atol=1.1)
@@ -397,7 +397,7 @@ def test_clock_in_text_that_restarts_has_not_wrapped():
     clock = DeviceClock()
     for number in [*range(1000, 1200), *range(20)]:
         frames = feed(f"t_ms:{5 * number},A:1", parser=parser)
-        clock.read(Chunk(b"", 0.0, 0), [frame.t_us for frame in frames], parser.t_us_modulus)
+        clock.stamp(Chunk(b"", 0.0, 0), frames, parser.t_us_modulus)
     assert clock.restarts == 1
 
 

@@ -24,8 +24,8 @@ def with_frames(table=PAGE_EXAMPLE, **frames):
 
 def read_charges(device, data):
     """Return the raw charges that `serve stream` reads from bytes, shape (frames, electrodes), pC."""
-    readings = ReadingStream(ELECTRODES, device).feed(Chunk(data, 0.0, 0))
-    return np.array([timed.reading.raw_pC for timed in readings])
+    frames = ReadingStream(ELECTRODES, device).frames(Chunk(data, 0.0, 0))
+    return np.array([frame.raw_pC for frame in frames])
 
 
 def test_example_of_the_page_sends_counts_in_the_fields_of_the_channels():

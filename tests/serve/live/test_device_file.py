@@ -19,10 +19,18 @@ from isocharge.serve import (
 from isocharge.serve.frames.formats import Frames
 from isocharge.serve.frames.frame_layout import SyncParser
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.live.device import ANY_BOARD, with_settings
-from isocharge.serve.live.reading_stream import ChannelPicker
-from isocharge.serve.signal_chain.chain import SignalChain
-from isocharge.serve.signal_chain.stages import Gain
+from isocharge.serve.live.device import ANY_BOARD, STAGES, create_stages, with_settings
+from isocharge.serve.signal_chain.channels import Channels
+from isocharge.serve.signal_chain.gain import Gain, GainRule
+from isocharge.serve.signal_chain.hum import HumRule
+from isocharge.serve.signal_chain.inflow import LeakSection
+from isocharge.serve.signal_chain.leak import Leak
+from isocharge.serve.signal_chain.saturation import SaturationRule
+from isocharge.serve.signal_chain.stage import Setup
+from isocharge.serve.signal_chain.tare import TareRule
+from isocharge.serve.signal_chain.thermal import ThermalRule
+from isocharge.serve.signal_chain.touch import TouchRule
+from stage_runner import StageRunner
 
 ELECTRODES = ("A", "B", "C")
 FORMATS = ", ".join(section.__struct_config__.tag for section in get_args(Frames))
@@ -66,35 +74,34 @@ def device(tmp_path):
 
 def test_device_file_with_all_sections(device):
     board = device(FULL)
-    chain = board.chain(ELECTRODES)
+    setup = board.setup(ELECTRODES)
     assert (board.name, board.channels["A"]) == ("bench board 3", "adc1")
-    np.testing.assert_array_equal(chain.gain_pC, [0.5, -0.25, 0.5])
-    np.testing.assert_array_equal(chain.tau_s, [10.0, 10.2, 9.9])
-    assert (chain.limit_pC, chain.hum.frequency_Hz, chain.hum.settle_s) == (1500, 60.0, 1.0)
-    assert (chain.tare.frames, chain.leak.settle_s, chain.touch.floor_pC) == (50, 5.0, 20.0)
+    np.testing.assert_array_equal(Gain(setup).gain_pC, [0.5, -0.25, 0.5])
+    np.testing.assert_array_equal(Leak.c_settings(setup)["tau_s"], [10.0, 10.2, 9.9])
+    hum = board.rule(HumRule)
+    assert (board.rule(SaturationRule).limit_pC, hum.frequency_Hz, hum.settle_s) == (1500, 60.0, 1.0)
+    assert (board.rule(TareRule).frames, board.rule(LeakSection).settle_s) == (50, 5.0)
+    assert board.rule(TouchRule).floor_pC == 20.0
     assert isinstance(board.parser(), TextParser)
 
 
-def test_device_without_a_file_has_tare_and_touch():
-    chain = ANY_BOARD.chain(ELECTRODES)
-    assert (chain.gain_pC, chain.limit_pC, chain.hum, chain.tau_s) == (None, None, None, None)
-    assert None not in (chain.tare, chain.touch)
+def test_device_without_a_file_has_tare_and_touch(device):
+    assert set(ANY_BOARD.rules) == {TareRule, TouchRule}
+    assert device("").rules == ANY_BOARD.rules
     assert isinstance(ANY_BOARD.parser(), AutoParser)
 
 
-@pytest.mark.parametrize("stage", ["gain", "saturation", "hum", "tare", "leak", "touch"])
-def test_stage_can_be_switched_off(device, stage):
-    chain = device(FULL.replace(f"[{stage}]", f"[{stage}]\non = false")).chain(ELECTRODES)
-    attribute = {"gain": "gain_pC", "saturation": "limit_pC", "leak": "tau_s"}.get(stage, stage)
-    assert getattr(chain, attribute) is None
-    others = {"gain_pC", "limit_pC", "hum", "tare", "tau_s", "touch"} - {attribute}
-    assert all(getattr(chain, other) is not None for other in others)
+@pytest.mark.parametrize("section", ["gain", "saturation", "hum", "tare", "leak", "touch"])
+def test_stage_can_be_switched_off(device, section):
+    (rule_class,) = [stage.rule_class for stage in STAGES if stage.section == section]
+    board = device(FULL.replace(f"[{section}]", f"[{section}]\non = false"))
+    assert set(device(FULL).rules) - set(board.rules) == {rule_class}
 
 
 def test_setting_may_be_one_number_for_all_channels(device):
-    chain = device("[gain]\npC_per_unit = 2.0\n[leak]\ntau_s = 1.0\n").chain(ELECTRODES)
-    np.testing.assert_array_equal(chain.gain_pC, [2.0] * 3)
-    np.testing.assert_array_equal(chain.tau_s, [1.0] * 3)
+    setup = device("[gain]\npC_per_unit = 2.0\n[leak]\ntau_s = 1.0\n").setup(ELECTRODES)
+    np.testing.assert_array_equal(Gain(setup).gain_pC, [2.0] * 3)
+    np.testing.assert_array_equal(Leak.c_settings(setup)["tau_s"], [1.0] * 3)
 
 
 def test_format_decides_the_parser(device):
@@ -103,23 +110,26 @@ def test_format_decides_the_parser(device):
     assert isinstance(device(described).parser(), SyncParser)
 
 
-def gain_of(chain):
-    """Return the stage with the gain of a signal chain."""
-    return Gain(chain.gain_pC, chain.zero)
+def converted(board, values):
+    """Return the charges of values that a board sends, shape (3,), pC."""
+    frame = Frame(None, None, ())
+    frame.sent = np.asarray(values)
+    Gain(board.setup(ELECTRODES)).step(frame)
+    return frame.charge_pC
 
 
 def test_offset_is_subtracted_before_the_gain(device):
     """The offset is one number, such as half of the range of a converter, or one number for each electrode."""
     for offset, zero in (("8388608", [8388608] * 3), ("{A = 1, B = 2, C = 3}", [1, 2, 3])):
-        chain = device(f"[gain]\noffset = {offset}\npC_per_unit = {{A = 0.5, B = -0.5, C = 1}}\n").chain(ELECTRODES)
-        np.testing.assert_array_equal(gain_of(chain).convert(np.array(zero) + 10.0), [5.0, -5.0, 10.0])
+        board = device(f"[gain]\noffset = {offset}\npC_per_unit = {{A = 0.5, B = -0.5, C = 1}}\n")
+        np.testing.assert_array_equal(converted(board, np.array(zero) + 10.0), [5.0, -5.0, 10.0])
 
 
 def test_volts_on_a_feedback_capacitance(device):
     """A voltage of 1 V on a capacitance of 1 nF is a charge of 1 nC."""
     text = "[gain]\nV_per_unit = -0.001\noffset = 1650\nfeedback_pF = {A = 1000, B = 1000, C = 500}\n"
-    np.testing.assert_allclose(gain_of(device(text).chain(ELECTRODES)).convert(np.full(3, 1651.0)), [-1.0, -1.0, -0.5])
-    assert device(text).gain.charge_pC("C", np.array([1651.0])) == pytest.approx(-0.5)
+    np.testing.assert_allclose(converted(device(text), np.full(3, 1651.0)), [-1.0, -1.0, -0.5])
+    assert device(text).rule(GainRule).charge_pC("C", np.array([1651.0])) == pytest.approx(-0.5)
 
 
 def test_device_file_renames_frame_counter_and_clock(device):
@@ -192,10 +202,10 @@ def test_table_of_a_device_is_unchanged(device):
 
 def test_offset_limit_changes_in_the_rule_and_in_the_table(device):
     board = with_settings(device(FULL), "tare", offset_limit_pC=250.0)
-    assert (board.tare.frames, board.tare.offset_limit_pC) == (50, 250.0)
+    assert (board.rule(TareRule).frames, board.rule(TareRule).offset_limit_pC) == (50, 250.0)
     assert board.table["tare"] == {"frames": 50, "offset_limit_pC": 250.0}
     other = with_settings(ANY_BOARD, "tare", offset_limit_pC=250.0)
-    assert (other.tare.offset_limit_pC, ANY_BOARD.table) == (250.0, {})
+    assert (other.rule(TareRule).offset_limit_pC, ANY_BOARD.table) == (250.0, {})
     with pytest.raises(DeviceError, match=r"device\.toml: tare\.offset_limit_pC: expected a number from 0"):
         with_settings(board, "tare", offset_limit_pC=-1.0)
 
@@ -210,7 +220,7 @@ def test_setting_for_other_electrodes_is_refused(device):
     with pytest.raises(
         DeviceError, match=r"one for each of the electrodes \('A', 'B', 'C'\), got \{'A': 1.0, 'B': 1.0\}"
     ):
-        board.chain(ELECTRODES)
+        create_stages(board.setup(ELECTRODES))
 
 
 @pytest.mark.parametrize(
@@ -231,8 +241,9 @@ def test_setting_for_other_electrodes_is_refused(device):
     ],
 )
 def test_channel_of_each_electrode(names, channels, picked):
-    picker = ChannelPicker(ELECTRODES, channels, "linear/1")
-    assert picker.pick(Frame(0, 0, (1.0, 2.0, 3.0), names=names)).tolist() == picked
+    frame = Frame(0, 0, (1.0, 2.0, 3.0), names=names)
+    Channels(Setup(ELECTRODES, channels=channels)).step(frame)
+    assert frame.sent.tolist() == picked
 
 
 @pytest.mark.parametrize(
@@ -248,9 +259,10 @@ def test_channel_of_each_electrode(names, channels, picked):
     ],
 )
 def test_unknown_channels_are_refused(names, channels, message):
-    picker = ChannelPicker(ELECTRODES, {"A": "1", "B": "2", "C": "3"} | channels if channels else {}, "m", "board.toml")
+    assigned = {"A": "1", "B": "2", "C": "3"} | channels if channels else {}
+    stage = Channels(Setup(ELECTRODES, channels=assigned, where="board.toml"))
     with pytest.raises(ChargeError, match=message):
-        picker.pick(Frame(0, 0, (1.0,) * (len(names) or 3), names=names))
+        stage.step(Frame(0, 0, (1.0,) * (len(names) or 3), names=names))
 
 
 def test_tare_error_states_the_offset_for_the_device_file():
@@ -258,11 +270,11 @@ def test_tare_error_states_the_offset_for_the_device_file():
     frames = [Frame(number, 5000 * number, (2048.0, 2050.5, 2047.0)) for number in range(20)]
     data = b"".join(map(encode_frame, frames))
     with pytest.raises(TareError, match=r"\[gain\] offset = \{A = 2048, B = 2050.5, C = 2047\}"):
-        list(stream.feed(Chunk(data, 1e9, 0)))
+        list(stream.frames(Chunk(data, 1e9, 0)))
 
 
 def test_saturation_is_flagged_until_the_press_is_over(device):
-    chain = SignalChain(device("[saturation]\nlimit_pC = 1500.0\n[tare]\nframes = 5\n").chain(ELECTRODES), 3)
+    chain = StageRunner(device=device("[saturation]\nlimit_pC = 1500.0\n[tare]\nframes = 5\n"))
     charges_pC = [0.0] * 6 + [800.0, 1500.0, 800.0, 800.0, 0.0, 0.0, 800.0]
     is_saturated = []
     for number, charge_pC in enumerate(charges_pC):
@@ -273,7 +285,7 @@ def test_saturation_is_flagged_until_the_press_is_over(device):
 
 def test_warming_needs_four_electrodes(device):
     board = device("[common_mode]\nevery_s = 0.1\n")
-    assert board.chain(("A", "B", "C", "D")).thermal.every_s == 0.1
+    assert board.rule(ThermalRule).every_s == 0.1
     with pytest.raises(DeviceError, match=r"device\.toml: common_mode: expected four electrodes or more"):
-        board.chain(ELECTRODES)
-    assert device("[common_mode]\non = false\n").chain(ELECTRODES).thermal is None
+        StageRunner(3, lambda _: None, device=board)
+    assert device("[common_mode]\non = false\n").rule(ThermalRule) is None

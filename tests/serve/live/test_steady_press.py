@@ -7,13 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from isocharge.serve import Frame
 from isocharge.serve.flags import RECONNECTED, SATURATED, TARE
 from isocharge.serve.live import steady_press
-from isocharge.serve.live.reading_stream import TimedReading
 from isocharge.serve.live.steady_press import Phase, PressWatch
-from isocharge.serve.port.device_clock import ReadingTime
-from isocharge.serve.signal_chain.chain import Reading
-from isocharge.serve.signal_chain.tare import Tare
 
 RATE_HZ = 200.0
 """Number of frames per second, Hz."""
@@ -36,17 +33,16 @@ def readings(charge_pC, *, flags=None):
         charge_pC: Charges without noise, shape (n, 4), pC.
         flags: Function from the number of a frame to its flags.
     """
-    tare = Tare(np.zeros(4), np.ones(4), 100)
     rng = np.random.default_rng(1)
     for number, clean_pC in enumerate(charge_pC):
         noisy_pC = clean_pC + noise_std(clean_pC) * rng.standard_normal(4)
         frame_flags = flags(number) if flags else ()
         has_tare = TARE not in frame_flags
-        is_contact = has_tare and clean_pC[0] > 20.0
-        reading = Reading(noisy_pC, noisy_pC if has_tare else None, tare, contact=is_contact, flags=frame_flags)
-        time_s = number / RATE_HZ
-        time = ReadingTime(1e9 + time_s, round(1e6 * time_s), 1.0 / RATE_HZ, time_s)
-        yield TimedReading(reading, time)
+        frame = Frame(number, round(1e6 * number / RATE_HZ), (), clock_s=number / RATE_HZ, flags=list(frame_flags))
+        frame.charge_pC = noisy_pC if has_tare else None
+        frame.noise_pC = np.ones(4)
+        frame.is_contact = has_tare and clean_pC[0] > 20.0
+        yield frame
 
 
 def watch_presses(*parts, **options):

@@ -8,7 +8,6 @@ import pytest
 
 from isocharge.common.errors import ChargeError, ModelError, PortError
 from isocharge.serve import (
-    Chain,
     Chunk,
     Frame,
     Policy,
@@ -19,14 +18,12 @@ from isocharge.serve import (
     open_source,
     stream,
 )
-from isocharge.serve.frames.frame import SequenceGaps
-from isocharge.serve.signal_chain.tare import TareRule
 
 OFFSET = np.array([12.0, -7.0, 3.0])
 """Charges at rest, shape (3,), pC."""
 
-CHAIN = Chain(tare=TareRule(frames=10))
-"""Settings of the signal chain with a short tare."""
+BOARD = device_from_table({"tare": {"frames": 10}}, "board")
+"""Board with a short tare."""
 
 
 def chunk(*frames):
@@ -43,9 +40,9 @@ def rest_frames(n=10):
 def records_after_rest(predictor):
     """Return a function that processes frames after ten frames at rest, and returns the records of these frames."""
 
-    def process(*frames, **options):
+    def process(*frames):
         chunks = [chunk(*rest_frames()), *(chunk(frame) for frame in frames)]
-        records = list(stream(chunks, predictor, chain=CHAIN, **options))
+        records = list(stream(chunks, predictor, BOARD))
         return records[10:]
 
     return process
@@ -90,7 +87,7 @@ def test_record_of_a_press(film, records_after_rest):
 
 def test_policy_latest_passes_flags_of_skipped_frames_on(predictor):
     """Only flags that describe earlier events, such as lost frames, are passed on. The flag `invalid` is not."""
-    touch = TouchStream(predictor, chain=CHAIN, policy=Policy.latest)
+    touch = TouchStream(predictor, BOARD, policy=Policy.latest)
 
     def frame(seq):
         return Frame(seq, 5000 * seq, tuple(OFFSET.tolist()))
@@ -110,7 +107,7 @@ def test_policy_latest_passes_flags_of_skipped_frames_on(predictor):
 
 
 def test_use_another_model_of_the_same_electrodes(film, make_film, predictor, tmp_path):
-    touch = TouchStream(predictor, chain=CHAIN, frame_id="left")
+    touch = TouchStream(predictor, BOARD, frame_id="left")
     *_, last_at_rest = touch.feed(chunk(*rest_frames()))
     touch.use(Predictor(film.write(tmp_path, version=2)))
     (record,) = touch.feed(chunk(Frame(10, 50_000, raw_press(film))))
@@ -130,7 +127,7 @@ def test_record_out_of_contact(records_after_rest):
 
 
 def test_record_before_the_tare(predictor):
-    for record in stream([chunk(*rest_frames())], predictor, chain=CHAIN):
+    for record in stream([chunk(*rest_frames())], predictor, BOARD):
         assert record.flags == ("tare",)
         assert (record.contact, record.force_N, record.charge_pC, record.tare_pC) == (False, 0.0, None, None)
         assert record.charge_raw_pC == {"A": 12.0, "B": -7.0, "C": 3.0}
@@ -151,9 +148,8 @@ def test_flags_of_the_frame_are_in_the_record(film, records_after_rest):
     The flag `saturated` lasts until the end of the press.
     """
     charges = raw_press(film)
-    gaps = SequenceGaps()
     records = records_after_rest(
-        Frame(10, 0, charges), Frame(13, 0, charges, flags=1), Frame(13, 0, charges), Frame(2, 0, charges), gaps=gaps
+        Frame(10, 0, charges), Frame(13, 0, charges, bits=1), Frame(13, 0, charges), Frame(2, 0, charges)
     )
     assert [record.flags for record in records] == [
         (),
@@ -161,7 +157,6 @@ def test_flags_of_the_frame_are_in_the_record(film, records_after_rest):
         ("repeat", "saturated"),
         ("restart", "saturated"),
     ]
-    assert (gaps.lost, gaps.repeated, gaps.restarts) == (2, 1, 1)
 
 
 @pytest.mark.parametrize("damaged", [1.01e9, -1e38, 1e300, -1.7e308, math.inf])

@@ -1,14 +1,16 @@
 """Tests of the signal chain: tare, detection of touches, and invalid frames."""
 
+import math
+
 import numpy as np
 import pytest
 
 from isocharge.common.errors import TareError
-from isocharge.serve import Chain
-from isocharge.serve.signal_chain.chain import SignalChain
-from isocharge.serve.signal_chain.contact import Touch, TouchRule, update_contact
-from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve import Frame
+from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.tare import TareRule, measure_tare
+from isocharge.serve.signal_chain.touch import Touch, TouchRule
+from stage_runner import StageRunner
 
 OFFSET = np.array([12.0, -7.0, 3.0])
 """Charges at rest, shape (3,), pC."""
@@ -25,17 +27,16 @@ def rest(n, seed=0, std_pC=1.0):
     return OFFSET + std_pC * np.random.default_rng(seed).standard_normal((n, 3))
 
 
-def run(frames_pC, settings=None):
+def run(frames_pC, **sections):
     """Return the readings of frames with charges of shape (n, 3), pC."""
-    chain = SignalChain(settings or Chain(), 3)
+    chain = StageRunner(**sections)
     return [chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ) for number, raw_pC in enumerate(frames_pC)]
 
 
 def test_tare_is_mean_and_noise():
-    tare = measure_tare(TareRule(), rest(10_000))
-    np.testing.assert_allclose(tare.charge_pC, OFFSET, atol=0.05)
-    np.testing.assert_allclose(tare.noise_pC, 1.0, rtol=0.03)
-    assert tare.frames == 10_000
+    tare_pC, noise_pC = measure_tare(TareRule(), rest(10_000))
+    np.testing.assert_allclose(tare_pC, OFFSET, atol=0.05)
+    np.testing.assert_allclose(noise_pC, 1.0, rtol=0.03)
 
 
 def test_tare_under_a_resting_weight_is_refused():
@@ -45,9 +46,9 @@ def test_tare_under_a_resting_weight_is_refused():
 
 def test_tare_takes_the_first_hundred_frames():
     readings = run(rest(150))
-    assert [reading.tare is None for reading in readings] == [True] * 100 + [False] * 50
+    assert [reading.tare_pC is None for reading in readings] == [True] * 100 + [False] * 50
     assert {reading.flags for reading in readings[:100]} == {("tare",)}
-    np.testing.assert_allclose(readings[100].tare.charge_pC, rest(150)[:100].mean(axis=0), atol=0.01)
+    np.testing.assert_allclose(readings[100].tare_pC, rest(150)[:100].mean(axis=0), atol=0.01)
     mean_charge_pC = np.mean([reading.charge_pC for reading in readings[100:]], axis=0)
     np.testing.assert_allclose(mean_charge_pC, 0.0, atol=0.5)
 
@@ -57,31 +58,45 @@ def test_tare_waits_for_quiet():
     frames_pC = rest(400)
     frames_pC[:220] += np.linspace(900.0, 300.0, 220)[:, None]
     readings = run(frames_pC)
-    has_tare = [reading.tare is not None for reading in readings]
+    has_tare = [reading.tare_pC is not None for reading in readings]
     assert 300 < has_tare.index(True) <= 321
-    np.testing.assert_allclose(readings[-1].tare.charge_pC, OFFSET, atol=2.0)
+    np.testing.assert_allclose(readings[-1].tare_pC, OFFSET, atol=2.0)
 
 
 def test_tare_gives_up_with_the_reason():
     with pytest.raises(TareError, match="varies by"):
-        run(rest(300, std_pC=50.0), Chain(tare=TareRule(patience=250)))
+        run(rest(300, std_pC=50.0), tare={"patience": 250})
 
 
 def test_second_tare_never_gives_up():
     """A finger that rests on the film does not stop a live stream."""
-    chain = SignalChain(Chain(tare=TareRule(frames=20, patience=50)), 3)
+    chain = StageRunner(tare={"frames": 20, "patience": 50})
     for number, raw_pC in enumerate(rest(60)):
         chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
     chain.reset_tare()
     has_tare = []
     for number, raw_pC in enumerate(np.concatenate([rest(200, std_pC=100.0), rest(30)])):
         reading = chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
-        has_tare.append(reading.tare is not None)
+        has_tare.append(reading.tare_pC is not None)
     assert has_tare.index(True) == 220
 
 
 THRESHOLD_PC = 10.0 + 6.0 * np.sqrt(3.0)
 """Touch threshold for noise of 1 pC on three electrodes, pC."""
+
+
+def touch_stage():
+    """Return a stage that detects touches, with its default settings."""
+    return Touch(Setup(("A", "B", "C"), {TouchRule: TouchRule()}))
+
+
+def detect(touch, total_pC, noise_pC, base_relax_s=math.inf):
+    """Return whether a stage detects a touch in a frame of 1 s with a total charge and a noise, pC."""
+    frame = Frame(None, None, (), dt_s=1.0, base_relax_s=base_relax_s)
+    frame.charge_pC = np.array([total_pC, 0.0, 0.0])
+    frame.noise_pC = noise_pC
+    touch.step(frame)
+    return frame.is_contact
 
 
 @pytest.mark.parametrize(
@@ -99,17 +114,13 @@ THRESHOLD_PC = 10.0 + 6.0 * np.sqrt(3.0)
     ids=["floor and noise", "floor", "hysteresis", "share of the peak", "drifted base", *["spike"] * 3],
 )
 def test_touches_begin_and_end(totals, noise, expected):
-    touch = Touch()
-    contacts = []
-    for total_pC in totals:
-        touch = update_contact(TouchRule(), touch, total_pC, noise)
-        contacts.append(touch.contact)
-    assert contacts == expected
+    touch = touch_stage()
+    assert [detect(touch, total_pC, noise) for total_pC in totals] == expected
 
 
 def contacts_of(readings):
     """Return whether something touches in each reading."""
-    return [reading.contact for reading in readings]
+    return [reading.is_contact for reading in readings]
 
 
 def test_smallest_press_is_detected_at_once():
@@ -126,7 +137,7 @@ def test_negative_charges_are_no_touch_and_are_flagged():
     readings = run(frames_pC)
     assert not any(contacts_of(readings))
     assert [reading.flags for reading in readings[100:]] == [()] * 50 + [("negative",)] * 50
-    corrected = run(frames_pC, Chain(gain_pC=-ONE_PC))
+    corrected = run(frames_pC, gain={"pC_per_unit": -1.0})
     assert contacts_of(corrected) == [False] * 150 + [True] * 50
 
 
@@ -138,9 +149,9 @@ def test_noise_of_a_minute_gives_no_touch():
 @pytest.mark.parametrize("gain", [None, 0.5, 2.0])
 def test_invalid_frame_passes_no_stage(value, gain):
     """The readings after the invalid frame are the same as in a chain that did not receive this frame."""
-    settings = Chain(gain_pC=None if gain is None else np.full(3, gain))
-    chain = SignalChain(settings, 3)
-    undisturbed_chain = SignalChain(settings, 3)
+    sections = {} if gain is None else {"gain": {"pC_per_unit": gain}}
+    chain = StageRunner(**sections)
+    undisturbed_chain = StageRunner(**sections)
     for number, raw_pC in enumerate(rest(150)):
         chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
         undisturbed_chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
@@ -148,7 +159,7 @@ def test_invalid_frame_passes_no_stage(value, gain):
     invalid_s = 0.25
     invalid_values = np.array([1.0, value / (gain or 1.0), 2.0])
     invalid = chain.advance(invalid_values, 150 / RATE_HZ, invalid_s, flags=("gap",))
-    assert (invalid.charge_pC, invalid.tare, invalid.contact) == (None, None, False)
+    assert (invalid.charge_pC, invalid.tare_pC, invalid.is_contact) == (None, None, False)
     assert invalid.flags == ("gap", "invalid")
 
     for number, raw_pC in enumerate(rest(20, seed=1)):
@@ -164,7 +175,7 @@ def test_time_of_invalid_frames_counts_for_the_next():
 
     This time is 0.5 s, of which 0.2 s belong to invalid frames. The time constant is 1 s.
     """
-    chain = SignalChain(Chain(tare=None, touch=None, tau_s=np.ones(3), leak=LeakRule(learn=False)), 3)
+    chain = StageRunner(tare={"on": False}, touch={"on": False}, leak={"tau_s": 1.0, "learn": False})
     for charge_pC, dt_s in ((0.0, 0.1), (0.0, 0.1), (100.0, 0.1), (np.nan, 0.05), (np.inf, 0.15)):
         chain.advance(np.full(3, charge_pC), 0.0, dt_s)
     decayed_pC = 100.0 * np.exp(np.full(3, -0.5))
@@ -173,7 +184,7 @@ def test_time_of_invalid_frames_counts_for_the_next():
 
 
 def test_flags_of_the_frame_come_before_those_of_the_chain():
-    reading = SignalChain(Chain(), 3).advance(OFFSET, 0.0, 0.0, limited=True, flags=("gap",))
+    reading = StageRunner().advance(OFFSET, 0.0, 0.0, limited=True, flags=("gap",))
     assert reading.flags == ("gap", "tare", "saturated")
 
 
@@ -181,40 +192,36 @@ def test_base_that_relaxes_to_zero_is_no_touch():
     """After a long press, the charge may be below zero. If the base decays like the charge, no touch is detected."""
     totals_pC = -100.0 * np.exp(-np.arange(1000) / 200.0)
 
-    def has_touch(base_decay):
-        touch = Touch(last_pC=-100.0, base_pC=-100.0)
-        contacts = []
-        for total_pC in totals_pC.tolist():
-            touch = update_contact(TouchRule(), touch, total_pC, ONE_PC, base_decay)
-            contacts.append(touch.contact)
-        return any(contacts)
+    def has_touch(base_relax_s):
+        touch = touch_stage()
+        return any(detect(touch, total_pC, ONE_PC, base_relax_s) for total_pC in [-100.0, *totals_pC.tolist()])
 
-    assert not has_touch(base_decay=float(np.exp(-1.0 / 200.0)))
-    assert has_touch(base_decay=1.0)
+    assert not has_touch(base_relax_s=200.0)
+    assert has_touch(base_relax_s=math.inf)
 
 
 @pytest.mark.parametrize("drift_pC_per_s", [0.3, -0.3, 1.0])
 def test_tare_follows_a_slow_drift_of_an_untouched_film(drift_pC_per_s):
     """Without a leak, the zero of a board drifts for half a minute. A press after that has nearly no offset."""
-    chain = SignalChain(Chain(), 3)
+    chain = StageRunner()
     frames_pC = rest(6000) + drift_pC_per_s * np.arange(6000)[:, None] / RATE_HZ
     readings = [chain.advance(row, number / RATE_HZ, 1 / RATE_HZ) for number, row in enumerate(frames_pC)]
-    assert not any(reading.contact for reading in readings)
-    np.testing.assert_allclose(readings[-1].raw_pC - readings[-1].tare.charge_pC, readings[-1].charge_pC)
+    assert not any(reading.is_contact for reading in readings)
+    np.testing.assert_allclose(readings[-1].raw_pC - readings[-1].tare_pC, readings[-1].charge_pC)
     pressed = chain.advance(frames_pC[-1] + 500.0, 30.0, 1 / RATE_HZ)
-    assert pressed.contact
+    assert pressed.is_contact
     assert pressed.charge_pC == pytest.approx([500.0] * 3, abs=6.0)
 
 
 def test_tare_does_not_follow_a_finger():
     """A held press keeps its charge. A finger that is below the release threshold is not absorbed by the tare."""
-    chain = SignalChain(Chain(), 3)
+    chain = StageRunner()
     run_pC = [(400, 0.0), (2000, 1000.0), (400, 30.0), (200, 1000.0)]
     frames_pC = np.concatenate([rest(count) + press_pC for count, press_pC in run_pC])
     readings = [chain.advance(row, number / RATE_HZ, 1 / RATE_HZ) for number, row in enumerate(frames_pC)]
-    offset_pC = readings[399].tare.charge_pC
+    offset_pC = readings[399].tare_pC
     assert readings[2399].charge_pC == pytest.approx(frames_pC[2399] - offset_pC, abs=0.1)
-    assert not readings[2799].contact
+    assert not readings[2799].is_contact
     assert readings[-1].charge_pC == pytest.approx([1000.0] * 3, abs=0.01 * 1000.0)
 
 
@@ -222,5 +229,5 @@ def test_film_that_recovers_after_a_press_is_not_touched():
     """After a release, creep leaves negative charges, which return to zero slowly."""
     frames_pC = [rest(400), rest(400) + 1000.0]
     frames_pC.append(rest(4000) - 40.0 * np.exp(-np.arange(4000) / (5.0 * RATE_HZ))[:, None])
-    readings = run(np.concatenate(frames_pC), Chain())
-    assert not any(reading.contact for reading in readings[-3990:])
+    readings = run(np.concatenate(frames_pC))
+    assert not any(reading.is_contact for reading in readings[-3990:])

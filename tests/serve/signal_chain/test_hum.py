@@ -3,16 +3,19 @@
 import numpy as np
 import pytest
 
-from isocharge.serve.signal_chain.hum import Hum, HumRule, remove_hum
+from isocharge.serve import Frame
+from isocharge.serve.signal_chain.hum import Hum
+from isocharge.serve.signal_chain.stage import Setup
 
 
 def without_hum(raw_pC, rate_Hz):
     """Return charges, shape (n, electrodes), pC, from which the hum is removed."""
-    hum = Hum.start(raw_pC.shape[1])
+    hum = Hum(Setup(tuple("ABC")))
     rows = []
     for number, row_pC in enumerate(raw_pC):
-        hum, clean_pC = remove_hum(HumRule(), hum, row_pC, number / rate_Hz, 1 / rate_Hz)
-        rows.append(clean_pC)
+        frame = Frame(None, None, (), dt_s=1 / rate_Hz, clock_s=number / rate_Hz, charge_pC=row_pC)
+        hum.step(frame)
+        rows.append(frame.charge_pC)
     return np.array(rows)
 
 

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from isocharge.serve import Chain
-from isocharge.serve.signal_chain.chain import SignalChain
-from isocharge.serve.signal_chain.leak import Leak, LeakRule, undo_leak
-from isocharge.serve.signal_chain.tare import TareRule
+from isocharge.serve.signal_chain.inflow import Inflow, LeakRule
+from isocharge.serve.signal_chain.leak import Leak
+from stage_runner import StageRunner
 
 RATE_HZ = 200.0
 """Number of frames per second, Hz."""
@@ -36,20 +35,19 @@ def touch_charge(*presses, seconds=20.0):
     return charge_pC
 
 
-def correct_leak(output_pC, rule=None, every=1, tau_s=TAU_S):
+def correct_leak(output_pC, every=1, tau_s=TAU_S, **settings):
     """Correct the leak of three electrodes with the same output.
 
     Args:
         output_pC: Output of the amplifiers, shape (n,), pC.
-        rule: Settings of the leak correction.
         every: Only every such frame arrives.
         tau_s: Time constant that the correction assumes, s.
+        settings: Further settings of the section `[leak]`.
 
     Returns:
         Touch charges, shape (m, 3), pC, NaN before the tare; and whether something touches, shape (m,).
     """
-    settings = Chain(tare=TareRule(frames=20), tau_s=np.full(3, tau_s), leak=rule or LeakRule())
-    chain = SignalChain(settings, 3)
+    chain = StageRunner(tare={"frames": 20}, leak={"tau_s": tau_s} | settings)
     charges = []
     contact = []
     previous_s = 0.0
@@ -58,7 +56,7 @@ def correct_leak(output_pC, rule=None, every=1, tau_s=TAU_S):
         reading = chain.advance(np.full(3, output_pC[number]), t_s, t_s - previous_s)
         previous_s = t_s
         charges.append(np.full(3, np.nan) if reading.charge_pC is None else reading.charge_pC)
-        contact.append(reading.contact)
+        contact.append(reading.is_contact)
     return np.array(charges), np.array(contact)
 
 
@@ -82,7 +80,7 @@ def test_inflow_is_learned_out_of_contact():
     output_pC = amplifier_output(charge_pC) + inflow_output_pC
     end_of_press = 3550
     with_estimate, _ = correct_leak(output_pC)
-    without_estimate, _ = correct_leak(output_pC, LeakRule(learn=False))
+    without_estimate, _ = correct_leak(output_pC, learn=False)
     np.testing.assert_allclose(with_estimate[end_of_press, 0], 300.0, atol=8.0)
     assert without_estimate[end_of_press, 0] > 340.0
 
@@ -121,36 +119,35 @@ def test_slow_common_warming_is_no_touch():
     assert np.abs(charge_pC[1000:]).max() < 4.0
 
 
-def advance(leak, output_pC, noise_pC=1.0, *, contact=False):
-    """Return the state after a frame of 5 ms in which all amplifiers have the same output."""
-    output = np.full(3, output_pC)
-    noise = np.full(3, noise_pC)
-    return undo_leak(LeakRule(), np.full(3, TAU_S), leak, output, noise, 0.005, contact=contact)
+def settled_inflow():
+    """Return the estimate of the inflow after a long time at rest."""
+    inflow = Inflow(LeakRule(), 3)
+    inflow.learned_s = 10.0
+    return inflow
 
 
-SETTLED_LEAK = Leak.start(np.zeros(3))._replace(learned_s=10.0)
-"""State after a long time at rest."""
+@pytest.mark.parametrize(
+    ("surplus_pC", "noise_pC", "learned_pC"),
+    [(1.0, 1.0, 1.0), (1000.0, 1.0, 4.0 * np.sqrt(2.0)), (-1000.0, 0.0, -0.1)],
+    ids=["small", "large", "without noise"],
+)
+def test_spike_is_clipped_in_learning(surplus_pC, noise_pC, learned_pC):
+    """A surplus changes the inflow by 1/3 of its size, because the time constant of the estimate is 3 s.
 
-
-def test_spike_is_clipped_in_learning():
-    """An innovation changes the inflow by 1/3 of its size, because the time constant of the estimate is 3 s.
-
-    An innovation is clipped to four standard deviations, which are sqrt(2) pC each, or to 0.1 pC without noise.
+    A surplus is clipped to four standard deviations, which are sqrt(2) pC each, or to 0.1 pC without noise.
     """
-    small = advance(SETTLED_LEAK, 1.0)
-    large = advance(SETTLED_LEAK, 1000.0)
-    without_noise = advance(SETTLED_LEAK, -1000.0, noise_pC=0.0)
-    assert small.inflow_pC_per_s == pytest.approx(np.full(3, 1.0 / 3.0))
-    assert large.inflow_pC_per_s == pytest.approx(np.full(3, 4.0 * np.sqrt(2.0) / 3.0))
-    assert without_noise.inflow_pC_per_s == pytest.approx(np.full(3, -0.1 / 3.0))
+    inflow = settled_inflow()
+    inflow.learn(np.full(3, surplus_pC), np.full(3, noise_pC), 0.005)
+    assert inflow.pC_per_s == pytest.approx(np.full(3, learned_pC / 3.0))
 
 
 def test_learning_pauses_after_a_release():
     """After the release, the charge of a finger that leaves the film still falls for half a second."""
-    leak = advance(SETTLED_LEAK, 40.0, contact=True)
-    for number in range(99):
-        leak = advance(leak, 40.0 - 0.4 * number)
-    assert not leak.inflow_pC_per_s.any()
-    for number in range(20):
-        leak = advance(leak, -0.4 * number)
-    assert leak.inflow_pC_per_s.any()
+    output_pC = np.concatenate([np.zeros(300), np.full(100, 400.0), np.linspace(15.0, 0.0, 100), np.full(300, -2.0)])
+    chain = StageRunner(tare={"frames": 20}, leak={"tau_s": 1e6})
+    inflows = []
+    for number, row_pC in enumerate(output_pC):
+        chain.advance(np.full(3, row_pC), number / RATE_HZ, 1.0 / RATE_HZ)
+        inflows.append(chain.stage(Leak)._inflow.pC_per_s[0])
+    assert not any(inflows[301:500])  # the touch is detected at the end of the frame 300
+    assert inflows[520] != 0.0

@@ -14,10 +14,11 @@ from scipy.signal import lfilter
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Contact, Frame, TouchStream, device_from_table, encode_frame
 from isocharge.serve.prediction.contact import Sensitivity
-from isocharge.serve.signal_chain.chain import SignalChain
 from isocharge.serve.signal_chain.memory import CREEP_LAW_DEVIATION, LEARN_S, WARMTH_CHANGE_PC
 from isocharge.serve.signal_chain.memory_state import DECADES_S
+from isocharge.serve.signal_chain.thermal import warming_ratios
 from isocharge.train.export_c.folder import device_header
+from stage_runner import StageRunner
 
 RATE_HZ = 200.0
 """Number of frames per second, Hz."""
@@ -92,12 +93,12 @@ def run_chain(charge_pC, table=MEMORY, noise_pC=0.3, misfit=None):
     n_electrode = charge_pC.shape[1]
     rng = np.random.default_rng(0)
     noisy_pC = charge_pC + noise_pC * rng.standard_normal(charge_pC.shape)
-    chain = SignalChain(device_from_table(table, "b").chain(tuple("ABCD"[:n_electrode])), n_electrode, misfit)
+    chain = StageRunner(n_electrode, misfit, **table)
     readings = [chain.advance(row, number / RATE_HZ, 1.0 / RATE_HZ) for number, row in enumerate(noisy_pC)]
     charges = [np.zeros(n_electrode) if reading.charge_pC is None else reading.charge_pC for reading in readings]
     return ChainResult(
         charge_pC=np.array(charges),
-        contact=np.array([reading.contact for reading in readings]),
+        contact=np.array([reading.is_contact for reading in readings]),
         scale_std=np.array([reading.charge_scale_std for reading in readings]),
     )
 
@@ -321,14 +322,14 @@ def test_records_have_the_standard_deviations_of_an_uncertain_memory(film, predi
 
 def test_warming_charges_are_relative_to_their_mean():
     board = device_from_table({"common_mode": {"pC_per_K": {"A": 2.0, "B": -6.0, "C": 3.0, "D": 1.0}}}, "b")
-    np.testing.assert_allclose(board.chain((*NAMES, "D")).warming_ratios, np.array([2.0, -6.0, 3.0, 1.0]) / 3.0)
+    np.testing.assert_allclose(warming_ratios(board.setup((*NAMES, "D"))), np.array([2.0, -6.0, 3.0, 1.0]) / 3.0)
 
 
 @pytest.mark.parametrize("per_K", [{"A": 1.0}, {"A": 0.0, "B": 0.0, "C": 0.0, "D": 0.0}])
 def test_charges_of_warming_are_for_each_electrode(per_K):
     board = device_from_table({"common_mode": {"pC_per_K": per_K}}, "b")
     with pytest.raises(DeviceError, match=r"b: common_mode.pC_per_K: expected a number"):
-        board.chain((*NAMES, "D"))
+        warming_ratios(board.setup((*NAMES, "D")))
 
 
 @pytest.mark.parametrize("table", [MEMORY, {"common_mode": {"pC_per_K": {"A": 1.0, "B": 1.0, "C": 1.0, "D": -1.0}}}])

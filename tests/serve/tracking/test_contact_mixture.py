@@ -18,7 +18,8 @@ from isocharge.serve.live.device import device_from_table
 from isocharge.serve.model.charge_series import ChargeSeries, read_charges
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.tracking.contact_mixture import GAIN_STD, ContactMixture
-from isocharge.serve.tracking.tracker import Tracker
+from stage_runner import new_tracker
+from stage_runner import track as track_frame
 
 RADIUS = 6.0
 """Largest distance of a contact from the centre, mm."""
@@ -71,18 +72,18 @@ def noisy_charges(x, y=1.0, force=0.5, seed=0, gains=(1.0, 1.0, 1.0)):
     return clean + np.sqrt(NOISE.variance(clean)) * rng.standard_normal(clean.shape)
 
 
-def new_tracker():
+def folded_tracker():
     """Return a tracker of the folded film."""
-    return Tracker(mixture=ContactMixture(folded_series(), NOISE))
+    return new_tracker(ContactMixture(folded_series(), NOISE))
 
 
 def track(x, rate_Hz=1000.0, **options):
     """Track contacts at positions x, mm; return the tracked contact and the other contact of each frame."""
-    tracker = new_tracker()
+    tracker = folded_tracker()
     results = []
     for number, charge_pC in enumerate(noisy_charges(x, **options)):
-        tracked, _ = tracker.update(MODEL_CONTACT, number / rate_Hz, (), charge_pC)
-        results.append((tracked, tracker.other))
+        tracked, _ = track_frame(tracker, MODEL_CONTACT, number / rate_Hz, (), charge_pC)
+        results.append((tracked, tracker._other))
     return results
 
 
@@ -150,18 +151,18 @@ def test_contact_that_turns_back_in_front_of_a_fold_stays_on_its_side():
 
 
 def test_charges_of_no_contact_are_not_tracked_and_saturated_frames_are_ignored():
-    tracker = new_tracker()
+    tracker = folded_tracker()
     for number in range(20):
-        assert tracker.update(MODEL_CONTACT, number / 1000.0, (), np.array([1e3, 1e6, 10.0])) == (None, None)
-    assert tracker.update(None, 0.05) == (None, None)
+        assert track_frame(tracker, MODEL_CONTACT, number / 1000.0, (), np.array([1e3, 1e6, 10.0])) == (None, None)
+    assert track_frame(tracker, None, 0.05) == (None, None)
 
     results = []
     for number, charge_pC in enumerate(noisy_charges(np.full(30, -4.0))):
-        results.append(tracker.update(MODEL_CONTACT, 0.1 + number / 1000.0, (), charge_pC))
+        results.append(track_frame(tracker, MODEL_CONTACT, 0.1 + number / 1000.0, (), charge_pC))
     last_tracked, _ = results[-1]
     assert [event for _, event in results if event] == ["press"]
     assert last_tracked.x_mm == pytest.approx(-4.0, abs=0.3)
-    assert tracker.update(MODEL_CONTACT, 0.2, ("saturated",), np.full(3, 1e5)) == (last_tracked, None)
+    assert track_frame(tracker, MODEL_CONTACT, 0.2, ("saturated",), np.full(3, 1e5)) == (last_tracked, None)
 
 
 @pytest.mark.parametrize("set_back_s", [0.002, 50.0])

@@ -13,8 +13,9 @@ from isocharge.serve.flags import INVALID
 from isocharge.serve.live.device import device_from_table, with_settings
 from isocharge.serve.tracking.measurement_noise import SCALAR_SHAPE, CovarianceShape, NoiseEstimate
 from isocharge.serve.tracking.motion import MIN_ACCELERATION_SHARE, POSITION_MOTION, MotionModel
-from isocharge.serve.tracking.tracker import Tracker, TrackRule
+from isocharge.serve.tracking.tracker import TrackRule
 from isocharge.serve.tracking.two_mode_filter import TwoModeFilter
+from stage_runner import new_tracker, track
 
 STD = 0.06
 """Standard deviation of a simulated position, mm."""
@@ -59,11 +60,11 @@ def track_contacts(contacts, rate_Hz=1000.0):
     Returns:
         The tracked contacts, shape (n, 9), and the events with the numbers of their frames.
     """
-    tracker = Tracker(TrackRule(lasting=0.0))
+    tracker = new_tracker(lasting=0.0)
     rows = []
     events = []
     for number, contact in enumerate(contacts):
-        tracked, event = tracker.update(contact, number / rate_Hz)
+        tracked, event = track(tracker, contact, number / rate_Hz)
         rows.append(structs.astuple(tracked))
         if event is not None:
             events.append((number, event))
@@ -72,7 +73,7 @@ def track_contacts(contacts, rate_Hz=1000.0):
 
 def update_all(tracker, contacts, begin_s, flags=()):
     """Track contacts at 1 kHz from a time on, s; return the results of all updates."""
-    return [tracker.update(contact, begin_s + number / 1000.0, flags) for number, contact in enumerate(contacts)]
+    return [track(tracker, contact, begin_s + number / 1000.0, flags) for number, contact in enumerate(contacts)]
 
 
 def events_of(results):
@@ -210,46 +211,46 @@ def test_events_press_hold_slide_hold_of_a_slide():
 
 def test_velocity_of_a_slide_and_event_release():
     path, _ = slide(50.0, direction=math.radians(40.0))
-    tracker = Tracker()
+    tracker = new_tracker()
     results = update_all(tracker, noisy_contacts(path), begin_s=0.0)
     vx, vy = np.mean([(tracked.vx_mm_s, tracked.vy_mm_s) for tracked, _ in results[400:590]], axis=0)
     assert math.hypot(vx, vy) == pytest.approx(50.0, rel=0.03)
     assert math.degrees(math.atan2(vy, vx)) == pytest.approx(40.0, rel=0.03)
 
     last_tracked, _ = results[-1]
-    assert tracker.update(None, 0.85, (INVALID,)) == (last_tracked, None)
-    assert tracker.update(None, 0.9) == (None, "release")
-    assert tracker.update(None, 0.95) == (None, None)
+    assert track(tracker, None, 0.85, (INVALID,)) == (last_tracked, None)
+    assert track(tracker, None, 0.9) == (None, "release")
+    assert track(tracker, None, 0.95) == (None, None)
 
 
 def test_event_tap_of_a_short_press_and_event_release_of_a_short_slide():
-    tracker = Tracker()
+    tracker = new_tracker()
     tap = update_all(tracker, noisy_contacts(np.zeros(100)), begin_s=1.0)
     assert events_of(tap) == ["press"]
-    assert tracker.update(None, 1.1) == (None, "tap")
+    assert track(tracker, None, 1.1) == (None, "tap")
     swipe = update_all(tracker, noisy_contacts(0.1 * np.arange(100)), begin_s=2.0)
     assert events_of(swipe) == ["press", "slide"]
-    assert tracker.update(None, 2.1) == (None, "release")
+    assert track(tracker, None, 2.1) == (None, "release")
 
 
 def test_touch_continues_if_the_clock_is_set_back():
     """The clock is set back by 50 s after a touch of 0.1 s. The events hold and release do not wait for 50 s."""
-    tracker = Tracker()
+    tracker = new_tracker()
     before = update_all(tracker, noisy_contacts(np.zeros(100)), begin_s=100.0)
     after = update_all(tracker, noisy_contacts(np.zeros(200)), begin_s=50.0)
     assert events_of(before) == ["press"]
     hold_frames = [number for number, (_, event) in enumerate(after) if event == "hold"]
     assert hold_frames == pytest.approx([100], abs=30)
-    assert tracker.update(None, 50.2) == (None, "release")
+    assert track(tracker, None, 50.2) == (None, "release")
 
 
 @pytest.mark.parametrize("set_back_s", [0.002, 0.1, 50.0])
 def test_tracked_contact_is_correct_directly_after_the_clock_was_set_back(set_back_s):
     """The filter begins again, so that the first tracked contact is the contact of the frame."""
-    tracker = Tracker()
+    tracker = new_tracker()
     update_all(tracker, noisy_contacts(slide(50.0)[0][:450]), begin_s=100.0)
     contact, *_ = noisy_contacts([2.0 + 1.0j])
-    tracked, _ = tracker.update(contact, 100.449 - set_back_s)
+    tracked, _ = track(tracker, contact, 100.449 - set_back_s)
     assert (tracked.x_mm, tracked.y_mm) == pytest.approx((contact.x_mm, contact.y_mm), abs=1e-9)
     assert (tracked.x_std_mm, tracked.y_std_mm) == pytest.approx((STD, STD), rel=1e-6)
     assert all(math.isfinite(value) for value in structs.astuple(tracked))
@@ -258,9 +259,9 @@ def test_tracked_contact_is_correct_directly_after_the_clock_was_set_back(set_ba
 @pytest.mark.parametrize("frames_per_time", [2, 10])
 def test_frames_with_the_same_time_are_smoothed(frames_per_time):
     """A board without a clock sends ten frames in a chunk, or a board at 2 kHz states its time in milliseconds."""
-    tracker = Tracker(TrackRule(lasting=0.0))
+    tracker = new_tracker(lasting=0.0)
     tracked = [
-        tracker.update(contact, 1e-3 * frames_per_time * (number // frames_per_time))[0]
+        track(tracker, contact, 1e-3 * frames_per_time * (number // frames_per_time))[0]
         for number, contact in enumerate(noisy_contacts(np.zeros(1000)))
     ]
     assert np.std([contact.x_mm for contact in tracked[500:]]) < 0.2 * STD
@@ -268,7 +269,7 @@ def test_frames_with_the_same_time_are_smoothed(frames_per_time):
 
 
 def test_saturated_frames_have_a_small_weight():
-    tracker = Tracker()
+    tracker = new_tracker()
     update_all(tracker, noisy_contacts(np.zeros(100)), begin_s=0.0)
     moved = update_all(tracker, noisy_contacts([0.5] * 5), begin_s=0.1, flags=("saturated",))
     assert max(tracked.x_mm for tracked, _ in moved) < 0.1
@@ -308,6 +309,6 @@ def test_records_with_track_only_add_fields_and_are_repeated_bit_for_bit(film, p
 
 
 def test_device_file_section_track_switches_tracking_on():
-    assert Device().track is None
-    assert device_from_table({"track": {"lasting": 0.9}}, "b").track == TrackRule(lasting=0.9)
+    assert Device().rule(TrackRule) is None
+    assert device_from_table({"track": {"lasting": 0.9}}, "b").rule(TrackRule) == TrackRule(lasting=0.9)
     assert with_settings(device_from_table({}, "b"), "track", on=True).table == {"track": {"on": True}}

@@ -28,10 +28,10 @@ from isocharge.serve import (
     device_from_table,
     encode_frame,
 )
-from isocharge.serve.live.contact_stages import ContactFrame, CurrentModel, FilmStage, PredictionStage
+from isocharge.serve.live.contact_stages import FollowFilm, Prediction
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.pretensions import read_pretensions
-from isocharge.serve.signal_chain.chain import Reading
+from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.thermal import TRIED_PC, ThermalRule
 from isocharge.serve.tracking.film_follower import FilmFollower, FollowedContact, FollowRule
 from isocharge.serve.tracking.touch_collector import ObservedTouch
@@ -83,15 +83,14 @@ def test_common_offset_of_warm_fingers_is_not_taken_for_pretension(mine, problem
 @pytest.fixture
 def film_stage(mine):
     """The stage that follows the film, before the first touch."""
-    return FilmStage(CurrentModel(Predictor(mine)), FollowRule(), 1.0)
+    return FollowFilm(Setup(tuple("ABCD"), {FollowRule: FollowRule()}, predictor=Predictor(mine)))
 
 
 def frame_at(stage, charge_pC, clock_s, flags=()):
     """Return a frame with the contact that the model of a stage predicts; None as the charge for no contact."""
-    reading = Reading(np.zeros(4), charge_pC, None, charge_pC is not None, flags)
-    frame = ContactFrame(reading, clock_s, flags)
-    if charge_pC is not None:
-        PredictionStage(CurrentModel(stage.follower.predictor)).step(frame)
+    frame = Frame(None, None, (), charge_pC=charge_pC, clock_s=clock_s, flags=list(flags))
+    frame.is_contact = charge_pC is not None
+    Prediction(stage._setup).step(frame)
     return frame
 
 
@@ -102,20 +101,21 @@ def test_touch_with_invalid_frames_counts_once(film_stage, touch_charge):
             frame_at(film_stage, None if is_invalid else touch_charge, 0.01 * number, ("invalid",) * is_invalid)
         )
     film_stage.step(frame_at(film_stage, None, 1.0))
-    assert film_stage.follower.film.touches == 1
+    assert film_stage._follower.film.touches == 1
 
 
 @pytest.mark.parametrize("misfit", [0.5, 50.0])
 def test_flags_of_a_followed_film_belong_to_the_corrected_contact(film_stage, touch_charge, monkeypatch, misfit):
     """The contact before the correction has a misfit on the other side of the limit."""
     frame = frame_at(film_stage, touch_charge, 0.0, ("gap",))
-    frame.flags = ("gap",) if misfit > 1.0 else ("gap", "misfit")
+    frame.contact_flags = () if misfit > 1.0 else ("misfit",)
     corrected_contact = frame.contact._replace(misfit=misfit)
     monkeypatch.setattr(
-        film_stage.follower, "follow_contact", lambda *_: FollowedContact(corrected_contact, touch_charge)
+        film_stage._follower, "follow_contact", lambda *_: FollowedContact(corrected_contact, touch_charge)
     )
     film_stage.step(frame)
-    assert frame.flags == (("gap", "misfit") if misfit > 1.0 else ("gap",))
+    assert frame.flags == ["gap"]
+    assert frame.contact_flags == (("misfit",) if misfit > 1.0 else ())
 
 
 def test_film_that_is_lost_twice_keeps_the_state_before_the_latest_touches(mine, problem, film, monkeypatch):
@@ -201,7 +201,8 @@ def mean_warming(mine, problem, film, seed):
     device = device_from_table({"follow": {"on": True}, "common_mode": {"on": True}}, "test")
     stream = TouchStream(Predictor(mine), device)
     _, charge = touch_charges(problem, film, stream.predictor, 1.0 + DEGREE_MPa, 60, seed=seed)
-    follow_touches(stream._film_stage.follower, charge)
+    (film_stage,) = [stage for stage in stream._contact_stages if isinstance(stage, FollowFilm)]
+    follow_touches(film_stage._follower, charge)
     held = film(1.0 + DEGREE_MPa).charges(np.array([[4.0, 3.0, 0.5]]))
     clean = np.vstack([np.zeros((110, 4)), np.tile(held, (400, 1))])
     raw = problem.noise.add(clean, np.random.default_rng(seed))

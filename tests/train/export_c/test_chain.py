@@ -10,12 +10,15 @@ from hypothesis import strategies as st
 from isocharge.common.errors import DeviceError, TareError
 from isocharge.serve import BinaryParser, Predictor, device_from_table, encode_frame
 from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
+from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import T_US_MODULUS, Frame
-from isocharge.serve.port.device_clock import DeviceClock
 from isocharge.serve.port.source import Chunk
-from isocharge.serve.signal_chain.chain import SignalChain
-from isocharge.train.export_c import folder
+from isocharge.serve.signal_chain.gain import Gain
+from isocharge.serve.signal_chain.hum import Hum
+from isocharge.serve.signal_chain.thermal import ThermalRule
+from isocharge.serve.signal_chain.touch import TouchRule
 from isocharge.train.export_c.folder import device_header
+from stage_runner import StageRunner
 
 BITS = {TARE: 1, SATURATED: 2, NEGATIVE: 4, THERMAL: 8, BLIND: 16, INVALID: 32}
 """Bit of each flag in C."""
@@ -100,10 +103,7 @@ def draw_frames(board, seed, seconds=20.0):
     charge += np.where(is_pressed, 30.0, 0.0)[:, None] * rng.random()
     charge[rng.choice(np.flatnonzero(is_pressed), 3)] *= 40.0  # spikes, which are not peaks of a press
 
-    chain = device(board).chain(ELECTRODES)
-    values = charge if chain.gain_pC is None else charge / chain.gain_pC
-    if chain.zero is not None:
-        values += chain.zero
+    values = Gain(device(board).setup(ELECTRODES)).revert(charge)
     for invalid in (np.nan, np.inf, -np.inf, 3e9, 1e300):
         values[rng.integers(0, count, 2), rng.integers(0, n_electrode, 2)] = invalid
     limited = rng.random(count) < 0.003
@@ -111,16 +111,16 @@ def draw_frames(board, seed, seconds=20.0):
     return Frames(values, t_s, dt_s, limited, tare)
 
 
-def python_chain(chain, frames, misfit):
+def python_chain(device, frames, misfit):
     """Process frames with the signal chain in Python, and return arrays like those of `Exported.chain`.
 
     Args:
-        chain: Settings of the chain.
+        device: The board.
         frames: The frames.
         misfit: Function from charges to misfits, for the estimate of the warming.
     """
     n_electrode = frames.values.shape[1]
-    signal_chain = SignalChain(chain, n_electrode, misfit)
+    signal_chain = StageRunner(n_electrode, misfit, device=device)
     charge = np.zeros_like(frames.values)
     tare_charge = np.zeros_like(frames.values)
     contact = []
@@ -132,9 +132,9 @@ def python_chain(chain, frames, misfit):
         reading = signal_chain.advance(values, float(frames.t_s[index]), float(frames.dt_s[index]), limited=is_limited)
         if reading.charge_pC is not None:
             charge[index] = reading.charge_pC
-        if reading.tare is not None:
-            tare_charge[index] = reading.tare.charge_pC
-        contact.append(reading.contact)
+        if reading.tare_pC is not None:
+            tare_charge[index] = reading.tare_pC
+        contact.append(reading.is_contact)
         flags.append(sum(BITS[flag] for flag in reading.flags))
     return charge, tare_charge, np.array(contact), np.array(flags)
 
@@ -149,14 +149,13 @@ def misfit():
 def test_c_and_python_give_the_same_charges_and_states_for_each_frame(board, build, misfit):
     """The estimated warming depends on the network, whose values in C have other rounding errors."""
     exported = build("four-25um-biaxial", device(board))
-    chain = device(board).chain(ELECTRODES)
-    estimates_warming = chain.thermal is not None
+    estimates_warming = device(board).rule(ThermalRule) is not None
     tolerance_pC = 0.2 if estimates_warming else 1e-9
     max_share_of_other_flags = 0.002 if estimates_warming else 0.0
     other_bits = ALL_BITS - WARMING_BITS
     for seed in range(2):
         frames = draw_frames(board, seed)
-        expected_charge, expected_tare, expected_contact, expected_flags = python_chain(chain, frames, misfit)
+        expected_charge, expected_tare, expected_contact, expected_flags = python_chain(device(board), frames, misfit)
         charge, tare, contact, flags = exported.chain(*frames)
         np.testing.assert_array_equal(contact, expected_contact)
         np.testing.assert_array_equal(flags & other_bits, expected_flags & other_bits)
@@ -165,7 +164,7 @@ def test_c_and_python_give_the_same_charges_and_states_for_each_frame(board, bui
         np.testing.assert_allclose(tare, expected_tare, rtol=0, atol=tolerance_pC)
         assert expected_contact.mean() > 0.05
         release_count = np.count_nonzero(np.diff(expected_contact.astype(int)) < 0)
-        assert release_count >= 3 or chain.touch is None
+        assert release_count >= 3 or device(board).rule(TouchRule) is None
 
 
 @pytest.mark.parametrize("board", ["any board", "leak", "gain and limit", "hum"])
@@ -176,8 +175,7 @@ def test_single_precision_changes_charges_by_less_than_a_twentieth_of_a_picocoul
     )
     frames = draw_frames(board, seed=4)
     frames.values[np.abs(frames.values) > 1e30] = np.inf
-    chain = device(board).chain(ELECTRODES)
-    expected_charge, _, expected_contact, expected_flags = python_chain(chain, frames, misfit)
+    expected_charge, _, expected_contact, expected_flags = python_chain(device(board), frames, misfit)
     charge, _, contact, flags = exported.chain(*frames)
     np.testing.assert_array_equal(contact, expected_contact)
     np.testing.assert_array_equal(flags, expected_flags)
@@ -199,7 +197,7 @@ IMPATIENT_BOARD = device_from_table({"tare": {"frames": 20, "patience": 50}}, "b
 
 def test_failed_tare_is_reported_after_the_patience_of_the_board(build, restless_frames):
     with pytest.raises(TareError):
-        python_chain(IMPATIENT_BOARD.chain(("A", "B", "C")), restless_frames, None)
+        python_chain(IMPATIENT_BOARD, restless_frames, None)
     exported = build("three-25um-biaxial", IMPATIENT_BOARD)
     _, _, _, flags = exported.chain(*restless_frames)
     first_failed, *_ = np.flatnonzero(flags & TARE_FAILED)
@@ -219,7 +217,7 @@ def test_tare_that_is_too_long_for_c_is_refused():
 
 
 def test_stage_without_code_in_c_is_refused_by_its_name(monkeypatch):
-    monkeypatch.setattr(folder, "C_SECTIONS", folder.C_SECTIONS - {"hum"})
+    monkeypatch.setattr(Hum, "c_prefix", "")
     board = device_from_table({"hum": {}}, "board")
     with pytest.raises(DeviceError, match="board: hum: this stage does not exist"):
         device_header(board, ("A", "B", "C"))
@@ -236,7 +234,7 @@ FRAMES = st.builds(
     seq=st.integers(0, 65535),
     t_us=st.integers(0, T_US_MODULUS - 1),
     values=st.lists(FLOAT32, max_size=255).map(tuple),
-    flags=st.integers(0, 255),
+    bits=st.integers(0, 255),
 )
 TOO_LONG = st.binary(min_size=1050, max_size=1100)
 PIECES = st.one_of(FRAMES.map(encode_frame), st.binary(max_size=40), st.just(b"\0"), TOO_LONG)
@@ -257,7 +255,7 @@ def test_c_and_python_parse_any_bytes_into_the_same_frames_and_counters(exported
         data[position % len(data)] = value
     data += b"\0"
     parser = BinaryParser()
-    expected_frames = [(frame.seq, frame.t_us, frame.flags, frame.values) for frame in parser.feed(bytes(data))]
+    expected_frames = [(frame.seq, frame.t_us, frame.bits, frame.values) for frame in parser.feed(bytes(data))]
     expected = parser.counts
     frames, counts = exported.frames(bytes(data))
     np.testing.assert_equal(frames, expected_frames)
@@ -267,14 +265,14 @@ def test_c_and_python_parse_any_bytes_into_the_same_frames_and_counters(exported
 @given(frame=FRAMES)
 @settings(max_examples=200, deadline=None)
 def test_c_and_python_write_the_same_frames(exported, frame):
-    assert exported.encode(frame.seq, frame.t_us, frame.flags, frame.values) == encode_frame(frame)
+    assert exported.encode(frame.seq, frame.t_us, frame.bits, frame.values) == encode_frame(frame)
 
 
 @pytest.mark.parametrize("n_value", [0, 1, 60, 61, 62, 63, 124, 125, 126, 255])
 def test_frames_without_a_zero_byte_are_divided_after_254_bytes(exported, n_value):
     values = np.frombuffer(b"\1\1\1\1" * n_value, np.float32).tolist()
     frame = Frame(0x0101, 0x01010101, values, 1)
-    assert exported.encode(frame.seq, frame.t_us, frame.flags, frame.values) == encode_frame(frame)
+    assert exported.encode(frame.seq, frame.t_us, frame.bits, frame.values) == encode_frame(frame)
     frames, _ = exported.frames(encode_frame(frame))
     assert frames == [(frame.seq, frame.t_us, 1, tuple(frame.values))]
 
@@ -285,8 +283,9 @@ def test_clock_overflows_and_restarts_in_c_as_in_python(exported):
     t_us[300:] = (t_us[300:] - t_us[300] + 17) % T_US_MODULUS  # the board was reset
     t_us[400:] = (t_us[400:] + (1 << 31) + 500_000) % T_US_MODULUS
     clock = DeviceClock()
-    times = clock.read(Chunk(b"", 0.0, 0), t_us.tolist(), T_US_MODULUS)
+    frames = [Frame(None, device_us, ()) for device_us in t_us.tolist()]
+    clock.stamp(Chunk(b"", 0.0, 0), frames, T_US_MODULUS)
     t_s, dt_s = exported.clock(t_us)
-    np.testing.assert_allclose(t_s, [time.clock_s for time in times], rtol=1e-15)
-    np.testing.assert_allclose(dt_s, [time.step_s for time in times], rtol=1e-15)
+    np.testing.assert_allclose(t_s, [frame.clock_s for frame in frames], rtol=1e-15)
+    np.testing.assert_allclose(dt_s, [frame.dt_s for frame in frames], rtol=1e-15)
     assert clock.restarts == 2

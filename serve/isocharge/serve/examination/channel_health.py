@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.signal_chain.chain import LARGEST_PC
+from isocharge.serve.signal_chain.gain import LARGEST_PC
 
 MAINS_HZ = (50.0, 60.0)
 """Frequencies at which hum is searched for, Hz."""

@@ -19,8 +19,8 @@ from isocharge.common.printable_text import printable
 from isocharge.serve.examination.proposal import estimate_noise
 from isocharge.serve.examination.touch_search import BLOCK_S, CHANGE_SIGMAS, rounding_error_std
 from isocharge.serve.live.device import Device
-from isocharge.serve.live.reading_stream import channel_index
 from isocharge.serve.port.source import Port
+from isocharge.serve.signal_chain.channels import channel_index
 
 REST_BLOCKS = 5
 """Number of quiet blocks before a press, from which the rest is measured: half a second."""

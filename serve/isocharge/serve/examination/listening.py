@@ -9,12 +9,12 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PortLost
+from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
 from isocharge.serve.live.device import Device
-from isocharge.serve.live.reading_stream import channel_names
-from isocharge.serve.port.device_clock import DeviceClock
 from isocharge.serve.port.serial_line import UDP_SCHEME, Request
 from isocharge.serve.port.source import Chunk, Port, has_speed
+from isocharge.serve.signal_chain.channels import channel_names
 
 BAUDS = (115200, 921600, 1000000, 2000000, 460800, 230400, 57600, 38400, 19200, 9600)
 """Baud rates to try, in this order, bit/s."""
@@ -234,9 +234,9 @@ def read_frames(received: ReceivedData, device: Device) -> Capture:
     clock = DeviceClock()
     for chunk in received.chunks:
         frames = capture.parser.feed(chunk.data)
-        times = clock.read(chunk, [frame.t_us for frame in frames], capture.parser.t_us_modulus)
+        clock.stamp(chunk, frames, capture.parser.t_us_modulus)
         capture.frames += frames
-        capture.times_s += [time.clock_s for time in times]
+        capture.times_s += [frame.clock_s for frame in frames]
         for frame in frames:
             capture.gaps.update(frame.seq, capture.parser.seq_modulus)
     return capture

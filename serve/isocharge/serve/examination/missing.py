@@ -10,8 +10,10 @@ from isocharge.serve.examination.held_press import HeldPress
 from isocharge.serve.examination.listening import Capture
 from isocharge.serve.live.device import Device
 from isocharge.serve.live.fading import section_text
-from isocharge.serve.live.reading_stream import ChannelPicker
 from isocharge.serve.port.serial_line import TELNET_ADVICE
+from isocharge.serve.signal_chain.channels import Channels
+from isocharge.serve.signal_chain.inflow import LeakSection
+from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.tare import TareRule
 
 CLEAN_SHARE = 0.99
@@ -100,7 +102,7 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
             f"the names of the channels state {findings.unit}: state the charge of one {findings.unit} in pC with "
             "--pc-per-unit NUMBER"
         )
-    tare_rule = findings.device.tare or TareRule()  # the defaults if the device file has no tare
+    tare_rule = findings.device.rule(TareRule) or TareRule()  # the defaults if the device file has no tare
     for channel in findings.channels:
         if channel.unusable:
             yield (
@@ -148,7 +150,7 @@ def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
     if has_every_electrode_a_channel:
         return
     try:
-        ChannelPicker(electrodes, {}, "the model", has_gain=True).named_indices(findings.capture.frames[-1])
+        Channels(Setup(electrodes, reader="the model"), any_unit=True).named_indices(findings.capture.frames[-1])
     except ChargeError as error:
         yield str(error)
         return
@@ -216,7 +218,7 @@ def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
     device = findings.device
     held_press = findings.held_press
     has_device_clock = findings.capture.frames[0].t_us is not None
-    if device.leak is not None and not has_device_clock:
+    if device.rule(LeakSection) is not None and not has_device_clock:
         yield (
             "send the time of a device clock in each frame (t_us, t_ms or t_s): without it the leak is corrected with "
             "the arrival times, which jitter"
@@ -226,7 +228,7 @@ def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
         for section_name, settings in held_press.sections.items():
             if section_name not in device.table:  # the device file has no such section yet
                 yield f"put {section_text(section_name, settings)} into a device file"
-    elif device.leak is None:
+    elif device.rule(LeakSection) is None:
         yield (
             "state the time constants of the amplifiers in a device file ([leak] tau_s): without them the force of a "
             "held press seems to decrease. The time constants follow from the circuit. To measure them instead, listen "

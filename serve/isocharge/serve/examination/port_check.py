@@ -22,10 +22,13 @@ from isocharge.serve.examination.proposal import Proposal, propose, unit_of
 from isocharge.serve.examination.touch_search import find_touch
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
-from isocharge.serve.live.reading_stream import ReadingStream, channel_index
+from isocharge.serve.live.stream import ReadingStream
 from isocharge.serve.port.serial_line import Request, without_telnet
 from isocharge.serve.port.source import has_speed
 from isocharge.serve.recognition.recognise import recognise
+from isocharge.serve.signal_chain.channels import channel_index
+from isocharge.serve.signal_chain.gain import Gain, GainRule
+from isocharge.serve.signal_chain.tare import TareRule
 
 RIGHT_BAUD_SHARE = 0.5
 """Smallest share of bytes in good frames at the right baud rate, dimensionless."""
@@ -169,7 +172,7 @@ def _proposed_device(proposal: Proposal, *, is_gain_stated: bool) -> Device:
     """
     table = {key: value for key, value in proposal.table.items() if is_gain_stated or key != "gain"}
     device = device_from_table(table, "board")
-    device.check_gain(proposal.electrodes)
+    Gain(device.setup(proposal.electrodes))  # raises an error for the numbers of other electrodes
     return device
 
 
@@ -208,7 +211,7 @@ def examine_received(
     # Read the frames, and examine the channels in the time before a held press. With a gain, all values are converted
     # to pC.
     capture = read_frames(received, device)
-    unit = "pC" if device.gain is not None else unit_of(capture)
+    unit = "pC" if device.rule(GainRule) is not None else unit_of(capture)
     electrode_at_position = electrodes_by_position(capture, device)
     unused_channels = tuple(
         name for position, name in enumerate(capture.names) if position not in electrode_at_position
@@ -343,21 +346,20 @@ def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: 
     try:
         # Process the bytes again as a reader of the board does, until a frame has a tare.
         device = device_from_table(table, "board")
+        tare_rule = device.rule(TareRule)
         stream = ReadingStream(electrodes, device)
         for chunk in received.chunks:
-            for timed_reading in stream.feed(chunk):
+            for frame in stream.frames(chunk):
                 frame_count += 1
-                is_tare_needed = device.tare is not None
-                has_tare = timed_reading.reading.tare is not None
-                if has_tare or not is_tare_needed:
+                if frame.tare_pC is not None or tare_rule is None:
                     return True
     except IsochargeError:
         return False
 
-    if device.tare is None or frame_count == 0:  # without a tare rule, the first frame has ended the loop
+    if tare_rule is None or frame_count == 0:  # without a tare rule, the first frame has ended the loop
         return False
     # No frame has a tare. If there were few frames, this does not show that a tare fails.
-    return frame_count < 2 * device.tare.frames
+    return frame_count < 2 * tare_rule.frames
 
 
 def electrodes_by_position(capture: Capture, device: Device) -> dict[int, str]:
@@ -418,8 +420,9 @@ def _rest_charges(
     is_rest = times_s < rest_end_s
     positions_in_frame = list(electrode_at_position)
     charges = values[is_rest][:, positions_in_frame]
-    if device.gain is not None:
+    gain = device.rule(GainRule)
+    if gain is not None:
         for column, electrode in enumerate(electrode_at_position.values()):
             with np.errstate(over="ignore"):  # an unusable value may become infinite, and is ignored later
-                charges[:, column] = device.gain.charge_pC(electrode, charges[:, column])
+                charges[:, column] = gain.charge_pC(electrode, charges[:, column])
     return charges, times_s[is_rest]

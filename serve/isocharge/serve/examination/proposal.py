@@ -15,8 +15,9 @@ from isocharge.serve.examination.held_press import find_held_press
 from isocharge.serve.examination.listening import Capture, ReceivedData, read_frames
 from isocharge.serve.frames.binary import FORMAT as BINARY
 from isocharge.serve.live.device import device_from_table
-from isocharge.serve.live.reading_stream import ChannelPicker, electrode_of, stated_unit
 from isocharge.serve.recognition.recognise import recognise
+from isocharge.serve.signal_chain.channels import Channels, electrode_of, stated_unit
+from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.tare import TareRule
 
 QUIET_SHARE = 0.1
@@ -220,7 +221,7 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
         electrodes = letters if set(letters) <= set(ELECTRODES) else tuple(ELECTRODES[: len(letters)])
     try:
         # A unit in the names does not matter, because the gain is requested if it is missing.
-        named_positions = ChannelPicker(electrodes, {}, "the model", has_gain=True).named_indices(capture.frames[-1])
+        named_positions = Channels(Setup(electrodes), any_unit=True).named_indices(capture.frames[-1])
     except ChargeError:  # the names are nearly those of electrodes, which is reported later
         return {}
     if named_positions is not None:

@@ -47,7 +47,7 @@ def encode_frame(frame: Frame) -> bytes:
         struct.error: If a number does not fit its field.
     """
     charge_count = len(frame.values)
-    header = HEADER.pack(FRAME_VERSION, frame.seq or 0, frame.t_us or 0, charge_count, frame.flags)
+    header = HEADER.pack(FRAME_VERSION, frame.seq or 0, frame.t_us or 0, charge_count, frame.bits)
     charges = struct.pack(f"<{charge_count}f", *frame.values)
     body = header + charges
     crc = CRC.pack(crc16(body))

@@ -5,12 +5,16 @@ counters do not depend on the division of the bytes into chunks. A parser stores
 it never finds a frame.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from isocharge.serve.flags import GAP, REPEAT, RESTART
+from isocharge.common.arrays import Array
+from isocharge.serve.flags import GAP, INVALID, REPEAT, RESTART
+from isocharge.serve.prediction.contact import Contact, Validity
+from isocharge.serve.record.record import FollowedFilm, Tracking
 
 SEQ_MODULUS = 1 << 16
 """Value at which a 16-bit frame counter wraps to 0."""
@@ -157,23 +161,85 @@ class CounterWrap:
         return self._modulus
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Frame:
-    """One reading of a sensor.
+    """One reading of a sensor, on its way from the bytes to its record.
+
+    A parser creates the frame. The clock and then the stages of the stream fill in the further attributes.
 
     Attributes:
         seq: Frame counter, modulo the `seq_modulus` of the parser; None if the format has no counter.
         t_us: Clock of the device, us, modulo the `t_us_modulus` of the parser; None if the format has no clock.
         values: One value for each channel, in the unit of the device. In the binary frame of isocharge, the unit is pC.
-        flags: Bits; see `SATURATED_BIT`.
+        bits: Flags that the device sends; see `SATURATED_BIT`.
         names: Names of the channels; empty if the format has no names.
+        host_s: Time of the host, unix seconds. It is computed from the clock of the device. If the device sends no
+            clock, it is computed from the arrival time. The time decreases only if a clock was set.
+        device_us: Clock of the device after the wraps were removed, us; None if the device sends no clock.
+        dt_s: Time since the previous valid frame, s; 0 for the first frame after a start. It does not depend on the
+            wall clock of the host.
+        clock_s: Time of the frame on the clock of the device, s. If the device sends no clock, it is a time of the host
+            that does not jump if the wall clock is set.
+        sent: Values of the electrodes in their order, shape (n_electrode,), in the unit of the device.
+        raw_pC: Charges as the device sent them, shape (n_electrode,), pC.
+        charge_pC: Charges after the stages so far, and touch charges after all stages, shape (n_electrode,), pC; None
+            while there is no tare, and for an invalid frame.
+        tare_pC: Charge at rest that was subtracted, shape (n_electrode,), pC; None without touch charges.
+        noise_pC: Standard deviation of the charges at rest, shape (n_electrode,), pC. It requires a tare.
+        is_contact: Whether something touches the film.
+        charge_scale_std: Relative standard deviation that all touch charges have in common, because the memory of the
+            film is not known exactly.
+        base_relax_s: Time constant with which the charge out of contact decays to zero, s.
+        is_base_held: Whether a finger is touching or leaving the film. A positive base of the touch detection then does
+            not decay.
+        contact: The computed contact; None if nothing touches the film, or if the frame is invalid.
+        contact_flags: Flags that are the reasons why the contact may be wrong.
+        model_charge_pC: Charges from which the model predicts the contact, shape (n_electrode,), pC. None if the model
+            has not predicted the contact. If the film is followed, they differ from the touch charges.
+        film: Estimated film; None if the film is not followed.
+        tracking: The tracked contact; None if contacts are not tracked.
+        flags: Flags of `isocharge.serve.flags` that do not depend on the contact.
     """
 
     seq: int | None
     t_us: int | None
     values: tuple[float, ...]
-    flags: int = 0
+    bits: int = 0
     names: tuple[str, ...] = ()
+    host_s: float = 0.0
+    device_us: int | None = None
+    dt_s: float = 0.0
+    clock_s: float = 0.0
+    sent: Array = field(init=False, repr=False, compare=False)
+    raw_pC: Array = field(init=False, repr=False, compare=False)
+    charge_pC: Array | None = None
+    tare_pC: Array | None = None
+    noise_pC: Array = field(init=False, repr=False, compare=False)
+    is_contact: bool = False
+    charge_scale_std: float = 0.0
+    base_relax_s: float = math.inf
+    is_base_held: bool = False
+    contact: Contact | None = None
+    contact_flags: tuple[str, ...] = ()
+    model_charge_pC: Array | None = None
+    film: FollowedFilm | None = None
+    tracking: Tracking | None = None
+    flags: list[str] = field(default_factory=list)
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether all values of the electrodes can be charges."""
+        return INVALID not in self.flags
+
+    def set_contact(self, contact: Contact, validity: Validity) -> None:
+        """Set the contact, and the flags of the contact.
+
+        Args:
+            contact: The contact.
+            validity: Domain in which the contact is valid.
+        """
+        self.contact = contact
+        self.contact_flags = validity.flags(contact)
 
 
 @dataclass(slots=True)
@@ -292,7 +358,7 @@ class Columns:
             seq=None if self.seq_column is None else round(numbers[self.seq_column]),
             t_us=None if self.clock_column is None else round(numbers[self.clock_column] * self.clock_unit_us),
             values=tuple([numbers[column] * scale for column, scale in self.channels]),  # faster than a generator
-            flags=0 if self.flags_column is None else int(numbers[self.flags_column]),
+            bits=0 if self.flags_column is None else int(numbers[self.flags_column]),
             names=self.names,
         )
 

@@ -323,7 +323,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         t_us = 0 if frame.t_us is None else frame.t_us
 
         # Values by the name of the field. The clock is given in all units, because its field may have any of the names.
-        values: dict[str, float] = {SEQ: seq, FLAGS: frame.flags}
+        values: dict[str, float] = {SEQ: seq, FLAGS: frame.bits}
         for clock_name, unit_us in TIMES_US.items():
             values[clock_name] = t_us / unit_us
         for channel, value in zip(self.channels, frame.values, strict=True):

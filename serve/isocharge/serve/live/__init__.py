@@ -1,4 +1,4 @@
 """Processing of a live stream, which converts the bytes of a board to prediction records.
 
-May import: port, frames, signal_chain, prediction, flags.
+May import: tracking, signal_chain, frames, prediction, record, port, flags.
 """

@@ -16,9 +16,9 @@ from isocharge.serve.frames.frame import SATURATED_BIT, SEQ, SEQ_MODULUS, T_US_M
 from isocharge.serve.frames.frame_field import Field
 from isocharge.serve.frames.frame_layout import DATAGRAM, FrameLayout
 from isocharge.serve.frames.text_lines import TEXT_FORMATS, encode_text
-from isocharge.serve.live.device import Device
-from isocharge.serve.live.reading_stream import ChannelPicker, channel_number
-from isocharge.serve.signal_chain.stages import Gain
+from isocharge.serve.live.device import Device, create_stages
+from isocharge.serve.signal_chain.channels import Channels, channel_number
+from isocharge.serve.signal_chain.gain import Gain
 
 BINARY = "binary"
 """Name of the notation that is the binary frame of isocharge."""
@@ -82,17 +82,15 @@ class BoardEncoder:
             ChargeError: If an electrode has no channel.
         """
         self._frames = _board_frames(device, electrodes, notation)
-        chain = device.chain(electrodes)
-        self._gain = Gain(chain.gain_pC, chain.zero)
+        setup = device.setup(electrodes)
+        create_stages(setup)  # raises an error for settings of other electrodes
+        self._gain = Gain(setup)
 
         # Find the index of each electrode's channel in a frame. All frames have the same channels, so that any frame
         # can be used.
-        picker = ChannelPicker(
-            electrodes, device.channels, "the sensor", device.where, has_gain=device.gain is not None
-        )
         zeros = (0.0,) * len(self._frames.channels)
         frame_of_zeros = Frame(0, 0, zeros, names=self._frames.names)
-        self._channel_indices = picker.channel_indices(frame_of_zeros)
+        self._channel_indices = Channels(setup).channel_indices(frame_of_zeros)
 
         self.seq_modulus = self._frames.seq_modulus
         self.t_us_modulus = self._frames.t_us_modulus
@@ -165,11 +163,11 @@ class BoardEncoder:
             channel_values[channel_index] = channel.nearest_value(value)
             if not channel.holds(value):
                 is_clipped = True
-        flags = frame.flags
+        bits = frame.bits
         if is_clipped:
             self.clipped += 1
-            flags |= SATURATED_BIT
-        board_frame = Frame(frame.seq, frame.t_us, tuple(channel_values), flags, self._frames.names)
+            bits |= SATURATED_BIT
+        board_frame = Frame(frame.seq, frame.t_us, tuple(channel_values), bits, self._frames.names)
         return self._frames.encode(board_frame)
 
 

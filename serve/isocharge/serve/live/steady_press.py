@@ -15,9 +15,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.fading import cause_of_fading
-from isocharge.serve.live.reading_stream import TimedReading
-from isocharge.serve.signal_chain.chain import Reading
 
 CHECKS_PER_WINDOW = 10
 """Number of times that a window is examined within its length.
@@ -196,7 +195,7 @@ class PressWatch:
         if self._phase is Phase.settling:
             self._phase = Phase.lift
 
-    def feed(self, timed: TimedReading) -> WatchResult:
+    def feed(self, frame: Frame) -> WatchResult:
         """Process the next reading, and return the phase of the watch with the charges of the reading.
 
         The first phase is `taring`, which ends when the charge of the untouched film has been measured. The phase
@@ -204,33 +203,32 @@ class PressWatch:
         phase `lift` follows until the finger leaves the film. The phase `waiting` then begins again.
 
         Args:
-            timed: The touch charges of a frame, with their time.
+            frame: The frame, after the stages of a `ReadingStream`.
 
         Returns:
             The phase, the charges of the reading and, if a press is refused or not steady yet, the reason. The result
             contains an accepted press only for the reading with which the press was accepted.
         """
-        reading = timed.reading
-        t_s = timed.time.clock_s
-        if RECONNECTED in reading.flags or RESTART in reading.flags:
+        t_s = frame.clock_s
+        if RECONNECTED in frame.flags or RESTART in frame.flags:
             # The charges before the interruption cannot be compared with later charges.
             self._rest_frames.clear()
             return self._refuse(PORT_LOST, Phase.taring)
-        if reading.charge_pC is None:  # there is no tare yet, or the frame is invalid
-            if TARE in reading.flags:  # the tare is being measured
+        if frame.charge_pC is None:  # there is no tare yet, or the frame is invalid
+            if TARE in frame.flags:  # the tare is being measured
                 self._phase = Phase.taring
             return WatchResult(self._phase)
-        if not reading.contact:
-            return self._process_rest(reading.charge_pC, t_s)
+        if not frame.is_contact:
+            return self._process_rest(frame.charge_pC, t_s)
 
         # Something touches the film.
         if self._phase in (Phase.waiting, Phase.taring):
             self._begin_press(t_s)
-        charge_pC = reading.charge_pC - self._rest_pC
+        charge_pC = frame.charge_pC - self._rest_pC
         held_s = t_s - self._begin_s
         if self._phase is Phase.lift:  # the press was accepted or refused before, and the finger is still on the film
             return WatchResult(Phase.lift, charge_pC, held_s)
-        result = self._process_press(reading, charge_pC, t_s)
+        result = self._process_press(frame, charge_pC, t_s)
         return result._replace(charge_pC=charge_pC, held_s=held_s)
 
     def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
@@ -290,14 +288,14 @@ class PressWatch:
         self._reason = ""
         self._min_scatter_pC = np.inf
 
-    def _process_press(self, reading: Reading, charge_pC: Array, t_s: float) -> WatchResult:
+    def _process_press(self, frame: Frame, charge_pC: Array, t_s: float) -> WatchResult:
         """Add a frame to the window of the present press, and accept or refuse the press if this can be decided.
 
         The press is accepted if it is steady. It is refused if an amplifier is saturated, if the film was not at rest
         before the press, or if the press is not steady within `max_held_s`.
 
         Args:
-            reading: Touch charges and flags of the frame.
+            frame: The frame.
             charge_pC: Touch charges minus the charges at rest before the press, shape (n_electrode,), pC.
             t_s: Time of the frame, s.
 
@@ -308,12 +306,12 @@ class PressWatch:
         rule = self._rule
         self._end_s = t_s
         held_s = t_s - self._begin_s
-        if SATURATED in reading.flags:
+        if SATURATED in frame.flags:
             return self._refuse("an amplifier is at its limit: press less hard", Phase.lift)
         if not self._has_rest and held_s >= rule.min_held_s:
             return self._refuse(NO_REST_BEFORE_PRESS, Phase.lift)
 
-        self._window.append(WindowFrame(t_s, charge_pC, reading.flags))
+        self._window.append(WindowFrame(t_s, charge_pC, tuple(frame.flags)))
         while self._window[0].t_s < t_s - rule.window_s:
             self._window.popleft()
 
@@ -322,7 +320,7 @@ class PressWatch:
         is_check_due = t_s - self._last_check_s >= rule.window_s / CHECKS_PER_WINDOW
         if is_window_full and is_check_due:
             self._last_check_s = t_s
-            press = self._steady_press(reading)
+            press = self._steady_press(frame)
             if press is not None:
                 self._phase = Phase.lift
                 return WatchResult(Phase.taken, press=press)
@@ -331,7 +329,7 @@ class PressWatch:
             return self._refuse(f"not steady within {rule.max_held_s:g} s: {reason}", Phase.lift)
         return WatchResult(Phase.settling, reason=self._reason)
 
-    def _steady_press(self, reading: Reading) -> SteadyPress | None:
+    def _steady_press(self, frame: Frame) -> SteadyPress | None:
         """Return the press in the window if the press is steady. Otherwise, return None and store the reason.
 
         A window is calm if it contains no sudden movement: its scatter is at most `MAX_SCATTER_RATIO` times the
@@ -339,7 +337,7 @@ class PressWatch:
         magnitude nor the reason is stored, because they would only describe the movement.
 
         Args:
-            reading: The latest frame. Its tare contains the noise of the charges at rest.
+            frame: The latest frame, which contains the noise of the charges at rest.
         """
         press = self._measure_window()
         scatter_pC = float(press.scatter_pC.max())
@@ -348,10 +346,7 @@ class PressWatch:
         if is_calm:
             self._store_mean_magnitude(press)
 
-        noise_pC = np.zeros_like(press.charge_pC)
-        if reading.tare is not None:
-            noise_pC = reading.tare.noise_pC
-        reason = unsteadiness(self._rule, press, noise_pC, self._electrodes, self._mean_magnitudes)
+        reason = unsteadiness(self._rule, press, frame.noise_pC, self._electrodes, self._mean_magnitudes)
         if not reason:
             return press
         if is_calm:

@@ -11,12 +11,14 @@ only briefly. Each difference is clipped. The filter does not delay the signal.
 
 import cmath
 import math
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
+from isocharge.serve.signal_chain.stage import Setup, Stage
 
 MIN_SQUARED_STEP = 0.02
 """Smallest squared change of the unit phasor between two frames for an update of the hum, dimensionless."""
@@ -36,27 +38,8 @@ class HumRule(Rule, frozen=True, kw_only=True):
     limit_pC: Setting = 5.0
 
 
-class Hum(NamedTuple):
-    """State of the estimate after a frame.
-
-    Attributes:
-        phasor_pC: Amplitude and phase in each channel, shape (electrodes,), complex, pC.
-        unit_phasor: Phasor of magnitude 1 that turns with the mains frequency, at this frame.
-        raw_pC: Charges of this frame, shape (electrodes,), pC; None before the first frame.
-    """
-
-    phasor_pC: Complexes
-    unit_phasor: complex = 1.0 + 0.0j
-    raw_pC: Array | None = None
-
-    @classmethod
-    def start(cls, electrodes: int) -> "Hum":
-        """Return the state before the first frame, in which the hum is zero."""
-        return cls(np.zeros(electrodes, dtype=complex))
-
-
-def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) -> tuple[Hum, Array]:
-    """Subtract the hum from a frame, and update the estimate of the hum.
+class Hum(Stage):
+    """Subtracts mains hum.
 
     The hum of a channel is the real part of a product of two complex numbers. The first number is the phasor of the
     channel. The magnitude of the phasor is the amplitude of the hum, and its angle is the phase of the hum. The second
@@ -70,32 +53,49 @@ def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) 
 
     where the error is the change of the charge minus the expected change of the hum. With a gain of 1, the updated hum
     would explain the whole error.
-
-    Args:
-        rule: Settings of the estimate of hum.
-        hum: State of the estimate after the previous frame.
-        raw_pC: Charges of the frame, shape (electrodes,), pC.
-        t_s: Time on the clock of the device, s.
-        dt_s: Time since the previous frame, s.
-
-    Returns:
-        The state after this frame, and the charges without hum, shape (electrodes,), pC.
     """
-    unit_phasor = cmath.exp(2j * math.pi * rule.frequency_Hz * t_s)
-    phasor_step = unit_phasor - hum.unit_phasor
-    squared_step = phasor_step.real * phasor_step.real + phasor_step.imag * phasor_step.imag
-    channel_phasor_pC = hum.phasor_pC
 
-    # The estimate needs a previous frame. If the unit phasor has hardly changed, the change contains little hum.
-    if hum.raw_pC is not None and squared_step > MIN_SQUARED_STEP:
-        expected_change_pC = (channel_phasor_pC * phasor_step).real
-        error_pC = raw_pC - hum.raw_pC - expected_change_pC
-        # Clipping limits the influence of a touch, which may change the charges by more than the hum.
-        clipped_error_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
-        # The charges contain only the real part of the product. With a gain of 1, a frame therefore corrects only half
-        # of the error of the phasor on average. With the factor 2, the time constant of the estimate is `settle_s`.
-        gain = min(1.0, 2.0 * dt_s / rule.settle_s)
-        correction_per_error = gain / squared_step * phasor_step.conjugate()
-        channel_phasor_pC = channel_phasor_pC + clipped_error_pC * correction_per_error
-    hum_pC = (channel_phasor_pC * unit_phasor).real
-    return Hum(channel_phasor_pC, unit_phasor, raw_pC), raw_pC - hum_pC
+    section = "hum"
+    rule_class = HumRule
+    c_prefix = "HUM"
+
+    def __init__(self, setup: Setup) -> None:
+        """Begin with an estimate of zero hum."""
+        self._rule = setup.rule(HumRule) or HumRule()
+        self._phasor_pC: Complexes = np.zeros(len(setup.electrodes), dtype=complex)  # amplitude and phase by channel
+        self._unit_phasor = 1.0 + 0.0j  # phasor of magnitude 1 that turns with the mains frequency
+        self._previous_pC: Array | None = None  # charges of the previous frame
+
+    def step(self, frame: Frame) -> None:
+        """Subtract the hum from a frame, and update the estimate of the hum."""
+        if frame.charge_pC is None:
+            return
+        rule = self._rule
+        raw_pC = frame.charge_pC
+        unit_phasor = cmath.exp(2j * math.pi * rule.frequency_Hz * frame.clock_s)
+        phasor_step = unit_phasor - self._unit_phasor
+        squared_step = phasor_step.real * phasor_step.real + phasor_step.imag * phasor_step.imag
+
+        # The estimate needs a previous frame. If the unit phasor has hardly changed, the change contains little hum.
+        if self._previous_pC is not None and squared_step > MIN_SQUARED_STEP:
+            expected_change_pC = (self._phasor_pC * phasor_step).real
+            error_pC = raw_pC - self._previous_pC - expected_change_pC
+            # Clipping limits the influence of a touch, which may change the charges by more than the hum.
+            clipped_error_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
+            # The charges contain only the real part of the product. With a gain of 1, a frame therefore corrects only
+            # half of the error of the phasor on average. With the factor 2, the time constant is `settle_s`.
+            gain = min(1.0, 2.0 * frame.dt_s / rule.settle_s)
+            correction_per_error = gain / squared_step * phasor_step.conjugate()
+            self._phasor_pC = self._phasor_pC + clipped_error_pC * correction_per_error
+        self._unit_phasor = unit_phasor
+        self._previous_pC = raw_pC
+        frame.charge_pC = raw_pC - (self._phasor_pC * unit_phasor).real
+
+    def reset(self) -> None:
+        """Keep the estimate of the hum, but do not compare the next frame with the latest frame."""
+        self._previous_pC = None
+
+    @classmethod
+    def c_settings(cls, setup: Setup) -> dict[str, Any]:
+        """Return the settings, and the smallest squared step of the phasor."""
+        return super().c_settings(setup) | {"min_squared_step": MIN_SQUARED_STEP}

@@ -1,94 +1,163 @@
-"""The interface of a stage of the signal chain, and the frame that passes through the stages."""
+"""The protocol of a stage, and what the stages of a stream share.
 
-import math
+A frame passes through the stages of a stream in the order of the list `isocharge.serve.live.device.STAGES`. Each stage
+reads and writes attributes of the frame. To add a stage, write a class and add it to the list. The class declares the
+section of the device file that contains its settings. The help of the device file, the stages of a stream and the
+export to C follow from the list.
+"""
+
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+from msgspec import structs
 
 from isocharge.common.arrays import Array
-from isocharge.serve.signal_chain.contact import NO_TOUCH, Touch
-from isocharge.serve.signal_chain.tare import Tare
+from isocharge.common.errors import DeviceError
+from isocharge.serve.frames.frame import Frame
+from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.signal_chain.rule import Rule
+
+R = TypeVar("R", bound=Rule)
+
+NOT_IN_C = (
+    "this stage does not exist in the signal chain in C; remove it from the device file, or run `isocharge serve "
+    "stream` on a host"
+)
+"""Part of the message about a stage that cannot be exported to C."""
 
 
 @dataclass(slots=True)
-class ChainFrame:
-    """A frame of the signal chain. The stages change it in place.
+class Setup:
+    """Settings and objects that the stages of a stream share.
 
     Attributes:
-        values: Values as the device sent them, in the unit of the device, shape (electrodes,).
-        t_s: Time on the clock of the device, s.
-        dt_s: Time since the previous frame, s.
-        is_at_limit: Whether an amplifier is at its limit.
-        was_contact: Whether something touched in the previous frame.
-        flags: Flags of `isocharge.serve.flags`, in the order in which the stages add them.
-        raw_pC: Charges as the device sent them, shape (electrodes,), pC.
-        charge_pC: Charges after the stages that have processed the frame, shape (electrodes,), pC.
-        tare: The tare that was subtracted; None while there is none.
-        is_finished: Whether the later stages skip the frame, because there is no tare yet.
-        charge_scale_std: Relative standard deviation that all charges have in common, because the film's memory is not
-            known exactly.
-        touch: State of the touch detection after this frame. The touch stage sets it.
-        base_relax_s: Time constant with which the charge out of contact decays to zero, s.
-        is_base_held: Whether a finger is touching or leaving the film. A positive base of the touch detection then does
-            not decay.
-        is_saturated: Whether an amplifier was at its limit at any time in this press.
+        electrodes: Names of the electrodes, in the order of the charges.
+        rules: Settings of each stage that the device file switches on, by their class.
+        channels: Name or number of the channel by electrode name; empty if the device file assigns no channels.
+        predictor: The present model. If the film is followed, it is the model of the film at its estimated pretension.
+            None if a stream computes only touch charges.
+        reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
+        where: Name of the device file, for messages.
+        offset_stage: Last stage that stores the charge at rest; None until a stage is created.
     """
 
-    values: Array
-    t_s: float
-    dt_s: float
-    is_at_limit: bool
-    was_contact: bool
-    flags: list[str]
-    raw_pC: Array = field(init=False)
-    charge_pC: Array = field(init=False)
-    tare: Tare | None = None
-    is_finished: bool = False
-    charge_scale_std: float = 0.0
-    touch: Touch = NO_TOUCH
-    base_relax_s: float = math.inf
-    is_base_held: bool = False
-    is_saturated: bool = False
+    electrodes: tuple[str, ...]
+    rules: Mapping[type[Rule], Rule] = field(default_factory=dict)
+    channels: Mapping[str, str] = field(default_factory=dict)
+    predictor: Predictor | None = None
+    reader: str = "the sensor"
+    where: str = "device"
+    offset_stage: "OffsetStage | None" = None
 
-    def __post_init__(self) -> None:
-        self.raw_pC = self.values
-        self.charge_pC = self.values
+    def rule(self, rule_class: type[R]) -> R | None:
+        """Return the settings of a class, or None if their stage is switched off."""
+        rule = self.rules.get(rule_class)
+        return rule if isinstance(rule, rule_class) else None
 
-    @property
-    def noise_pC(self) -> Array:
-        """Standard deviation of each electrode at rest, shape (electrodes,), pC. It requires a tare."""
-        assert self.tare is not None
-        return self.tare.noise_pC
+    def for_each_electrode(self, key: str, setting: float | Mapping[str, float]) -> Array:
+        """Return the value of a setting for each electrode, shape (n_electrode,).
+
+        Args:
+            key: Section and key of the setting, for messages.
+            setting: One number for all electrodes, or a dictionary of numbers by electrode name.
+
+        Raises:
+            DeviceError: If the keys of the dictionary are not exactly the electrodes.
+        """
+        numbers = setting if isinstance(setting, Mapping) else dict.fromkeys(self.electrodes, setting)
+        if set(numbers) != set(self.electrodes):
+            raise DeviceError(
+                f"{self.where}: {key}: expected a number, or one for each of the electrodes {self.electrodes}, got "
+                f"{setting}"
+            )
+        return np.array([numbers[name] for name in self.electrodes], dtype=float)
 
 
 class Stage(ABC):
-    """One stage of the signal chain. The object contains the settings and the state of the stage."""
+    """One step on the way of a frame from its values to its record.
+
+    The object contains the settings and the state of the stage. A stage must be used in one thread only. The same
+    sequence of frames always gives the same results.
+
+    Attributes:
+        section: Name of the section of the device file with the settings; empty if the stage has no settings.
+        rule_class: Class of the settings.
+        is_required: Whether each stream has the stage, even if the device file switches it off.
+        is_default: Whether the stage is switched on, with default settings, if the device file has no such section.
+        needs_contact: Whether the stage processes the contact of a record. Such a stage skips frames without a record,
+            and is not part of an export to C.
+        c_prefix: Prefix of the settings in the export to C; empty if the stage does not exist in C.
+    """
+
+    section: ClassVar[str] = ""
+    rule_class: ClassVar[type[Rule]] = Rule
+    is_required: ClassVar[bool] = False
+    is_default: ClassVar[bool] = False
+    needs_contact: ClassVar[bool] = False
+    c_prefix: ClassVar[str] = ""
+
+    def __init__(self, setup: Setup) -> None:  # noqa: B027  # some stages have no settings
+        """Begin without any frame.
+
+        Args:
+            setup: Settings of all stages, and objects that the stages share.
+        """
+
+    @classmethod
+    def is_used(cls, setup: Setup) -> bool:
+        """Return whether a stream has this stage."""
+        return cls.is_required or cls.rule_class in setup.rules
 
     @abstractmethod
-    def step(self, frame: ChainFrame) -> None:
-        """Process the next frame in place."""
+    def step(self, frame: Frame) -> None:
+        """Process the next frame in place.
 
-    def reset(self) -> None:  # noqa: B027  # most stages have no state
-        """Discard the state that depends on the tare, because the film is tared again."""
+        A frame without charges is invalid, or comes before the first tare. Most stages ignore such a frame.
+        """
 
-    def begin_touch(self, frame: ChainFrame) -> None:  # noqa: B027  # most stages do nothing
-        """Change the state and the frame for a touch that begins with this frame. The touch stage calls this method."""
+    def reset(self) -> None:  # noqa: B027  # some stages have no state
+        """Discard the state of the present touch, because the film is tared again."""
+
+    @classmethod
+    def c_settings(cls, setup: Setup) -> dict[str, Any]:
+        """Return the settings of the stage for C by name, as numbers, truth values or arrays.
+
+        Raises:
+            DeviceError: If the stage does not exist in C with these settings.
+        """
+        rule = setup.rule(cls.rule_class)
+        settings = {} if rule is None else structs.asdict(rule)
+        return {name: value for name, value in settings.items() if name != "on"}
 
 
 class OffsetStage(Stage):
     """A stage that stores the charge at rest. The touch charge is measured relative to the charge at rest."""
 
+    def __init__(self, setup: Setup) -> None:
+        """Begin without any frame, as the last stage that stores the charge at rest.
+
+        Args:
+            setup: Settings of all stages, and objects that the stages share.
+        """
+        setup.offset_stage = self
+
+    def begin_touch(self, frame: Frame) -> None:  # most stages do nothing
+        """Compute the charges of the first frame of a touch again, because the touch began before it was detected."""
+
     @abstractmethod
     def add_warming(self, change: "WarmingChange") -> None:
-        """Assign a part of the touch charge to the warming of the film."""
+        """Assign a part of the touch charge of the present frame to the warming of the film."""
 
 
 class WarmingChange(NamedTuple):
     """A change of the estimated warming.
 
     Attributes:
-        charge_pC: Part of the touch charge that is warming, shape (electrodes,), pC.
-        rate_pC_per_s: Change of the slope of the warming, shape (electrodes,), pC/s.
+        charge_pC: Part of the touch charge that is warming, shape (n_electrode,), pC.
+        rate_pC_per_s: Change of the slope of the warming, shape (n_electrode,), pC/s.
         is_learned: Whether the properties of the film may be learned after this touch.
     """
 

@@ -5,14 +5,20 @@ follows a slow drift of the charge at rest.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import TareError
+from isocharge.common.errors import DeviceError, TareError
 from isocharge.common.structs import WrongKey
+from isocharge.serve.flags import TARE
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.rule import Count, Rule, Setting, TimeConstant
+from isocharge.serve.signal_chain.stage import OffsetStage, Setup, WarmingChange
+
+MAX_TARE_FRAMES_IN_C = 10_000
+"""Largest number of frames of a tare in C, which limits the memory that the C program needs."""
 
 
 class TareRule(Rule, frozen=True, kw_only=True):
@@ -45,88 +51,177 @@ class TareRule(Rule, frozen=True, kw_only=True):
             raise WrongKey("patience", f"at least the {self.frames} frames of a tare, or 0 for no limit", self.patience)
 
 
-class Tare(NamedTuple):
-    """The charge at rest.
+class Tare(OffsetStage):
+    """Measures the charge at rest in quiet frames, and subtracts this charge from all later frames.
 
-    Attributes:
-        charge_pC: Mean charge, shape (electrodes,), pC.
-        noise_pC: Standard deviation of the charge, shape (electrodes,), pC.
-        frames: Number of frames from which the tare was measured.
+    Without a later stage that estimates the drift, the tare follows a slow drift while nothing touches the film. It
+    approaches the charge of each frame exponentially. Its rate is limited, so that a finger that rests lightly on the
+    film or is just arriving hardly changes it. The tare follows a frame only after the later stages have found that the
+    frame has no contact. The first frame of a touch therefore does not change the tare.
     """
 
-    charge_pC: Array
-    noise_pC: Array
-    frames: int
+    section = "tare"
+    is_required = True
+    rule_class = TareRule
+    is_default = True
+    c_prefix = "TARE"
+
+    def __init__(self, setup: Setup) -> None:
+        """Begin without a tare."""
+        super().__init__(setup)
+        self._rule = setup.rule(TareRule)
+        self._setup = setup
+        self._tare_pC: Array | None = None  # charge at rest
+        self._noise_pC = np.zeros(len(setup.electrodes))  # standard deviation of the charge at rest
+        self._previous: tuple[Frame, Array] | None = None  # previous frame, and its charges before this stage, pC
+        self._latest_pC = np.empty((0, len(setup.electrodes)))  # charges from which the tare is measured
+        self._searched_frames = 0  # number of frames since the beginning of the search
+        self._is_search_limited = True  # whether the search ends with an error after too many frames
+
+    def step(self, frame: Frame) -> None:
+        """Subtract the tare from a frame. While there is no tare, search for a tare, and remove the charges.
+
+        Raises:
+            TareError: If the film is touched during the whole search for a tare.
+        """
+        if frame.charge_pC is None:
+            return
+        if self._tare_pC is None:
+            self._search(frame)
+            frame.charge_pC = None
+            frame.flags.append(TARE)
+            return
+        # Without a later stage that stores the charge at rest, the tare follows the drift.
+        if self._rule is not None and self._setup.offset_stage is self:
+            if self._previous is not None:
+                previous_frame, previous_pC = self._previous
+                if not previous_frame.is_contact:
+                    self._tare_pC = follow_drift(self._rule, self._tare_pC, previous_pC, previous_frame.dt_s)
+            # The charge out of contact decays, but the charge of a finger that is leaving the film does not.
+            frame.base_relax_s = self._rule.relax_s
+            frame.is_base_held = True
+        self._previous = (frame, frame.charge_pC)
+        frame.tare_pC = self._tare_pC
+        frame.noise_pC = self._noise_pC
+        frame.charge_pC = frame.charge_pC - self._tare_pC
+
+    def reset(self) -> None:
+        """Measure the tare again from the next quiet frames.
+
+        Unlike the first search for a tare, the new search does not end with an error.
+        """
+        self._tare_pC = None
+        self._previous = None
+        self._latest_pC = self._latest_pC[:0]  # without any frame
+        self._searched_frames = 0
+        self._is_search_limited = False
+
+    def add_warming(self, change: WarmingChange) -> None:
+        """Add the warming to the tare."""
+        assert self._tare_pC is not None
+        assert self._previous is not None
+        self._tare_pC = self._tare_pC + change.charge_pC
+        present_frame, _ = self._previous
+        present_frame.tare_pC = self._tare_pC
+
+    def _search(self, frame: Frame) -> None:
+        """Add a frame to the latest frames, and measure the tare if these frames are enough and quiet.
+
+        If the tare is switched off, the tare is 0.
+
+        Raises:
+            TareError: If the frames are not quiet, and the search has lasted for `TareRule.patience` frames.
+        """
+        rule = self._rule
+        assert frame.charge_pC is not None
+        if rule is None:
+            self._tare_pC = np.zeros(len(self._setup.electrodes))
+            return
+        stored_pC = np.vstack([self._latest_pC, frame.charge_pC])
+        self._latest_pC = stored_pC[-rule.frames :]  # at most as many frames as a tare needs
+        if self._is_search_limited:  # otherwise the count remains 0, and the search never ends with an error
+            self._searched_frames += 1
+        if len(self._latest_pC) < rule.frames:
+            return
+        try:
+            self._tare_pC, self._noise_pC = measure_tare(rule, self._latest_pC)
+        except TareError as error:
+            has_time_limit = rule.patience > 0
+            if has_time_limit and self._searched_frames >= rule.patience:
+                raise self._with_offsets(error, frame) from error
+            return  # search again with the next frame
+        self._latest_pC = self._latest_pC[:0]  # the frames are not needed any more
+
+    def _with_offsets(self, error: TareError, frame: Frame) -> TareError:
+        """Return the error with the present values of the board as settings.
+
+        The search may have failed because the film is touched, or because the board has large offsets. In the second
+        case, the present values are the offsets.
+        """
+        value_of_electrode = zip(self._setup.electrodes, frame.sent.tolist(), strict=True)
+        offsets = ", ".join(f"{name} = {value:.10g}" for name, value in value_of_electrode)
+        setting = "[gain] offset = {" + offsets + "}"
+        return TareError(f"{error}; if the board rests there without a touch, say so in a device file: {setting}")
+
+    @classmethod
+    def c_settings(cls, setup: Setup) -> dict[str, Any]:
+        """Return the settings.
+
+        Raises:
+            DeviceError: If the tare is too long for the memory of the C program.
+        """
+        rule = setup.rule(TareRule)
+        if rule is not None and not 1 <= rule.frames <= MAX_TARE_FRAMES_IN_C:
+            raise DeviceError(
+                f"{setup.where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES_IN_C} for a signal "
+                f"chain in C, which stores all frames of the tare, got {rule.frames}"
+            )
+        return super().c_settings(setup)
 
 
-def look_for_tare(rule: TareRule, latest_pC: Array, searched_frames: int) -> Tare | None:
-    """Measure the tare, which is the charge at rest, from the latest frames if these frames are quiet.
-
-    Args:
-        rule: Number of frames that a tare needs, limits of their noise and offset, and `patience`, the number of frames
-            after which the search ends with an error (0 for a search without end).
-        latest_pC: Charges of the latest frames, at most `rule.frames`, shape (k, electrodes), pC.
-        searched_frames: Number of frames since the search began.
-
-    Returns:
-        The tare; None if there are too few frames, or the frames are not quiet.
-
-    Raises:
-        TareError: If the frames are not quiet, and the search has lasted for `rule.patience` frames.
-    """
-    if len(latest_pC) < rule.frames:
-        return None
-    try:
-        return measure_tare(rule, latest_pC)
-    except TareError:
-        has_time_limit = rule.patience > 0
-        if has_time_limit and searched_frames >= rule.patience:
-            raise
-        return None  # search again with the next frame
-
-
-def measure_tare(rule: TareRule, raw_pC: Array) -> Tare:
-    """Measure the tare: the mean and the noise of each electrode in frames in which nothing touches the film.
+def measure_tare(rule: TareRule, raw_pC: Array) -> tuple[Array, Array]:
+    """Measure the mean and the noise of each electrode in frames in which nothing touches the film.
 
     Args:
         rule: Limits of noise and offset of quiet frames.
-        raw_pC: Charges of the frames, shape (n, electrodes), pC.
+        raw_pC: Charges of the frames, shape (n, n_electrode), pC.
+
+    Returns:
+        The mean charges, and their standard deviations, both of the shape (n_electrode,), pC.
 
     Raises:
         TareError: If the noise of an electrode or the magnitude of its mean charge exceeds the limit. Something then
             touches the film.
     """
-    tare = Tare(charge_pC=raw_pC.mean(axis=0), noise_pC=raw_pC.std(axis=0), frames=len(raw_pC))
-    largest_noise_pC = float(tare.noise_pC.max())
-    largest_offset_pC = float(np.abs(tare.charge_pC).max())
+    tare_pC = raw_pC.mean(axis=0)
+    noise_pC = raw_pC.std(axis=0)
+    largest_noise_pC = float(noise_pC.max())
+    largest_offset_pC = float(np.abs(tare_pC).max())
     if largest_noise_pC > rule.noise_limit_pC:
         raise TareError(
-            f"cannot tare on the last {tare.frames} frames: the charge of an electrode varies by "
+            f"cannot tare on the last {len(raw_pC)} frames: the charge of an electrode varies by "
             f"{largest_noise_pC:.3g} pC rms, expected at most {rule.noise_limit_pC:g} pC; leave the film alone and "
             "start again"
         )
     if largest_offset_pC > rule.offset_limit_pC:
         raise TareError(
-            f"cannot tare on the last {tare.frames} frames: an electrode rests at {largest_offset_pC:.4g} pC, expected "
+            f"cannot tare on the last {len(raw_pC)} frames: an electrode rests at {largest_offset_pC:.4g} pC, expected "
             f"at most {rule.offset_limit_pC:g} pC; take off what lies on the film, or raise the limit if the amplifier "
             "rests there"
         )
-    return tare
+    return tare_pC, noise_pC
 
 
-def follow_drift(rule: TareRule, tare: Tare, charge_pC: Array, dt_s: float) -> Tare:
-    """Return the tare after a frame in which nothing touches the film.
-
-    The tare approaches the charge of the frame exponentially. Its rate is limited, so that a finger that rests lightly
-    on the film or is just arriving hardly changes it.
+def follow_drift(rule: TareRule, tare_pC: Array, charge_pC: Array, dt_s: float) -> Array:
+    """Return the tare, shape (n_electrode,), pC, after a frame in which nothing touches the film.
 
     Args:
         rule: Time constant, and the limit of the difference between the charge and the tare.
-        tare: The tare before the frame.
-        charge_pC: Charges of the frame, shape (electrodes,), pC.
+        tare_pC: The tare before the frame, shape (n_electrode,), pC.
+        charge_pC: Charges of the frame, shape (n_electrode,), pC.
         dt_s: Time since the previous frame, s.
     """
     limit_pC = rule.noise_limit_pC
-    difference_pC = np.minimum(np.maximum(charge_pC - tare.charge_pC, -limit_pC), limit_pC)
+    difference_pC = np.minimum(np.maximum(charge_pC - tare_pC, -limit_pC), limit_pC)
     share = -math.expm1(-dt_s / rule.relax_s)
-    return tare._replace(charge_pC=tare.charge_pC + share * difference_pC)
+    return np.asarray(tare_pC + share * difference_pC)

@@ -17,13 +17,18 @@ and the record has the flag `blind`.
 """
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Reals
+from isocharge.common.arrays import Array
+from isocharge.common.errors import DeviceError
+from isocharge.common.structs import Finite
+from isocharge.serve.flags import BLIND, SATURATED, THERMAL
+from isocharge.serve.frames.frame import Frame
+from isocharge.serve.signal_chain.memory import MemoryRule
 from isocharge.serve.signal_chain.rule import Rule, Setting
+from isocharge.serve.signal_chain.stage import NOT_IN_C, Setup, Stage, WarmingChange
 
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
 """Changes of the common charge at which the misfit is evaluated, pC. A parabola is fitted to the squared misfits."""
@@ -31,8 +36,11 @@ TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
 # Pseudo-inverse for a least-squares fit: the product with the squared misfits gives the coefficients of the parabola.
 _PARABOLA_FIT = np.linalg.pinv(np.column_stack([np.ones(5), TRIED_PC, TRIED_PC**2]))
 
-Misfit = Callable[[Array], Reals]
-"""Function that returns misfits of shape (n,), in standard deviations, for charges of shape (n, electrodes), pC."""
+MIN_ELECTRODES = 4
+"""Smallest number of electrodes with which warming can be distinguished from force.
+
+A contact has three unknowns, and warming is a fourth unknown.
+"""
 
 
 class ThermalRule(Rule, frozen=True, kw_only=True):
@@ -46,6 +54,8 @@ class ThermalRule(Rule, frozen=True, kw_only=True):
         noise: Factor by which the errors of the model increase the standard deviation of an estimate.
         blind_pC: Standard deviation of an estimate above which temperature cannot be distinguished from force, pC.
         tell_pC: Smallest absolute value of p with which a record has the flag `thermal`, pC.
+        pC_per_K: Charge of each electrode if the film warms by 1 K, pC/K. Only the ratios and the signs are used. None
+            if all electrodes collect the same charge.
     """
 
     every_s: Setting = 0.05
@@ -53,145 +63,190 @@ class ThermalRule(Rule, frozen=True, kw_only=True):
     noise: Setting = 3.0
     blind_pC: Setting = 60.0
     tell_pC: Setting = 10.0
+    pC_per_K: dict[str, Finite] | None = None
 
 
-class ThermalDrift(NamedTuple):
-    """State of the estimate in this touch.
-
-    Attributes:
-        charge_pC: Common charge p, pC.
-        variance_pC2: Variance of p, pC^2.
-        waited_s: Time since the last estimate, s.
-        blind: Whether temperature could not be distinguished from force at the last estimate.
-        rate_pC_per_s: Change of the slope of p by this estimate, pC/s; 0 if the slope is not predicted.
-        covariance: Covariance of p and its slope, pC^2/s.
-        rate_variance: Variance of the slope, pC^2/s^2.
-    """
-
-    charge_pC: float = 0.0
-    variance_pC2: float = 0.0
-    waited_s: float = 0.0
-    blind: bool = False
-    rate_pC_per_s: float = 0.0
-    covariance: float = 0.0
-    rate_variance: float = 0.0
-
-
-NO_DRIFT = ThermalDrift()
-"""State at the beginning of a touch."""
-
-
-def track_thermal_drift(
-    rule: ThermalRule,
-    state: ThermalDrift,
-    charge_pC: Array,
-    misfit: Misfit,
-    dt_s: float,
-    ratios: Array | float = 1.0,
-    warmth_s: float | None = None,
-) -> ThermalDrift:
-    """Use a frame in contact to update the estimated charge p that the warming of the film adds to the electrodes.
+class Warming(Stage):
+    """Estimates the charge p that a warming of the film adds to all electrodes, and subtracts this charge.
 
     After each time interval `every_s`, a change of the charge p is estimated. Several trial values of the change are
     subtracted from the charges. The misfit of a trial value is the distance of the remaining charges from the nearest
     single contact. A parabola is fitted to the squared misfits. The minimum of the parabola is the estimate. A Kalman
-    filter weights this estimate by its variance and by the predicted variance of p. If the parabola is too flat, p is
-    not changed, its predicted variance is kept, and the state is marked as `blind`.
-
-    Args:
-        rule: Settings of the estimate of warming.
-        state: State after the previous frame.
-        charge_pC: Touch charges from which the present p has been subtracted, shape (electrodes,), pC.
-        misfit: Function from charges, shape (n, electrodes), pC, to misfits, shape (n,), in standard deviations of the
-            noise.
-        dt_s: Time since the previous frame, s.
-        ratios: Charge that warming adds to each electrode, relative to p, shape (electrodes,), dimensionless.
-        warmth_s: Time constant with which the slope of p decays, s; None if the slope is not predicted.
-
-    Returns:
-        The state after this frame. Its rate is the correction of the slope of p in this frame.
+    filter weights this estimate by its variance and by the predicted variance of p.
     """
-    waited_s = state.waited_s + dt_s
-    if waited_s < rule.every_s:  # no estimate in this frame, so the slope is not corrected
-        return state._replace(waited_s=waited_s, rate_pC_per_s=0.0)
-    predicted_variance_pC2, predicted_covariance, predicted_rate_variance = _predicted_variances(
-        rule, state, waited_s, warmth_s
-    )
 
-    # Fit: squared misfit = constant + slope * c + curvature * c^2, where c is the trial value of the change.
-    trial_charges_pC = charge_pC - TRIED_PC[:, np.newaxis] * ratios  # shape (trials, electrodes)
-    squared_misfits = np.square(misfit(trial_charges_pC), dtype=float)
-    _constant, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
+    section = "common_mode"
+    rule_class = ThermalRule
+    c_prefix = "THERMAL"
 
-    # The variance of the estimate is the inverse of the curvature, because the misfit is in standard deviations. Errors
-    # of the model increase it by `noise` squared. If the parabola is flat, warming cannot be distinguished from force.
-    estimate_variance_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
-    if estimate_variance_pC2 > rule.blind_pC**2:  # p is not changed
-        return ThermalDrift(
-            charge_pC=state.charge_pC,
-            variance_pC2=predicted_variance_pC2,
-            blind=True,
-            covariance=predicted_covariance,
-            rate_variance=predicted_rate_variance,
+    def __init__(self, setup: Setup) -> None:
+        """Begin with an estimated warming of zero."""
+        self._setup = setup
+        self._rule = setup.rule(ThermalRule) or ThermalRule()
+        self._ratios = warming_ratios(setup)
+        memory = setup.rule(MemoryRule)
+        # Time constant with which the film follows the temperature of the air; only known with a memory
+        self._warmth_s = None if memory is None else memory.warmth_s
+        self.reset()
+
+    @classmethod
+    def is_used(cls, setup: Setup) -> bool:
+        """Return whether the device file has the section, and there is a model that computes misfits."""
+        return super().is_used(setup) and setup.predictor is not None
+
+    def reset(self) -> None:
+        """Discard the warming, because a touch has ended."""
+        self._charge_pC = 0.0  # p
+        self._variance_pC2 = 0.0  # variance of p
+        self._covariance = 0.0  # covariance of p and its slope, pC^2/s
+        self._rate_variance = 0.0  # variance of the slope, pC^2/s^2
+        self._waited_s = 0.0  # time since the last estimate
+        self._is_blind = False  # whether temperature could not be distinguished from force at the last estimate
+
+    def step(self, frame: Frame) -> None:
+        """Estimate the warming of a frame in contact, subtract its change from the charges, and add the flags.
+
+        The stage that stores the charge at rest has already subtracted the earlier changes of the warming. It also
+        receives the present change. While an amplifier is saturated, the warming is not estimated, because the charges
+        then fit no contact for any value of the warming.
+        """
+        if frame.charge_pC is None:
+            return
+        if not frame.is_contact:
+            self.reset()
+            return
+        if SATURATED in frame.flags:
+            return
+        change_pC, rate_pC_per_s = self._estimate(frame.charge_pC, frame.dt_s)
+
+        # After a touch with a large warming, the stage of the film's memory must not learn the properties of the film.
+        is_large = abs(self._charge_pC) >= self._rule.tell_pC
+        if change_pC != 0.0 and self._setup.offset_stage is not None:
+            change = WarmingChange(change_pC * self._ratios, rate_pC_per_s * self._ratios, is_learned=not is_large)
+            frame.charge_pC = frame.charge_pC - change.charge_pC
+            self._setup.offset_stage.add_warming(change)
+        if is_large:
+            frame.flags.append(THERMAL)
+        if self._is_blind:
+            frame.flags.append(BLIND)
+
+    def _estimate(self, charge_pC: Array, dt_s: float) -> tuple[float, float]:
+        """Update the estimate, and return the changes of p, pC, and of its slope, pC/s.
+
+        If the parabola is too flat, p is not changed, its predicted variance is kept, and the state is blind.
+
+        Args:
+            charge_pC: Touch charges from which the present p has been subtracted, shape (n_electrode,), pC.
+            dt_s: Time since the previous frame, s.
+        """
+        rule = self._rule
+        self._waited_s += dt_s
+        if self._waited_s < rule.every_s:  # no estimate in this frame
+            return 0.0, 0.0
+        self._predict_variances(self._waited_s)
+        self._waited_s = 0.0
+
+        # Fit: squared misfit = constant + slope * c + curvature * c^2, where c is the trial value of the change.
+        assert self._setup.predictor is not None
+        trial_charges_pC = charge_pC - TRIED_PC[:, np.newaxis] * self._ratios  # shape (trials, n_electrode)
+        squared_misfits = np.square(self._setup.predictor.predict_batch(trial_charges_pC).misfit, dtype=float)
+        _constant, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
+
+        # The variance of the estimate is the inverse of the curvature, because the misfit is in standard deviations.
+        # Errors of the model increase it by `noise` squared. If the parabola is flat, warming cannot be distinguished
+        # from force.
+        estimate_variance_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
+        self._is_blind = estimate_variance_pC2 > rule.blind_pC**2
+        if self._is_blind:
+            return 0.0, 0.0
+
+        # The estimate is the minimum of the parabola, limited to the range of the trial values.
+        minimum_pC = -slope / (2.0 * curvature)
+        change_pC = min(max(minimum_pC, float(TRIED_PC[0])), float(TRIED_PC[-1]))
+
+        # Kalman update of p and of its slope, with their variances and their covariance
+        innovation_variance_pC2 = self._variance_pC2 + estimate_variance_pC2
+        charge_gain = self._variance_pC2 / innovation_variance_pC2
+        rate_gain = self._covariance / innovation_variance_pC2
+        previous_pC = self._charge_pC
+        self._charge_pC = previous_pC + charge_gain * change_pC
+        self._variance_pC2 *= 1.0 - charge_gain
+        self._rate_variance -= rate_gain * self._covariance
+        self._covariance *= 1.0 - charge_gain
+        return self._charge_pC - previous_pC, rate_gain * change_pC
+
+    def _predict_variances(self, waited_s: float) -> None:
+        """Predict the uncertainty of p and of its rate of change after a time without an estimate.
+
+        The rate decays with the time constant `warmth_s`, and random changes are added to the rate (white process
+        noise). If this time constant is not known, p is a random walk without a rate.
+
+        Let t be the time since the last estimate. The rate decays by the factor e = exp(-t / warmth_s). A rate of 1
+        changes p by g = warmth_s (1 - e). Let r be the variance that the process noise adds to the rate. The prediction
+        is
+
+            var(p)       <- var(p) + 2 g cov(p, rate) + g^2 var(rate) + r t^2 / 3,
+            cov(p, rate) <- e (cov(p, rate) + g var(rate)) + r t / 2,
+            var(rate)    <- e^2 var(rate) + r.
+        """
+        wander_pC = self._rule.wander_pC
+        if self._warmth_s is None:
+            self._variance_pC2 += wander_pC**2 * waited_s
+            return
+
+        # The variance r is proportional to t. After one second, the variance r t^2 / 3 that is added to p is the square
+        # of `wander_pC`, which is by definition the standard deviation of the change of p in one second.
+        added_rate_variance = 3.0 * wander_pC**2 * waited_s
+        decay = math.exp(-waited_s / self._warmth_s)
+        rate_effect_s = self._warmth_s * (1.0 - decay)
+        covariance = self._covariance
+        rate_variance = self._rate_variance
+        self._variance_pC2 = (
+            self._variance_pC2
+            + rate_effect_s * (2.0 * covariance + rate_effect_s * rate_variance)
+            + added_rate_variance * waited_s**2 / 3.0
         )
+        self._covariance = decay * (covariance + rate_effect_s * rate_variance) + 0.5 * added_rate_variance * waited_s
+        self._rate_variance = decay * decay * rate_variance + added_rate_variance
 
-    # The estimate is the minimum of the parabola, limited to the range of the trial values.
-    minimum_pC = -slope / (2.0 * curvature)
-    change_pC = min(max(minimum_pC, float(TRIED_PC[0])), float(TRIED_PC[-1]))
+    @classmethod
+    def c_settings(cls, setup: Setup) -> dict[str, Any]:
+        """Return the settings.
 
-    # Kalman update of p and of its slope, with their variances and their covariance
-    innovation_variance_pC2 = predicted_variance_pC2 + estimate_variance_pC2
-    charge_gain = predicted_variance_pC2 / innovation_variance_pC2
-    rate_gain = predicted_covariance / innovation_variance_pC2
-    return ThermalDrift(
-        charge_pC=state.charge_pC + charge_gain * change_pC,
-        variance_pC2=(1.0 - charge_gain) * predicted_variance_pC2,
-        rate_pC_per_s=rate_gain * change_pC,  # correction of the slope in this frame
-        covariance=(1.0 - charge_gain) * predicted_covariance,
-        rate_variance=predicted_rate_variance - rate_gain * predicted_covariance,
-    )
+        Raises:
+            DeviceError: If the settings contain charges for each electrode, or there are too few electrodes.
+        """
+        warming_ratios(setup)  # raises an error for too few electrodes
+        settings = super().c_settings(setup)
+        if settings.pop("pC_per_K", None) is not None:
+            raise DeviceError(f"{setup.where}: common_mode.pC_per_K: {NOT_IN_C}")
+        return settings
 
 
-def _predicted_variances(
-    rule: ThermalRule, state: ThermalDrift, waited_s: float, warmth_s: float | None
-) -> tuple[float, float, float]:
-    """After a time without an estimate, predict the uncertainty of the common charge p and of its rate of change.
-
-    The rate decays with the time constant `warmth_s`, and random changes are added to the rate (white process noise).
-    If this time constant is not known, p is a random walk without a rate.
-
-    Let t be the time since the last estimate. The rate decays by the factor e = exp(-t / warmth_s). A rate of 1 changes
-    p by g = warmth_s (1 - e). Let r be the variance that the process noise adds to the rate. The prediction is
-
-        var(p)       <- var(p) + 2 g cov(p, rate) + g^2 var(rate) + r t^2 / 3,
-        cov(p, rate) <- e (cov(p, rate) + g var(rate)) + r t / 2,
-        var(rate)    <- e^2 var(rate) + r.
-
-    Args:
-        rule: Settings of the estimate of warming.
-        state: State at the last estimate.
-        waited_s: Time since the last estimate, s.
-        warmth_s: Time constant with which the rate of p decays, s; None if the rate is not predicted.
+def warming_ratios(setup: Setup) -> Array | float:
+    """Return the charge that warming adds to each electrode, relative to the mean magnitude over all electrodes.
 
     Returns:
-        Variance of p, pC^2; covariance of p and its rate, pC^2/s; and variance of the rate, pC^2/s^2.
-    """
-    if warmth_s is None:
-        random_walk_variance_pC2 = state.variance_pC2 + rule.wander_pC**2 * waited_s
-        return random_walk_variance_pC2, 0.0, 0.0
+        Ratios, shape (n_electrode,), dimensionless; the number 1.0, for equal charges on all electrodes, if the device
+        file does not state `common_mode.pC_per_K`.
 
-    # The variance r is proportional to t. After one second, the variance r t^2 / 3 that is added to p is the square of
-    # `wander_pC`, which is by definition the standard deviation of the change of p in one second.
-    added_rate_variance = 3.0 * rule.wander_pC**2 * waited_s
-    decay = math.exp(-waited_s / warmth_s)
-    rate_effect_s = warmth_s * (1.0 - decay)
-    covariance = state.covariance
-    rate_variance = state.rate_variance
-    predicted_variance_pC2 = (
-        state.variance_pC2
-        + rate_effect_s * (2.0 * covariance + rate_effect_s * rate_variance)
-        + added_rate_variance * waited_s**2 / 3.0
-    )
-    predicted_covariance = decay * (covariance + rate_effect_s * rate_variance) + 0.5 * added_rate_variance * waited_s
-    predicted_rate_variance = decay * decay * rate_variance + added_rate_variance
-    return predicted_variance_pC2, predicted_covariance, predicted_rate_variance
+    Raises:
+        DeviceError: If there are too few electrodes, if the charges of all electrodes are 0, or if the setting states
+            numbers for other electrodes.
+    """
+    rule = setup.rule(ThermalRule)
+    if rule is None:
+        return 1.0
+    if len(setup.electrodes) < MIN_ELECTRODES:
+        raise DeviceError(
+            f"{setup.where}: common_mode: expected four electrodes or more, the model has {setup.electrodes}; with "
+            "three every set of charges fits some contact, and warming cannot be separated from force: remove the "
+            "section"
+        )
+    if rule.pC_per_K is None:
+        return 1.0
+    charge_pC_per_K = setup.for_each_electrode("common_mode.pC_per_K", rule.pC_per_K)
+    mean_magnitude_pC_per_K = float(np.abs(charge_pC_per_K).mean())
+    if mean_magnitude_pC_per_K == 0.0:
+        raise DeviceError(f"{setup.where}: common_mode.pC_per_K: expected a number other than 0, got {rule.pC_per_K}")
+    return charge_pC_per_K / mean_magnitude_pC_per_K

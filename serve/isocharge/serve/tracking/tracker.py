@@ -5,13 +5,17 @@ fold, a model predicts only the contacts on one side of the fold. On such a film
 contact directly from the charges.
 """
 
-from isocharge.common.arrays import Array
-from isocharge.serve.flags import INVALID, SATURATED
+from dataclasses import replace
+
+from isocharge.serve.flags import SATURATED
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.prediction.contact import Contact
-from isocharge.serve.record.record import OtherContact, TrackedContact
+from isocharge.serve.record.record import NO_TRACKING, OtherContact, TrackedContact, Tracking
 from isocharge.serve.signal_chain.rule import Rule, Share
+from isocharge.serve.signal_chain.stage import Setup, Stage
 from isocharge.serve.tracking.contact_filter import ContactFilter
-from isocharge.serve.tracking.contact_mixture import ContactMixture
+from isocharge.serve.tracking.contact_mixture import ContactMixture, contact_mixture
+from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.mixture_components import ContactHypothesis
 from isocharge.serve.tracking.touch_events import TouchEvents
 
@@ -31,87 +35,93 @@ class TrackRule(Rule, frozen=True, kw_only=True):
     lasting: Share = 0.12
 
 
-class Tracker:
-    """Tracker of one contact, which processes the frames one after another.
+class Tracker(Stage):
+    """Tracks the contact from frame to frame.
 
-    The methods must be called from one thread. The same sequence of frames always gives bitwise equal results.
-
-    Attributes:
-        mixture: Mixture that estimates the contact from the charges; None for a film whose map has no fold.
-        mixture_contact: Contact that the mixture estimated for the latest frame. It replaces the contact that the model
-            predicted. None if there is no mixture, or if the mixture has no estimate.
-        other: Another contact that also explains the charges; None if there is no such contact, or no mixture.
+    On some films, several different contacts cause the same charges. The folder of the model of such a film contains
+    the file `charges.npz`, which describes the charges of all contacts. The tracker then uses a mixture of Gaussian
+    components that represents all possible contacts, and the most probable contact replaces the contact of the model.
+    While the film is followed, the tracker uses no mixture, because the file describes the charges at the calibrated
+    pretension.
     """
 
-    def __init__(self, rule: TrackRule | None = None, mixture: ContactMixture | None = None) -> None:
+    section = "track"
+    rule_class = TrackRule
+    needs_contact = True
+
+    def __init__(self, setup: Setup) -> None:
         """Start without a contact.
 
-        Args:
-            rule: Settings; None for the default value of every setting.
-            mixture: Mixture for a film whose map has a fold; None for other films.
+        Raises:
+            ModelError: If the file `charges.npz` of the model is damaged.
         """
-        rule = rule or TrackRule()
-        self.mixture = mixture
+        rule = setup.rule(TrackRule) or TrackRule()
         self._filter = ContactFilter(constant_variance_share=rule.lasting**2)
+        self._mixture: ContactMixture | None = None
+        predictor = setup.predictor
+        if predictor is not None and setup.rule(FollowRule) is None:
+            self._mixture = contact_mixture(predictor)  # None if the model has no file `charges.npz`
+        if predictor is not None and self._mixture is not None:
+            # A contact of the mixture is valid in the whole area for which the file describes the charges.
+            self._mixture_validity = replace(predictor.validity, corners_mm=self._mixture.charges.corners_mm)
         self.reset()
 
     def reset(self) -> None:
         """Discard the tracked contact, for example after an outage or a new tare."""
-        self.mixture_contact: Contact | None = None
-        self.other: OtherContact | None = None
+        self._other: OtherContact | None = None  # another contact that also explains the charges
         self._tracked: TrackedContact | None = None
         self._filter.reset()
         self._events = TouchEvents()
-        if self.mixture is not None:
-            self.mixture.reset()
+        if self._mixture is not None:
+            self._mixture.reset()
 
-    def update(
-        self, contact: Contact | None, t_s: float, flags: tuple[str, ...] = (), charge_pC: Array | None = None
-    ) -> tuple[TrackedContact | None, str | None]:
-        """Process the next frame, and return the tracked contact and the event that begins with this frame.
+    def step(self, frame: Frame) -> None:
+        """Update the tracked contact with a frame, and add the tracked contact and its event to the frame.
 
-        Without a mixture or without charges, a filter smooths the contact that the model predicted. With a mixture, the
-        tracked contact is the most probable of the contacts that the mixture estimates from the charges. The previous
-        tracked contact is returned again if the frame is invalid, if its charges are saturated, or if no contact
-        explains them.
+        The previous tracked contact is used again if the frame is invalid, if its charges are saturated and there is a
+        mixture, or if no contact explains the charges.
 
         If the clock was set back, the filter or the mixture begins again with the frame, but the touch continues. The
         time between the two frames is then not counted for the events.
+        """
+        event = None
+        tracked = self._tracked
+        if frame.contact is not None:
+            event, tracked = self._follow(frame, frame.contact)
+        elif frame.is_valid:  # an invalid frame does not show whether the touch has ended
+            event = self._end_touch(frame.clock_s)
+            tracked = None
+        frame.tracking = NO_TRACKING
+        if tracked is not None or event is not None or self._other is not None:
+            frame.tracking = Tracking(tracked, event, self._other)
+
+    def _follow(self, frame: Frame, contact: Contact) -> tuple[str | None, TrackedContact | None]:
+        """Update the tracked contact with a frame in contact, and return the event that begins and the tracked contact.
 
         Args:
-            contact: Contact predicted by the model; None if nothing touches the film, or if the frame is invalid.
-            t_s: Time of the frame on any clock, s.
-            flags: Flags of the frame.
-            charge_pC: Touch charges of the frame, shape (n_electrode,), pC; only needed with a mixture.
-
-        Returns:
-            The tracked contact, and the event that begins with this frame. The contact is None if nothing touches the
-            film, or if the touch has not yet had a tracked contact. The event is `press`, `hold`, `slide`, `tap` or
-            `release`; None if no event begins.
+            frame: The frame. A contact of the mixture replaces its contact.
+            contact: Contact predicted by the model.
         """
-        self.mixture_contact = None
-        if contact is None:
-            if INVALID in flags:  # an invalid frame does not show whether the touch has ended
-                return self._tracked, None
-            return None, self._end_touch(t_s)
-
-        if self.mixture is None or charge_pC is None:
-            tracked = self._filter.step(contact, t_s, flags)
+        t_s = frame.clock_s
+        if self._mixture is None:
+            tracked = self._filter.step(contact, t_s, (*frame.flags, *frame.contact_flags))
         else:
             hypotheses: list[ContactHypothesis] = []  # possible contacts, the most probable first
-            if SATURATED not in flags:  # the charges of a saturated frame are wrong
-                hypotheses = self.mixture.update(charge_pC, t_s)
+            if SATURATED not in frame.flags and frame.charge_pC is not None:  # saturated charges are wrong
+                hypotheses = self._mixture.update(frame.charge_pC, t_s)
             if not hypotheses:  # the frame contains no information, so the previous contact is returned again
-                return self._tracked, None
-            self.mixture_contact = hypotheses[0].contact
-            self.other = _other_contact(hypotheses)
-            tracked = _tracked_contact(hypotheses[0], self.mixture_contact)
+                return None, self._tracked
+            mixture_contact = hypotheses[0].contact
+            frame.set_contact(mixture_contact, self._mixture_validity)
+            frame.model_charge_pC = None
+            self._other = _other_contact(hypotheses)
+            tracked = _tracked_contact(hypotheses[0], mixture_contact)
 
         is_new_touch = self._tracked is None
         self._tracked = tracked
         if is_new_touch:
-            return tracked, self._events.begin(tracked, t_s)
-        return tracked, self._events.step(tracked, t_s)
+            return self._events.begin(tracked, t_s), tracked
+        return self._events.step(tracked, t_s), tracked
 
     def _end_touch(self, t_s: float) -> str | None:
         """Discard the tracked contact, and return the event with which its touch ends.
@@ -124,8 +134,8 @@ class Tracker:
         """
         if self._tracked is None:
             # The mixture may have received charges that no contact explains. Discard them before the next touch.
-            if self.mixture is not None:
-                self.mixture.reset()
+            if self._mixture is not None:
+                self._mixture.reset()
             return None
         event = self._events.end(t_s)
         self.reset()  # only now, because `reset` also discards the events of the touch

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 
 from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption
@@ -24,6 +23,7 @@ from isocharge.common.errors import InputError, PressError, error_prefix
 from isocharge.common.measured_presses import CONTACT, read_press_list
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress
+from isocharge.serve.signal_chain.thermal import ThermalRule
 from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, read_earlier
 from isocharge.train.calibration.folder import error_table
@@ -218,12 +218,11 @@ def _open_events(port: SensorPort, problem: CalibrationProblem) -> Iterator[Pres
         problem: The calibration problem, which contains the names of the electrodes.
     """
     board = load_device(port.device)
-    if board.common_mode is not None:
+    if board.rule(ThermalRule) is not None:
         say(
             f"{port.device}: [common_mode] is not used for these presses, because it needs a model that is calibrated "
             "for the film"
         )
-        board = msgspec.structs.replace(board, common_mode=None)
     stream = ReadingStream(problem.electrodes, board, reader=f"sensor {problem.sensor.name}")
     watch = PressWatch(problem.electrodes)
     with (

@@ -99,8 +99,8 @@ class PressEvents:
                 if must_be_armed:
                     arm_count = self._arm_count
                     self._watch.arm()
-                for reading in self._stream.feed(chunk):
-                    self._queue.put((arm_count, self._watch.feed(reading)))
+                for frame in self._stream.frames(chunk):
+                    self._queue.put((arm_count, self._watch.feed(frame)))
             self._stream.finish()
             self._queue.put((arm_count, SessionEnd()))
         except Exception as error:  # raised again by `next`, in the thread that waits for events

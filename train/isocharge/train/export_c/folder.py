@@ -9,40 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from msgspec import structs
 
 from isocharge.common.errors import DeviceError
 from isocharge.common.files import new_folder, refuse_existing, write_whole
-from isocharge.serve.live.device import ANY_BOARD, Device, DeviceSections
-from isocharge.serve.live.reading_stream import check_channels
+from isocharge.serve.live.device import ANY_BOARD, STAGES, Device, check_channels
 from isocharge.serve.model.model_folder import load_model
-from isocharge.serve.signal_chain.chain import Chain
-from isocharge.serve.signal_chain.hum import MIN_SQUARED_STEP
+from isocharge.serve.signal_chain.stage import NOT_IN_C
 from isocharge.train.export_c.c_text import c_comment, c_double, c_doubles, source_text
 from isocharge.train.export_c.model_source import model_header, model_source, self_test
 from isocharge.train.model_release.onnx_graph import read_graph
 
 log = logging.getLogger(__name__)
 
-MAX_TARE_FRAMES = 10_000
-"""Largest number of frames of a tare in C, which limits the memory that the C program needs."""
-
-SWITCHES = {"HUM": "HUM", "TARE": "TARE_ON", "LEAK": "LEAK", "TOUCH": "TOUCH", "THERMAL": "THERMAL_ON"}
-"""Name of the C constant that switches a stage on, by the prefix of the stage's other constants."""
-
-C_NAMES = {"frequency_Hz": "HZ"}
-"""Names in C of the settings whose name in C is not simply their name in capital letters."""
-
-
-C_SECTIONS = frozenset({"frames", "channels", "gain", "saturation", "hum", "tare", "leak", "touch", "common_mode"})
-"""Sections of a device file that a signal chain in C needs or that do not change its charges."""
-
-HOST_SECTIONS = frozenset({"track", "follow", "touch_offset"})
-"""Sections of a device file that process the contacts after the signal chain, and that only the host executes."""
-
 
 def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     """Return the text of `isocharge_device.h`.
+
+    Each stage of the signal chain states its settings for C. The macro `ISOCHARGE_<STAGE>_ON` is 1 if the stage is
+    switched on. The other macros have the names of the settings in capital letters.
 
     Args:
         device: The board.
@@ -52,25 +36,26 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
         DeviceError: If the device file is for other electrodes, if its tare is too long for C, or if it uses a stage
             that does not exist in C.
     """
-    _check_exists_in_c(device)
-    chain = device.chain(electrodes)
-    # A chain without zeros subtracts nothing, and a chain without gains reads charges in pC.
-    zero = np.zeros(len(electrodes)) if chain.zero is None else chain.zero
-    gain_pC = np.ones(len(electrodes)) if chain.gain_pC is None else chain.gain_pC
-    has_saturation = chain.limit_pC is not None
-    numbers = {
-        "ZERO": c_doubles(zero),
-        "GAIN_PC": c_doubles(gain_pC),
-        "LARGEST": c_double(chain.largest),
-        "SATURATION": str(int(has_saturation)),
-        "HUM_LEAST_TURN": c_double(MIN_SQUARED_STEP),  # smallest squared step of the phasor of the hum
-    }
-    if chain.limit_pC is not None:
-        numbers["LIMIT_PC"] = c_double(chain.limit_pC)
-    for prefix, settings in _stage_settings(chain).items():
-        numbers.update(_stage_numbers(prefix, settings))
-    lines = "\n".join(f"#define ISOCHARGE_{name} {text}" for name, text in numbers.items())
-    return source_text("isocharge_device.h", origin=settings_origin(device), lines=lines)
+    setup = device.setup(electrodes)
+    lines = []
+    sections_of_host = []
+    for stage in STAGES:
+        is_on = stage.rule_class in device.rules
+        if stage.c_prefix:
+            settings = {"on": is_on, **stage.c_settings(setup)}
+            for name, value in settings.items():
+                lines.append(f"#define ISOCHARGE_{stage.c_prefix}_{name.upper()} {_c_literal(value)}")
+        elif stage.section and is_on:
+            if not stage.needs_contact:
+                raise DeviceError(f"{device.where}: {stage.section}: {NOT_IN_C}")
+            sections_of_host.append(stage.section)
+    if sections_of_host:
+        log.warning(
+            "%s: %s: not exported, because only `isocharge serve stream` does this",
+            device.where,
+            ", ".join(sections_of_host),
+        )
+    return source_text("isocharge_device.h", origin=settings_origin(device), lines="\n".join(lines))
 
 
 def settings_origin(device: Device) -> str:
@@ -78,81 +63,6 @@ def settings_origin(device: Device) -> str:
     if device is ANY_BOARD:
         return "the defaults, because no device file was given"
     return f'from the device file "{c_comment(device.name)}"'
-
-
-def _stage_numbers(prefix: str, settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return the settings of a stage as C literals, by the names of their macros without `ISOCHARGE_`.
-
-    The first macro switches the stage on: its literal is 1 if the stage is on, and 0 otherwise.
-
-    Args:
-        prefix: Prefix of the macros of the stage, for example "TARE".
-        settings: Settings of the stage with its switch `on`; empty for a stage that is not in the chain.
-    """
-    is_on = settings.get("on", False)
-    numbers = {SWITCHES[prefix]: str(int(is_on))}
-    for name, value in settings.items():
-        if name == "on":
-            continue
-        c_name = C_NAMES.get(name, name.upper())
-        numbers[f"{prefix}_{c_name}"] = _c_literal(value)
-    return numbers
-
-
-def _stage_settings(chain: Chain) -> dict[str, dict[str, Any]]:
-    """Return the settings of each stage of a signal chain, by the prefix of the C macros of the stage.
-
-    A stage is one step of the signal processing, such as the tare. If a stage is missing in the chain, its settings are
-    empty. The switch `on` of a stage is one of its settings.
-
-    Args:
-        chain: The signal chain.
-    """
-    # A chain has settings of the leak in any case. Without a time constant, the charges do not leak.
-    leak = None if chain.tau_s is None else chain.leak
-    stages = {"HUM": chain.hum, "TARE": chain.tare, "LEAK": leak, "TOUCH": chain.touch, "THERMAL": chain.thermal}
-    settings_by_prefix: dict[str, dict[str, Any]] = {}
-    for prefix, stage in stages.items():
-        settings = {} if stage is None else structs.asdict(stage)
-        settings.pop("pC_per_K", None)  # a chain in C has no pyroelectric charges
-        settings_by_prefix[prefix] = settings
-    if leak is not None:
-        # The settings of the leak contain a single time constant. The time constants of the chain, one for each
-        # electrode, replace it. They become the first setting, and the macros are written in the order of the settings.
-        leak_settings = settings_by_prefix["LEAK"]
-        del leak_settings["tau_s"]
-        settings_by_prefix["LEAK"] = {"tau_s": chain.tau_s, **leak_settings}
-    return settings_by_prefix
-
-
-def _check_exists_in_c(device: Device) -> None:
-    """Raise an error if the signal chain of a board cannot be exported to C, and warn of sections that C ignores.
-
-    Args:
-        device: The board.
-
-    Raises:
-        DeviceError: If the tare is too long for the memory of the C program, or the device file has a stage that does
-            not exist in C.
-    """
-    where = device.where
-    if device.tare is not None and not 1 <= device.tare.frames <= MAX_TARE_FRAMES:
-        raise DeviceError(
-            f"{where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES} for a signal chain in C, which "
-            f"stores all frames of the tare, got {device.tare.frames}"
-        )
-    names = [section.name for section in structs.fields(DeviceSections) if section.name != "name"]
-    unknown = [name for name in names if name not in C_SECTIONS and getattr(device, name) is not None]
-    refused = [name for name in unknown if name not in HOST_SECTIONS]
-    if device.common_mode is not None and device.common_mode.pC_per_K is not None:
-        refused.append("common_mode.pC_per_K")
-    if refused:
-        raise DeviceError(
-            f"{where}: {', '.join(refused)}: this stage does not exist in the signal chain in C; remove it from the "
-            "device file, or run `isocharge serve stream` on a host"
-        )
-    if unknown:
-        log.warning("%s: %s: not exported, because only `isocharge serve stream` does this", where, ", ".join(unknown))
 
 
 def _c_literal(value: Any) -> str:

@@ -19,19 +19,19 @@ typedef isocharge_real real;
 #define ABS fabs
 #endif
 
-static const real LARGEST = (real)ISOCHARGE_LARGEST;
+static const real LARGEST = (real)ISOCHARGE_GAIN_LARGEST;
 
 static real smaller(real a, real b) { return b < a ? b : a; }
 
 static real larger(real a, real b) { return b > a ? b : a; }
 
-#if ISOCHARGE_TARE_ON && !ISOCHARGE_LEAK
+#if ISOCHARGE_TARE_ON && !ISOCHARGE_LEAK_ON
 #define TARE_FOLLOWS 1
 #else
 #define TARE_FOLLOWS 0
 #endif
 
-#if ISOCHARGE_HUM || ISOCHARGE_LEAK || TARE_FOLLOWS
+#if ISOCHARGE_HUM_ON || ISOCHARGE_LEAK_ON || TARE_FOLLOWS
 static real within(real value, real limit) { return smaller(larger(value, -limit), limit); }
 #endif
 
@@ -42,7 +42,7 @@ static void forget_tare(isocharge_chain *chain)
     chain->waiting = chain->next = chain->frames = 0;
 #endif
     chain->tared = 0;
-#if ISOCHARGE_LEAK
+#if ISOCHARGE_LEAK_ON
     chain->leak_running = 0;
 #endif
     chain->contact = chain->below = chain->saturated = 0;
@@ -58,7 +58,7 @@ void isocharge_chain_start(isocharge_chain *chain)
     memset(chain, 0, sizeof *chain);
     EACH(k) chain->tare_pC[k] = chain->noise_pC[k] = 0;
     chain->invalid_s = 0;
-#if ISOCHARGE_HUM
+#if ISOCHARGE_HUM_ON
     EACH(k) chain->hum_re[k] = chain->hum_im[k] = 0;
     chain->turn_re = 1;
     chain->turn_im = 0;
@@ -72,22 +72,22 @@ void isocharge_chain_tare(isocharge_chain *chain)
 #if ISOCHARGE_TARE_ON
     chain->patient = 1;
 #endif
-#if ISOCHARGE_HUM
+#if ISOCHARGE_HUM_ON
     chain->hum_running = 0;
 #endif
 }
 
-#if ISOCHARGE_HUM
+#if ISOCHARGE_HUM_ON
 /* Subtract the hum from charges, and learn it from their steps. */
 static void remove_hum(isocharge_chain *chain, const real raw_pC[N], real quiet_pC[N], double t_s, real dt_s)
 {
-    const double cycles = ISOCHARGE_HUM_HZ * t_s;
+    const double cycles = ISOCHARGE_HUM_FREQUENCY_HZ * t_s;
     const double phase = 6.283185307179586 * (cycles - floor(cycles));
     const real re = (real)cos(phase), im = (real)sin(phase);
     const real step_re = re - chain->turn_re, step_im = im - chain->turn_im;
     const real norm = step_re * step_re + step_im * step_im;
 
-    if (chain->hum_running && norm > (real)ISOCHARGE_HUM_LEAST_TURN) {
+    if (chain->hum_running && norm > (real)ISOCHARGE_HUM_MIN_SQUARED_STEP) {
         const real share = smaller(1, 2 * dt_s / (real)ISOCHARGE_HUM_SETTLE_S) / norm;
         EACH(k)
         {
@@ -166,7 +166,7 @@ static int look_for_tare(isocharge_chain *chain, const real quiet_pC[N])
     return 1;
 }
 
-#if ISOCHARGE_LEAK
+#if ISOCHARGE_LEAK_ON
 /* Correct the inflow by the clipped surplus; after a while the candidate becomes the trusted inflow. */
 static void learn_inflow(isocharge_chain *chain, const real surplus_pC[N], real dt_s)
 {
@@ -236,7 +236,7 @@ static void start_leak(isocharge_chain *chain, const real output_pC[N])
 /* Contact with hysteresis, from the total charge. */
 static void update_contact(isocharge_chain *chain, real total_pC, real decay)
 {
-#if ISOCHARGE_TOUCH
+#if ISOCHARGE_TOUCH_ON
     real squares = 0, threshold;
 
     EACH(k) squares += chain->noise_pC[k] * chain->noise_pC[k];
@@ -322,7 +322,7 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
         reading->tare_pC[k] = chain->tare_pC[k];
         output_pC[k] = quiet_pC[k] - chain->tare_pC[k];
     }
-#if ISOCHARGE_LEAK
+#if ISOCHARGE_LEAK_ON
     if (chain->leak_running)
         undo_leak(chain, output_pC, dt_s);
     else
@@ -344,7 +344,7 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
         EACH(k)
         {
             charge_pC[k] -= change_pC;
-#if ISOCHARGE_LEAK
+#if ISOCHARGE_LEAK_ON
             chain->charge_pC[k] -= change_pC;
 #else
             chain->tare_pC[k] += change_pC;
@@ -375,7 +375,7 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
 void isocharge_chain_advance(isocharge_chain *chain, const isocharge_real value[ISOCHARGE_ELECTRODES], double t_s,
                              isocharge_real dt_s, int limited, isocharge_reading *reading)
 {
-    static const real zero[N] = ISOCHARGE_ZERO, gain_pC[N] = ISOCHARGE_GAIN_PC;
+    static const real zero[N] = ISOCHARGE_GAIN_ZERO, gain_pC[N] = ISOCHARGE_GAIN_PC;
     real *raw_pC = reading->raw_pC, quiet_pC[N], squares = 0;
 
     EACH(k)
@@ -393,10 +393,10 @@ void isocharge_chain_advance(isocharge_chain *chain, const isocharge_real value[
     }
     dt_s += chain->invalid_s;
     chain->invalid_s = 0;
-#if ISOCHARGE_SATURATION
-    EACH(k) limited = limited || ABS(raw_pC[k]) >= (real)ISOCHARGE_LIMIT_PC;
+#if ISOCHARGE_SATURATION_ON
+    EACH(k) limited = limited || ABS(raw_pC[k]) >= (real)ISOCHARGE_SATURATION_LIMIT_PC;
 #endif
-#if ISOCHARGE_HUM
+#if ISOCHARGE_HUM_ON
     remove_hum(chain, raw_pC, quiet_pC, t_s, dt_s);
 #else
     (void)t_s;

@@ -38,7 +38,7 @@ typedef struct {
 
 typedef struct {
     isocharge_real invalid_s; /* time of the invalid frames since the last valid one */
-#if ISOCHARGE_HUM
+#if ISOCHARGE_HUM_ON
     isocharge_real hum_re[ISOCHARGE_ELECTRODES], hum_im[ISOCHARGE_ELECTRODES]; /* amplitude and phase, pC */
     isocharge_real turn_re, turn_im;                                           /* the mains at the frame before */
     isocharge_real hum_raw_pC[ISOCHARGE_ELECTRODES];                           /* charges of the frame before */
@@ -51,7 +51,7 @@ typedef struct {
 #endif
     int tared;
     isocharge_real tare_pC[ISOCHARGE_ELECTRODES], noise_pC[ISOCHARGE_ELECTRODES];
-#if ISOCHARGE_LEAK
+#if ISOCHARGE_LEAK_ON
     int leak_running;
     isocharge_real charge_pC[ISOCHARGE_ELECTRODES], output_pC[ISOCHARGE_ELECTRODES];
     isocharge_real inflow[ISOCHARGE_ELECTRODES], trusted[ISOCHARGE_ELECTRODES], candidate[ISOCHARGE_ELECTRODES];

@@ -14,8 +14,8 @@ from the wall clock. If the device sends no clock, it is computed from the monot
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.port.source import Chunk
 
 BANDWIDTH_Hz = 0.05
@@ -35,29 +35,10 @@ larger difference between the wall clock and the monotonic time of the host mean
 """
 
 
-class ReadingTime(NamedTuple):
-    """Time at which the device took a reading.
-
-    Attributes:
-        host_s: Time of the host, unix seconds. It is computed from the clock of the device. If the device sends no
-            clock, it is computed from the arrival time. The time decreases only if a clock was set.
-        device_us: Clock of the device after the wraps were removed, us; None if the device sends no clock.
-        step_s: Time since the previous reading, s; 0 for the first reading after a start. It does not depend on the
-            wall clock of the host.
-        clock_s: Time of the reading on the clock of the device, s. If the device sends no clock, it is a time of the
-            host that does not jump if the wall clock is set.
-    """
-
-    host_s: float
-    device_us: int | None
-    step_s: float
-    clock_s: float
-
-
 class DeviceClock:
     """Clock of one device, which is fitted to the time of the host.
 
-    Call the method `read` for every chunk in order. A chunk consists of the bytes that arrived together.
+    Call the method `stamp` for every chunk in order. A chunk consists of the bytes that arrived together.
 
     Attributes:
         rate: Seconds of the host per second of the device.
@@ -90,33 +71,32 @@ class DeviceClock:
         self._is_fit_provisional = True  # whether the fit relies on the arrival of only one chunk
         self._latest_host_s = -math.inf  # host time of the latest reading
 
-    def read(self, chunk: Chunk, t_us: Sequence[int | None], modulus: int) -> list[ReadingTime]:
-        """Return the times at which the readings of a chunk were taken, and adjust the clock to the chunk.
+    def stamp(self, chunk: Chunk, frames: Sequence[Frame], modulus: int) -> None:
+        """Write into the frames of a chunk the times at which they were taken, and adjust the clock to the chunk.
 
         The clock of the device is converted to the time of the host by a straight line, which is called the fit. If the
-        device sends no clock, the readings of the chunk share the time since the previous chunk evenly, and the last
-        reading has the arrival time of the chunk.
+        device sends no clock, the frames of the chunk share the time since the previous chunk evenly, and the last
+        frame has the arrival time of the chunk.
 
         Args:
-            chunk: The bytes that contain the ends of the readings.
-            t_us: Clock of each reading as the device sent it, us; None for a reading without a clock.
+            chunk: The bytes that contain the ends of the frames.
+            frames: The frames, which are changed in place.
             modulus: Time at which the clock wraps to 0, us.
         """
-        if not t_us:  # the time is shared by the readings of the next chunk
-            return []
+        if not frames:  # the time is shared by the frames of the next chunk
+            return
         is_first_chunk = self._chunk_arrival_s is None
         elapsed_s = self._enter_chunk(chunk)
-        share_s = 0.0 if is_first_chunk else elapsed_s / len(t_us)
-        times = []
-        for n_later, reading_us in zip(reversed(range(len(t_us))), t_us, strict=True):
-            if reading_us is None:
+        share_s = 0.0 if is_first_chunk else elapsed_s / len(frames)
+        for n_later, frame in zip(reversed(range(len(frames))), frames, strict=True):
+            if frame.t_us is None:
                 before_arrival_s = n_later * share_s
-                clock_s = self._monotonic_s - before_arrival_s
-                times.append(ReadingTime(chunk.timestamp - before_arrival_s, None, share_s, clock_s))
+                frame.host_s = chunk.timestamp - before_arrival_s
+                frame.dt_s = share_s
+                frame.clock_s = self._monotonic_s - before_arrival_s
             else:
-                times.append(self._time_of_device(reading_us, modulus, chunk.timestamp))
+                self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp)
         self._end_chunk(chunk.timestamp)
-        return times
 
     def _enter_chunk(self, chunk: Chunk) -> float:
         """Return the time from the previous chunk to this chunk, s, and advance the monotonic time of the host.
@@ -138,10 +118,11 @@ class DeviceClock:
                 self._chunk_arrival_s += wall_jump_s
         return elapsed_s
 
-    def _time_of_device(self, t_us: int, modulus: int, arrival_s: float) -> ReadingTime:
-        """Return the time of a reading from the clock of the device.
+    def _stamp_with_device(self, frame: Frame, t_us: int, modulus: int, arrival_s: float) -> None:
+        """Write the time of a frame from the clock of the device.
 
         Args:
+            frame: The frame, which is changed in place.
             t_us: Clock as the device sent it, us.
             modulus: Time at which the clock wraps to 0, us.
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
@@ -161,7 +142,10 @@ class DeviceClock:
 
         # The host time must not decrease, even if a correction of the fit has moved the predicted host time back.
         self._latest_host_s = max(self._latest_host_s, self._predict(self._device_us))
-        return ReadingTime(self._latest_host_s, self._device_us, step_us * 1e-6, self._device_us * 1e-6)
+        frame.host_s = self._latest_host_s
+        frame.device_us = self._device_us
+        frame.dt_s = step_us * 1e-6
+        frame.clock_s = self._device_us * 1e-6
 
     def _is_far_ahead_of(self, arrival_s: float) -> bool:
         """Return whether the fit predicts a host time for the latest reading that is far later than its arrival.
@@ -192,7 +176,7 @@ class DeviceClock:
         is_first_arrival = previous_arrival_s is None
         is_repeated = previous_arrival_s == arrival_s
         if self._fitted_us is None or is_first_arrival or is_repeated:  # the first arrival may be that of a file
-            return  # the provisional fit of `read` remains
+            return  # the provisional fit of `stamp` remains
 
         delay_s = arrival_s - self._predict(self._device_us)  # positive if the chunk arrived later than predicted
         was_clock_set = abs(delay_s) > MAX_DEVIATION_s

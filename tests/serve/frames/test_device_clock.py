@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from isocharge.serve.port.device_clock import DeviceClock
+from isocharge.serve import Frame
+from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.port.source import Chunk
 
 MODULUS = 2**32
@@ -15,12 +16,19 @@ def chunk_at(monotonic_s, wall_s=None):
     return Chunk(b"x", START_S + (monotonic_s if wall_s is None else wall_s), round(monotonic_s * 1e9))
 
 
+def read(clock, chunk, t_us, modulus):
+    """Return frames with the clock values of a device, after the clock has stamped them."""
+    frames = [Frame(None, device_us, ()) for device_us in t_us]
+    clock.stamp(chunk, frames, modulus)
+    return frames
+
+
 def follow(t_us, arrived_s):
     """Read times of a device that arrive one by one, and return the clock and the times of the readings."""
     clock = DeviceClock()
     times = []
     for device_us, arrival_s in zip(t_us, arrived_s, strict=True):
-        times += clock.read(chunk_at(arrival_s - START_S), [int(device_us) % MODULUS], MODULUS)
+        times += read(clock, chunk_at(arrival_s - START_S), [int(device_us) % MODULUS], MODULUS)
     return clock, times
 
 
@@ -29,7 +37,7 @@ def test_device_clock_unwraps():
     clock, times = follow(t_us, START_S + t_us * 1e-6)
     assert [time.device_us for time in times] == t_us.tolist()
     assert clock.restarts == 0
-    assert [time.step_s for time in times] == pytest.approx([0.0] + [1e-3] * 99)
+    assert [time.dt_s for time in times] == pytest.approx([0.0] + [1e-3] * 99)
 
 
 @pytest.mark.parametrize("ppm", [0.0, 150.0, -2000.0])
@@ -52,7 +60,7 @@ def test_clock_of_a_device_that_restarts():
     clock, times = follow(t_us, arrived_s)
     host_s = np.array([time.host_s for time in times])
     assert clock.restarts == 1
-    assert times[1000].step_s == 0.0
+    assert times[1000].dt_s == 0.0
     assert np.abs(host_s - arrived_s).max() < 1e-3
 
 
@@ -63,7 +71,7 @@ def test_clock_of_a_device_that_jumps_ahead():
     clock, times = follow(t_us, START_S + np.arange(2000) * 1e-3)
     np.testing.assert_allclose(np.diff([time.host_s for time in times]), 1e-3, atol=1e-3)
     assert clock.restarts == 1
-    assert max(time.step_s for time in times) == pytest.approx(1e-3)
+    assert max(time.dt_s for time in times) == pytest.approx(1e-3)
 
 
 def test_times_never_decrease():
@@ -75,7 +83,7 @@ def test_times_never_decrease():
     delays_s = rng.exponential(0.05, starts.size)
     for start, stop, delay_s in zip(starts, starts[1:], delays_s, strict=False):
         t_us = [4000 * int(number % 7000) for number in range(start, stop)]
-        host_s += [time.host_s for time in clock.read(chunk_at(0.004 * stop + delay_s), t_us, MODULUS)]
+        host_s += [time.host_s for time in read(clock, chunk_at(0.004 * stop + delay_s), t_us, MODULUS)]
     assert np.diff(host_s).min() >= 0.0
     assert clock.restarts == 1
 
@@ -85,7 +93,7 @@ def test_readings_of_one_chunk_are_spread_by_the_device_clock():
     host_s = []
     for chunk in range(200):
         t_us = [1000 * number for number in range(16 * chunk, 16 * chunk + 16)]
-        host_s += [time.host_s for time in clock.read(chunk_at(0.016 * (chunk + 1)), t_us, MODULUS)]
+        host_s += [time.host_s for time in read(clock, chunk_at(0.016 * (chunk + 1)), t_us, MODULUS)]
     np.testing.assert_allclose(np.diff(host_s)[160:], 1e-3, rtol=1e-3)
 
 
@@ -93,9 +101,9 @@ def test_readings_without_a_device_clock_share_the_time_between_chunks():
     clock = DeviceClock()
     times = []
     for arrival_s, n_readings in ((0.0, 2), (0.01, 1), (0.015, 0), (1.01, 200)):
-        times += clock.read(chunk_at(arrival_s), [None] * n_readings, MODULUS)
+        times += read(clock, chunk_at(arrival_s), [None] * n_readings, MODULUS)
     assert {time.device_us for time in times} == {None}
-    assert [time.step_s for time in times] == pytest.approx([0.0, 0.0, 0.01] + [0.005] * 200)
+    assert [time.dt_s for time in times] == pytest.approx([0.0, 0.0, 0.01] + [0.005] * 200)
     assert [time.host_s - START_S for time in times[2:5]] == pytest.approx([0.01, 0.015, 0.02], abs=1e-6)
     assert times[-1].host_s - START_S == pytest.approx(1.01)
     np.testing.assert_allclose(np.diff([time.clock_s for time in times[1:]])[1:], 0.005, atol=1e-6)
@@ -110,8 +118,8 @@ def test_wall_clock_that_is_set_changes_no_step(jump_s, has_clock):
     for number in range(400):
         monotonic_s = 0.005 * number
         t_us = [round(monotonic_s * 1e6) if has_clock else None]
-        times += clock.read(chunk_at(monotonic_s, monotonic_s + jump_s * (number >= 200)), t_us, MODULUS)
-    assert [time.step_s for time in times[1:]] == pytest.approx([0.005] * 399)
+        times += read(clock, chunk_at(monotonic_s, monotonic_s + jump_s * (number >= 200)), t_us, MODULUS)
+    assert [time.dt_s for time in times[1:]] == pytest.approx([0.005] * 399)
     np.testing.assert_allclose(np.diff([time.clock_s for time in times]), 0.005, atol=1e-6)
     assert times[-1].host_s - START_S == pytest.approx(1.995 + jump_s, abs=0.2)
     assert clock.restarts == 0
@@ -121,13 +129,13 @@ def test_chunks_without_a_monotonic_time_are_timed_by_their_arrivals():
     clock = DeviceClock()
     times = []
     for arrival_s in (0.0, 0.01, 0.03, 0.02):
-        times += clock.read(Chunk(b"x", START_S + arrival_s, 0), [None], MODULUS)
-    assert [time.step_s for time in times] == pytest.approx([0.0, 0.01, 0.02, 0.0])
+        times += read(clock, Chunk(b"x", START_S + arrival_s, 0), [None], MODULUS)
+    assert [time.dt_s for time in times] == pytest.approx([0.0, 0.01, 0.02, 0.0])
 
 
 def test_chunks_of_a_file_have_no_time_between_them():
     clock = DeviceClock()
     times = []
     for clock_ns in (0, 10**9):
-        times += clock.read(Chunk(b"x", START_S, clock_ns), [None], MODULUS)
-    assert [time.step_s for time in times] == [0.0, 0.0]
+        times += read(clock, Chunk(b"x", START_S, clock_ns), [None], MODULUS)
+    assert [time.dt_s for time in times] == [0.0, 0.0]

@@ -1,0 +1,66 @@
+"""Stages that process frames without a board and without a model."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from isocharge.serve import Frame, Validity, device_from_table
+from isocharge.serve.flags import in_order
+from isocharge.serve.frames.frame import SATURATED_BIT
+from isocharge.serve.live.device import create_stages
+from isocharge.serve.signal_chain.stage import Setup
+from isocharge.serve.tracking.tracker import Tracker, TrackRule
+
+
+class StageRunner:
+    """The stages of a board that compute touch charges.
+
+    Args:
+        n_electrode: Number of electrodes, which are called A, B, C and so on.
+        misfit: Function from charges, shape (n, n_electrode), to misfits, for the estimate of warming.
+        sections: Sections of the device file.
+    """
+
+    def __init__(self, n_electrode=3, misfit=None, **sections):
+        device = sections.pop("device", None) or device_from_table(sections, "b")
+        predictor = None
+        if misfit is not None:
+            predictor = SimpleNamespace(predict_batch=lambda charge_pC: SimpleNamespace(misfit=misfit(charge_pC)))
+        self.stages = create_stages(device.setup(tuple("ABCDEFGH"[:n_electrode]), predictor=predictor))
+
+    def advance(self, values, t_s, dt_s, *, limited=False, flags=()):
+        """Process a frame, and return it with its flags in their order."""
+        frame = Frame(None, None, tuple(np.asarray(values).tolist()), SATURATED_BIT if limited else 0)
+        frame.clock_s = t_s
+        frame.dt_s = dt_s
+        frame.flags = list(flags)
+        for stage in self.stages:
+            stage.step(frame)
+        frame.flags = in_order(frame.flags)
+        return frame
+
+    def reset_tare(self):
+        """Measure the tare again."""
+        for stage in self.stages:
+            stage.reset()
+
+    def stage(self, stage_class):
+        """Return the stage of a class."""
+        (found,) = [stage for stage in self.stages if isinstance(stage, stage_class)]
+        return found
+
+
+def new_tracker(mixture=None, **settings):
+    """Return a tracker with settings of the section `[track]`, and with a mixture for a film with a fold."""
+    tracker = Tracker(Setup((), {TrackRule: TrackRule(**settings)}))
+    if mixture is not None:
+        tracker._mixture = mixture
+        tracker._mixture_validity = Validity(mixture.charges.corners_mm, (0.0, np.inf))
+    return tracker
+
+
+def track(tracker, contact, t_s, flags=(), charge_pC=None):
+    """Process a frame with a tracker, and return the tracked contact and the event."""
+    frame = Frame(None, None, (), clock_s=t_s, flags=list(flags), charge_pC=charge_pC, contact=contact)
+    tracker.step(frame)
+    return frame.tracking.tracked, frame.tracking.event
