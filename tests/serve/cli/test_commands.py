@@ -26,6 +26,7 @@ from boards import TcpBoard, interrupt, taps
 from isocharge.cli.serve.records import write_records
 from isocharge.common.errors import InputError
 from isocharge.serve import Predictor, Recording, Script, VirtualSensor, load_device
+from isocharge.serve.signal_chain.gain import GainRule
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 
 
@@ -353,7 +354,7 @@ def test_doctor_writes_no_file_of_which_the_unit_is_missing(command, tmp_path):
         stop.set()
         sender.join()
         port.close()
-    assert load_device(path).gain.pC_per_unit == 0.1
+    assert load_device(path).rule(GainRule).pC_per_unit == 0.1
 
 
 ISOCHARGE = f"{sys.executable} -m isocharge.cli"
