@@ -292,6 +292,7 @@ class TouchStream(ReadingStream):
             self._setup.predictor = present_predictor
             raise
         self.predictor = predictor
+        self._label = predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
 
     def use(self, predictor: Predictor) -> None:
@@ -410,7 +411,7 @@ class TouchStream(ReadingStream):
             tare_pC=self._by_electrode(frame.tare_pC),
             flags=in_order((*frame.flags, *frame.contact_flags)),
             latency_us=(self._now_ns() - chunk.clock_ns) / 1e3,  # includes the time that the stages have taken
-            model=self.predictor.metadata.label,
+            model=self._label,
             frame_id=self.frame_id,
             tracking=frame.tracking,
             film=frame.film,

@@ -185,7 +185,16 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
         values = structs.asdict(self)
         if self.tracking is not None:
             values |= structs.asdict(self.tracking)
-        return {name: _json_value(values[name]) for name in self.field_names}
+        json_values: dict[str, Any] = {}
+        for name in self.field_names:
+            value = values[name]
+            value_class = value.__class__  # comparing the class is faster than a call of `isinstance`
+            if value_class is float:
+                value = round(value, DECIMALS)
+            elif value_class not in _UNCHANGED:
+                value = _rounded_numbers(value)
+            json_values[name] = value
+        return json_values
 
     def to_json(self) -> str:
         """Return the record as one line of strictly valid JSON, in which numbers are rounded to six decimals.
@@ -271,22 +280,7 @@ _UNCHANGED = frozenset({str, int, bool, tuple, type(None)})
 _ENCODE = json.JSONEncoder(allow_nan=False).encode
 
 
-def _json_value(value: Any) -> Any:
-    """Convert the value of a field to a value that JSON can represent.
-
-    Floating-point numbers are rounded to six decimals, and a struct becomes a dictionary.
-
-    The function compares the class of the value, because this comparison is faster than a call of `isinstance`. The
-    speed matters, because the function is called for every field of every record.
-
-    Args:
-        value: A number, text, boolean, tuple of texts, None, dictionary of charges by electrode, or struct.
-    """
-    value_class = value.__class__
-    if value_class is float:
-        return round(value, DECIMALS)
-    if value_class in _UNCHANGED:
-        return value
-    if value_class is dict:  # the charges by electrode; the charge of an electrode may be None
-        return {name: charge if charge is None else round(charge, DECIMALS) for name, charge in value.items()}
-    return {name: _json_value(getattr(value, name)) for name in value.__struct_fields__}  # the value is a struct
+def _rounded_numbers(value: Charges | Struct) -> dict[str, Any]:
+    """Return the numbers of a dictionary or of a struct by their names, rounded to six decimals. None is unchanged."""
+    numbers = value if isinstance(value, dict) else structs.asdict(value)
+    return {name: number if number is None else round(number, DECIMALS) for name, number in numbers.items()}
