@@ -66,5 +66,5 @@ def test_mounted_asgi_app_checks_token_size_and_origin(ask):
 def test_asgi_app_refuses_wrong_tokens_and_folders(models, tmp_path):
     with pytest.raises(InputError, match="printable ASCII"):
         asgi_app(models, token="")
-    with pytest.raises(ModelError, match="expected models, .* found none"):
+    with pytest.raises(ModelError, match=r"expected models, .* found none"):
         asgi_app(tmp_path)
