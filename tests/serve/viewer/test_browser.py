@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Script, VirtualSensor
-from isocharge.serve.network.protocol.page import page as start_page
 
 RATE_HZ, PRESS_S, PAUSE_S = 200.0, 1.5, 0.9
 PRESSES = [(0.0, 0.0, 1.0), (6.0, 2.0, 0.5), (-5.0, 3.0, 2.0), (2.0, -6.0, 0.2), (5.0, -3.5, 0.1)]
@@ -150,19 +149,3 @@ def test_live_page_takes_the_numbers_away_when_the_frames_stop(start_stream, ope
     process.send_signal(signal.SIGSTOP)
     shown = wait_for(page, f"isocharge.page.film.drawnKind === 'silent' && {{shown: {SHOWN}}}")["shown"]
     assert np.all(np.isnan(shown))
-
-
-def test_start_page_shows_all_columns_on_a_desktop_and_on_a_phone(chromium, store):
-    html = (
-        start_page(store)
-        .replace("linear/", "eight-25um-biaxial-student/")
-        .replace("A, B, C<", "A, B, C, D, E, F, G, H<")
-    )
-    page = chromium.new_page()
-    page.set_content(html)
-    for width in (1280, 390):
-        page.set_viewport_size({"width": width, "height": 844})
-        boxes = [cell.bounding_box() for cell in page.locator("td, dd").all()]
-        assert all(box["x"] + box["width"] <= width for box in boxes)
-        assert min(cell.bounding_box()["width"] for cell in page.locator("dd").all()) > 300
-    page.close()

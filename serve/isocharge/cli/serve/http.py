@@ -91,8 +91,7 @@ def http_command(
         store = open_model_store(models)
         for reason in store.refusals():
             _report(traffic, "warning", "refused", reason)
-        scheme = "https" if tls else "http"
-        handler = Handler(store, traffic=traffic, token=secret, browser_check=browser_check, scheme=scheme)
+        handler = Handler(store, traffic=traffic, token=secret, browser_check=browser_check)
         server = HttpServer(Application(handler), address, handler.limits, traffic, tls=tls)
         with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:  # empty without gRPC
             _report(traffic, "info", "serving", _labels(store))

@@ -116,7 +116,6 @@ def _inference_families(counters: _Counters) -> Iterable[Metric]:
     # For each attribute of `Statistics`: name and description of the metric that contains the values of this attribute
     metrics_of_attribute = {
         "presses": ("isocharge_presses", "Presses that were answered."),
-        "checked": ("isocharge_misfit_checked", "Presses whose misfit was computed."),
         "alarms": ("isocharge_misfit_alarms", "Presses whose misfit is above the limit of the model."),
         "refused": ("isocharge_inferences_refused", "Requests for an inference that were refused."),
     }

@@ -191,7 +191,6 @@ class Statistics:
 
     Attributes:
         presses: Number of presses for which contacts were returned.
-        unchecked: Number of these presses whose misfit was not computed.
         alarms: Number of these presses whose misfit is above the limit of the model.
         answered: Number of requests that were answered.
         refused: Number of requests that were refused.
@@ -203,7 +202,6 @@ class Statistics:
     """
 
     presses: int = 0
-    unchecked: int = 0
     alarms: int = 0
     answered: int = 0
     refused: int = 0
@@ -213,15 +211,12 @@ class Statistics:
     last_ms: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock, compare=False)
 
-    def count_answered(
-        self, presses: int, stages_ns: tuple[int, int, int], unchecked: int = 0, alarms: int = 0
-    ) -> None:
+    def count_answered(self, presses: int, stages_ns: tuple[int, int, int], alarms: int = 0) -> None:
         """Count a request that was answered.
 
         Args:
             presses: Number of presses in the request.
             stages_ns: Time that the request has spent in each of `STAGES`, ns.
-            unchecked: Number of presses whose misfit was not computed.
             alarms: Number of presses whose misfit is above the limit.
         """
         read_ns, run_ns, write_ns = stages_ns
@@ -229,7 +224,6 @@ class Statistics:
         bucket = bisect_left(LATENCY_BOUNDS_NS, read_ns + run_ns + write_ns)
         with self._lock:
             self.presses += presses
-            self.unchecked += unchecked
             self.alarms += alarms
             self.answered += 1
             self.latency[bucket] += 1
@@ -248,11 +242,6 @@ class Statistics:
         with self._lock:
             self.refused += 1
             self.refused_ns += ns
-
-    @property
-    def checked(self) -> int:
-        """Number of presses whose misfit was computed."""
-        return self.presses - self.unchecked
 
     def snapshot(self) -> "Statistics":
         """Return a copy of all counters. No other thread can change a counter while the counters are copied."""

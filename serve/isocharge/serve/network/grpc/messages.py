@@ -13,14 +13,10 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
 from isocharge.common.errors import RequestError
+from isocharge.common.structs import convert
 from isocharge.serve.network.model_store import LoadedVersion
-from isocharge.serve.network.protocol.inference import (
-    FLAGS,
-    InferAnswer,
-    InferRequest,
-    binary_tensor,
-    parse_request,
-)
+from isocharge.serve.network.protocol.bodies import InferBody
+from isocharge.serve.network.protocol.inference import FLAGS, InferRequest, Rows, binary_tensor, check_request
 
 SERVICE = "inference.GRPCInferenceService"
 """Full name of the gRPC service."""
@@ -50,8 +46,8 @@ def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> Infer
     """Read a ModelInferRequest, and return the charges and the requested outputs.
 
     The message is first converted to the JSON object that the equivalent HTTP request would contain. The function
-    `parse_request` then reads the JSON object. If the charges are sent as raw contents, the outputs of the response are
-    also sent as raw contents.
+    `check_request` then checks the JSON object. If the charges are sent as raw contents, the outputs are also sent as raw
+    contents.
 
     Args:
         message: The ModelInferRequest.
@@ -73,7 +69,7 @@ def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> Infer
         "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
         "parameters": {"binary_data_output": raw_charges is not None},
     }
-    return parse_request(json_object, raw_charges or b"", loaded, max_presses)
+    return check_request(convert(json_object, InferBody, "", RequestError), raw_charges or b"", loaded, max_presses)
 
 
 def _input_object(tensor: Any, raw_charges: bytes | None) -> dict[str, Any]:
@@ -94,7 +90,7 @@ def _input_object(tensor: Any, raw_charges: bytes | None) -> dict[str, Any]:
     }
     if raw_charges is not None:
         parameters["binary_data_size"] = len(raw_charges)
-    # If the request contains both numbers and raw content, the object contains both. The function `parse_request` then
+    # If the request contains both numbers and raw content, the object contains both. The function `check_request` then
     # refuses the object. It also refuses an unknown number type.
     if tensor.HasField("contents") or raw_charges is None:
         field = CONTENT_FIELDS.get(tensor.datatype, "fp32_contents")
@@ -110,25 +106,27 @@ def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
     return {name: True for name in ("shared_memory_region", "classification") if name in tensor.parameters}
 
 
-def write_response(answer: InferAnswer) -> Any:
+def write_response(loaded: LoadedVersion, request: InferRequest, outputs: dict[str, Rows]) -> Any:
     """Convert the outputs of a model to a ModelInferResponse.
 
     If an output was requested as a binary tensor, its values are sent as raw contents. The values of every other output
     are sent as a list of texts or numbers.
 
     Args:
-        answer: Outputs of the model, and the names of the outputs that were requested as binary tensors.
+        loaded: Version of the model that was run.
+        request: The request, which states which outputs are sent as binary tensors.
+        outputs: Values of the requested outputs by their names, each of shape (n, width).
     """
     _, response_type = METHODS["ModelInfer"]
     message = response_type()
-    message.model_name = answer.name
-    message.model_version = answer.version
-    message.id = answer.id
-    for name, rows in answer.outputs.items():
+    message.model_name = loaded.metadata.name
+    message.model_version = loaded.version
+    message.id = request.id
+    for name, rows in outputs.items():
         is_text = name == FLAGS
         datatype = "BYTES" if is_text else "FP32"
         tensor = message.outputs.add(name=name, datatype=datatype, shape=rows.shape)
-        if name in answer.binary:
+        if request.outputs[name]:
             message.raw_output_contents.append(binary_tensor(rows))
         elif is_text:
             texts = rows[:, 0].tolist()  # the output `flags` has a single column

@@ -10,18 +10,16 @@ time.
 import re
 import time
 from collections.abc import Iterable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import NamedTuple
 
-from isocharge.common.errors import TokenError, UnknownPath, WrongMethod
+from isocharge.common.errors import UnknownPath, WrongMethod
 from isocharge.serve.network.address import ServerLimits, Token
 from isocharge.serve.network.browser_check import BrowserCheck, header_values
 from isocharge.serve.network.metrics import Metrics
 from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol import describe
-from isocharge.serve.network.protocol.openapi import openapi_document
-from isocharge.serve.network.protocol.page import PAGE_HEADERS, TOKEN_PAGE, TOKEN_PAGE_POLICY
-from isocharge.serve.network.protocol.response import Response, decompress, error_response, response_of
+from isocharge.serve.network.protocol.response import Response, decompress, error_response
 from isocharge.serve.network.protocol.routes import ROUTES, Request, Route, Service
 from isocharge.serve.network.traffic import Client, Exchange, Traffic
 
@@ -81,16 +79,6 @@ def match_path(path: str) -> Match:
     return NO_ROUTE
 
 
-def token_page(error: TokenError) -> Response:
-    """Return the page that asks a browser for the token, with the status 401."""
-    refusal = error_response(error)
-    response = response_of(refusal.status, b"text/html; charset=utf-8", TOKEN_PAGE.encode(), refusal.error)
-    response.headers.extend(PAGE_HEADERS)
-    response.headers.append((b"content-security-policy", TOKEN_PAGE_POLICY))
-    response.headers.append((b"www-authenticate", b"Bearer"))
-    return response
-
-
 class Handler:
     """Handler that answers HTTP requests with the models of a store, and counts and logs the requests."""
 
@@ -101,7 +89,6 @@ class Handler:
         traffic: Traffic | None = None,
         token: Token | None = None,
         browser_check: BrowserCheck | None = None,
-        scheme: str = "http",
     ) -> None:
         """Create a handler for the models of a store.
 
@@ -114,7 +101,6 @@ class Handler:
             browser_check: Check that refuses requests from web pages of other sites. By default, the check only accepts
                 requests for IP addresses and for `localhost`. If there is a token, it accepts requests for any host
                 name.
-            scheme: Scheme of the address of the server, which is "http" or "https".
         """
         self.store = store
         self.token = token
@@ -123,7 +109,7 @@ class Handler:
         self._browser_check = browser_check or BrowserCheck(any_host=has_token)
         self.traffic = traffic or Traffic()
         metrics = Metrics(store, self.traffic, describe.server_metadata()["version"])
-        self._service = Service(store, self.limits, metrics, partial(openapi_document, ROUTES, store), scheme)
+        self._service = Service(store, self.limits, metrics)
 
     def may_block(self, path: str) -> bool:
         """Return whether computing the response for a path may take a long time.
@@ -169,26 +155,6 @@ class Handler:
             log.write_exchange(exchange)
         return response
 
-    def count_refusal(self, response: Response, client: Client = None) -> None:
-        """Count and log the refusal of a request that the server did not read completely.
-
-        Args:
-            response: The refusal, which the server sends to the client.
-            client: Address and port of the client, for the log.
-        """
-        exchange = Exchange(
-            transport="http",
-            route="none",
-            status=response.status,
-            model=None,
-            error=response.error,
-            ns=0,
-            bytes_in=0,
-            bytes_out=len(response.body),
-            client=client,
-        )
-        self.traffic.count_and_log(exchange)
-
     def _check_and_answer(
         self, method: str, path: str, match: Match, headers: dict[bytes, bytes], body: bytes
     ) -> Response:
@@ -209,12 +175,7 @@ class Handler:
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
         # which paths exist.
         if self.token is not None and (route is None or route.needs_token):
-            try:
-                self.token.check(headers.get(b"authorization", b""))
-            except TokenError as error:
-                if b"text/html" not in headers.get(b"accept", b""):
-                    raise
-                return token_page(error)  # a browser shows a page instead of JSON
+            self.token.check(headers.get(b"authorization", b""))
         if route is None:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
         # A HEAD request is answered like a GET request. The server then sends the response without its body.

@@ -1,9 +1,9 @@
-"""JSON body of a request for an inference. The OpenAPI schema is derived from the same types.
+"""JSON bodies of requests.
 
 Some clients send `null` for every field that is not given. All optional fields therefore accept `null`.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
@@ -21,12 +21,12 @@ class Parameters(Struct, frozen=True):
 
 
 class InputTensor(Struct, frozen=True):
-    """Input tensor with the charges, pC. The shape is checked before the numbers."""
+    """Input tensor with the charges, pC."""
 
     name: Literal["charge_pC"]
     datatype: Literal["FP32", "FP64"]
     shape: list[int]
-    data: Annotated[Any, Meta(extra_json_schema={"type": "array", "description": "numbers, flat or in rows"})] = None
+    data: Annotated[list[float | list[float]], Meta(description="numbers, flat or in rows")] | None = None
     parameters: Parameters | None = None
 
 
@@ -44,3 +44,9 @@ class InferBody(Struct, frozen=True):
     id: str | None = None
     outputs: list[OutputTensor] | None = None
     parameters: Parameters | None = None
+
+
+class IndexBody(Struct, frozen=True):
+    """Body of a request for the index of the repository."""
+
+    ready: bool | None = None
