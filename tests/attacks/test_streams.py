@@ -21,6 +21,7 @@ from isocharge.serve import (
 )
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.recognition.recognise import recognise
+from layout_encoder import encode_layout, encode_unstuffed
 
 FRAMES = [Frame(seq, 5000 * seq, (800.0 + seq, 700.0 - seq, 900.5), 0, ("A", "B", "C")) for seq in range(6)]
 
@@ -56,13 +57,13 @@ def stuffed(framing):
         "hdlc": lambda data: data.replace(b"}", b"}]").replace(b"~", b"}^") + b"~",
         "datagram": lambda data: data,
     }
-    return layout.parser, b"".join(escapes[framing](layout.encode_unstuffed(frame)) for frame in FRAMES)
+    return layout.parser, b"".join(escapes[framing](encode_unstuffed(layout, frame)) for frame in FRAMES)
 
 
 def formats():
     layout = device_from_table({"frames": DESCRIBED}, "attack").frames
     yield "binary", BinaryParser, b"".join(map(encode_frame, FRAMES))
-    yield "described", layout.parser, b"".join(map(layout.encode, FRAMES))
+    yield "described", layout.parser, b"".join(encode_layout(layout, frame) for frame in FRAMES)
     for framing in ("cobs", "slip", "hdlc", "datagram"):
         yield f"described {framing}", *stuffed(framing)
     for notation in ("csv", "pairs", "teleplot", "json"):

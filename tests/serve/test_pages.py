@@ -19,6 +19,7 @@ from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import STAGES
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
+from layout_encoder import encode_layout
 
 SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
@@ -60,7 +61,7 @@ def test_described_frames_of_the_documentation_are_read():
     layout = device_from_table(table, "board.toml").frames
     parser = device_from_table(table, "board.toml").parser()
     frame = Frame(7, None, (100.0, -200.0, 300.0), names=("A", "B", "C"))
-    assert parser.feed(layout.encode(frame)) == [frame]
+    assert parser.feed(encode_layout(layout, frame)) == [frame]
 
 
 @pytest.fixture(scope="module")

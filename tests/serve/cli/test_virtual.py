@@ -4,7 +4,6 @@ import re
 import threading
 import time
 from contextlib import suppress
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +12,7 @@ import pytest
 from boards import interrupt
 from isocharge.cli.shared import virtual_sensor
 from isocharge.common.errors import InputError, OutputExists, SceneError, SensorError
-from isocharge.serve import Port, Script, VirtualSensor, device_from_table, load_device, wander
+from isocharge.serve import AutoParser, Port, Script, VirtualSensor, wander
 from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor, virtual_film
 from kept import kept
 
@@ -49,14 +48,14 @@ def played(run, tmp_path):
     Gives the values of all frames, shape (n, electrodes), pC, and the result of the command.
     """
 
-    def play(count, *words, board=None):
-        link, device, frames = tmp_path / "film", board or device_from_table({}, "any"), []
-        parser = device.parser()
+    def play(count, *words):
+        link, frames = tmp_path / "film", []
+        parser = AutoParser()
 
         def read():
             while not link.exists():
                 time.sleep(0.01)
-            with Port(str(link), reconnect=True, request=device.request) as port:
+            with Port(str(link), reconnect=True) as port:
                 last = np.inf
                 for chunk in port:
                     frames.extend(parser.feed(chunk.data))
@@ -109,39 +108,17 @@ def test_virtual_option_film_plays_a_random_film_without_printing_it(played, tmp
     assert f"playing film 9 of {SENSOR} at 1000 Hz" in result.stderr
 
 
-def test_described_frames_with_the_faults_of_a_script(played, tmp_path):
-    device, script = tmp_path / "board.toml", tmp_path / "play.toml"
-    device.write_text(
-        '[frames]\nformat = "described"\nsync = "AA 55"\nlength = 14\nchecksum = "crc-16/x-25"\nfields = [\n'
-        '{name = "seq", type = "u16"}, {name = "t_ms", type = "u16"},\n'
-        '{name = "A", type = "i16", scale = 0.1}, {name = "B", type = "i16", scale = 0.1},'
-        '{name = "C", type = "i16", scale = 0.1}]\n'
-    )
+def test_frames_with_the_faults_of_a_script(played, tmp_path):
+    script = tmp_path / "play.toml"
     script.write_text("[faults]\nlose_share = 0.05\ncorrupt_share = 0.001\nunplug_every_s = 0.5\nunplug_s = 0.2\n")
-    values, result = played(700, "--device", device, "--script", script, board=load_device(device))
+    values, result = played(700, "--script", script)
     assert values.shape == (len(values), 3)
     lost, damaged, unplugged = map(
         int, re.search(r"(\d+) lost and (\d+) damaged on purpose, (\d+) times", result.stderr).groups()
     )
     assert lost > 100
-    assert 0 < damaged < lost  # 1.4 of 5 %
+    assert 0 < damaged < lost
     assert unplugged >= 1
-
-
-def test_device_file_of_the_page_with_byte_stuffing_and_requests_is_played_as_counts(played, tmp_path):
-    """The board inverts B, swaps B and C, and sends a status. The charges differ by at most one count."""
-    page = (Path(__file__).parents[3] / "serve" / "docs" / "device_file.md").read_text("utf-8")
-    device, script = tmp_path / "board.toml", tmp_path / "held.toml"
-    added_keys = '[frames]\nframing = "cobs"\nrequest = "3F 0A"\nrequest_Hz = 500\n'
-    device.write_text(page.split("```toml\n")[1].split("```")[0].replace("[frames]\n", added_keys))
-    script.write_text("presses = [[0, 0, 0, 0], [0.5, 0, 0, 0], [0.501, 1, 2, 0.3], [2, 1, 2, 0.3]]\n")
-    values, result = played(100, "--script", script, "--noise", "clean", "--device", device, board=load_device(device))
-    charge_pC = values[:, [1, 3, 2]] * [0.0457, -0.0459, 0.0457]
-    expected_pC = small_map(*DESCRIBED).charges(np.array([[1.0, 2.0, 0.3]]))[0]
-    np.testing.assert_allclose(charge_pC[-1] - charge_pC[0], expected_pC, atol=0.046)
-    np.testing.assert_array_equal(values[:, 0], 0.0)
-    assert "beyond the range" not in result.stderr
-    assert "withheld because no program requested them" in result.stderr
 
 
 def test_virtual_solves_the_film_only_up_to_the_scripted_distance(tmp_path, run, solved):
@@ -222,16 +199,10 @@ def test_virtual_film_with_the_same_seed_is_the_same(run, solved):
         (f"{SENSOR} --seconds 0 --link TMP/no/film", InputError, "the link cannot be made"),
         ("five-25um-biaxial", SensorError, "no sensor 'five-25um-biaxial'"),
         (f"{SENSOR} --film 1 --probe triangle:4", InputError, r"--film: expected a --probe like circle.*'triangle:4'"),
-        (f"{SENSOR} --device TMP/extra.toml --frames json", InputError, "expected no notation, because .* got json"),
-        (f"{SENSOR} --device TMP/extra.toml", InputError, "expects 3 charges .* has 4 .*'status'"),
     ],
 )
 def test_virtual_refuses_wrong_options(run, solved, tmp_path, words, error, message):
     (tmp_path / "film").write_text("mine")
-    fields = ", ".join(f'{{name = "{name}", type = "i16"}}' for name in ("status", "x", "y", "z"))
-    (tmp_path / "extra.toml").write_text(
-        f'[frames]\nformat = "described"\nsync = "55"\nlength = 9\nfields = [{fields}]\n'
-    )
     with pytest.raises(error, match=message):
         run("virtual", *words.replace("TMP", str(tmp_path)).split())
     assert len(solved) <= 1

@@ -6,7 +6,6 @@ The folder tests/data/frames contains the layouts of three sensors, as their mak
 import binascii
 import math
 import struct
-import sys
 import tomllib
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from hypothesis import strategies as st
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame, device_from_table
 from isocharge.serve.frames.frame_layout import SyncParser
+from layout_encoder import encode_layout
 
 FOLDER = Path(__file__).parents[2] / "data" / "frames"
 
@@ -83,7 +83,7 @@ def encoded(name, counts):
     """Return the bytes of a frame whose channels have these values before the scaling."""
     layout = LAYOUTS[name]
     values = [count * field.scale for count, field in zip(counts, layout.channels, strict=False)]
-    return layout.encode(Frame(abs(counts[0]), abs(counts[1]), tuple(values)))
+    return encode_layout(layout, Frame(abs(counts[0]), abs(counts[1]), tuple(values)))
 
 
 @settings(derandomize=True)
@@ -153,7 +153,7 @@ def test_numbers_of_three_bytes(a, b, c, order):
     data = b"\xa5\x5a" + body + struct.pack("<H", mkPredefinedCrcFun("xmodem")(body))
     (frame,) = SyncParser(described).feed(data)
     assert frame.values == (a, b / 2, c)
-    assert described.encode(frame) == data
+    assert encode_layout(described, frame) == data
 
 
 def stuffed(framing, **others):
@@ -181,7 +181,7 @@ def test_cobs_slip_and_hdlc_frames_are_encoded_and_read(framing, stuff):
     too_short = stuff(b"123")
     stream = b"".join([*sent[:9], with_wrong_checksum, too_short, *sent[9:]])
     described = stuffed(framing)
-    encoded_frames = [described.encode(Frame(seq, None, (0.1 * seq,))) for seq in range(256)]
+    encoded_frames = [encode_layout(described, Frame(seq, None, (0.1 * seq,))) for seq in range(256)]
     first_delimiter = b"~" if framing == "hdlc" else b""
     assert [first_delimiter + data for data in encoded_frames] == sent
 
@@ -219,7 +219,7 @@ fields = [{name = "seq", type = "u8"}, {type = "pad", value = "02"}, {name = "A"
     described = layout(text)
     frames = SyncParser(described).feed(bytes.fromhex("7E 01 02 10 00  7E 02 09 11 22  7E 03 02 20 00"))
     assert [(frame.seq, frame.values) for frame in frames] == [(1, (16.0,)), (3, (32.0,))]
-    assert described.encode(Frame(1, 0, (16.0,))) == bytes.fromhex("7E 01 02 10 00")
+    assert encode_layout(described, Frame(1, 0, (16.0,))) == bytes.fromhex("7E 01 02 10 00")
 
 
 def test_checksum_described_by_its_crc_parameters():
@@ -242,31 +242,18 @@ fields = [{name = "seq", type = "u8"}, {name = "t_ms", type = "u8"}, {name = "A"
 """
     described = layout(text)
     parser = SyncParser(described)
-    assert parser.feed(described.encode(Frame(257, 300_000, (1e6,)))) == [Frame(1, 44_000, (16383.5,), names=("A",))]
+    assert parser.feed(encode_layout(described, Frame(257, 300_000, (1e6,)))) == [
+        Frame(1, 44_000, (16383.5,), names=("A",))
+    ]
     assert (parser.seq_modulus, parser.t_us_modulus) == (256, 256_000)
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "expected"),
-    [
-        ({"type": "i16"}, 1e300, 32767.0),
-        ({"type": "u8"}, -1.0, 0.0),
-        ({"type": "i24", "scale": -2.0}, 1e9, -2.0 * -(2**23)),
-        ({"type": "f32"}, -math.inf, -struct.unpack(">f", b"\x7f\x7f\xff\xff")[0]),
-        ({"type": "f64"}, math.inf, sys.float_info.max),
-    ],
-)
-def test_channel_beyond_the_range_of_its_field_is_clipped(field, value, expected):
-    size = {"8": 1, "6": 2, "4": 3, "2": 4}[field["type"][-1]] if field["type"] != "f64" else 8
-    described = layout({"sync": "55", "length": 1 + size, "fields": [{"name": "A"} | field]})
-    assert described.parser().feed(described.encode(Frame(None, None, (value,))))[0].values == (expected,)
-
-
-def test_signed_counter_wraps_and_has_no_scale():
+def test_signed_counter_has_no_scale():
     described = layout({"sync": "55", "length": 3, "fields": [
         {"name": "seq", "type": "i8", "scale": 0.5}, {"name": "A", "type": "u8"},
     ]})  # fmt: skip
-    assert described.encode(Frame(130, None, (0.0,))) == b"\x55" + struct.pack("<bB", 130 - 256, 0)
+    (frame,) = described.parser().feed(b"\x55" + struct.pack("<bB", -126, 0))
+    assert frame.seq % 256 == 130
 
 
 WRONG = [

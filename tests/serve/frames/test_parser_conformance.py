@@ -19,6 +19,7 @@ from isocharge.serve.frames.frame import Parser, SequenceGaps
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_lines import TEXT_FORMATS
 from isocharge.serve.virtual_sensor.script import corrupt
+from layout_encoder import encode_layout, encode_unstuffed
 
 HEAD = [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
 FLOATS = [{"name": name, "type": "f32"} for name in "ABC"]
@@ -100,7 +101,7 @@ def described(table):
     noise = st.one_of(st.just(layout.sync), st.just(layout.sync[:1]), st.binary(max_size=6))
     return Format(
         layout.parser,
-        layout.encode,
+        partial(encode_layout, layout),
         st.builds(Frame, seq=SEQ, t_us=T_US, values=values),
         st.lists(noise, min_size=1, max_size=5).map(b"".join),
         tail=bytes(layout.length),
@@ -109,7 +110,7 @@ def described(table):
 
 def slip(frame):
     """Return a frame with the byte stuffing of RFC 1055."""
-    data = device_from_table({"frames": STUFFED}, "test").frames.encode_unstuffed(frame)
+    data = encode_unstuffed(device_from_table({"frames": STUFFED}, "test").frames, frame)
     return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
 
 

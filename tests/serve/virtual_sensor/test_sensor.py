@@ -13,7 +13,6 @@ import serial
 from isocharge.common.errors import PortError, SceneError
 from isocharge.serve import BinaryParser, Faults, Port, Script, VirtualSensor, encode_frame, encode_text, wander
 from isocharge.serve.frames.frame import SequenceGaps
-from isocharge.serve.port.serial_line import Request
 from isocharge.serve.virtual_sensor.script import corrupt
 
 
@@ -65,20 +64,6 @@ def test_frame_number_and_clock_overflow(film):
     assert sum(map(len, islice(sensor.frames(), 65_540))) == 65_540
     assert (frames[65_535].seq, frames[65_536].seq) == (65_535, 0)
     assert frames[4295].t_us == 4_295_000_000 - 2**32
-
-
-def test_frame_number_and_clock_of_a_board_with_a_wider_counter(film):
-    frames = []
-    sensor = VirtualSensor(
-        film.charges,
-        steady(10, 1.0),
-        encode=lambda frame: bytes(frames.append(frame) or 1),
-        seq_modulus=1 << 32,
-        t_us_modulus=1000 << 32,
-    )
-    assert sum(map(len, islice(sensor.frames(), 65_540))) == 65_540
-    assert frames[65_536].seq == 65_536
-    assert frames[4295].t_us == 4_295_000_000
 
 
 @pytest.mark.parametrize("charges", [np.zeros(3), np.zeros((2, 3)), np.full((10, 3), np.nan)])
@@ -150,27 +135,6 @@ def test_truth_of_a_frame_that_was_sent_before_the_script_was_replaced_is_refuse
             sensor.truth(early_frames[-1].seq)
 
 
-def test_truth_of_a_board_with_a_narrow_counter(film):
-    """The force is different in every frame. The counter wraps at 256."""
-    script = Script(np.zeros(1000), np.zeros(1000), np.linspace(0.1, 1.0, 1000), 200.0)
-    with VirtualSensor(film.charges, script, offset_pC=[0.0] * 3, seq_modulus=256) as sensor:
-        frames, _ = read(sensor.url, 300)
-        latest_frames = frames[-20:]
-        truths = [sensor.truth(frame.seq) for frame in latest_frames]
-        with pytest.raises(SceneError, match="no frame 256 was played; expected 0 to 255"):
-            sensor.truth(256)
-    for frame, truth in zip(latest_frames, truths, strict=True):
-        np.testing.assert_allclose(frame.values, truth.charge_pC, rtol=1e-6)
-    sent_s = [truth.sent_s for truth in truths]
-    assert sent_s == sorted(sent_s)
-
-
-def test_truth_of_a_board_that_sends_frames_only_on_request_is_refused(film):
-    sensor = VirtualSensor(film.charges, steady(), request=b"?")
-    with sensor, pytest.raises(SceneError, match="only on request"):
-        sensor.truth(0)
-
-
 def test_frames_after_a_stall_of_the_process_are_postponed_and_not_sent_in_a_burst(film):
     """The stall is as long as 200 frames. Without a pause, these frames would be sent within a few milliseconds."""
 
@@ -207,20 +171,6 @@ def test_frames_are_withheld_without_a_reader(film):
         assert frames[0].seq < 1000
     with pytest.raises(PortError, match="does not play"):
         sensor.url  # noqa: B018
-
-
-@pytest.mark.parametrize("echo", [False, True])
-def test_frames_are_sent_and_numbered_on_request(film, echo):
-    request = Request(b"?\n", rate_Hz=100.0, echo=echo)
-    parser = BinaryParser()
-    with VirtualSensor(film.charges, steady(rate_Hz=500.0), request=request.data, echo=echo) as sensor:
-        with Port(sensor.url, request=request) as port:
-            frames = list(islice((frame for chunk in port for frame in parser.feed(chunk.data)), 20))
-        assert port.echo_share == pytest.approx(1.0 if echo else 0.0, abs=0.06)
-        assert sensor.withheld > 20
-    assert [frame.seq for frame in frames] == list(range(20))
-    assert frames[-1].t_us > 19 * 9_000  # at most 100 requests per second
-    assert parser.counts.bytes_dropped == 0
 
 
 def test_bytes_that_a_sensor_ignores_do_not_block_their_sender(film):

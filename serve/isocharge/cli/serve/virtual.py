@@ -19,8 +19,7 @@ from isocharge.cli.shared.virtual_sensor import film_charges, film_charges_per_K
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
-from isocharge.serve import Script, VirtualSensor, encode_frame, encode_text, load_device
-from isocharge.serve.live.board_encoder import BoardEncoder
+from isocharge.serve import Script, VirtualSensor, encode_frame, encode_text
 from isocharge.serve.virtual_sensor.pseudo_port import posix_modules
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
 from isocharge.simulate import (
@@ -37,7 +36,7 @@ from isocharge.simulate import (
 
 
 class FrameFormat(StrEnum):
-    """Format of the frames that is used if no device file describes the frames."""
+    """Format of the frames."""
 
     binary = "binary"
     csv = "csv"
@@ -100,19 +99,7 @@ def virtual_command(
             "(default: random presses, no faults)",
         ),
     ] = None,
-    frames: Annotated[
-        FrameFormat | None,
-        typer.Option("--frames", help="Format of the frames. (default: binary, or a format that fits --device)"),
-    ] = None,
-    device: Annotated[
-        Path | None,
-        typer.Option(
-            "--device",
-            metavar="FILE",
-            help="Device file of the board to simulate, TOML: its frames, channels and gains. (default: none, charges "
-            "in pC)",
-        ),
-    ] = None,
+    frames: Annotated[FrameFormat, typer.Option("--frames", help="Format of the frames.")] = FrameFormat.binary,
 ) -> None:
     """Play a sensor: simulate presses that wander over the film, and send their charges as frames on a pseudo-terminal.
 
@@ -129,9 +116,6 @@ def virtual_command(
     played_sensor, footprint = _sensor_and_probe(sensor, probe, film)
     amplifier = _amplifier(noise, settings)
     electrode_count = len(played_sensor.electrodes)
-    board = None
-    if device is not None:
-        board = BoardEncoder(load_device(device), played_sensor.electrode_names, frames)
     # Until the film is solved, the player sends frames without a touch. It then only computes the charges of an empty
     # list of contacts, for which the first function returns an empty array.
     player = VirtualSensor(
@@ -139,7 +123,7 @@ def virtual_command(
         _untouched_frame(rate),
         noise=measure_function(amplifier, rate),
         seed=seed,
-        **_frame_settings(frames, board),
+        encode=encode_frame if frames is FrameFormat.binary else partial(encode_text, notation=frames.value),
         faults=settings.faults,
         link=link,
     )
@@ -163,15 +147,12 @@ def virtual_command(
         played_name = sensor if film is None else f"film {film} of {sensor}"
         say(f"playing {played_name} at {rate:g} Hz; Ctrl-C stops")
         threading.Event().wait(seconds)  # sleeps until Ctrl-C if `seconds` is None
-    reads = "read" if board is None or board.request is None else "requested"
     say(
-        f"{player.sent} frames sent, {player.withheld} withheld because no program {reads} them, {player.lost} lost "
+        f"{player.sent} frames sent, {player.withheld} withheld because no program read them, {player.lost} lost "
         f"and {player.corrupted} damaged on purpose, {player.unplugged} times unplugged"
     )
     if player.paused_s > 0.0:
         say(f"the sensor paused for {player.paused_s:.1f} s in all, because this computer was busy")
-    if board is not None and board.clipped:
-        say(f"{board.clipped} frames had a charge beyond the range of its field in {device}, and were set to its limit")
 
 
 def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) -> tuple[Sensor, Probe]:
@@ -215,27 +196,6 @@ def _untouched_frame(rate_Hz: float) -> Script:
     no_position = np.full(1, np.nan)
     no_force = np.zeros(1)
     return Script(no_position, no_position, no_force, rate_Hz)
-
-
-def _frame_settings(frames: FrameFormat | None, board: BoardEncoder | None) -> dict[str, Any]:
-    """Return the arguments of `VirtualSensor` that determine the frames.
-
-    Args:
-        frames: Format of the frames if there is no board; None for the binary format. A board has its own format.
-        board: Board of the device file; None if there is none.
-    """
-    if board is not None:
-        settings: dict[str, Any] = {"encode": board.encode}
-        # Values at which the sequence number and the device clock of the board wrap to 0
-        settings["seq_modulus"] = board.seq_modulus
-        settings["t_us_modulus"] = board.t_us_modulus
-        if board.request is not None:
-            settings["request"] = board.request.data
-            settings["echo"] = board.request.echo
-        return settings
-    if frames is None or frames is FrameFormat.binary:
-        return {"encode": encode_frame}
-    return {"encode": partial(encode_text, notation=frames.value)}
 
 
 def _largest_distance_mm(radius_mm: float, scripted_presses: Script | None) -> float:

@@ -1,13 +1,11 @@
 """Definition of one field of a frame. A device file describes the layout of such frames field by field."""
 
 import struct
-import sys
 from typing import Annotated, Literal
 
 from msgspec import Meta, field
 
 from isocharge.common.structs import Finite, Settings, WrongKey
-from isocharge.serve.frames.frame import FLAGS, SEQ, TIMES_US
 
 STRUCT_FORMATS = {
     "u8": "B",
@@ -25,9 +23,6 @@ STRUCT_FORMATS = {
 
 A number of three bytes is read as bytes, because `struct` has no format for such numbers.
 """
-
-LARGEST_FLOATS = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": sys.float_info.max}
-"""Largest number that each floating-point type of a field can represent (IEEE 754)."""
 
 PADDING = "pad"
 """Type of a field whose bytes are not read."""
@@ -103,66 +98,6 @@ class Field(Settings, frozen=True):
         return 1 << 8 * self.size
 
     @property
-    def largest_number(self) -> float:
-        """Largest number that the field can contain."""
-        if self.type_name in LARGEST_FLOATS:
-            return LARGEST_FLOATS[self.type_name]
-        if self.is_signed:
-            return self.modulus // 2 - 1
-        return self.modulus - 1
-
-    @property
-    def smallest_number(self) -> float:
-        """Smallest number that the field can contain."""
-        if self.type_name in LARGEST_FLOATS:
-            return -LARGEST_FLOATS[self.type_name]
-        return -self.modulus // 2 if self.is_signed else 0
-
-    @property
     def is_signed(self) -> bool:
         """Whether the field contains signed integers."""
         return self.type_name.startswith("i")
-
-    def holds(self, value: float) -> bool:
-        """Return whether the field can contain a given value in the unit of the channel."""
-        return self.smallest_number <= value / self.scale <= self.largest_number
-
-    def nearest_value(self, value: float) -> float:
-        """Return the value in the range of the field that is nearest to a given value.
-
-        Both values are in the unit of the channel.
-        """
-        return self._nearest_number(value / self.scale) * self.scale
-
-    def _nearest_number(self, number: float) -> float:
-        """Return the number in the range of the field that is nearest to a given number."""
-        return min(max(number, self.smallest_number), self.largest_number)
-
-    def pack(self, value: float, byte_order: ByteOrder) -> float | bytes:
-        """Convert a value to a form that the module `struct` can pack.
-
-        The field contains a number, which is the value divided by the scale of the field. A counter or clock in an
-        integer field wraps around if its number exceeds the range of the field. Every other number is limited to the
-        range of the field. The result is the number, which is converted to bytes for a field of three bytes.
-
-        Args:
-            value: Value in the unit of the channel or of the clock.
-            byte_order: Byte order of the frame. It is used only for fields of three bytes.
-
-        Raises:
-            ValueError: If the value of an integer field is not a number.
-        """
-        number = value
-        if self.name not in (SEQ, FLAGS):  # a parser reads the frame counter and the flags without a scale
-            number = value / self.scale
-        is_float = self.type_name in LARGEST_FLOATS
-        is_counter_or_clock = self.name in (SEQ, *TIMES_US)
-        if is_counter_or_clock and not is_float:  # the number wraps around within the range of the field
-            number = (round(number) - self.smallest_number) % self.modulus + self.smallest_number
-        limited_number = self._nearest_number(number)
-        if is_float:
-            return limited_number
-        whole_number = round(limited_number)
-        if self.size == 3:  # struct has no format for three bytes
-            return whole_number.to_bytes(3, byte_order, signed=self.is_signed)
-        return whole_number

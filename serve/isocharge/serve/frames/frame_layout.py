@@ -41,10 +41,8 @@ from isocharge.common.structs import Settings, WrongKey
 from isocharge.serve.frames.checksums import CHECKSUMS, Checksum, crc_with_parameters
 from isocharge.serve.frames.frame import (
     FLAGS,
-    SEQ,
     SEQ_MODULUS,
     T_US_MODULUS,
-    TIMES_US,
     ChecksumError,
     Columns,
     Frame,
@@ -296,44 +294,6 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     def frame_of_zeros(self) -> Frame:
         """Return a frame in which all numbers are 0."""
         return self.columns.frame([0] * len(self.fields))
-
-    def encode(self, frame: Frame) -> bytes:
-        """Return the bytes that a board sends for a frame, including any byte stuffing and delimiter.
-
-        The first value of the frame belongs to the first channel, the second value to the second channel, and so on.
-
-        Raises:
-            ValueError: If the frame has another number of values than there are channels, or a value is not a number.
-        """
-        data = self.encode_unstuffed(frame)
-        if self.framing not in STUFFINGS:  # frames with a sync pattern and datagrams have no stuffing
-            return data
-        stuffing = STUFFINGS[self.framing]
-        return stuffing.encode(data) + stuffing.delimiter
-
-    def encode_unstuffed(self, frame: Frame) -> bytes:
-        """Return the bytes of a frame without byte stuffing and without delimiter.
-
-        The first value of the frame belongs to the first channel, the second value to the second channel, and so on.
-
-        Raises:
-            ValueError: If the frame has another number of values than there are channels, or a value is not a number.
-        """
-        seq = 0 if frame.seq is None else frame.seq
-        t_us = 0 if frame.t_us is None else frame.t_us
-
-        # Values by the name of the field. The clock is given in all units, because its field may have any of the names.
-        values: dict[str, float] = {SEQ: seq, FLAGS: frame.bits}
-        for clock_name, unit_us in TIMES_US.items():
-            values[clock_name] = t_us / unit_us
-        for channel, value in zip(self.channels, frame.values, strict=True):
-            values[channel.name] = value
-
-        packed_values = [field.pack(values[field.name], self.byte_order) for field in self.fields]
-        data = bytearray(self.sync + self.body.pack(*packed_values))
-        for position, constant in self.constants:  # `struct` has packed all padding as zeros
-            data[position : position + len(constant)] = constant
-        return bytes(data) + self.compute_checksum(bytes(data))
 
     def parser(self) -> Parser:
         """Create a parser for frames with this layout and this framing."""

@@ -17,13 +17,11 @@ class Stuffing(NamedTuple):
 
     Attributes:
         delimiter: The byte between frames.
-        encode: Function that converts the bytes of a frame to the bytes that are sent before the delimiter.
         decode: Function that converts the bytes between two delimiters to the bytes of the frame. It raises ValueError
             for bytes that no encoder produces.
     """
 
     delimiter: bytes
-    encode: Callable[[bytes], bytes]
     decode: Callable[[bytes], bytes]
 
 
@@ -40,12 +38,6 @@ def cobs_decode(stuffed: bytes) -> bytes:
     return decoded
 
 
-def _slip_encode(data: bytes) -> bytes:
-    """Apply the byte stuffing of SLIP, so that the result does not contain the byte C0."""
-    # The byte DB is replaced first, because the second replacement inserts further bytes DB.
-    return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc")
-
-
 def _slip_decode(stuffed: bytes) -> bytes:
     """Remove the byte stuffing of SLIP, which sends the byte C0 as DB DC and the byte DB as DB DD.
 
@@ -58,12 +50,6 @@ def _slip_decode(stuffed: bytes) -> bytes:
         raise ValueError("expected DC or DD after the byte DB")
     # The sequence DB DD is replaced last, because a DB that results from it may stand before a byte DC of the data.
     return stuffed.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
-
-
-def _hdlc_encode(data: bytes) -> bytes:
-    """Apply the byte stuffing of HDLC, so that the result does not contain the byte 7E."""
-    # The byte 7D is replaced first, because the second replacement inserts further bytes 7D.
-    return data.replace(b"\x7d", b"\x7d\x5d").replace(b"\x7e", b"\x7d\x5e")
 
 
 def _hdlc_decode(stuffed: bytes) -> bytes:
@@ -86,8 +72,8 @@ def _hdlc_decode(stuffed: bytes) -> bytes:
 
 
 STUFFINGS = {
-    "cobs": Stuffing(b"\x00", cobs.encode, cobs_decode),
-    "slip": Stuffing(b"\xc0", _slip_encode, _slip_decode),
-    "hdlc": Stuffing(b"\x7e", _hdlc_encode, _hdlc_decode),
+    "cobs": Stuffing(b"\x00", cobs_decode),
+    "slip": Stuffing(b"\xc0", _slip_decode),
+    "hdlc": Stuffing(b"\x7e", _hdlc_decode),
 }
 """Every kind of byte stuffing, by its name in a device file."""

@@ -52,9 +52,6 @@ After a larger delay, all later frames are postponed by the delay.
 BLOCK_S = 0.5
 """Length of the blocks that the amplifier processes, s."""
 
-STORED_FRAME_COUNT = 1 << 16
-"""Number of the latest frames for which the time of sending is stored."""
-
 MAX_RANDOM_OFFSET_pC = 20.0
 """Largest absolute value of a random constant charge, pC."""
 
@@ -84,8 +81,7 @@ class VirtualSensor:
 
     Attributes:
         port_path: Path of the pseudo-terminal that was opened first.
-        withheld: Number of frames that were discarded because they did not fit into the buffer of the port, or were not
-            requested.
+        withheld: Number of frames that were discarded because they did not fit into the buffer of the port.
         lost: Number of frames that were not sent because of a fault.
         corrupted: Number of frames that were damaged by a fault.
         unplugged: Number of outages of the port that have ended.
@@ -106,10 +102,6 @@ class VirtualSensor:
         offset_pC: Sequence[float] | None = None,
         seed: int = 0,
         encode: Encode = encode_frame,
-        seq_modulus: int = SEQ_MODULUS,
-        t_us_modulus: int = T_US_MODULUS,
-        request: bytes | None = None,
-        echo: bool = False,
         faults: Faults | None = None,
         link: Path | None = None,
     ) -> None:
@@ -123,11 +115,6 @@ class VirtualSensor:
                 charges are drawn at random.
             seed: Seed of noise, offset and faults.
             encode: Frame format.
-            seq_modulus: Value at which the frame counter wraps to 0.
-            t_us_modulus: Time at which the clock of the sensor wraps to 0, us.
-            request: Bytes that the reader sends for each frame. The frame that is due next after a request is sent, and
-                only such frames are numbered. None for a sensor that sends all frames.
-            echo: Whether the request is returned before the frame, as on a line with two wires.
             faults: Faults between the sensor and the reader; none by default.
             link: Path of a symbolic link to the port, which exists while the context is active. If the faults contain
                 outages, a temporary link is created by default, because the port has another name after an outage.
@@ -139,12 +126,6 @@ class VirtualSensor:
         self._script = script
         self._noise = noise
         self._encode = encode
-        self._seq_modulus = seq_modulus
-        self._t_us_modulus = t_us_modulus
-        self._request = request
-        self._echo = echo
-        self._unanswered = b""  # bytes from the reader that may contain the beginning of a request
-        self._answer_count = 0
         self._faults = faults or Faults()
         self._link = link
         # Touch charges of the script, and their changes per kelvin of the film, each of shape (n, electrodes).
@@ -163,7 +144,7 @@ class VirtualSensor:
         self.paused_s = 0.0
         self._frame_count = 0
         self._first_frame_of_script = 0  # number of the frame with which the script began
-        self._sent_s = np.full(STORED_FRAME_COUNT, np.nan)  # times at which the latest frames were sent, as a ring
+        self._sent_s = np.full(SEQ_MODULUS, np.nan)  # times at which the latest frames were sent, as a ring
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
         self._port: PseudoPort | None = None
@@ -263,10 +244,8 @@ class VirtualSensor:
             self.lost += 1
             return b""
         device_us_per_s = 1e6 + faults.clock_ppm  # an error of 1 ppm is 1 us in a second
-        t_us = round(frame_number / self._script.rate_Hz * device_us_per_s) % self._t_us_modulus
-        # A board that waits for requests only counts the frames that it sends as answers.
-        counter = frame_number if self._request is None else self._answer_count
-        data = self._encode(Frame(counter % self._seq_modulus, t_us, charge_pC))
+        t_us = round(frame_number / self._script.rate_Hz * device_us_per_s) % T_US_MODULUS
+        data = self._encode(Frame(frame_number % SEQ_MODULUS, t_us, charge_pC))
         if not faults.corrupt_share:
             return data
         damaged_data = corrupt(data, faults.corrupt_share, self._rng)
@@ -282,28 +261,20 @@ class VirtualSensor:
         """Return the true press in the latest frame that has the given frame counter.
 
         Args:
-            seq: The frame counter: number of the frame since the start, modulo the `seq_modulus` of the sensor.
+            seq: The frame counter: number of the frame since the start, modulo `SEQ_MODULUS`.
 
         Raises:
-            SceneError: If no frame with this counter has been played, if the frame belongs to an earlier script, or if
-                more than `STORED_FRAME_COUNT` frames were played since. The error is also raised if the sensor sends
-                frames only on request, because its counter is then not the number of the frame.
+            SceneError: If no frame with this counter has been played, or if the frame belongs to an earlier script.
         """
-        if self._request is not None:
-            raise SceneError("a sensor that sends frames only on request has no truth, because it counts its answers")
-
         # Several frames may have this counter, because the counter wraps. Find the latest of these frames.
         latest_number = self._frame_count - 1
-        later_frame_count = (latest_number - seq) % self._seq_modulus  # frames after the frame with this counter
-        frame_number = latest_number - later_frame_count
-        if frame_number < 0 or not 0 <= seq < self._seq_modulus:
-            raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest_number, self._seq_modulus - 1)}")
-        if later_frame_count >= STORED_FRAME_COUNT:
-            raise SceneError(f"frame {seq} is too old; expected one of the latest {STORED_FRAME_COUNT} frames")
+        frame_number = latest_number - (latest_number - seq) % SEQ_MODULUS
+        if frame_number < 0 or not 0 <= seq < SEQ_MODULUS:
+            raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest_number, SEQ_MODULUS - 1)}")
         if frame_number < self._first_frame_of_script:
             raise SceneError(
                 f"frame {seq} was played before the script was replaced; expected a frame of the present script, which "
-                f"began with frame {self._first_frame_of_script % self._seq_modulus}"
+                f"began with frame {self._first_frame_of_script % SEQ_MODULUS}"
             )
         script = self._script
         row = (frame_number - self._first_frame_of_script) % len(script)  # the script is repeated without end
@@ -312,7 +283,7 @@ class VirtualSensor:
             y_mm=float(script.y_mm[row]),
             force_N=float(script.force_N[row]),
             charge_pC=self._clean_pC[row],
-            sent_s=float(self._sent_s[frame_number % STORED_FRAME_COUNT]),
+            sent_s=float(self._sent_s[frame_number % SEQ_MODULUS]),
         )
 
     def __enter__(self) -> Self:
@@ -325,8 +296,6 @@ class VirtualSensor:
         self.withheld = 0
         self.unplugged = 0
         self.paused_s = 0.0
-        self._unanswered = b""
-        self._answer_count = 0
         # After an outage, the port has another name. The reader therefore needs a link whose name stays the same.
         if self._link is None and self._faults.unplug_every_s > 0.0:
             self._folder = tempfile.TemporaryDirectory(prefix="isocharge-")
@@ -366,12 +335,14 @@ class VirtualSensor:
                 self.paused_s += lateness_s
 
             # Count the frame before it is written, because a reader may ask for its truth as soon as it has the frame.
-            self._sent_s[frame_number % STORED_FRAME_COUNT] = time.perf_counter()
+            self._sent_s[frame_number % SEQ_MODULUS] = time.perf_counter()
             self._frame_count = frame_number + 1
 
             self._plug_or_unplug(frame_number)
-            if self._port is not None:  # otherwise the frame is discarded because of an outage
-                self._write_or_withhold(self._port, data)
+            if self._port is not None and data:  # otherwise the frame is discarded because of a fault
+                self._port.discard_received()
+                if not self._port.write_whole(data):
+                    self.withheld += 1
 
     def _plug_or_unplug(self, frame_number: int) -> None:
         """Close the port if an outage has begun, or open a new port if an outage has ended.
@@ -384,57 +355,6 @@ class VirtualSensor:
         elif self._port is None:
             self._open_port()
             self.unplugged += 1
-
-    def _write_or_withhold(self, port: PseudoPort, data: bytes) -> None:
-        """Read the requests of the reader, and write a frame to the port. Count the frame if it is withheld.
-
-        A frame is withheld if the buffer of the port is full. If the sensor sends frames only on request, a frame is
-        also withheld if there was no request since the previous frame.
-
-        Args:
-            port: The open port.
-            data: Bytes of the frame; empty if the frame is lost because of a fault.
-        """
-        # Read the requests even if the frame is lost, so that they do not fill the buffer of the port.
-        is_requested = self._take_request(port)
-        is_lost = not data
-        if is_lost:
-            return
-        is_written = is_requested and port.write_whole(self._echo_of_request + data)
-        if not is_written:
-            self.withheld += 1
-
-    @property
-    def _echo_of_request(self) -> bytes:
-        """Echo that the line returns before a frame; empty if the line returns no echo."""
-        if self._request is None or not self._echo:
-            return b""
-        return self._request
-
-    def _take_request(self, port: PseudoPort) -> bool:
-        """Read the bytes that the reader has sent, and return whether they complete a request since the last call.
-
-        Several requests since the last call count as one request. If the sensor sends all frames without requests, the
-        bytes are ignored, and the result is true.
-
-        Args:
-            port: The open port.
-        """
-        # The bytes are read even if no request is needed. Otherwise the buffer would become full, and a reader that
-        # sends bytes would wait forever.
-        received = port.received()
-        request = self._request
-        if request is None:
-            return True
-        self._unanswered += received
-        request_start = self._unanswered.rfind(request)
-        is_found = request_start >= 0
-        if not is_found:
-            self._unanswered = self._unanswered[-len(request) :]  # may contain the beginning of a request
-            return False
-        self._unanswered = self._unanswered[request_start + len(request) :]
-        self._answer_count += 1
-        return True
 
     def _open_port(self) -> PseudoPort:
         """Open a new port as the port of the sensor. If the sensor has a link, create the link to the new port.
