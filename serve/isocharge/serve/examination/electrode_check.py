@@ -6,7 +6,6 @@ the changes of the same channel under the other presses. The gains of the channe
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,20 +15,10 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressCheckError
 from isocharge.common.printable_text import printable
-from isocharge.serve.examination.proposal import estimate_noise
-from isocharge.serve.examination.touch_search import BLOCK_S, CHANGE_SIGMAS, rounding_error_std
+from isocharge.serve.examination.press_detector import BLOCK_S, PressDetector, channel_noise
 from isocharge.serve.live.device import Device
 from isocharge.serve.port.source import Port
 from isocharge.serve.signal_chain.channels import channel_index
-
-REST_BLOCKS = 5
-"""Number of quiet blocks before a press, from which the rest is measured: half a second."""
-
-RELEASED_SHARE = 0.3
-"""Share of the largest change below which a press has ended, dimensionless.
-
-The share is not small, because a leaking amplifier returns to rest slowly.
-"""
 
 NORMALISATION_STEPS = 20
 """Number of times that the changes are divided by the means of their rows and columns."""
@@ -313,8 +302,7 @@ class _BlockReader:
             if chunk is not None:  # otherwise no bytes have arrived in time
                 rows += self._rows(chunk.data)
         values = np.array(rows)  # shape (frames, channels)
-        # Consecutive values of a coarse converter may be equal. The noise is then the rounding error of whole numbers.
-        noise = np.array([max(estimate_noise(column), rounding_error_std(column)) for column in values.T])
+        noise = np.array([channel_noise(column) for column in values.T])
         return np.median(values, axis=0), noise
 
     def _rows(self, data: bytes) -> Iterator[list[float]]:
@@ -332,12 +320,7 @@ class _BlockReader:
 
 
 class _PressReader:
-    """Reader of presses, each of which the user is asked for.
-
-    Each block contains the median and the noise of each channel over a short time. The rest level is the mean of the
-    latest quiet blocks before a press. After a press, the rest level before this press is used until the channels are
-    quiet again, so that the next press may follow at once.
-    """
+    """Reader of presses, each of which the user is asked for."""
 
     def __init__(self, blocks: _BlockReader, ask: Callable[[str], None], timeout_s: float) -> None:
         """Store the arguments. The rest level is unknown.
@@ -350,9 +333,7 @@ class _PressReader:
         self._blocks = blocks
         self._ask = ask
         self._timeout_s = timeout_s
-        self._recent_blocks: deque[tuple[Array, Array]] = deque(maxlen=REST_BLOCKS)
-        self._rest: tuple[Array, Array] | None = None  # rest level and noise; None if they are not known
-        self._released_change = 0.0  # smallest total change of a press before the channels are quiet again
+        self._detector = PressDetector()
 
     def press_near(self, electrode: str) -> Array:
         """Ask for a press, wait until it has begun and ended, and return the change of the channels at its peak.
@@ -372,7 +353,7 @@ class _PressReader:
             if errors:
                 self._ask(str(errors[-1]))
             if attempt == PRESS_ATTEMPTS - 1:
-                self._rest = None  # a press may have been taken for the rest
+                self._detector.forget_rest()  # a press may have been taken for the rest
             try:
                 return self._wait_for_press(electrode)
             except PressCheckError as error:
@@ -380,101 +361,45 @@ class _PressReader:
         raise errors[0]
 
     def _wait_for_press(self, electrode: str) -> Array:
-        """Wait for a press that begins and ends, and return the change of the channels at its peak.
-
-        The change of a channel is the difference between a block and the rest level. The press begins when the change
-        of a channel is much larger than the noise. The press ends when the changes have become small again.
+        """Wait for the rest if it is not known, and for a press that begins and ends. Return the change at its peak.
 
         Args:
             electrode: Electrode near which the press is expected.
 
         Raises:
-            PressCheckError: If the press does not begin and end in time.
+            PressCheckError: If the rest, or the begin or the end of the press, does not come in time.
         """
-        self._rest = self._rest or self._wait_for_rest(electrode)
-        rest_level, noise = self._rest
+        detector = self._detector
+        if detector.rest is None:
+            self._ask("wait, and do not touch the film, until the rest level is known")
+            self._wait_until(lambda: detector.rest is not None, electrode, is_rest_awaited=True)
         self._ask(f"press near electrode {electrode}, as close to it as you can, and let go")
-        deadline_s = time.monotonic() + self._timeout_s
-        largest_change = np.zeros_like(rest_level)
-        largest_total = 0.0
-        while (block := self._blocks.next_block(deadline_s)) is not None:
-            change = block[0] - rest_level
-            total_change = float(np.abs(change).sum())
-            if largest_total == 0.0:
-                quiet = self._quiet_level(block)
-                if quiet is not None and total_change <= max(self._released_change, CHANGE_SIGMAS * float(noise.sum())):
-                    rest_level, noise = quiet
-                    self._rest = quiet
-                    self._released_change = 0.0
-                    continue
-                is_large = bool(np.any(np.abs(change) > CHANGE_SIGMAS * noise))  # the noise at rest, not of this block
-                if not is_large or total_change <= self._released_change:
-                    continue
-            if total_change > largest_total:
-                largest_change = change
-                largest_total = total_change
-            if total_change < RELEASED_SHARE * largest_total:
-                self._released_change = RELEASED_SHARE * largest_total
-                self._recent_blocks.clear()
-                return largest_change
+        self._wait_until(lambda: self._has_ended, electrode, is_rest_awaited=False)
+        return detector.change
 
-        # No block came before the deadline. Either the press did not end, or it did not begin.
-        if largest_total > 0.0:
-            raise _restless_error(electrode, self._timeout_s)
-        raise _missing_press_error(electrode, self._timeout_s)
-
-    def _wait_for_rest(self, electrode: str) -> tuple[Array, Array]:
-        """Ask the user to wait until the channels are quiet, and return their rest level and their noise.
+    def _wait_until(self, is_done: Callable[[], bool], electrode: str, *, is_rest_awaited: bool) -> None:
+        """Feed blocks to the detector until a condition is true.
 
         Args:
-            electrode: Electrode near which the next press is expected, for the error message.
+            is_done: The condition.
+            electrode: Electrode near which the press is expected.
+            is_rest_awaited: Whether the rest level is awaited, and not a press.
 
         Raises:
-            PressCheckError: If the channels are not quiet in time.
+            PressCheckError: If the condition does not become true in time.
         """
-        self._ask("wait, and do not touch the film, until the rest level is known")
-        self._released_change = 0.0
         deadline_s = time.monotonic() + self._timeout_s
+        has_block = False
         while (block := self._blocks.next_block(deadline_s)) is not None:
-            quiet = self._quiet_level(block)
-            if quiet is not None:
-                return quiet
-
-        # No block came before the deadline. Either the channels were not quiet, or no frames came.
-        if self._recent_blocks:
-            raise _restless_error(electrode, self._timeout_s)
-        raise _missing_press_error(electrode, self._timeout_s)
-
-    def _quiet_level(self, block: tuple[Array, Array]) -> tuple[Array, Array] | None:
-        """Add a block, and return the rest level and the noise if the channels are quiet in `REST_BLOCKS` blocks.
-
-        The channels are quiet if the level of each channel varies by at most half of the change that begins a press.
-
-        Args:
-            block: Level (median) and noise of each channel, both of shape (channels,).
-
-        Returns:
-            Rest level and noise of a single frame, both of shape (channels,), in the unit of the board; None if the
-            channels are not quiet.
-        """
-        self._recent_blocks.append(block)
-        levels = np.array([level for level, _block_noise in self._recent_blocks])  # shape (blocks, channels)
-        noise = np.median([block_noise for _level, block_noise in self._recent_blocks], axis=0)
-        variation = np.ptp(levels, axis=0)  # largest minus smallest level of each channel
-        is_quiet = bool(np.all(variation <= 0.5 * CHANGE_SIGMAS * noise))
-        if len(self._recent_blocks) < REST_BLOCKS or not is_quiet:
-            return None
-        return levels.mean(axis=0), noise
-
-
-def _restless_error(electrode: str, timeout_s: float) -> PressCheckError:
-    """Return the error for charges that have not come to rest within `timeout_s`."""
-    return PressCheckError(
-        f"electrode {electrode}: the charges did not come to rest within {timeout_s:g} s; take the finger away after "
-        "each press, and try again"
-    )
-
-
-def _missing_press_error(electrode: str, timeout_s: float) -> PressCheckError:
-    """Return the error for a press that has not begun within `timeout_s`."""
-    return PressCheckError(f"electrode {electrode}: no press came within {timeout_s:g} s; try again")
+            has_block = True
+            self._has_ended = self._detector.feed(*block)
+            if is_done():
+                return
+        is_restless = has_block if is_rest_awaited else self._detector.is_pressed
+        self._detector.is_pressed = False
+        if is_restless:
+            raise PressCheckError(
+                f"electrode {electrode}: the charges did not come to rest within {self._timeout_s:g} s; take the "
+                "finger away after each press, and try again"
+            )
+        raise PressCheckError(f"electrode {electrode}: no press came within {self._timeout_s:g} s; try again")

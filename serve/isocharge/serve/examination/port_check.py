@@ -18,8 +18,8 @@ from isocharge.serve.examination.channel_health import ChannelHealth, measure_ch
 from isocharge.serve.examination.held_press import HeldPress, find_held_press
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
 from isocharge.serve.examination.missing import CLEAN_SHARE, BoardFindings, held_press_sentences, missing_sentences
+from isocharge.serve.examination.press_detector import find_touch
 from isocharge.serve.examination.proposal import Proposal, propose, unit_of
-from isocharge.serve.examination.touch_search import find_touch
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
 from isocharge.serve.live.stream import ReadingStream

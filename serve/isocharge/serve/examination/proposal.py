@@ -3,7 +3,6 @@
 The charge of one count cannot be derived from the bytes. The user has to state this charge.
 """
 
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError
 from isocharge.serve.examination.held_press import find_held_press
 from isocharge.serve.examination.listening import Capture, ReceivedData, read_frames
+from isocharge.serve.examination.press_detector import estimate_noise
 from isocharge.serve.frames.binary import FORMAT as BINARY
 from isocharge.serve.live.device import device_from_table
 from isocharge.serve.recognition.recognise import recognise
@@ -58,29 +58,6 @@ def measure_rest_level(values: Array) -> float:
     """Compute the rest level of a channel, which is the median of its finite values. It is 0 without finite values."""
     finite_values = values[np.isfinite(values)]
     return float(np.median(finite_values)) if len(finite_values) else 0.0
-
-
-def estimate_noise(values: Array) -> float:
-    """Estimate the noise of a channel from the differences between consecutive values.
-
-    Presses have little effect on these differences. If the noise is normally distributed, the median magnitude of a
-    difference is 0.6745 * sqrt(2) standard deviations. For coarse counts, most differences may be 0. In this case, the
-    mean magnitude of a difference is used, which is 2 / sqrt(pi) standard deviations.
-
-    Args:
-        values: Values of the channel, shape (n,), any unit. Values that are not finite are left out.
-
-    Returns:
-        The standard deviation in the unit of the values; 0 if there are fewer than two finite values.
-    """
-    finite_values = values[np.isfinite(values)].astype(float)
-    differences = np.abs(np.diff(finite_values))
-    if len(differences) == 0:
-        return 0.0
-    median_difference = float(np.median(differences))
-    if median_difference > 0.0:
-        return median_difference / (0.6745 * math.sqrt(2.0))
-    return float(differences.mean()) * math.sqrt(math.pi) / 2.0
 
 
 class Proposal(NamedTuple):

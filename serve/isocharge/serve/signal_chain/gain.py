@@ -17,6 +17,10 @@ LARGEST_PC = 1e9
 """Largest charge of a valid reading, pC. Sums of such charges are exact to 1e-7 pC in double precision."""
 
 
+SMALLEST_GAIN = 1e-300
+"""Lower limit of the largest gain, pC. It avoids a division by zero for a board without electrodes."""
+
+
 class GainRule(Rule, frozen=True, kw_only=True):
     """Settings that convert the unit of a board to charge.
 
@@ -135,7 +139,7 @@ class Gain(Stage):
                 self.gain_pC = self.gain_pC * setup.for_each_electrode("gain.feedback_pF", rule.feedback_pF)
             if rule.offset is not None:
                 self.zero = setup.for_each_electrode("gain.offset", rule.offset)
-        self.largest = LARGEST_PC / float(np.abs(self.gain_pC).max())
+        self.largest = LARGEST_PC / float(np.abs(self.gain_pC).max(initial=SMALLEST_GAIN))
         self._skipped_s = 0.0  # duration of the invalid frames since the last valid frame
 
     def revert(self, charge_pC: Array) -> Array:

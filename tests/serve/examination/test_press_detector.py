@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.serve.examination.touch_search import block_medians, find_touch
+from isocharge.serve.examination.press_detector import block_medians, find_touch
 from isocharge.simulate import load_amplifier
 
 PRESS_PC = np.array([150.0, 90.0, 110.0])
