@@ -349,8 +349,9 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
                 yield draft
                 draft.remove()
             except BaseException as error:
-                # These errors depend only on the settings, which are the same in the next run.
-                would_fail_again = isinstance(error, InputError | SolveError | TrainingError)
+                # These errors depend only on the settings, which are the same in the next run. An InputError may be due
+                # to a file that can be mended, and must not cost the finished parts.
+                would_fail_again = isinstance(error, SolveError | TrainingError)
                 if draft.is_empty() or would_fail_again:
                     draft.remove()
                 raise

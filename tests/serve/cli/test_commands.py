@@ -327,6 +327,14 @@ def test_doctor_refuses_with_the_reason(resting, run, words, message):
         run("doctor", "--port", sensor.url, "--seconds", 0.5, *words)
 
 
+def test_doctor_refuses_a_gain_beside_a_device_file(command, tmp_path):
+    board = tmp_path / "board.toml"
+    board.write_text("[gain]\npC_per_unit = 2.0\n")
+    code, _, err = command("serve", "doctor", "--port", "/dev/ttyNone", "--device", board, "--feedback-pf", 1000)
+    assert code == 2
+    assert "--feedback-pf: expected no gain beside --device" in err
+
+
 def test_doctor_writes_no_file_of_which_the_unit_is_missing(command, tmp_path):
     """The command that is completed with the unit can then write the file, and the file is valid."""
     path = tmp_path / "board.toml"

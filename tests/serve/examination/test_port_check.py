@@ -90,6 +90,14 @@ def test_check_of_a_channel_without_a_number():
     json.dumps(asdict(report), allow_nan=False)
 
 
+def test_table_of_a_board_that_sends_microcoulombs():
+    report = examine_received(
+        received(lambda k: b"A_uC:%.7f,B_uC:%.7f\n" % (4e-4 + 1e-7 * (k % 2), -3e-4 - 3e-7 * (k % 2)))
+    )
+    rows = [line.split()[:3] for line in report_lines(report) if line.startswith(("A", "B"))]
+    assert rows == [["A_uC", "0.00040005", "5e-08"], ["B_uC", "-0.00030015", "1.5e-07"]]
+
+
 @pytest.mark.parametrize(
     ("board", "message"),
     [

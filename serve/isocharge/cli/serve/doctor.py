@@ -117,6 +117,12 @@ def doctor_command(
     electrodes = metadata.electrodes if metadata else ()  # empty for any model
     unnoticed = metadata.unnoticed if metadata else None  # presses outside the working area that the model misses
     settings = {"pC_per_unit": pC_per_unit, "V_per_unit": V_per_unit, "feedback_pF": feedback_pF}
+    gain = {key: _parse_gain_setting(key, text) for key, text in settings.items() if text is not None}
+    if gain and device is not None:
+        raise InputError(
+            f"{_gain_option(next(iter(gain)))}: expected no gain beside --device, because the device file states it; "
+            f"leave the option out, or write the gain into the section [gain] of {device}"
+        )
     say(f"listening for {seconds:g} s; leave the film alone")
     examination = examine(
         port,
@@ -124,7 +130,7 @@ def doctor_command(
         seconds=seconds,
         device=load_device(device),
         electrodes=electrodes,
-        gain={key: _parse_gain_setting(key, text) for key, text in settings.items() if text is not None},
+        gain=gain,
         request=_parse_request(request, request_Hz),
         wait=wait,
     )
@@ -240,8 +246,14 @@ def _parse_gain_setting(key: str, text: str) -> Any:
         pairs = (part.partition("=") for part in text.split(","))
         return {electrode.strip(): parse_number(number.strip()) for electrode, _equals_sign, number in pairs}
     except ValueError as error:  # from `parse_number`
-        option = f"--{key.replace('_', '-').lower()}"
-        raise InputError(f"{option}: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}") from error
+        raise InputError(
+            f"{_gain_option(key)}: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}"
+        ) from error
+
+
+def _gain_option(key: str) -> str:
+    """Return the option that states a key of the section `[gain]`, such as `--pc-per-unit` for `pC_per_unit`."""
+    return f"--{key.replace('_', '-').lower()}"
 
 
 def _parse_request(text: str | None, rate_Hz: float) -> Request | None:
@@ -339,11 +351,15 @@ UNIT_SYMBOLS = {"pC": "pC", "counts": "ct", "V": " V"}
 COLUMN_WIDTHS = (12, 11, 12, 10, 10)
 """Widths of the columns of numbers, characters."""
 
-DECIMALS = (2, 3, 2, 2, 2)
-"""Decimals of the columns of numbers in pC and in counts."""
+FORMATS = {
+    "pC": (".2f", ".3f", ".2f", ".2f", ".2f"),
+    "counts": (".2f", ".3f", ".2f", ".2f", ".2f"),
+    "V": (".5f", ".6f", ".5f", ".5f", ".5f"),
+}
+"""Formats of the columns of numbers, by the unit. Other units get `OTHER_FORMATS`."""
 
-VOLT_DECIMALS = (5, 6, 5, 5, 5)
-"""Decimals of the columns of numbers in volts."""
+OTHER_FORMATS = (".5g", ".3g", ".3g", ".3g", ".3g")
+"""Formats of the columns in units whose size is not known, such as the uC of a channel `A_uC`: significant digits."""
 
 
 def _numbering_line(examination: Examination) -> str:
@@ -364,9 +380,9 @@ def _channel_line(channel: ChannelHealth, unit: str) -> str:
     # The attributes are named after pC, but their values have the unit of the channel. The hum has two amplitudes, at
     # 50 Hz and at 60 Hz. A value that was not measured is None.
     results = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
-    decimals_of_columns = VOLT_DECIMALS if unit == "V" else DECIMALS
+    formats = FORMATS.get(unit, OTHER_FORMATS)
     cells = [f"{printable(channel.name):8.8s}"]
-    for result, width, decimals in zip(results, COLUMN_WIDTHS, decimals_of_columns, strict=True):
-        text = "?" if result is None else f"{result:.{decimals}f}"
+    for result, width, form in zip(results, COLUMN_WIDTHS, formats, strict=True):
+        text = "?" if result is None else f"{result:{form}}"
         cells.append(f"{text:>{width}s}")
     return "".join(cells)

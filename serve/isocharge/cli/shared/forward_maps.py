@@ -42,7 +42,7 @@ def executor_for(workers: int | None, cluster: str | None) -> AbstractContextMan
 def shown_run(target: Path) -> Iterator[None]:
     """Context manager that shows the progress of a run, which is a long computation that can be stopped and resumed.
 
-    If the user stops the run, a message states that the same command resumes the run.
+    If the user stops the run, or if the run refuses an input, a message states where the finished parts are kept.
 
     Args:
         target: File or folder that the run writes.
@@ -50,10 +50,11 @@ def shown_run(target: Path) -> Iterator[None]:
     try:
         with shown_progress():
             yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, InputError) as error:
         draft = draft_of(target)
         if draft.exists():
-            say(f"stopped; the finished parts are kept in {draft}, and the same command resumes the run")
+            reason = "stopped" if isinstance(error, KeyboardInterrupt) else "the run failed"
+            say(f"{reason}; the finished parts are kept in {draft}, and the same command resumes the run")
         raise
 
 

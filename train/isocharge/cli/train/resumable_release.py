@@ -114,7 +114,7 @@ def train_and_release(
         trained = train(run)
         try:
             released = write_release(trained, model_folder, version=options.version, command=this_command())
-        except IsochargeError as error:  # an OutputError, because the run would be removed after an InputError
+        except IsochargeError as error:
             other_folder = model_folder.with_name("OTHER")
             raise OutputError(
                 f"{error}; the finished training is kept in {run.folder}: mend the cause and repeat the command, or "
