@@ -14,7 +14,7 @@ from isocharge.serve.prediction.press_check import check_presses
 from isocharge.simulate import Domain
 from isocharge.simulate.numerics.polygon import area_of
 from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit_presses
-from isocharge.train.data.channel_noise import ChannelNoise
+from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
 from isocharge.train.data.measured_sensor import PressedArea, outline
 from isocharge.train.data.presses import folds_by_place, held_out
 from isocharge.train.model_release.release import model_domain, release
@@ -233,7 +233,7 @@ def test_contacts_on_a_pad_beside_the_origin_are_estimated_and_not_flagged(long_
     assert flags == [predictor.flags(predictor.predict(row)) for row in charge]
     assert flags[:2] == [(), ()]
     assert "positions from (-" in repr(predictor)
-    assert check_presses(predictor, presses_on_long_pad(200, 8)).fits
+    assert check_presses(predictor, presses_on_long_pad(200, 8)).position_mm.rms < 1.0  # a short training
 
 
 def test_flags_of_contacts_depend_on_the_distance_from_the_centre_of_the_pad(long_pad):
@@ -300,6 +300,17 @@ def test_noise_is_right_where_presses_repeat_places_and_forces():
     contact = np.repeat(contacts_on_l(200, 5), 6, axis=0)
     noise = ChannelNoise.estimate(charges_on_l(contact, 8), PressedArea.of_contacts(contact).to_unit(contact))
     np.testing.assert_allclose(noise.sigma(np.zeros((1, 4)))[0], NOISE_pC, rtol=0.07)
+
+
+def test_charges_between_places_that_were_pressed_many_times_fit_the_presses():
+    """With more repetitions than neighbours, a plane must still know how the charges change from place to place."""
+    contact = np.repeat(contacts_on_l(200, 5), 20, axis=0)
+    to_unit = PressedArea.of_contacts(contact).to_unit
+    planes = LocalPlanes.fit(to_unit(contact), charges_on_l(contact, 8) / NOISE_pC)
+    other_contact = contacts_on_l(300, 6)
+    residual = planes.residuals(charges_on_l(other_contact, 9) / NOISE_pC)
+    # Four charges of three unknowns leave one noise with standard deviation 1, spread over four residuals.
+    assert 0.1 < np.median(np.abs(residual)) < 0.4
 
 
 def test_factors_of_standard_deviations_are_the_ratio_of_errors_to_standard_deviations():

@@ -18,6 +18,12 @@ from isocharge.simulate import NoiseModel
 NEIGHBOURS = 16
 """Number of presses to which a plane is fitted, which is four times the number of its coefficients."""
 
+LEAST_CONTACTS = 8
+"""Smallest number of different contacts to which a plane is fitted, which is twice the number of its coefficients."""
+
+SAME_CONTACT_DECIMALS = 3
+"""Decimals of the unit coordinates in which two contacts agree if they count as the same contact."""
+
 ROUNDS = 10
 """Number of weighted least-squares fits. The variances of each fit determine the weights of the next fit."""
 
@@ -164,12 +170,14 @@ class ChannelNoise:
 class LocalPlanes:
     """One plane for each press, which is fitted to the neighbours of the press but not to the press itself.
 
+    Neighbours with the same contact are averaged.
+
     Attributes:
         value: Value of the plane at the press, shape (n, k).
         slope: Derivatives of the values with respect to the unit coordinates, shape (n, k, 3).
         residual: Difference between the values of the press and of the plane, shape (n, k). It is divided by sqrt(1 +
             v), where v is the variance of the plane if the values of the neighbours have the variance 1.
-        reach: Distance of the farthest neighbour in unit coordinates, shape (n,).
+        reach: Distance of the farthest neighbours in unit coordinates, shape (n,).
     """
 
     value: Array
@@ -192,28 +200,44 @@ class LocalPlanes:
         Returns:
             The planes, one for each press.
         """
-        tree = cKDTree(unit_contact)
-        distance, nearest = tree.query(unit_contact, NEIGHBOURS + 1)  # both of shape (n, NEIGHBOURS + 1)
-        # A press with the same contact may come before the press itself, which is therefore found by its number.
-        is_itself = nearest == np.arange(len(unit_contact))[:, None]
-        columns_without_itself = np.argsort(is_itself, axis=1, kind="stable")[:, :NEIGHBOURS]
-        neighbours = np.take_along_axis(nearest, columns_without_itself, axis=1)
-        offsets = unit_contact[neighbours] - unit_contact[:, None]  # shape (n, NEIGHBOURS, 3)
-        # The constant and the offsets of the neighbours, shape (n, NEIGHBOURS, 1 + number of coordinates)
-        columns = np.concatenate([np.ones((*neighbours.shape, 1)), offsets], axis=2)
-        # The pseudoinverse contains the weights of the neighbours in the least-squares solution.
-        neighbour_weights = np.linalg.pinv(columns)
+        # Average the presses of each contact: a rig may repeat a contact more often than a plane has neighbours.
+        _, contact_of_press, press_count = np.unique(
+            np.round(unit_contact, SAME_CONTACT_DECIMALS), axis=0, return_inverse=True, return_counts=True
+        )
+        contact_sum, value_sum = (
+            np.stack([np.bincount(contact_of_press, column) for column in table.T], axis=1)
+            for table in (unit_contact, values)
+        )
+        distance, nearest = cKDTree(contact_sum / press_count[:, None]).query(
+            unit_contact, min(NEIGHBOURS + 1, len(press_count))
+        )  # both of shape (n, number of contacts of a plane)
+        is_own = nearest == contact_of_press[:, None]
+        count = press_count[nearest] - is_own  # the press itself is left out
+        mean_divisor = np.maximum(count, 1)[..., None]
+        own = is_own[..., None]
+        offsets = (contact_sum[nearest] - own * unit_contact[:, None]) / mean_divisor - unit_contact[:, None]
+        neighbour_values = (value_sum[nearest] - own * values[:, None]) / mean_divisor
+
+        # Use as few contacts as have enough presses. A contact counts as often as it was pressed.
+        presses_before, contacts_before = (np.cumsum(number, axis=1) - number for number in (count, count > 0))
+        is_used = (count > 0) & ((presses_before < NEIGHBOURS) | (contacts_before < LEAST_CONTACTS))
+        root_weight = np.sqrt(count * is_used)[..., None]
+        # The constant and the offsets of the neighbours, shape (n, number of contacts, 1 + number of coordinates)
+        columns = np.concatenate([np.ones_like(root_weight), offsets], axis=2)
+        # The pseudoinverse contains the weights of the weighted neighbours in the least-squares solution.
+        neighbour_weights = np.linalg.pinv(root_weight * columns)
         # The first coefficient is the value at the press, and the others are the slopes; shape (n, 4, k).
-        coefficients = neighbour_weights @ values[neighbours]
+        coefficients = neighbour_weights @ (root_weight * neighbour_values)
         value = coefficients[:, 0]
         slope = coefficients[:, 1:].swapaxes(1, 2)  # shape (n, k, 3)
 
         # A residual contains the noise of the press and the noise of the plane. If the noise of each value has the
-        # variance 1, the variance of the plane is the sum of the squared weights of its neighbours.
-        value_weights = neighbour_weights[:, :1]  # weights in the value of the plane, shape (n, 1, NEIGHBOURS)
+        # variance 1, so has the noise of each weighted mean, and the variance of the plane is the sum of the squares of
+        # their weights.
+        value_weights = neighbour_weights[:, :1]  # weights in the value of the plane, shape (n, 1, number of contacts)
         relative_residual_std = np.sqrt(1.0 + (value_weights**2).sum(axis=2))
         residual = (values - value) / relative_residual_std
-        reach = distance[:, -1]  # the distances are sorted
+        reach = np.max(distance * is_used, axis=1)
         return cls(value, slope, residual, reach)
 
     def residuals(self, values: Array) -> Array:
