@@ -140,9 +140,10 @@ def test_an_option_in_the_base_install_names_the_install_command(line, extra, in
 
 
 @pytest.fixture(scope="module")
-def outcomes_without(installed):
-    """The message of each command, or "" if it is imported, for each extra that is missing."""
-    absent = {extra: sorted(packages) for extra, packages in ABSENT_PACKAGES.items()}
+def outcomes_without(installed, request):
+    """The message of each command, or "" if it is imported, for each extra that is missing in a test that runs."""
+    wanted = {item.callspec.params["missing"] for item in request.session.items if "missing" in item.fixturenames}
+    absent = {extra: sorted(packages) for extra, packages in ABSENT_PACKAGES.items() if extra in wanted}
     done = subprocess.run(
         [sys.executable, "-c", LOAD_ALL, json.dumps(absent)],
         env=installed("all"),
@@ -155,7 +156,13 @@ def outcomes_without(installed):
     return dict(json.loads(line) for line in done.stdout.splitlines())
 
 
-@pytest.mark.parametrize("missing", ABSENT_PACKAGES)
+@pytest.mark.parametrize(
+    "missing",
+    [
+        pytest.param(extra, marks=[] if extra in {"simulate", "http", "every extra"} else [pytest.mark.slow])
+        for extra in ABSENT_PACKAGES
+    ],
+)
 def test_commands_are_imported_or_name_the_one_extra_that_is_missing(missing, outcomes_without):
     """Every command in an install that has all packages but those of one extra, and in the base install."""
     outcomes = outcomes_without[missing]
