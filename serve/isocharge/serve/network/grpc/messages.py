@@ -45,9 +45,8 @@ CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
 def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> InferRequest:
     """Read a ModelInferRequest, and return the charges and the requested outputs.
 
-    The message is first converted to the JSON object that the equivalent HTTP request would contain. The function
-    `check_request` then checks the JSON object. If the charges are sent as raw contents, the outputs are also sent as raw
-    contents.
+    The message is first converted to the JSON object that the equivalent HTTP request would contain, and is then
+    checked like this object. If the charges are sent as raw contents, so are the outputs of the response.
 
     Args:
         message: The ModelInferRequest.
