@@ -1,11 +1,12 @@
-"""HTTP: ours against a bare route, an idiomatic FastAPI service and Triton; all serve the same model file.
+"""HTTP: ours against ten lines of uvicorn, an idiomatic FastAPI service and Triton; all serve the same model file.
 
     python tests/benchmarks/bench_http.py [--environments DIR] [--without-rivals] [--seconds 10] [--json]
 
-FastAPI and Triton get environments of their own in `--environments`, made once; one that cannot be installed
-or does not start is left out, and stderr says why. Client and servers share the cores; the client is a plain socket,
-the same for all. Latency: one request at a time over one open connection, contenders take turns. Throughput: 32
-connections, each with one request under way. A batch of 1024 is measured twice: bytes on a socket, and arrays in and
+The ten lines (`bare_app.py`) give the same answer with a Predictor, and need no other packages. FastAPI and Triton get
+environments of their own in `--environments`, made once; one that cannot be installed or does not start is left out,
+and stderr says why. Client and servers share the cores; the client is a plain socket, the same for all. Latency: one
+request at a time over one open connection, contenders take turns. Throughput: 32 connections, each with one request
+under way; contenders take turns in ten rounds. A batch of 1024 is measured twice: bytes on a socket, and arrays in and
 out of Triton's stock client. Triton runs the model in Python, as its wheel has no backend for ONNX.
 """
 
@@ -177,7 +178,7 @@ def _wait_for(process: subprocess.Popen[bytes], address: Address, output: IO[byt
 
 
 def start(stack: ExitStack, model: str, environments: Path | None) -> Contenders:
-    """Start every contender; without `environments`, only ours."""
+    """Start every contender; without `environments`, only ours and the ten lines of uvicorn."""
     folder = find_model(model).resolve()
     path = f"/v2/models/{load_model(folder).metadata.name}/infer"
     tcp, uds = _local_address(), f"{stack.enter_context(tempfile.TemporaryDirectory())}/isocharge.sock"
@@ -185,11 +186,15 @@ def start(stack: ExitStack, model: str, environments: Path | None) -> Contenders
     stack.enter_context(running([*ours, "--port", str(tcp[1])], tcp))
     stack.enter_context(running([*ours, "--uds", uds], uds))
     contenders: Contenders = {"isocharge": (tcp, path), "isocharge, Unix socket": (uds, path)}
-    for name, (environment, words) in RIVALS.items() if environments else ():
+    bare = _local_address()
+    words = [sys.executable, HERE / "rivals/bare_app.py", str(bare[1]), folder / "model.onnx"]
+    stack.enter_context(running(words, bare))
+    contenders["ten lines of uvicorn"] = bare, path
+    for name, (environment, words_of) in RIVALS.items() if environments else ():
         address = _local_address()
         try:
             python = python_of(environment, environments)
-            stack.enter_context(running([python, *words(str(address[1]), folder / "model.onnx")], address))
+            stack.enter_context(running([python, *words_of(str(address[1]), folder / "model.onnx")], address))
             contenders[name] = address, path
         except NotStarted as error:
             print(f"left out: {name}: {error}", file=sys.stderr)
@@ -201,7 +206,6 @@ def _local_address() -> tuple[str, int]:
 
 
 RIVALS = {
-    "bare route": ("fastapi", lambda port, model: [HERE / "rivals/bare_app.py", port, model]),
     "FastAPI": ("fastapi", lambda port, model: [HERE / "rivals/fastapi_app.py", port, model]),
     "Triton": ("triton", lambda port, model: [DEPLOY / "triton/start.py", model.parents[2], "--port", port]),
 }
@@ -262,7 +266,8 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
             title: in_turns([Contender(name, 1, call) for name, call in calls.items()], asked.seconds)
             for title, calls in tables.items()
         }
-        counts = {name: np.mean([throughput(*target, asked.seconds) for _ in range(2)]) for name, target in one.items()}
+        rounds = [{name: throughput(*target, asked.seconds / 10) for name, target in one.items()} for _ in range(10)]
+        counts = {name: np.median([counts[name] for counts in rounds]) for name in one}
     results["32 connections"] = [
         {"call": name, "per_second": round(count), "ours_over_it": round(float(counts["isocharge"] / count), 2)}
         for name, count in counts.items()

@@ -9,12 +9,7 @@ import uvicorn
 from isocharge.serve import Predictor
 
 touch = Predictor(Path(sys.argv[2]).parent)
-OUTPUTS = {
-    "contact": slice(0, 3),
-    "contact_std": slice(3, 6),
-    "contact_correlation": slice(7, 10),
-    "misfit": slice(6, 7),
-}
+OUTPUTS = {"contact": (0, 3), "contact_std": (3, 6), "contact_correlation": (7, 10), "misfit": (6, 7)}
 
 
 async def app(_, receive, send):

@@ -17,9 +17,10 @@ from websockets.exceptions import ConnectionClosedError, InvalidStatus
 
 from isocharge.common.errors import OriginError, TokenError
 from isocharge.serve.network.address import Token
-from isocharge.serve.viewer import server
+from isocharge.serve.viewer import connection
+from isocharge.serve.viewer.connection import MAX_BURST_BYTES, RateLimit
 from isocharge.serve.viewer.hub import MAX_MESSAGE_SAMPLES, MAX_SAMPLE_RATE_HZ
-from isocharge.serve.viewer.server import MAX_BURST_BYTES, MAX_VIEWERS, Access, RateLimit
+from isocharge.serve.viewer.server import MAX_VIEWERS, Access
 
 
 def put(page, record, count, **changes):
@@ -161,7 +162,7 @@ def open_websocket(place):
 
 def test_reading_is_paused_while_the_client_reads_no_responses(start_page, monkeypatch):
     """Otherwise, pongs that the client does not read would fill the memory."""
-    monkeypatch.setattr(server, "MAX_BURST_BYTES", 1 << 40)
+    monkeypatch.setattr(connection, "MAX_BURST_BYTES", 1 << 40)
     with open_websocket(urlsplit(start_page().url)) as hostile:
         hostile.settimeout(1.0)
         with pytest.raises(TimeoutError):

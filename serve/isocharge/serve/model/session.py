@@ -228,6 +228,8 @@ class BoundPress:
         read: Function that returns the computed values in the order of a `Contact`.
         size: Number of values that `read` returns: ten, or seven if the model computes no correlations.
         columns: Slice of each output in these values, by the name of the output.
+        outputs: Views of the computed values, each of shape (1, width), by the name of the output. The next press
+            changes their values.
     """
 
     def __init__(self, session: ort.InferenceSession, n_electrode: int) -> None:
@@ -241,6 +243,7 @@ class BoundPress:
         self.columns = _output_columns(output_widths(session))  # slice of each output, by the name of the output
         self.size = max(columns.stop for columns in self.columns.values())
         outputs = np.zeros(self.size, dtype=np.float32)
+        self.outputs = {name: outputs[np.newaxis, columns] for name, columns in self.columns.items()}
         # The session stores only the addresses of the arrays. The views in `write` and `read` keep the arrays alive.
         binding = _bind(session, charges, outputs, self.columns)
         self.run: Callable[[], None] = partial(session.run_with_iobinding, binding)

@@ -7,8 +7,6 @@ page.
 import asyncio
 import os
 import signal
-import socket
-import ssl
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
@@ -21,9 +19,11 @@ import uvloop
 
 from isocharge.common.errors import IsochargeError, ListenError
 from isocharge.serve.network.address import Address, Tls, Token
+from isocharge.serve.network.http import HttpServer
+from isocharge.serve.viewer.connection import ViewerConnection
 from isocharge.serve.viewer.hub import Hub
 from isocharge.serve.viewer.link import PageEnd
-from isocharge.serve.viewer.server import Access, PageServer
+from isocharge.serve.viewer.server import Access, PageApplication
 
 NICE = 10
 """Increase of the nice value of the process. The reader therefore has priority if both use the same core."""
@@ -34,8 +34,8 @@ START_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 5.0
 """Longest time to wait until the process ends by itself, s. After this time, the process is terminated."""
 
-BACKLOG = 128
-"""Largest number of connections that wait to be accepted."""
+MAX_MESSAGE_BYTES = 1 << 12
+"""Largest size of a message from a viewer, bytes."""
 
 
 @dataclass(frozen=True)
@@ -109,31 +109,35 @@ def run_page(page: Page, announce: Callable[[str], object]) -> None:
         InputError: If the token, the TLS files or an allowed host name cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
-    # The token and the TLS files are checked before the server listens, because it must not listen if they are invalid.
+    # The token is checked before the server listens, because it must not listen if the token is invalid.
     token = None if page.token is None else Token(page.token)
     access = Access(token, page.address.host, page.allowed_hosts)
-    tls_context = None if page.tls is None else page.tls.context()
     hub = Hub(page.link, page.description, is_recording=page.is_recording)
-    with closing(hub), page.address.listen(BACKLOG) as listening_socket:
-        announce(page.address.url(listening_socket, secure=page.tls is not None))
-        server = PageServer(hub, access)
-        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-            runner.run(_serve(server, hub, listening_socket, tls_context))
+    with closing(hub):
+        server = HttpServer(
+            PageApplication(hub, access),
+            page.address,
+            tls=page.tls,
+            ws=ViewerConnection,
+            ws_max_size=MAX_MESSAGE_BYTES,
+            ws_per_message_deflate=False,
+        )
+        with closing(server), asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            announce(server.url)
+            runner.run(_serve(server, hub))
 
 
-async def _serve(
-    server: PageServer, hub: Hub, listening_socket: socket.socket, tls_context: ssl.SSLContext | None
-) -> None:
+async def _serve(server: HttpServer, hub: Hub) -> None:
     """Answer the requests of browsers until the reader of the stream has ended.
 
     Args:
         server: Server of the page.
         hub: Hub that distributes the samples of the stream to the viewers.
-        listening_socket: Socket on which the server accepts connections.
-        tls_context: TLS context of the server, or None for HTTP without TLS.
     """
-    async with server.answering(listening_socket, tls_context):
-        await hub.run()  # ends when the reader has ended
+    serving = asyncio.create_task(server.serve())
+    await hub.run()  # ends when the reader has ended
+    server.stop()
+    await serving
 
 
 def _run_and_send_url(page: Page, url_sender: Connection) -> None:

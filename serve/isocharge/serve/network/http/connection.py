@@ -7,6 +7,7 @@ which compares the deadlines with the present time, because a timer for each req
 """
 
 import math
+from abc import ABC, abstractmethod
 from typing import Any, NoReturn
 
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
@@ -26,7 +27,19 @@ class RequestRefused(Exception):
     """Exception that stops the parser after a request was refused."""
 
 
-class Connection(HttpToolsProtocol):
+class TimedConnection(ABC):
+    """Connection that the server regularly asks to compare its deadlines with the present time."""
+
+    @abstractmethod
+    def close_if_overdue(self, now: float) -> None:
+        """End the connection if a deadline has passed.
+
+        Args:
+            now: Present time on the clock of the event loop, s.
+        """
+
+
+class Connection(HttpToolsProtocol, TimedConnection):
     """One connection of the server.
 
     Attributes:
@@ -119,7 +132,7 @@ class Connection(HttpToolsProtocol):
         self._is_reading = False
         self._pending_bytes = 0
         self.deadline = math.inf
-        if self.cycle.response_complete:  # the application has not read the whole body
+        if self.cycle is not None and self.cycle.response_complete:  # the application has not read the whole body
             self.deadline = self.loop.time() + self._limits.idle_seconds
         super().on_message_complete()
 

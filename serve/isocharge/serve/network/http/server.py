@@ -14,7 +14,7 @@ import uvicorn
 import uvloop
 
 from isocharge.serve.network.address import Address, ServerLimits, Tls
-from isocharge.serve.network.http.connection import Connection
+from isocharge.serve.network.http.connection import Connection, TimedConnection
 from isocharge.serve.network.traffic import Traffic
 
 GRACE_SECONDS = 10
@@ -39,7 +39,7 @@ class HttpServer:
         traffic: Traffic | None = None,
         *,
         tls: Tls | None = None,
-        websocket: Any = "none",
+        **uvicorn_options: Any,
     ) -> None:
         """Open the socket on which the server listens.
 
@@ -49,7 +49,7 @@ class HttpServer:
             limits: Limits of the connections. By default, the limits of `ServerLimits`.
             traffic: Counters of refused requests and of open connections. By default, nothing is counted.
             tls: Certificate and private key for TLS, or None for a server without TLS.
-            websocket: Protocol class of uvicorn for WebSockets. By default, the server accepts no WebSockets.
+            uvicorn_options: Further options of `uvicorn.Config`. By default, the server accepts no WebSockets.
 
         Raises:
             InputError: If a TLS file cannot be used.
@@ -62,7 +62,6 @@ class HttpServer:
         config = uvicorn.Config(
             application,
             http=connection,
-            ws=websocket,
             lifespan="off",
             log_config=None,
             log_level="critical",  # errors that a client causes are counted, and are sent to this client
@@ -73,6 +72,7 @@ class HttpServer:
             timeout_keep_alive=math.ceil(limits.idle_seconds),
             timeout_graceful_shutdown=GRACE_SECONDS,
             ssl_context_factory=(lambda *_: tls_context) if tls_context else None,
+            **{"ws": "none"} | uvicorn_options,
         )
         self._server = _Server(config)
         self._address = address
@@ -115,6 +115,6 @@ class _Server(uvicorn.Server):
         """End overdue connections. uvicorn calls this method ten times per second until the server is stopped."""
         now = asyncio.get_running_loop().time()
         for connection in list(self.server_state.connections):
-            if isinstance(connection, Connection):
+            if isinstance(connection, TimedConnection):
                 connection.close_if_overdue(now)
         return await super().on_tick(counter)

@@ -183,6 +183,7 @@ class Handler:
         if method != route.method and not is_head_of_get:
             raise WrongMethod(f"{path}: expected the method {route.method}, got {method[:20]}", route.method)
         self.limits.check_body(len(body))
-        encoding = headers.get(b"content-encoding", b"").lower()
-        plain_body = decompress(body, encoding, self.limits.body_bytes)
-        return route.respond(Request(self._service, headers, plain_body, match.model, match.version))
+        encoding = headers.get(b"content-encoding")
+        if encoding is not None:
+            body = decompress(body, encoding.lower(), self.limits.body_bytes)
+        return route.respond(Request(self._service, headers, body, match.model, match.version))

@@ -182,6 +182,9 @@ def _json_charges(values: list[Any] | None, shape: list[int]) -> np.ndarray[Any,
 def infer(loaded: LoadedVersion, charge_pC: Singles) -> dict[str, Rows]:
     """Compute all outputs of a model for the charges of presses. Any thread may call this function.
 
+    The memory of a single press belongs to the thread and is reused, which is faster than `session.run`. The next call
+    in the same thread therefore changes the outputs of a single press.
+
     Args:
         loaded: Version of the model that is run.
         charge_pC: Charges, shape (n, electrodes), pC.
@@ -196,14 +199,13 @@ def infer(loaded: LoadedVersion, charge_pC: Singles) -> dict[str, Rows]:
         outputs = run(loaded.model.session, charge_pC, loaded.outputs)
         check_output_shapes(outputs, len(charge_pC), loaded.metadata.label)
         return dict[str, Rows](outputs)
-    # The memory of a single press is reused, which is faster than `session.run`.
     press = loaded.press_of_thread()
-    row = np.empty((1, press.size), np.float32)
+    press.write(*charge_pC[0].tolist())
     try:
-        press.run_into(charge_pC[0], row[0])
+        press.run()
     except Exception as error:  # the exceptions of onnxruntime have no common base class other than Exception
         raise run_error(error) from error
-    return {name: row[:, press.columns[name]] for name in loaded.outputs}
+    return dict[str, Rows](press.outputs)
 
 
 def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
@@ -251,9 +253,10 @@ def answer_inference(
         loaded.statistics.count_refused(clock_ns() - start_ns)
         raise
     stages_ns = (read_end_ns - start_ns, run_end_ns - read_end_ns, clock_ns() - run_end_ns)
-    misfit = outputs["misfit"]
-    good_count = int(np.count_nonzero(misfit <= loaded.validity.misfit_limit))  # without presses whose misfit is NaN
-    loaded.statistics.count_answered(len(misfit), stages_ns, alarms=len(misfit) - good_count)
+    misfits = outputs["misfit"].ravel().tolist()
+    limit = loaded.validity.misfit_limit
+    alarms = sum(not misfit <= limit for misfit in misfits)  # also counts NaN
+    loaded.statistics.count_answered(len(misfits), stages_ns, alarms)
     return response
 
 
