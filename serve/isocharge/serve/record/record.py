@@ -8,7 +8,6 @@ CSV file.
 
 import json
 import math
-from functools import cached_property
 from typing import Annotated, Any
 
 from msgspec import Struct, structs
@@ -177,7 +176,7 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     @property
     def field_names(self) -> tuple[str, ...]:
         """Names of the fields that the record contains, in the order in which they are written."""
-        return field_names(with_tracking=self.tracking is not None, with_film=self.film is not None)
+        return _NAMES[self.tracking is not None, self.film is not None]
 
     @property
     def json_values(self) -> dict[str, Any]:
@@ -191,8 +190,9 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
             value_class = value.__class__  # comparing the class is faster than a call of `isinstance`
             if value_class is float:
                 value = round(value, DECIMALS)
-            elif value_class not in _UNCHANGED:
-                value = _rounded_numbers(value)
+            elif value_class not in _UNCHANGED:  # the charges by electrode, or a struct of numbers
+                numbers = value if value_class is dict else structs.asdict(value)
+                value = {key: None if number is None else round(number, DECIMALS) for key, number in numbers.items()}
             json_values[name] = value
         return json_values
 
@@ -204,12 +204,10 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
         Raises:
             ValueError: If a number is not finite.
         """
-        return self._json
-
-    @cached_property
-    def _json(self) -> str:
-        """The record as one line of JSON."""
-        return _ENCODE(self.json_values)
+        text: str | None = self.__dict__.get("json")
+        if text is None:
+            text = self.__dict__["json"] = _ENCODE(self.json_values)
+        return text
 
 
 RECORD_FIELDS: tuple[Field, ...] = fields_of(PredictionRecord)
@@ -278,9 +276,3 @@ _UNCHANGED = frozenset({str, int, bool, tuple, type(None)})
 """Classes of values that are written to JSON without a change."""
 
 _ENCODE = json.JSONEncoder(allow_nan=False).encode
-
-
-def _rounded_numbers(value: Charges | Struct) -> dict[str, Any]:
-    """Return the numbers of a dictionary or of a struct by their names, rounded to six decimals. None is unchanged."""
-    numbers = value if isinstance(value, dict) else structs.asdict(value)
-    return {name: number if number is None else round(number, DECIMALS) for name, number in numbers.items()}
