@@ -15,6 +15,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Protocol
 
+from isocharge.common.errors import IsochargeError, OutputError
 from isocharge.serve.record.record import PredictionRecord
 
 
@@ -41,6 +42,20 @@ def discard(output: Output) -> None:
     """Call the method `discard` of an output. If the output has no such method, call `close` instead."""
     discard_or_close = getattr(output, "discard", output.close)
     discard_or_close()
+
+
+def output_error(error: Exception, target: str) -> Exception:
+    """Return an error of an output as an error that states its cause and the target.
+
+    Args:
+        error: The error. An `IsochargeError` or an `OSError` states its cause already.
+        target: Target of the output.
+    """
+    if isinstance(error, (IsochargeError, OSError)):
+        return error
+    output_failure = OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
+    output_failure.__cause__ = error
+    return output_failure
 
 
 def is_file_with(suffix: str) -> Callable[[str], bool]:

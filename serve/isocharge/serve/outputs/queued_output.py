@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable
 
 from isocharge.common.writer_queue import WriterQueue
-from isocharge.serve.outputs.output import Output, discard
+from isocharge.serve.outputs.output import Output, discard, output_error
 from isocharge.serve.record.record import PredictionRecord
 
 log = logging.getLogger(__name__)
@@ -95,4 +95,5 @@ class QueuedOutput:
         if self._ends_stream:
             raise error
         if is_first_error:
-            log.error("%s: stopped (%s); the records after that are missing", self._target, error)
+            reason = output_error(error, self._target)
+            log.error("%s: stopped (%s); the records after that are missing", self._target, reason)

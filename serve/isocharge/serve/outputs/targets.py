@@ -5,10 +5,9 @@ from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Self
 
-from isocharge.common.errors import InputError, IsochargeError, shown
-from isocharge.serve.outputs.added_output import protected_kind
+from isocharge.common.errors import InputError, shown
 from isocharge.serve.outputs.mcap_output import MCAP_FILE, ROS2_MCAP_FILE
-from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, discard
+from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, discard, output_error
 from isocharge.serve.outputs.queued_output import QueuedOutput
 from isocharge.serve.outputs.text_outputs import CSV_FILE, JSON_FILE, NO_OUTPUT, STDOUT_CSV, STDOUT_JSON
 from isocharge.serve.outputs.udp_output import UDP
@@ -56,8 +55,14 @@ def output_kind(target: str) -> OutputKind:
     added_forms = []
     for entry_point in entry_points(group=ENTRY_POINTS):
         added_kind = _load_kind(entry_point)
-        if added_kind.accepts(target):
-            return added_kind
+        try:
+            if added_kind.accepts(target):
+                return added_kind
+        except Exception as error:
+            raise InputError(
+                f"output {entry_point.name}: cannot tell whether it accepts {shown(target)} ({type(error).__name__}: "
+                f"{error}); correct or remove the package that adds it"
+            ) from error
         added_forms.append(added_kind.form)
 
     forms = ", ".join([target_forms(), *added_forms])
@@ -85,7 +90,7 @@ def _load_kind(entry_point: EntryPoint) -> OutputKind:
             f"output {entry_point.name} ({entry_point.value}): expected an OutputKind, got {shown(kind)}; correct the "
             "package that adds it"
         )
-    return protected_kind(kind, entry_point.name)
+    return kind
 
 
 class Outputs:
@@ -133,8 +138,10 @@ class Outputs:
         for target, kind in self._kinds.items():
             try:
                 output = kind.open(target, self._context)
-            except BaseException:
+            except BaseException as error:
                 self._discard()
+                if isinstance(error, Exception):
+                    raise output_error(error, target)  # noqa: B904  # the cause is set
                 raise
             # A live stream must not wait for a slow consumer, so its records are written by another thread.
             if self._context.is_live and kind.may_block:
@@ -180,8 +187,12 @@ class Outputs:
         Raises:
             Exception: In a replay, the error of any output. In a live stream, only an error of standard output.
         """
-        for output in self._outputs.values():
-            output.write(record)
+        target = ""
+        try:
+            for target, output in self._outputs.items():  # noqa: B007  # the error states the target
+                output.write(record)
+        except Exception as error:
+            raise output_error(error, target)  # noqa: B904  # the cause is set
 
     def close(self) -> None:
         """Close all open outputs, and store in `not_written` how many records each output has not received.
@@ -193,8 +204,10 @@ class Outputs:
         for target, output in self._remove_each():
             try:
                 output.close()
-            except (Exception, KeyboardInterrupt) as error:
-                errors.append(error)
+            except KeyboardInterrupt as interruption:
+                errors.append(interruption)
+            except Exception as error:
+                errors.append(output_error(error, target))
             # Only a queue can lose records without raising an error.
             if isinstance(output, QueuedOutput) and output.has_failed:
                 self.not_written[target] = None  # the number is unknown, because the output has stopped
@@ -211,8 +224,8 @@ class Outputs:
         for target, output in self._remove_each():
             try:
                 discard(output)
-            except (IsochargeError, OSError) as error:
-                log.error("%s", error)
+            except Exception as error:
+                log.error("%s", output_error(error, target))
             if not self._kinds[target].writes_nothing:
                 self.not_written[target] = None  # the number of missing records is unknown
 
