@@ -6,7 +6,9 @@ import termios
 import threading
 import time
 import tty
+from contextlib import nullcontext
 from itertools import pairwise
+from types import SimpleNamespace
 from unittest import mock
 
 import pytest
@@ -14,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import InputError, PortError, PortLost
-from isocharge.serve import Port, open_source
+from isocharge.serve import Chunk, Port, open_source
 from isocharge.serve.port.serial_line import QUIET_TIME_s, REPEAT_TIME_s, Request, Requester
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 
@@ -400,3 +402,25 @@ def test_request_is_sent_for_each_frame():
     os.close(board)
     os.close(reader)
     assert received_bytes.split(b"\n")[:10] == [b"%d" % number for number in range(10)]
+
+
+def test_installed_package_adds_a_source(monkeypatch):
+    chunk = Chunk(b"1,2,3\n", 1e9, 0)
+
+    class Bus(list):
+        outages = 0
+        is_live = True
+
+    def entry_points(group, name):
+        assert group == "isocharge.sources"
+        is_added = name in ("can", "broken")
+        load = {"can": lambda: lambda url: nullcontext(Bus([chunk, url])), "broken": dict.clear}
+        return [SimpleNamespace(value="my_package:open_bus", load=load[name])] if is_added else []
+
+    monkeypatch.setattr("isocharge.serve.port.source.entry_points", entry_points)
+    with open_source("can://vcan0") as source:
+        assert list(source) == [chunk, "can://vcan0"]
+    with pytest.raises(InputError, match=r"broken://x: cannot be opened by my_package:open_bus \(TypeError"):
+        open_source("broken://x")
+    with open_source("loop://") as source:
+        assert source.is_live

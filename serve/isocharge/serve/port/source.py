@@ -7,6 +7,13 @@ A port is a device path or a URL that pyserial accepts, such as `/dev/ttyACM0`, 
 `rfc2217://host:port` or `loop://`. In addition, `tcp://host:port` means the same as `socket://host:port`, and
 `udp://host:port` receives datagrams.
 
+Other packages can add sources. Such a package must declare an entry point in the group "isocharge.sources", whose name
+is the scheme of its URLs. The entry point must refer to a function that accepts a URL and returns a context manager of
+a `Source`. For example, this entry point in pyproject.toml adds URLs such as `can://vcan0`:
+
+    [project.entry-points."isocharge.sources"]
+    can = "my_package:open_bus"
+
 If `reconnect` is true, a port that disappears or falls silent is opened repeatedly until it is back. The first chunk
 after an outage contains the length of the outage. If a board sends frames only on request, the port sends the requests.
 """
@@ -18,8 +25,9 @@ import stat
 import sys
 import time
 from collections.abc import Iterator
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple, Protocol, Self
 
 from isocharge.common.errors import InputError, PortError, PortLost
 from isocharge.serve.port.foreign_files import HEAD_BYTES, refuse_foreign_file
@@ -370,7 +378,23 @@ STDIN = "-"
 CHUNK_BYTES = 4096
 """Largest chunk from a file, bytes."""
 
-Chunks = contextlib.AbstractContextManager["Port | FileSource"]
+ENTRY_POINTS = "isocharge.sources"
+"""Group of the entry points through which other packages add sources."""
+
+
+class Source(Protocol):
+    """A source of the bytes of a board.
+
+    Attributes:
+        outages: Number of outages of the source so far.
+        is_live: Whether bytes are lost if they are not read in time.
+    """
+
+    outages: int
+    is_live: bool
+
+    def __iter__(self) -> Iterator[Chunk]:
+        """Yield chunks as they arrive, until the source ends."""
 
 
 class FileSource:
@@ -421,7 +445,7 @@ def open_source(
     reconnect: bool = False,
     request: Request | None = None,
     wait: float = 0.0,
-) -> Chunks:
+) -> contextlib.AbstractContextManager[Source]:
     """Return a context manager that opens a port, a file or the standard input as a source of chunks.
 
     The function waits until the path exists. The port or the file is opened when the context is entered.
@@ -436,10 +460,21 @@ def open_source(
 
     Raises:
         InputError: If the file cannot be read, or is a recording, a table or another file that does not come from a
-            board.
+            board; or if a package that adds sources cannot open the URL.
     """
     if url == STDIN:
         return contextlib.nullcontext(FileSource(sys.stdin.fileno(), STDIN))
+
+    scheme, _, _address = url.partition("://")
+    for entry_point in entry_points(group=ENTRY_POINTS, name=scheme):
+        try:
+            added: contextlib.AbstractContextManager[Source] = entry_point.load()(url)
+        except Exception as error:
+            raise InputError(
+                f"{url}: cannot be opened by {entry_point.value} ({type(error).__name__}: {error}); correct or remove "
+                "the package that adds these sources"
+            ) from error
+        return added
 
     # Wait until the path exists, because the type of a missing path (a file or a port) is unknown.
     is_path = "://" not in url
