@@ -102,8 +102,12 @@ def test_dataset_that_a_network_cannot_be_trained_on_is_refused(dataset, change,
         (lambda d: with_one_charge(d, 1e39), r"^sample 17, column 'B': expected a charge in pC, got 1e\+39"),
         (lambda d: with_samples(d, charge_pC=d.samples.charge_pC[:, [0, 0, 2]]), "channels 'A', 'B': expected charges"),
         (lambda d: with_samples(d, charge_pC=1e-310 * d.samples.charge_pC), "channel 'A': expected charges in pC"),
+        (
+            lambda d: with_samples(d, force_N=2.0 + 0.01 * d.samples.force_N),
+            r"expected forces that vary, got 2.00\d to 2.02 N in all 6000 presses; .* CSV file",
+        ),
     ],
-    ids=["large charge", "impossible charge", "copied channel", "tiny charges"],
+    ids=["large charge", "impossible charge", "copied channel", "tiny charges", "one force"],
 )
 def test_a_measured_dataset_with_a_fault_is_refused(dataset, change, message):
     measured = replace(dataset, manifest={})

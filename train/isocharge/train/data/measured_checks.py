@@ -13,7 +13,7 @@ from isocharge.common.errors import DatasetError, PressError, shown
 from isocharge.common.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.simulate import Dataset
 from isocharge.train.data.channel_noise import usual_size
-from isocharge.train.data.measured_sensor import PressedArea
+from isocharge.train.data.measured_sensor import LEAST_RANGE, PressedArea
 
 USUAL_SIZES = (1e-30, 1e30)
 """Range of the median size of the charges of a channel, pC.
@@ -75,8 +75,8 @@ def check_measured_dataset(dataset: Dataset) -> None:
         dataset: The dataset.
 
     Raises:
-        DatasetError: If `check_measured_presses` would raise an error, or if a number is too large for a file of
-            presses.
+        DatasetError: If `check_measured_presses` would raise an error, if a number is too large for a file of presses,
+            or if all presses have nearly the same force.
     """
     samples = dataset.samples
     count = len(samples)
@@ -93,6 +93,12 @@ def check_measured_dataset(dataset: Dataset) -> None:
         check_measured_presses(presses)
     except PressError as error:
         raise DatasetError(str(error)) from error
+    weakest_N, strongest_N = samples.force_N.min(), samples.force_N.max()
+    if strongest_N < LEAST_RANGE * weakest_N:
+        raise DatasetError(
+            f"expected forces that vary, got {weakest_N:.4g} to {strongest_N:.4g} N in all {count} presses; press with "
+            "several forces, or train on the presses as a CSV file, from which a model learns x and y alone"
+        )
 
 
 def _check_variation(name: str, charge: Array) -> None:
