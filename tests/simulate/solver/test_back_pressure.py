@@ -72,6 +72,7 @@ def test_deflection_with_trapped_air_equals_that_of_a_taut_membrane(volume, at):
     np.testing.assert_allclose(deflection(solved, points), expected, atol=1e-4 * np.abs(expected).max())
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("at", [(12.0, -5.0), (20.0, 8.0)])
 def test_estimated_error_holds_for_a_closed_back_off_the_centre(at):
     sensor = sensor_with(back_volume=CAVITY)
@@ -205,6 +206,7 @@ def test_a_very_large_back_volume_equals_a_vented_back():
     np.testing.assert_allclose(charges[1], charges[0], rtol=1e-6)
 
 
+@pytest.mark.slow  # in `make test`, the presses of a closed back are compared, and maps of other films
 def test_forward_map_of_a_film_with_a_closed_back_equals_direct_solves():
     sensor = sensor_with(back_volume=CAVITY, static_pressure=1e-6)
     forward_map = ForwardMap.build(sensor, Circle(1.0), 4.0, (0.3, 0.5))

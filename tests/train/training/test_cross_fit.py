@@ -450,6 +450,7 @@ def flat_presses(force_N):
     return measured_presses(contact, pressure, tuple("STUVWXYZ"))
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(("force_N", "stated_N", "stated_std"), [(2.0, 2.0, 0.005), (np.nan, 1.0, 1.0)])
 def test_presses_of_one_force_or_without_forces_train_x_and_y(force_N, stated_N, stated_std, tmp_path, caplog):
     presses = flat_presses(force_N)
