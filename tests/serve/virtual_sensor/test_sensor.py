@@ -180,10 +180,12 @@ def test_bytes_that_a_sensor_ignores_do_not_block_their_sender(film):
             line.write(b"?" * 2000)
 
 
-def test_unplugged_port_returns_under_the_same_link(film):
+def test_unplugged_port_returns_under_the_same_link(film, tmp_path):
     encode = lambda frame: encode_text(frame, "pairs")  # noqa: E731
     faults = Faults(unplug_every_s=0.8, unplug_s=0.3)
-    with VirtualSensor(film.charges, steady(rate_Hz=500.0), faults=faults, encode=encode) as sensor:
+    with VirtualSensor(
+        film.charges, steady(rate_Hz=500.0), faults=faults, encode=encode, link=tmp_path / "film"
+    ) as sensor:
         with Port(sensor.url, reconnect=True) as port:
             outages_s = list(islice((chunk.outage_s for chunk in port if chunk.outage_s > 0.0), 2))
         assert sensor.unplugged >= 2
@@ -192,3 +194,9 @@ def test_unplugged_port_returns_under_the_same_link(film):
         )  # unplugged for three eighths of the time
     assert min(outages_s) > 0.1
     assert port.outages == 2
+
+
+def test_outages_without_a_link_are_refused(film):
+    sensor = VirtualSensor(film.charges, steady(), faults=Faults(unplug_every_s=0.8))
+    with pytest.raises(SceneError, match=r"faults: expected a link \(--link PATH\)"), sensor:
+        pass

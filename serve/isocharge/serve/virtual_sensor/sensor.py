@@ -11,7 +11,6 @@ this case, the reader receives frames with a gap in the frame numbers.
 """
 
 import itertools
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -116,8 +115,7 @@ class VirtualSensor:
             seed: Seed of noise, offset and faults.
             encode: Frame format.
             faults: Faults between the sensor and the reader; none by default.
-            link: Path of a symbolic link to the port, which exists while the context is active. If the faults contain
-                outages, a temporary link is created by default, because the port has another name after an outage.
+            link: Path of a symbolic link to the port, which exists while the context is active.
 
         Raises:
             SceneError: If the forward map returns charges of another shape, or charges that are not finite.
@@ -148,7 +146,6 @@ class VirtualSensor:
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
         self._port: PseudoPort | None = None
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.port_path = ""
 
     @property
@@ -291,15 +288,17 @@ class VirtualSensor:
 
         Raises:
             InputError: If the link cannot be created.
+            SceneError: If the faults contain outages, after which the port has another name, and there is no link.
         """
+        if self._faults.unplug_every_s > 0.0 and self._link is None:
+            raise SceneError(
+                "faults: expected a link (--link PATH) for outages of the port, got none; the port has another name "
+                "after each outage"
+            )
         self._frame_count = 0
         self.withheld = 0
         self.unplugged = 0
         self.paused_s = 0.0
-        # After an outage, the port has another name. The reader therefore needs a link whose name stays the same.
-        if self._link is None and self._faults.unplug_every_s > 0.0:
-            self._folder = tempfile.TemporaryDirectory(prefix="isocharge-")
-            self._link = Path(self._folder.name) / "film"
         self.port_path = self._open_port().url
         self._stop.clear()
         self._writer = threading.Thread(target=self._play, name="virtual sensor", daemon=True)
@@ -307,16 +306,12 @@ class VirtualSensor:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop the thread that writes the frames, close the port, and remove a temporary link."""
+        """Stop the thread that writes the frames, and close the port."""
         self._stop.set()
         if self._writer is not None:
             self._writer.join()
         self._close_port()
         self._writer = None
-        if self._folder is not None:  # the folder contains the temporary link
-            self._folder.cleanup()
-            self._folder = None
-            self._link = None
 
     def _play(self) -> None:
         """Write each frame when it is due, until the sensor is stopped.
