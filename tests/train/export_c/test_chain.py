@@ -103,7 +103,8 @@ def draw_frames(board, seed, seconds=20.0):
     charge += np.where(is_pressed, 30.0, 0.0)[:, None] * rng.random()
     charge[rng.choice(np.flatnonzero(is_pressed), 3)] *= 40.0  # spikes, which are not peaks of a press
 
-    values = Gain(device(board).setup(ELECTRODES)).revert(charge)
+    gain = Gain(device(board).setup(ELECTRODES))
+    values = charge / gain.gain_pC + gain.zero
     for invalid in (np.nan, np.inf, -np.inf, 3e9, 1e300):
         values[rng.integers(0, count, 2), rng.integers(0, n_electrode, 2)] = invalid
     limited = rng.random(count) < 0.003

@@ -17,7 +17,7 @@ from isocharge.common.errors import ModelError, NoFramesError, shown
 from isocharge.serve.flags import GAP, RECONNECTED, REPEAT, RESTART, in_order
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, SequenceGaps
-from isocharge.serve.live.contact_stages import FollowFilm, given_predictor
+from isocharge.serve.live.contact_stages import FollowFilm
 from isocharge.serve.live.device import ANY_BOARD, Device, create_stages
 from isocharge.serve.port.serial_line import TELNET_ADVICE, without_telnet
 from isocharge.serve.port.source import Chunk
@@ -241,8 +241,8 @@ class TouchStream(ReadingStream):
     Each object may be used by only one thread.
 
     Attributes:
-        predictor: The loaded model. If the film is followed (the stream estimates its pretension), the contacts are
-            predicted with `answering_predictor` instead.
+        predictor: The loaded model. If the film is followed, the contacts are predicted with the model of the film at
+            its estimated pretension instead.
         frame_id: Name of the film, which each record contains.
     """
 
@@ -326,15 +326,6 @@ class TouchStream(ReadingStream):
         If the film is followed, the records contain the field `film`.
         """
         return self._setup.rule(FollowRule) is not None
-
-    @property
-    def answering_predictor(self) -> Predictor:
-        """Model with which the contacts are predicted at present.
-
-        If the pretension of the film is estimated, the value is the model of the film at its estimated pretension.
-        Otherwise, the value is the loaded model.
-        """
-        return given_predictor(self._setup)
 
     def tare(self) -> None:
         """Discard the tare and the present touch, and measure the tare again from the next quiet frames."""

@@ -142,14 +142,6 @@ class Gain(Stage):
         self.largest = LARGEST_PC / float(np.abs(self.gain_pC).max(initial=SMALLEST_GAIN))
         self._skipped_s = 0.0  # duration of the invalid frames since the last valid frame
 
-    def revert(self, charge_pC: Array) -> Array:
-        """Convert charges, shape (n_electrode,), pC, to values of the device.
-
-        The values are infinite if the charge per unit is nearly 0.
-        """
-        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-            return charge_pC / self.gain_pC + self.zero
-
     def step(self, frame: Frame) -> None:
         """Convert the values of a frame to charges, and mark the frame if a value cannot be a charge."""
         magnitude = math.hypot(*frame.sent.tolist())  # at least the largest absolute value; NaN if a value is NaN
