@@ -149,20 +149,6 @@ class WatchResult(NamedTuple):
     press: SteadyPress | None = None
 
 
-class WindowFrame(NamedTuple):
-    """Charges of one frame in the window of a press.
-
-    Attributes:
-        t_s: Time of the frame, s.
-        charge_pC: Touch charges minus the charges at rest before the press, shape (n_electrode,), pC.
-        flags: Flags of the frame.
-    """
-
-    t_s: float
-    charge_pC: Array
-    flags: tuple[str, ...]
-
-
 class PressWatch:
     """Finds one steady press in each touch. Each object may be used by only one thread."""
 
@@ -179,7 +165,7 @@ class PressWatch:
         self._rest_frames: deque[tuple[float, Array]] = deque()  # times and charges of the latest frames without touch
 
         # State of the present or latest press
-        self._window: deque[WindowFrame] = deque()  # the latest frames of the press
+        self._window: deque[Frame] = deque()  # the latest frames of the press
         self._rest_pC = np.zeros(len(electrodes))  # mean charges just before the press
         self._has_rest = False  # whether enough frames before the press were at rest
         self._begin_s = -np.inf  # time of the first frame of the press
@@ -228,7 +214,7 @@ class PressWatch:
         held_s = t_s - self._begin_s
         if self._phase is Phase.lift:  # the press was accepted or refused before, and the finger is still on the film
             return WatchResult(Phase.lift, charge_pC, held_s)
-        result = self._process_press(frame, charge_pC, t_s)
+        result = self._process_press(frame)
         return result._replace(charge_pC=charge_pC, held_s=held_s)
 
     def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
@@ -288,7 +274,7 @@ class PressWatch:
         self._reason = ""
         self._min_scatter_pC = np.inf
 
-    def _process_press(self, frame: Frame, charge_pC: Array, t_s: float) -> WatchResult:
+    def _process_press(self, frame: Frame) -> WatchResult:
         """Add a frame to the window of the present press, and accept or refuse the press if this can be decided.
 
         The press is accepted if it is steady. It is refused if an amplifier is saturated, if the film was not at rest
@@ -296,14 +282,13 @@ class PressWatch:
 
         Args:
             frame: The frame.
-            charge_pC: Touch charges minus the charges at rest before the press, shape (n_electrode,), pC.
-            t_s: Time of the frame, s.
 
         Returns:
             The phase `taken` and the press if the press is steady, `refused` and the reason if the press is refused,
             and otherwise `settling`. The charges and the time since the touch are not filled in.
         """
         rule = self._rule
+        t_s = frame.clock_s
         self._end_s = t_s
         held_s = t_s - self._begin_s
         if SATURATED in frame.flags:
@@ -311,8 +296,8 @@ class PressWatch:
         if not self._has_rest and held_s >= rule.min_held_s:
             return self._refuse(NO_REST_BEFORE_PRESS, Phase.lift)
 
-        self._window.append(WindowFrame(t_s, charge_pC, tuple(frame.flags)))
-        while self._window[0].t_s < t_s - rule.window_s:
+        self._window.append(frame)
+        while self._window[0].clock_s < t_s - rule.window_s:
             self._window.popleft()
 
         # The window is examined several times within its length, but not in each frame, which would take too long.
@@ -376,11 +361,11 @@ class PressWatch:
         The scatter of a charge is the standard deviation of its residuals from the line. The drift of a charge is the
         change of its line from the beginning to the end of the window.
         """
-        begin_s = self._window[0].t_s
+        begin_s = self._window[0].clock_s
         end_s = self._end_s
         window_s = float(end_s - begin_s)
-        times_s = np.array([frame.t_s for frame in self._window]) - begin_s
-        charge_pC = np.array([frame.charge_pC for frame in self._window])  # shape (frames, n_electrode)
+        times_s = np.array([frame.clock_s for frame in self._window]) - begin_s
+        charge_pC = np.array([frame.charge_pC for frame in self._window]) - self._rest_pC  # shape (frames, n_electrode)
 
         # The line is fitted by least squares. Its value at the mean time of the frames is the mean charge.
         centred_s = times_s - times_s.mean()
