@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from isocharge.simulate.forward.forward_map import ForwardMap
     from isocharge.simulate.forward.readout import touch_charge
     from isocharge.simulate.forward.side_force import SideForceMap
-    from isocharge.simulate.forward.tension_map import TensionMap
+    from isocharge.simulate.forward.film_slopes import FilmSlopes
     from isocharge.simulate.identifiability.cramer_rao import limits_at
     from isocharge.simulate.identifiability.identification import identify
     from isocharge.simulate.identifiability.working_area import working_area
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from isocharge.simulate.mechanics.theory import Theory
     from isocharge.simulate.mesh.blocks import Resolution
     from isocharge.simulate.sensor.film import Film, Piezo
-    from isocharge.simulate.sensor.film_prior import FilmPrior, virtual_film
+    from isocharge.simulate.sensor.film_properties import FilmPrior, virtual_film
     from isocharge.simulate.sensor.probe import Circle, Ellipse, Finger, Polygon, Probe, parse_probe
     from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor
     from isocharge.simulate.sensor.sensor_file import built_in_sensors, load_sensor, write_sensor
@@ -79,7 +79,7 @@ __all__ = [
     "SideForceMap",
     "SolveSettings",
     "Sweep",
-    "TensionMap",
+    "FilmSlopes",
     "Theory",
     "Triangulation",
     "built_in_sensors",

@@ -8,7 +8,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE
 from isocharge.serve import Script, VirtualSensor, wander
 from isocharge.serve.virtual_sensor.sensor import Charges
-from isocharge.simulate import Amplifier, ForwardMap, TensionMap, load_amplifier
+from isocharge.simulate import Amplifier, ForwardMap, FilmSlopes, load_amplifier
 
 SCRIPT_S = 60.0
 """Length of the random script that a virtual sensor repeats, s."""
@@ -73,8 +73,8 @@ def film_charges_per_K(forward_map: ForwardMap) -> Charges | None:
     """
     if forward_map.sensor.film.expansion is None:
         return None
-    tension_map = TensionMap.build(forward_map)
-    return partial(_charges, tension_map.temperature_jacobian, forward_map.domain.force_range[0])
+    film_slopes = FilmSlopes.build(forward_map)
+    return partial(_charges, film_slopes.temperature_jacobian, forward_map.domain.force_range[0])
 
 
 def _charges(map_charges: Callable[[Array], Array], min_force_N: float, contact: Array) -> Array:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ from isocharge.common.errors import SceneError
 from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.forward.film_grid import FilmGrid
 from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.mesh.template import Template
@@ -28,7 +26,7 @@ from isocharge.simulate.numerics.interpolation import (
     periodic_weights,
 )
 from isocharge.simulate.sensor.film import Film, Surface
-from isocharge.simulate.sensor.probe import Circle, Probe
+from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
 from isocharge.simulate.solver.load_case import SolveSettings, check_press
@@ -452,50 +450,6 @@ def solve_chains(chains: Sequence[Chain], executor: Executor | None) -> Array:
     """
     values_of_chains = in_order(executor, _solve_chain, chains)
     return np.stack(list(track(values_of_chains, "solving the film", len(chains))))
-
-
-def solve_films(
-    film: Film,
-    surface: Surface,
-    grid: FilmGrid,
-    settings: SolveSettings,
-    executor: Executor | None,
-    read: Reading = probe_frame_stress,
-) -> Array:
-    """Solve presses with circular probes on many films.
-
-    A grid defines the properties of the films and of the presses: pretension, thickness, probe radius, distance and
-    force.
-
-    Args:
-        film: Film that defines the radius, Young's modulus and Poisson's ratio of all films.
-        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
-        grid: Grid of distances, loads, pretensions, thicknesses and probe radii, dimensionless.
-        settings: Theory, mesh and width of the thin rings at the rim.
-        executor: Executor that runs the solves; None for this process.
-        read: Function that computes the returned values from each solved press.
-
-    Returns:
-        Values that `read` computes for each press, shape (*grid.shape, n_value).
-    """
-    # The values of the grid are dimensionless: lengths are divided by the radius of the film, tensions by Young's
-    # modulus, and forces by the product of Young's modulus, the thickness and the radius. A chain contains the presses
-    # with all forces at one distance on one film. It begins with the largest force, and each further solve starts from
-    # the equilibrium under the previous force.
-    radius = film.radius
-    chains = []
-    for distance, tension, thickness, reach in product(grid.distance, grid.tension, grid.thickness, grid.reach):
-        grid_film = replace(film, pretension=float(tension) * film.young, thickness=float(thickness) * radius)
-        descending_forces = grid.load[::-1] * film.young * grid_film.thickness * radius
-        probe = Circle(float(reach) * radius)
-        chains.append(Chain(grid_film, probe, float(distance) * radius, descending_forces, surface, settings, read))
-    values = solve_chains(chains, executor)[:, ::-1]  # reverse the forces into ascending order
-
-    # The values have the axes (distance, tension, thickness, reach, load, value). In the grid, the load is the second
-    # axis.
-    n_distance, n_load, n_tension, n_thickness, n_reach = grid.shape
-    load_last = values.reshape(n_distance, n_tension, n_thickness, n_reach, n_load, -1)
-    return np.moveaxis(load_last, 4, 1)
 
 
 def _solve_chain(chain: Chain) -> Array:

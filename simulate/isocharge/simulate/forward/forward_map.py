@@ -25,6 +25,7 @@ from isocharge.simulate.forward.charge_map import Domain, as_contacts, differenc
 from isocharge.simulate.forward.family import (
     CheckPress,
     Family,
+    NodeCount,
     check_family,
     nearest_to_clamp,
     node_counts,
@@ -38,7 +39,7 @@ from isocharge.simulate.mechanics.theory import Theory, theory_for
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placed_mesh import distance_on_circular_film, film_oval
 from isocharge.simulate.mesh.placement import Placement, widest_smooth_layer
-from isocharge.simulate.mesh.template import template_for
+from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings, layer_for
@@ -68,6 +69,52 @@ With such a large error, the next entry would not suffice either.
 
 CHECK_COUNT = 10
 """Number of presses at which a forward map is compared with direct solves."""
+
+
+@dataclass(frozen=True)
+class FamilySettings:
+    """Settings that are the same for all solves of a forward map.
+
+    Attributes:
+        theory: Terms of the film theory.
+        resolution: Fineness of the mesh.
+        layer: Width of the thin rings of the mesh at the rim, in film radii.
+        template: Template of the mesh.
+    """
+
+    theory: Theory
+    resolution: Resolution
+    layer: float
+    template: Template
+
+    @property
+    def to_solve(self) -> SolveSettings:
+        """The settings in the form that the solver expects."""
+        return SolveSettings(theory=self.theory, resolution=self.resolution, layer=self.layer)
+
+
+def _family_settings(sensor: Sensor, probe: Probe, domain: Domain, settings: SolveSettings) -> FamilySettings:
+    """Choose the settings that are the same for all presses of a domain.
+
+    Args:
+        sensor: Sensor with the film.
+        probe: Probe that presses the film.
+        domain: Presses of the forward map.
+        settings: Required accuracy, and settings that are not chosen here; see `ForwardMap.build`.
+    """
+    film = sensor.film
+    min_force, max_force = domain.force_range
+    middle_force = float(np.sqrt(min_force * max_force))
+    theory = settings.theory
+    if theory == "auto":
+        theory = theory_for(sensor, probe, domain.force_range, settings.accuracy)
+    layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
+    settings = replace(settings, theory=theory, layer=layer)
+    outermost = nearest_to_clamp(film, domain.radius)
+    resolution = needed_resolution(film, probe, outermost, middle_force, settings)
+    template = template_for(probe, resolution, whole=not film.is_axisymmetric)
+    layer = min(layer, widest_smooth_layer(template, probe, domain.radius, film.radius))
+    return FamilySettings(theory, resolution, layer, template)
 
 
 @dataclass(frozen=True)
@@ -126,19 +173,7 @@ class ForwardMap:
         film = sensor.film
         domain = Domain(radius, force_range)
         check_family(film, probe, domain)
-
-        # Choose the settings that are the same for all presses of the family.
-        min_force, max_force = force_range
-        middle_force = float(np.sqrt(min_force * max_force))
-        theory = settings.theory
-        if theory == "auto":
-            theory = theory_for(sensor, probe, force_range, settings.accuracy)
-        layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
-        settings = replace(settings, theory=theory, layer=layer)
-        resolution = needed_resolution(film, probe, nearest_to_clamp(film, radius), middle_force, settings)
-        template = template_for(probe, resolution, whole=not film.is_axisymmetric)
-        layer = min(layer, widest_smooth_layer(template, probe, radius, film.radius))
-        settings = replace(settings, resolution=resolution, layer=layer)
+        settings = _family_settings(sensor, probe, domain, settings)
 
         # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared at
         # the check presses, which are solved directly in the first pass of the loop. If the error is very large, the
@@ -149,10 +184,7 @@ class ForwardMap:
         remaining_counts = list(node_counts(film))
         while remaining_counts:
             count = remaining_counts.pop(0)
-            family = Family.spread(domain, film, probe, count)
-            solved_stress = family.solve(sensor, probe, settings, executor)
-            table = family.unfold(solved_stress, template)
-            forward_map = cls(sensor, probe, family, theory, resolution, layer, table, error)
+            forward_map = cls._solve(sensor, probe, domain, settings, count, executor)
             if not check_charges:
                 solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
                 check_charges = list(in_order(executor, solve_directly, checks))
@@ -165,6 +197,48 @@ class ForwardMap:
             f"the forward map of {sensor.name} up to {radius:g} mm and {force_range[1]:g} N interpolates to "
             f"{error:.2g} only, expected {INTERPOLATION_ERROR:g}; ask for a smaller radius or range of forces"
         )
+
+    @classmethod
+    def build_unchecked(
+        cls,
+        sensor: Sensor,
+        probe: Probe,
+        domain: Domain,
+        count: NodeCount,
+        *,
+        executor: Executor | None = None,
+    ) -> "ForwardMap":
+        """Build a forward map from a few solves, and do not compare it with direct solves. Its error is not known.
+
+        Args:
+            sensor: Sensor whose charges the map computes.
+            probe: Probe that presses the film.
+            domain: Presses for which the map will be used.
+            count: Numbers of distances, forces, orientations and directions at which presses are solved.
+            executor: Executor that runs the solves; None for this process.
+
+        Raises:
+            SceneError: If some presses of the domain cannot exist.
+            SolveError: If a press has no equilibrium.
+        """
+        check_family(sensor.film, probe, domain)
+        settings = _family_settings(sensor, probe, domain, SolveSettings())
+        return cls._solve(sensor, probe, domain, settings, count, executor)
+
+    @classmethod
+    def _solve(
+        cls,
+        sensor: Sensor,
+        probe: Probe,
+        domain: Domain,
+        settings: "FamilySettings",
+        count: NodeCount,
+        executor: Executor | None,
+    ) -> "ForwardMap":
+        """Solve a family of presses with given settings. The error of the map is infinite, because it is not known."""
+        family = Family.spread(domain, sensor.film, probe, count)
+        table = family.unfold(family.solve(sensor, probe, settings.to_solve, executor), settings.template)
+        return cls(sensor, probe, family, settings.theory, settings.resolution, settings.layer, table, np.inf)
 
     @property
     def domain(self) -> Domain:

@@ -109,21 +109,6 @@ def _stiffness_imperfection(angle: float) -> AddImperfection:
     return add_stiffness
 
 
-def _add_poisson(solved: Equilibrium, value: float) -> Equilibrium:
-    """Return the equilibrium of a film whose Poisson's ratio is increased by a given value.
-
-    The bending stiffness is proportional to 1 / (1 - poisson^2), and changes accordingly.
-
-    Args:
-        solved: The solved press.
-        value: Increase of Poisson's ratio.
-    """
-    poisson = solved.groups.poisson
-    increased_poisson = poisson + value
-    bending = solved.groups.bending * (1.0 - poisson**2) / (1.0 - increased_poisson**2)
-    return replace(solved, groups=replace(solved.groups, poisson=increased_poisson, bending=bending))
-
-
 def _oval_imperfection(direction: complex) -> AddImperfection:
     """Create a function that makes the clamp of a film oval.
 
@@ -147,25 +132,22 @@ def _oval_imperfection(direction: complex) -> AddImperfection:
     return add_oval
 
 
-FIELDS = {
-    "tension": (
-        StressField(_tension_imperfection((1.0, -1.0, 0.0)), odd=False),
-        StressField(_tension_imperfection((0.0, 0.0, 1.0)), odd=True),
-    ),
-    "stiffness": (
-        StressField(_stiffness_imperfection(0.0), odd=False),
-        StressField(_stiffness_imperfection(0.25 * np.pi), odd=True),
-    ),
-    "poisson": (StressField(_add_poisson, odd=False),),
-    "oval": (
-        StressField(_oval_imperfection(1.0), odd=False),
-        StressField(_oval_imperfection(1j), odd=True),
-    ),
-}
-"""Stress fields of each imperfection.
+FILM_FIELDS = (
+    StressField(_tension_imperfection((1.0, 1.0, 0.0)), odd=False),
+    StressField(_tension_imperfection((1.0, -1.0, 0.0)), odd=False),
+    StressField(_tension_imperfection((0.0, 0.0, 1.0)), odd=True),
+    StressField(_stiffness_imperfection(0.0), odd=False),
+    StressField(_stiffness_imperfection(0.25 * np.pi), odd=True),
+    StressField(_oval_imperfection(1.0), odd=False),
+    StressField(_oval_imperfection(1j), odd=True),
+)
+"""Stress fields of a changed film: mean tension, uneven tension, uneven stiffness, and oval clamp.
 
-An imperfection with two axes has an even field and an odd field, in this order.
+The mean tension has one field. Each other imperfection has an even field and an odd field, in this order.
 """
+
+FILM_IS_ODD = np.array([field.odd for field in FILM_FIELDS])
+"""Whether each of `FILM_FIELDS` is odd about the direction of the press, shape (n_field,)."""
 
 
 def _side_load_imperfection(direction: tuple[float, float]) -> AddImperfection:
@@ -197,33 +179,6 @@ SIDE_FORCE_FIELDS = (
 SIDE_FORCE_IS_ODD = np.array([field.odd for field in SIDE_FORCE_FIELDS])
 """Whether each of `SIDE_FORCE_FIELDS` is odd, shape (2,)."""
 
-TENSION_FIELDS = (StressField(_tension_imperfection((1.0, 1.0, 0.0)), odd=False), *FIELDS["tension"])
-"""Field of a change of the mean pretension, and fields of both components of an uneven pretension."""
-
-TENSION_IS_ODD = np.array([field.odd for field in TENSION_FIELDS])
-"""Whether each of `TENSION_FIELDS` is odd, shape (3,)."""
-
-IS_ODD = np.array([field.odd for fields in FIELDS.values() for field in fields])
-"""Whether each field of `FIELDS` is odd, in the order of `stress_changes`, shape (n_field,)."""
-
-
-def stress_changes(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute how all imperfections in `FIELDS` change the scaled stress at the nodes.
-
-    The changes refer to fixed points of the film, after the press has been rotated onto the x axis. If the clamp
-    becomes oval, the nodes move. Stress changes that result only from the movement of the nodes are subtracted.
-
-    Args:
-        solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
-        surface: Surface of the film at which the stress is computed; see `touch_stress`.
-
-    Returns:
-        Changes of the stress of `nodal_stress` per unit of the imperfection, shape (n_field, n_element, n_local, 3).
-    """
-    all_fields = [field for fields in FIELDS.values() for field in fields]
-    return _changes_by_fields(solved, all_fields, surface)
-
-
 def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
     """Compute how the side forces in `SIDE_FORCE_FIELDS` change the scaled stress at the nodes.
 
@@ -241,21 +196,21 @@ def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array
     return np.moveaxis(_changes_by_fields(solved, SIDE_FORCE_FIELDS, surface), 0, 2)
 
 
-def tension_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute how the tensions in `TENSION_FIELDS` change the scaled stress at the nodes.
+def film_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
+    """Compute how changes of the film, as in `FILM_FIELDS`, change the scaled stress at the nodes.
 
-    The changes are computed for one unit of tension. The unit is the sum of E A^2 and the mean pretension, where E is
-    Young's modulus and A is the amplitude of the press.
+    The changes refer to fixed points of the film, after the press has been rotated onto the x axis. The unit of a
+    tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is the amplitude of the press.
 
     Args:
         solved: Press with a circular probe, solved with a theory that includes stretching.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
-        Changes, shape (n_element, n_local, 3, 3), in the order of the table of a `ForwardMap` with several fields. The
-        last two axes are the field and the stress component (S11, S22, S12).
+        Changes per unit, shape (n_element, n_local, n_field, 3), in the order of the table of a `ForwardMap` with
+        several fields. The last two axes are the field and the stress component (S11, S22, S12).
     """
-    return np.moveaxis(_changes_by_fields(solved, TENSION_FIELDS, surface), 0, 2)
+    return np.moveaxis(_changes_by_fields(solved, FILM_FIELDS, surface), 0, 2)
 
 
 def _changes_by_fields(solved: Equilibrium, fields: Sequence[StressField], surface: Surface) -> Array:

@@ -66,8 +66,8 @@ OTHER_UNITS = (
 )
 """Wrong units that the search for mistakes considers."""
 
-PRETENSIONS = (0.03, 0.25, 0.5, 1.0)
-"""Pretensions of the films with which presses are compared, relative to the largest pretension of the prior."""
+PRETENSIONS_MPa = (0.3, 1.5, 3.0)
+"""Pretensions of the films with which presses are compared, MPa."""
 
 SCATTER_STD = 0.1
 """Usual standard deviation, over electrodes and presses, of the logarithm of measured divided by expected charges.
@@ -143,7 +143,7 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
     Args:
         presses: The measured presses.
-        charges: Model of the charges of all films. A channel with small charges does not count as dead if one of a few
+        charges: Charges of a film and of similar films. A channel with small charges does not count as dead if one of a few
             examined films has similarly small charges.
 
     Raises:
@@ -166,11 +166,11 @@ def _smallest_film_ratios(presses: MeasuredPresses, charges: FilmCharges) -> Arr
     """Return the smallest charge ratio of each channel among a few films.
 
     The charge ratio of a channel is its typical charge divided by that of the other channels; see `_charge_ratios`. The
-    films have the pretensions in `PRETENSIONS`. Charge ratios above 1 are replaced by 1.
+    films have the pretensions in `PRETENSIONS_MPa`. Charge ratios above 1 are replaced by 1.
 
     Args:
         presses: The measured presses. The charges of the films are computed for presses with a known place and force.
-        charges: Model of the charges of all films.
+        charges: Charges of a film and of similar films.
 
     Returns:
         Ratios of charges as `_charge_ratios` returns them, but at most 1, shape (n_electrode,). All ratios are 1 if no
@@ -234,10 +234,10 @@ def _charge_ratios(charge: Array) -> Array:
 
 
 def expected_charges(charges: FilmCharges, contact: Array) -> Array:
-    """Compute the charges of presses on the mean film of the prior, for each pretension in `PRETENSIONS`.
+    """Compute the charges of presses on the mean film of the prior, for each pretension in `PRETENSIONS_MPa`.
 
     Args:
-        charges: Model of the charges of all films, with their prior.
+        charges: Charges of a film and of similar films, with their prior.
         contact: Contacts (x, y, F), shape (n, 3), mm and N. A contact outside the domain of the films is moved into the
             domain.
 
@@ -247,10 +247,10 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
     prior = charges.prior
     contact_in_domain = charges.into_domain(contact)
     charges_by_film = []
-    for pretension_share in PRETENSIONS:
-        parameters = prior.mean.copy()
-        parameters[prior.index("pretension")] = pretension_share * prior.spread.pretension
-        charges_by_film.append(charges.charges(parameters, contact_in_domain))
+    for pretension in PRETENSIONS_MPa:
+        values = prior.mean.copy()
+        values[prior.index("pretension")] = pretension
+        charges_by_film.append(charges.charges(values, contact_in_domain))
     return np.array(charges_by_film)
 
 
@@ -263,7 +263,7 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
 
     Args:
         presses: The measured presses. A press whose place or force is unknown is not used.
-        charges: Model of the charges of all films.
+        charges: Charges of a film and of similar films.
 
     Returns:
         One sentence for each mistake, with the best explanation first. The list is empty if no mistake explains the
@@ -303,7 +303,7 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
 
     Args:
         presses: The measured presses.
-        charges: Model of the charges of all films.
+        charges: Charges of a film and of similar films.
     """
     placed_presses = presses[presses.placed]
     if not len(placed_presses):
@@ -321,7 +321,7 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
     median of the logarithms, divided by `OFFSET_STD` squared. The function returns the smallest misfit of all films.
 
     Args:
-        charges: Model of the charges of all films, with their domain. The misfit is infinite if more than
+        charges: Charges of a film and of similar films, with their domain. The misfit is infinite if more than
             `MAX_OUTSIDE_FRACTION` of the contacts lie outside this domain.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         charge: Measured charges, shape (n, n_electrode), pC; NaN where a charge was not measured.
@@ -371,7 +371,7 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
 
     Args:
         presses: The measured presses, all with a known place and force.
-        charges: Model of the charges of all films, with which plausible orders of the columns are found.
+        charges: Charges of a film and of similar films, with which plausible orders of the columns are found.
     """
     contact = presses.contact
     charge = presses.charge_pC
@@ -406,13 +406,13 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
 def _plausible_electrode_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
     """Find the assignments of charge columns to electrodes that agree best with a few films.
 
-    For each pretension in `PRETENSIONS`, the columns are assigned to the electrodes of a film with this pretension. The
+    For each pretension in `PRETENSIONS_MPa`, the columns are assigned to the electrodes of a film with this pretension. The
     best assignment minimises the sum of squared differences between the logarithms of measured and expected charges.
     Before the logarithms are compared, a common factor of all charges is removed.
 
     Args:
         presses: The measured presses, all with a known place and force.
-        charges: Model of the charges of all films.
+        charges: Charges of a film and of similar films.
 
     Returns:
         Set of assignments. Each assignment contains, for each column, the index of the electrode to which its charges
@@ -461,7 +461,7 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
 
     Args:
         presses: The presses as they are written in the file.
-        charges: Model of the charges of all films.
+        charges: Charges of a film and of similar films.
         reason: Reason why the presses are refused, such as `FAR_FROM_ALL_FILMS`.
     """
     sensor_name = charges.prior.sensor.name

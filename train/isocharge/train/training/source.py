@@ -1,13 +1,15 @@
 """Training data of a network: simulated presses, measured presses, or the answers of another model."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 
 import numpy as np
 from torch import Tensor
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Dataset, Domain, Sensor
+from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.measured_checks import check_measured_dataset
 from isocharge.train.data.presses import LabelledPresses, domain_of, outside_presses_of, presses_of, yield_force_of
 from isocharge.train.training.fitted import Provenance
@@ -70,6 +72,7 @@ class TrainingData:
         test: Measured presses for measuring errors; None to hold out a part of `presses`.
         teacher: Model whose answers the network learns; None if it learns the contacts of the presses.
         provenance: Additional information about the origin of the model, for the release.
+        field: Charges as a function of the contact; None to fit them to `presses`.
     """
 
     sensor: Sensor
@@ -81,7 +84,8 @@ class TrainingData:
     yield_force_N: float | None = None
     test: LabelledPresses | None = None
     teacher: Teacher | None = None
-    provenance: Provenance = field(default_factory=Provenance)
+    provenance: Provenance = dataclass_field(default_factory=Provenance)
+    field: ChargeField | None = None
 
     @classmethod
     def of(cls, dataset: Dataset) -> "TrainingData":

@@ -67,7 +67,7 @@ class Split:
         presses = data.presses
         electrode_names = data.sensor.electrode_names
         field_train, field_validation = split_by_position(presses, training.hold_out, training.seed)
-        first_field = ChargeField.fit(data.domain, electrode_names, field_train, field_validation)
+        first_field = data.field or ChargeField.fit(data.domain, electrode_names, field_train, field_validation)
         domain, cautions = invertible_domain(first_field, presses, misfit_noise(training.noise_model))
         is_folded = domain != data.domain  # `invertible_domain` reduces the domain only if the map folds
         used_presses = presses.within(domain.radius) if is_folded else presses

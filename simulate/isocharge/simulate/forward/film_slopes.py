@@ -1,0 +1,137 @@
+"""Derivatives of the charges with respect to properties of the film, such as its pretension or an oval clamp.
+
+A change of a property changes the stress. The change of the stress is computed from the factorised tangent of the
+equilibrium (see `solver.sensitivity`), at a few distances and forces. Between the solved presses, it is interpolated as
+in a forward map.
+
+Each property with two axes, like an ellipse, has two components. Let alpha be the angle from the x axis to axis 1 of
+the property. The components are the size of the property times cos(2 alpha) and sin(2 alpha).
+
+Example:
+
+    forward_map = ForwardMap.build(sensor, Circle(1.0))
+    slopes = FilmSlopes.build(forward_map)
+    slopes.jacobian(contact)["oval_x"]  # pC, shape (n, n_electrode)
+    slopes.temperature_jacobian(contact)  # pC/K, shape (n, n_electrode)
+"""
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
+from isocharge.simulate.forward.derivative_fields import solve_derivatives
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.mechanics.film_temperature import tension_change
+from isocharge.simulate.mechanics.scaling import amplitude_squared
+from isocharge.simulate.solver.sensitivity import FILM_IS_ODD, film_stress
+
+TENSION = ("pretension", "tension_difference", "tension_shear")
+"""Mean pretension, half of T11 - T22, and T12, MPa."""
+
+STIFFNESS = ("stiffness_x", "stiffness_xy")
+"""Components of ln(E1 / E2), dimensionless."""
+
+OVAL = ("oval_x", "oval_xy")
+"""Components of the parameter e of an oval clamp, dimensionless."""
+
+
+@dataclass(frozen=True)
+class FilmSlopes:
+    """Derivatives of the charges with respect to properties of one film, at any position and force.
+
+    Attributes:
+        film: Forward map of the film.
+        fields: Forward map whose table contains the stress fields `sensitivity.FILM_FIELDS`.
+    """
+
+    film: ForwardMap
+    fields: ForwardMap
+
+    @classmethod
+    def build(cls, forward_map: ForwardMap, *, executor: Executor | None = None) -> "FilmSlopes":
+        """Solve a few presses in the domain of a forward map, and compute the stress fields of its properties.
+
+        Args:
+            forward_map: Forward map of the film under a circular probe. It provides the domain, the mesh and the
+                readout.
+            executor: Executor that runs the solves; None for this process.
+
+        Raises:
+            SceneError: If the probe is not axisymmetric.
+            SolveError: If a press has no equilibrium.
+        """
+        if not forward_map.probe.is_axisymmetric:
+            raise SceneError(f"properties of a film: expected a circular probe, got {forward_map.probe.notation}")
+        return cls(forward_map, solve_derivatives(forward_map, film_stress, executor))
+
+    def jacobian(self, contact: Array) -> dict[str, Array]:
+        """Compute the derivatives of the charges with respect to the properties in `TENSION`, `STIFFNESS` and `OVAL`.
+
+        Args:
+            contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
+
+        Returns:
+            Derivatives by the name of the property, each of shape (n, n_electrode), pC per unit of the property.
+
+        Raises:
+            SceneError: If a press lies outside the domain.
+        """
+        contact = self.film.domain.check(contact, "properties of a film")
+        film = self.film.sensor.film
+        field_charge = self.film.sensor.calibration.read(
+            self.fields.field_charges(contact, FILM_IS_ODD).swapaxes(1, 2)  # shape (n, n_field, n_electrode)
+        )
+        mean_tension, even_tension, odd_tension, *other_fields = np.moveaxis(field_charge, 1, 0)
+        tension_unit = (film.young * amplitude_squared(film, contact[:, 2]) + film.pretension)[:, None]
+
+        derivatives = {TENSION[0]: mean_tension / tension_unit}
+        even_and_odd = {
+            TENSION[1:]: (even_tension / tension_unit, odd_tension / tension_unit),
+            STIFFNESS: tuple(other_fields[:2]),
+            OVAL: tuple(other_fields[2:]),
+        }
+        # The axes of an even field are along and across the direction of the press, at the angle t from the x axis.
+        # The axes of an odd field are rotated by 45 degrees from them. Rotate both to the axes x and y.
+        twice_angle = 2.0 * np.arctan2(contact[:, 1], contact[:, 0])[:, None]
+        cosine = np.cos(twice_angle)
+        sine = np.sin(twice_angle)
+        for (x_name, xy_name), (even, odd) in even_and_odd.items():
+            derivatives[x_name] = cosine * even - sine * odd
+            derivatives[xy_name] = sine * even + cosine * odd
+        return derivatives
+
+    def tension_jacobian(self, contact: Array) -> Array:
+        """Compute the derivatives of the charges with respect to the pretension (T11, T22, T12) in the axes x and y.
+
+        Args:
+            contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
+
+        Returns:
+            Derivatives, shape (n, n_electrode, 3), pC/MPa.
+
+        Raises:
+            SceneError: If a press lies outside the domain.
+        """
+        mean, difference, shear = (self.jacobian(contact)[name] for name in TENSION)
+        # T11 and T22 contribute to the mean pretension and to half of their difference.
+        return np.stack([0.5 * (mean + difference), 0.5 * (mean - difference), shear], axis=2)
+
+    def temperature_jacobian(self, contact: Array) -> Array:
+        """Compute the derivatives of the touch charges with respect to the temperature of the film.
+
+        The temperature of the ring remains constant. The pyroelectric charge is not included.
+
+        Args:
+            contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
+
+        Returns:
+            Derivatives, shape (n, n_electrode), pC/K. They are zero if the film has no expansion coefficients.
+
+        Raises:
+            SceneError: If a press lies outside the domain.
+        """
+        tension_per_kelvin = tension_change(self.film.sensor.film, 1.0, 0.0)  # (T11, T22, T12), MPa/K
+        return np.asarray(self.tension_jacobian(contact) @ tension_per_kelvin)

@@ -1,0 +1,342 @@
+"""Unknown properties of a real film, and their prior distribution.
+
+A sensor file describes a film. The real film differs from it: the properties of the film and its piezoelectric
+coefficients are known only to within some percent, the positions of the electrodes to within tenths of a millimetre,
+and the pretension is almost unknown. `FILM_PROPERTIES` declares these properties. Each of them is declared once, with
+its name, its unit, its prior distribution, and the function that changes a sensor by the property. A calibration
+estimates the properties, and virtual films are drawn from their prior distribution.
+
+A value of a property is its deviation from the sensor file. The pretension is an exception: its value is the pretension
+itself. A property that depends on the direction has two components, the size of the property times the cosine and the
+sine of twice the angle of its axis.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
+from isocharge.simulate.sensor.probe import Circle, Probe
+from isocharge.simulate.sensor.sensor import Sensor
+
+MAX_DEVIATION = 4.0
+"""Largest allowed deviation of a property from its mean, in standard deviations."""
+
+MAX_DRAWN_DEVIATION = 2.5
+"""Largest deviation of a drawn property from its mean, in standard deviations."""
+
+LARGEST_PRETENSION = 3.0
+"""Largest pretension of a drawn film, MPa. All values from zero to this pretension are equally likely."""
+
+MAX_RADIUS_DEVIATION = 0.5
+"""Largest deviation of the radius of a probe, relative to the described radius."""
+
+
+Change = Callable[[Sensor, Probe, float], tuple[Sensor, Probe]]
+"""Function that changes a sensor and a probe by a value of one property."""
+
+
+@dataclass(frozen=True)
+class FilmProperty:
+    """Declaration of one unknown property of a film.
+
+    Attributes:
+        name: Name of the property.
+        meaning: Description of the property, for tables.
+        unit: Unit of the value.
+        std: Standard deviation of the prior distribution.
+        change: Function that changes a sensor and a probe by a value of the property.
+        drift: Standard deviation of the change of the property in the time between two calibrations.
+        mean: Mean of the prior distribution.
+        bounds: Smallest and largest value; None for `MAX_DEVIATION` standard deviations on both sides of the mean.
+        is_imperfection: Whether the property is an imperfection, which a good film does not have.
+    """
+
+    name: str
+    meaning: str
+    unit: str
+    std: float
+    change: Change
+    drift: float
+    mean: float = 0.0
+    bounds: tuple[float, float] | None = None
+    is_imperfection: bool = False
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Smallest and largest value of the property."""
+        return self.bounds or (self.mean - MAX_DEVIATION * self.std, self.mean + MAX_DEVIATION * self.std)
+
+
+def _film(**changes: Callable[[float, float], float]) -> Change:
+    """Return a function that changes attributes of the film. Each change is a function of the old value and a value."""
+
+    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+        changed = {name: function(getattr(sensor.film, name), value) for name, function in changes.items()}
+        return replace(sensor, film=replace(sensor.film, **changed)), probe
+
+    return change
+
+
+def _scaled(described: float, value: float) -> float:
+    """Return a described value whose logarithm is increased by `value`."""
+    return described * math.exp(value)
+
+
+def _deviator(component: int) -> Change:
+    """Return a function that increases a component of the uneven pretension."""
+
+    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+        difference, shear = sensor.film.deviator
+        deviator = (difference + value, shear) if component == 0 else (difference, shear + value)
+        return replace(sensor, film=replace(sensor.film, deviator=deviator)), probe
+
+    return change
+
+
+def _stiffness(direction: complex) -> Change:
+    """Return a function that increases a component of the uneven stiffness, which is ln(E1 / E2) exp(2 i axis)."""
+
+    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+        film = sensor.film
+        size = math.log(film.young_ratio) * complex(math.cos(2.0 * film.axis), math.sin(2.0 * film.axis))
+        changed = size + value * direction
+        # At the described size of zero, the axis stays, so that the film remains axisymmetric.
+        axis = film.axis if changed == size else 0.5 * math.atan2(changed.imag, changed.real)
+        ratio = film.young_ratio if changed == size else math.exp(abs(changed))
+        return replace(sensor, film=replace(film, young_ratio=ratio, axis=axis)), probe
+
+    return change
+
+
+def _oval(direction: complex) -> Change:
+    """Return a function that increases a component of the oval clamp, which is e exp(2 i axis)."""
+
+    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+        film = sensor.film
+        size = film.oval * complex(math.cos(2.0 * film.oval_axis), math.sin(2.0 * film.oval_axis))
+        changed = size + value * direction
+        if changed == size:
+            return sensor, probe
+        axis = 0.5 * math.atan2(changed.imag, changed.real)
+        return replace(sensor, film=replace(film, oval=abs(changed), oval_axis=axis)), probe
+
+    return change
+
+
+def _piezo(**changes: Callable[[float, float], float]) -> Change:
+    """Return a function that changes piezoelectric coefficients, like `_film`."""
+
+    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+        changed = {name: function(getattr(sensor.piezo, name), value) for name, function in changes.items()}
+        return replace(sensor, piezo=replace(sensor.piezo, **changed)), probe
+
+    return change
+
+
+def _shift(axis: int) -> Change:
+    """Return a function that moves the electrodes along x (0) or y (1)."""
+
+    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+        x, y = sensor.calibration.shift
+        shift = (x + value, y) if axis == 0 else (x, y + value)
+        return replace(sensor, calibration=replace(sensor.calibration, shift=shift)), probe
+
+    return change
+
+
+def _rotation(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+    """Rotate the electrodes by an angle, rad."""
+    calibration = sensor.calibration
+    return replace(sensor, calibration=replace(calibration, rotation=calibration.rotation + value)), probe
+
+
+def _crosstalk(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+    """Increase the crosstalk."""
+    calibration = sensor.calibration
+    return replace(sensor, calibration=replace(calibration, crosstalk=calibration.crosstalk + value)), probe
+
+
+def _probe_radius(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+    """Increase the radius of a circular probe. Other probes do not have this property."""
+    assert isinstance(probe, Circle)  # see `FilmPrior.properties`
+    return sensor, replace(probe, radius=probe.radius + value)
+
+
+def _gain(electrode: str) -> Change:
+    """Return a function that increases the logarithm of the gain of an electrode."""
+
+    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+        calibration = sensor.calibration
+        gains = calibration.gain | {electrode: _scaled(calibration.gain.get(electrode, 1.0), value)}
+        return replace(sensor, calibration=replace(calibration, gain=gains)), probe
+
+    return change
+
+
+def _imperfection(name: str, meaning: str, unit: str, std: float, change: Change) -> FilmProperty:
+    """Declare an imperfection, which does not drift."""
+    return FilmProperty(name, meaning, unit, std, change, drift=0.1 * std, is_imperfection=True)
+
+
+PRETENSION = FilmProperty(
+    "pretension",
+    "mean pretension",
+    "MPa",
+    LARGEST_PRETENSION / math.sqrt(12.0),  # that of the uniform distribution
+    _film(pretension=lambda _, value: value),
+    drift=0.35,  # creep, and a degree of temperature
+    mean=0.5 * LARGEST_PRETENSION,
+    bounds=(0.0, 4.0),
+)
+"""The pretension. Its value is the pretension itself."""
+
+FILM_PROPERTIES = (
+    PRETENSION,
+    FilmProperty("young", "ln of Young's modulus", "1", 0.2, _film(young=_scaled), 0.006),
+    FilmProperty("thickness", "ln of the thickness", "1", 0.05, _film(thickness=_scaled), 0.002),
+    FilmProperty("d31", "ln of d31", "1", 0.2, _piezo(d31=_scaled), 0.01),
+    FilmProperty("d32", "ln of d32", "1", 0.2, _piezo(d32=_scaled), 0.01),
+    FilmProperty("shift_x", "shift of the electrodes along x", "mm", 0.3, _shift(0), 0.01),
+    FilmProperty("shift_y", "shift of the electrodes along y", "mm", 0.3, _shift(1), 0.01),
+    FilmProperty("rotation", "rotation of the electrodes", "rad", math.radians(2.0), _rotation, 0.001),
+    _imperfection("tension_difference", "(T11 - T22) / 2", "MPa", 0.25, _deviator(0)),
+    _imperfection("tension_shear", "T12", "MPa", 0.15, _deviator(1)),
+    _imperfection("stiffness_x", "ln(E1 / E2), times the cosine of twice its angle", "1", 0.15, _stiffness(1.0)),
+    _imperfection("stiffness_xy", "ln(E1 / E2), times the sine of twice its angle", "1", 0.1, _stiffness(1j)),
+    _imperfection("oval_x", "e of an oval clamp, times the cosine of twice its angle", "1", 0.006, _oval(1.0)),
+    _imperfection("oval_xy", "e of an oval clamp, times the sine of twice its angle", "1", 0.006, _oval(1j)),
+    _imperfection("d12", "d12, by axes that are rotated", "pC/N", 0.3, _piezo(d12=lambda d12, value: d12 + value)),
+    _imperfection("crosstalk", "share of the charge of each other electrode", "1", 0.01, _crosstalk),
+)
+"""Properties of every film. The radius of a circular probe and the gains of the electrodes follow them."""
+
+
+@dataclass(frozen=True)
+class FilmPrior:
+    """Prior distribution of the properties of a real film, of its electrodes, and of the radius of a circular probe.
+
+    Attributes:
+        sensor: Sensor as described by its file.
+        probe: Described probe.
+    """
+
+    sensor: Sensor
+    probe: Probe
+
+    @cached_property
+    def properties(self) -> tuple[FilmProperty, ...]:
+        """Declarations of all properties, in the order of the vector of their values."""
+        probe_properties = []
+        if isinstance(self.probe, Circle):
+            radius = self.probe.radius
+            largest = MAX_RADIUS_DEVIATION * radius
+            std = min(0.3, 0.3 * radius)
+            probe_properties.append(
+                FilmProperty(
+                    "probe_radius", "radius of the probe", "mm", std, _probe_radius, 0.01, bounds=(-largest, largest)
+                )
+            )
+        gains = [
+            FilmProperty(f"gain {name}", f"ln of the gain of {name}", "1", 0.05, _gain(name), 0.005)
+            for name in self.sensor.electrode_names
+        ]
+        return (*FILM_PROPERTIES, *probe_properties, *gains)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the properties, in the order of the vector."""
+        return tuple(one.name for one in self.properties)
+
+    def index(self, name: str) -> int:
+        """Return the index of the property with the given name in the vector."""
+        return self.names.index(name)
+
+    @cached_property
+    def mean(self) -> Array:
+        """Means of the properties, shape (n_property,)."""
+        return np.array([one.mean for one in self.properties])
+
+    @cached_property
+    def std(self) -> Array:
+        """Standard deviations of the properties, shape (n_property,)."""
+        return np.array([one.std for one in self.properties])
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Smallest and largest values of the properties, each of shape (n_property,)."""
+        low, high = np.array([one.limits for one in self.properties]).T
+        return low, high
+
+    @cached_property
+    def is_imperfection(self) -> Array:
+        """Whether each property is an imperfection, shape (n_property,)."""
+        return np.array([one.is_imperfection for one in self.properties])
+
+    @property
+    def described(self) -> Array:
+        """Values of the film that the sensor file describes: its pretension, and zeros, shape (n_property,)."""
+        values = np.zeros(len(self.properties))
+        values[self.index(PRETENSION.name)] = self.sensor.film.pretension
+        return values
+
+    def film(self, values: Array) -> tuple[Sensor, Probe]:
+        """Return the sensor and the probe with the given values of the properties.
+
+        Args:
+            values: Values, shape (n_property,).
+
+        Raises:
+            SensorError: If no such sensor can exist, for example because an electrode lies over the rim.
+        """
+        if len(values) != len(self.properties):
+            raise SceneError(f"expected {len(self.properties)} values ({', '.join(self.names)}), got {len(values)}")
+        sensor, probe = self.sensor, self.probe
+        for one, value in zip(self.properties, np.asarray(values).tolist(), strict=True):
+            if value != 0.0 or one is PRETENSION:
+                sensor, probe = one.change(sensor, probe, value)
+        return sensor, probe
+
+    def draw(self, rng: np.random.Generator, count: int, *, imperfect: bool = False) -> Array:
+        """Draw films from the prior distribution.
+
+        The pretension is distributed uniformly. All other properties are distributed normally, and values that deviate
+        by more than `MAX_DRAWN_DEVIATION` standard deviations are drawn again.
+
+        Args:
+            rng: Random number generator.
+            count: Number of films.
+            imperfect: Whether the films have imperfections. Films without them are axisymmetric if the described film
+                is.
+
+        Returns:
+            Values, shape (count, n_property).
+        """
+        deviation = rng.standard_normal((count, len(self.properties)))
+        while (is_far := np.abs(deviation) > MAX_DRAWN_DEVIATION).any():
+            deviation = np.where(is_far, rng.standard_normal(deviation.shape), deviation)
+        if not imperfect:
+            deviation[:, self.is_imperfection] = 0.0
+        values = self.mean + self.std * deviation
+        values[:, self.index(PRETENSION.name)] = LARGEST_PRETENSION * rng.random(count)
+        low, high = self.bounds
+        return np.clip(values, low, high)
+
+
+def virtual_film(sensor: Sensor, probe: Probe, seed: int) -> tuple[Sensor, Probe]:
+    """Draw a random film without imperfections from the prior distribution of a described sensor and a probe.
+
+    Args:
+        sensor: Described sensor.
+        probe: Described probe.
+        seed: Seed of the random number generator.
+
+    Returns:
+        Sensor with the drawn film, gains and electrode positions. Probe, with the drawn radius if it is circular.
+    """
+    prior = FilmPrior(sensor, probe)
+    return prior.film(prior.draw(np.random.default_rng(seed), 1)[0])

@@ -1,0 +1,446 @@
+"""Estimator of a film: the most probable unknowns, given measured presses and a Gaussian prior distribution.
+
+The unknowns of the film and the contacts of the presses are found together by nonlinear least squares (Gauss-Newton). A
+contact may be known, known with an error, or unknown. The contacts are eliminated in every step (variable projection,
+Golub and Pereyra 1973). Presses that do not agree with the others get a lower weight, according to Student's t
+distribution (Lange and others, 1989), and are left out of the final estimate.
+
+How uneven a film is, how large its discrepancy is, and whether the session has an offset, a drift or scattered forces,
+is not known beforehand. Each combination of these cases is a hypothesis. The evidence of a hypothesis follows from the
+linearised problem (MacKay 1992), and the estimate is the mean over the hypotheses, weighted by their evidence.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from isocharge.common.arrays import Array, Booleans
+from isocharge.train.calibration.discrepancy import terms, unit_covariance
+from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout
+from isocharge.train.calibration.press_data import PressData
+
+MAX_LOG_FORCE = 20.0
+"""Largest logarithm of a force during the search, so that no number overflows."""
+
+MAX_STEPS = 30
+"""Largest number of Gauss-Newton steps."""
+
+STEP_TOLERANCE = 0.02
+"""Largest step, in prior standard deviations, after which the search ends."""
+
+LARGEST_STEP = 1.0
+"""Largest step of an unknown, in prior standard deviations. A longer step is shortened."""
+
+DEGREES_OF_FREEDOM = 5.0
+"""Degrees of freedom of Student's t distribution, from which the weights of the presses follow."""
+
+BAD_PROBABILITY = 1e-5
+"""Probability of residuals as large as those of a press, below which the press is left out."""
+
+FEW_PRESSES = 3
+"""Largest number of presses that counts as few. Among a few presses, a bad press cannot be recognised."""
+
+IMPERFECTION_SCALES = ((0.1, 0.3), (1.0, 0.5), (2.5, 0.2))
+"""Sizes of the imperfections relative to their prior standard deviations, with their prior probabilities."""
+
+DISCREPANCY_SIZES = ((0.0005, 0.3), (0.003, 0.3), (0.01, 0.3), (0.03, 0.1))
+"""Sizes of the discrepancy, relative to the charge, with their prior probabilities."""
+
+REMAINING_DISCREPANCY = 0.3
+"""Size of the discrepancy that an earlier calibration could not show, relative to the size of the hypothesis."""
+
+FORCE_SCATTERS = ((0.0, 0.8), (0.01, 0.1), (0.03, 0.1))
+"""Random errors of the forces beyond the stated ones, relative to the force, with their prior probabilities."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One combination of the sizes that are not known beforehand.
+
+    Attributes:
+        imperfections: Size of the imperfections, relative to their prior standard deviations.
+        discrepancy: Size of the discrepancy, relative to the charge.
+        session_std: Prior standard deviation of each unknown of the session, shape (n_session,).
+        force_scatter: Random error of the forces, relative to the force.
+        probability: Prior probability.
+    """
+
+    imperfections: float
+    discrepancy: float
+    session_std: tuple[float, ...]
+    force_scatter: float
+    probability: float
+
+
+def typical(data: PressData) -> Hypothesis:
+    """Return the hypothesis with which the search for the most probable unknowns begins."""
+    session_std = tuple(one.stds[-1][0] if one.is_possible(data) else 0.0 for one in SESSION)
+    return Hypothesis(1.0, 0.01, session_std, 0.0, 1.0)
+
+
+def hypotheses(data: PressData) -> Iterator[Hypothesis]:
+    """Yield all hypotheses about presses. An unknown of the session that these presses cannot have is zero."""
+    stds = [one.stds if one.is_possible(data) else ((0.0, 1.0),) for one in SESSION]
+    for imperfections, discrepancy, scatter, *session in product(
+        IMPERFECTION_SCALES, DISCREPANCY_SIZES, FORCE_SCATTERS, *stds
+    ):
+        cases = (imperfections, discrepancy, scatter, *session)
+        probability = float(np.prod([case[1] for case in cases]))
+        yield Hypothesis(
+            imperfections[0], discrepancy[0], tuple(one[0] for one in session), scatter[0], probability
+        )
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Gaussian prior distribution of all unknowns.
+
+    Attributes:
+        layout: Order of the unknowns.
+        earlier: Estimate of an earlier calibration with its drift; None for the prior distribution of the sensor.
+    """
+
+    layout: Layout
+    earlier: FilmEstimate | None = None
+
+    @property
+    def mean(self) -> Array:
+        """Means, shape (n_unknown,)."""
+        if self.earlier is not None:
+            return self.earlier.values
+        mean = np.zeros(self.layout.coefficients.stop)
+        mean[self.layout.film] = self.layout.prior.mean
+        return mean
+
+    def covariance(self, hypothesis: Hypothesis) -> Array:
+        """Return the covariance of the unknowns, shape (n_unknown, n_unknown).
+
+        After an earlier calibration, only the unknowns of the session depend on the hypothesis, and the discrepancy
+        grows by its size.
+        """
+        layout = self.layout
+        n_electrode = len(layout.prior.sensor.electrode_names)
+        discrepancy = hypothesis.discrepancy**2 * unit_covariance(n_electrode)
+        session = np.array(hypothesis.session_std) ** 2
+        if self.earlier is not None:
+            covariance = self.earlier.covariance.copy()
+            for index, one in enumerate(SESSION):
+                row = layout.index(one.name)
+                if covariance[row, row] == 0.0:
+                    covariance[row, row] = session[index]
+            covariance[layout.coefficients, layout.coefficients] += REMAINING_DISCREPANCY**2 * discrepancy
+            return covariance
+        covariance = np.zeros((layout.coefficients.stop,) * 2)
+        scale = np.where(layout.prior.is_imperfection, hypothesis.imperfections, 1.0)
+        covariance[layout.film, layout.film] = np.diag((scale * layout.prior.std) ** 2)
+        covariance[layout.session, layout.session] = np.diag(session)
+        covariance[layout.coefficients, layout.coefficients] = discrepancy
+        return covariance
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Residuals of presses and their derivatives, at given unknowns and contacts.
+
+    The residuals of a press are those of its charges and of its measured contact, in standard deviations.
+
+    Attributes:
+        residual: Residuals, shape (n, n_electrode + 3).
+        jacobian: Derivatives with respect to the unknowns, shape (n, n_electrode + 3, n_unknown).
+        contact_jacobian: Derivatives with respect to the contact (x, y, ln F), shape (n, n_electrode + 3, 3).
+    """
+
+    residual: Array
+    jacobian: Array
+    contact_jacobian: Array
+
+    def eliminated(self) -> tuple[Array, Array]:
+        """Return the residuals and their derivatives after the best change of each contact.
+
+        Returns:
+            Residuals, shape (n, n_electrode + 3), and derivatives, shape (n, n_electrode + 3, n_unknown), both
+            projected onto the space in which the contacts have no effect.
+        """
+        basis, _ = np.linalg.qr(self.contact_jacobian)  # shape (n, n_electrode + 3, 3)
+        transposed = basis.swapaxes(1, 2)
+        residual = self.residual - (basis @ (transposed @ self.residual[:, :, None]))[:, :, 0]
+        return residual, self.jacobian - basis @ (transposed @ self.jacobian)
+
+    def contact_change(self, change: Array) -> Array:
+        """Return the best changes of the contacts (x, y, ln F), shape (n, 3), after a change of the unknowns."""
+        residual = self.residual + self.jacobian @ change
+        return -(np.linalg.pinv(self.contact_jacobian) @ residual[:, :, None])[:, :, 0]
+
+
+@dataclass(frozen=True)
+class Estimation:
+    """Result of the estimator.
+
+    Attributes:
+        film: The estimate, averaged over the hypotheses.
+        contact: Most probable contacts (x, y, F), shape (n, 3), mm and N.
+        is_bad: Whether each press was left out, shape (n,).
+        press_chi2: Sum of the squared residuals of each press, divided by its redundant measurements, shape (n,); NaN
+            without redundant measurements.
+        chi2: Sum of the squared residuals of all presses that were not left out, and of the prior, under the most
+            probable hypothesis.
+        redundancy: Number of redundant measurements of these presses.
+        hypothesis: The most probable hypothesis.
+    """
+
+    film: FilmEstimate
+    contact: Array
+    is_bad: Booleans
+    press_chi2: Array
+    chi2: float
+    redundancy: float
+    hypothesis: Hypothesis
+
+
+def linearise(charges: FilmCharges, layout: Layout, data: PressData, unknowns: Array, contact: Array) -> Linearised:
+    """Compute the residuals of presses and their derivatives.
+
+    Args:
+        charges: Charges of a solved film and of similar films.
+        layout: Order of the unknowns.
+        data: The presses.
+        unknowns: Values of the unknowns, shape (n_unknown,).
+        contact: Contacts (x, y, ln F), shape (n, 3).
+    """
+    metric_contact = _in_domain(contact, charges)
+    film_values = unknowns[layout.film]
+    charge, film_jacobian = charges.linearised(film_values, metric_contact)
+    contact_slopes = charges.contact_slopes(film_values, metric_contact)
+    tension_slope = film_jacobian[:, :, layout.index("pretension")]
+    session_jacobian = np.stack([one.effect(data, charge, tension_slope) for one in SESSION], axis=2)
+
+    # The discrepancy multiplies the charge of its own electrode.
+    n_electrode = charge.shape[1]
+    term_values = terms(metric_contact, charges.domain)  # shape (n, n_term)
+    own_charge = charge[:, :, None] * np.eye(n_electrode)
+    coefficient_jacobian = own_charge[:, :, None, :] * term_values[:, None, :, None]
+    coefficient_jacobian = coefficient_jacobian.reshape(*charge.shape, -1)
+
+    jacobian = np.concatenate([film_jacobian, session_jacobian, coefficient_jacobian], axis=2)
+    beyond_film = slice(layout.film.stop, None)
+    model_charge = charge + jacobian[:, :, beyond_film] @ unknowns[beyond_film]
+    weight = 1.0 / data.charge_std
+    contact_weight = 1.0 / data.contact_std
+    residual = np.column_stack([weight * (model_charge - data.charge), contact_weight * (contact - data.contact)])
+    count = len(data)
+    padding = np.zeros((count, 3, jacobian.shape[2]))
+    contact_rows = contact_weight[:, :, None] * np.eye(3)
+    return Linearised(
+        residual,
+        np.concatenate([weight[:, :, None] * jacobian, padding], axis=1),
+        np.concatenate([weight[:, :, None] * contact_slopes, contact_rows], axis=1),
+    )
+
+
+def _in_domain(contact: Array, charges: FilmCharges) -> Array:
+    """Convert contacts (x, y, ln F) to (x, y, F), and move contacts outside the domain to its nearest contact."""
+    return charges.into_domain(np.column_stack([contact[:, :2], np.exp(np.minimum(contact[:, 2], MAX_LOG_FORCE))]))
+
+
+def estimate(
+    charges: FilmCharges, data: PressData, prior: Prior, start: Array | None = None, contact: Array | None = None
+) -> Estimation:
+    """Estimate a film from presses, with the derivatives of one solved film.
+
+    Args:
+        charges: Charges of a solved film and of similar films.
+        data: The presses.
+        prior: Prior distribution of the unknowns.
+        start: Unknowns from which the search begins; None for the prior mean.
+        contact: Contacts (x, y, F) from which the search begins, shape (n, 3); None for the measured contacts.
+    """
+    layout = prior.layout
+    unknowns = prior.mean if start is None else start
+    log_contact = data.contact if contact is None else np.column_stack([contact[:, :2], np.log(contact[:, 2])])
+    is_used = np.ones(len(data), dtype=bool)
+
+    unknowns, log_contact, press_chi2 = _search(charges, data, prior, typical(data), unknowns, log_contact, is_used)
+    redundancy = _redundancy(data)
+    is_bad = (redundancy > 0) & (chdtrc(np.maximum(redundancy, 1), press_chi2) < BAD_PROBABILITY)
+    # Presses are bad only if most presses agree with each other. Otherwise, no film explains the presses.
+    if is_bad.mean() > 0.5 or len(data) <= FEW_PRESSES:
+        is_bad[:] = False
+    is_used = ~is_bad
+
+    # The estimate of each hypothesis follows from the linearised problem at the most probable unknowns so far.
+    all_hypotheses = list(hypotheses(data))
+    used_data, used_contact = data[is_used], log_contact[is_used]
+    for _ in range(2):
+        linearised = linearise(charges, layout, used_data, unknowns, used_contact)
+        estimates = [_posterior(linearised, used_data, prior, one, unknowns) for one in all_hypotheses]
+        log_evidence = np.array([one.log_evidence for one in estimates])
+        weight = np.exp(log_evidence - log_evidence.max())
+        weight /= weight.sum()
+        means = np.array([one.mean for one in estimates])
+        mean = weight @ means
+        best = estimates[int(weight.argmax())]
+        used_contact = used_contact + linearised.contact_change(mean - unknowns)
+        unknowns = _bounded(mean, layout)
+    deviation = means - mean
+    covariance = sum(w * one.covariance for w, one in zip(weight, estimates, strict=True))
+    covariance = covariance + (weight[:, None] * deviation).T @ deviation
+
+    log_contact[is_used] = used_contact
+    final = linearise(charges, layout, data, unknowns, log_contact)
+    final_residual, _ = final.eliminated()
+    final_chi2 = (final_residual**2).sum(axis=1)
+    film = FilmEstimate(layout, unknowns, np.asarray(covariance), data.mean_C)
+    return Estimation(
+        film=film,
+        contact=_in_domain(log_contact, charges),
+        is_bad=is_bad,
+        press_chi2=np.divide(final_chi2, redundancy, out=np.full(len(data), np.nan), where=redundancy > 0),
+        chi2=best.chi2,
+        redundancy=float(redundancy[is_used].sum()),
+        hypothesis=all_hypotheses[int(weight.argmax())],
+    )
+
+
+def _search(
+    charges: FilmCharges,
+    data: PressData,
+    prior: Prior,
+    hypothesis: Hypothesis,
+    unknowns: Array,
+    contact: Array,
+    is_used: Booleans,
+) -> tuple[Array, Array, Array]:
+    """Search for the most probable unknowns and contacts under one hypothesis, with robust weights of the presses.
+
+    Args:
+        charges: Charges of a solved film and of similar films.
+        data: The presses.
+        prior: Prior distribution.
+        hypothesis: The hypothesis.
+        unknowns: Unknowns from which the search begins.
+        contact: Contacts (x, y, ln F) from which it begins.
+        is_used: Whether each press is used.
+
+    Returns:
+        The unknowns, the contacts, and the sum of the squared residuals of each press.
+    """
+    covariance = prior.covariance(hypothesis)
+    std = np.sqrt(np.diag(covariance))
+    is_free = std > 0.0
+    precision = np.linalg.inv(covariance[np.ix_(is_free, is_free)])
+    redundancy = np.maximum(_redundancy(data), 1)
+    press_chi2 = np.zeros(len(data))
+    for step in range(MAX_STEPS):
+        linearised = linearise(charges, prior.layout, data, unknowns, contact)
+        residual, jacobian = linearised.eliminated()
+        press_chi2 = (residual**2).sum(axis=1)
+        weight = (DEGREES_OF_FREEDOM + redundancy) / (DEGREES_OF_FREEDOM + press_chi2) * is_used
+        free_jacobian = jacobian[:, :, is_free]
+        weighted = weight[:, None, None] * free_jacobian
+        matrix = precision + np.einsum("nek,nel->kl", weighted, free_jacobian, optimize=True)
+        gradient = np.einsum("nek,ne->k", weighted, residual) + precision @ (unknowns - prior.mean)[is_free]
+        change = np.zeros(len(unknowns))
+        change[is_free] = -np.linalg.solve(matrix, gradient)
+        named = slice(0, prior.layout.session.stop)
+        relative = np.abs(change[named]) / np.where(std[named] > 0.0, std[named], 1.0)
+        change *= min(1.0, LARGEST_STEP / max(float(relative.max()), 1e-9))
+        contact = contact + linearised.contact_change(change)
+        unknowns = _bounded(unknowns + change, prior.layout)
+        if step > 0 and relative.max() < STEP_TOLERANCE:
+            break
+    return unknowns, contact, press_chi2
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """Estimate under one hypothesis: mean, covariance, logarithm of the evidence, and sum of the squared residuals."""
+
+    mean: Array
+    covariance: Array
+    log_evidence: float
+    chi2: float
+
+
+def _posterior(
+    linearised: Linearised, data: PressData, prior: Prior, hypothesis: Hypothesis, unknowns: Array
+) -> _Posterior:
+    """Compute the estimate and the evidence of a hypothesis from the linearised problem.
+
+    Args:
+        linearised: Residuals at `unknowns`, and their derivatives, with the stated errors of the forces.
+        data: The presses of the residuals.
+        prior: Prior distribution.
+        hypothesis: The hypothesis.
+        unknowns: Unknowns at which the residuals were computed.
+    """
+    log_scatter_volume = 0.0
+    if hypothesis.force_scatter > 0.0:
+        ratio = data.contact_std[:, 2] / data.with_force_scatter(hypothesis.force_scatter).contact_std[:, 2]
+        ratio = np.where(np.isfinite(data.contact_std[:, 2]), ratio, 1.0)
+        scale = np.ones_like(linearised.residual)
+        scale[:, -1] = ratio
+        linearised = Linearised(
+            scale * linearised.residual,
+            linearised.jacobian,
+            scale[:, :, None] * linearised.contact_jacobian,
+        )
+        log_scatter_volume = float(np.log(ratio).sum())
+    residual, jacobian = linearised.eliminated()
+    log_contact_volume = -0.5 * np.linalg.slogdet(
+        linearised.contact_jacobian.swapaxes(1, 2) @ linearised.contact_jacobian
+    )[1].sum()
+    covariance = prior.covariance(hypothesis)
+    is_free = np.diag(covariance) > 0.0
+    prior_covariance = covariance[np.ix_(is_free, is_free)]
+    precision = np.linalg.inv(prior_covariance)
+    flat_jacobian = jacobian[:, :, is_free].reshape(-1, int(is_free.sum()))
+    at_prior = residual.ravel() - jacobian.reshape(-1, len(unknowns)) @ (unknowns - prior.mean)
+    matrix = precision + flat_jacobian.T @ flat_jacobian
+    posterior_covariance = np.linalg.inv(matrix)
+    change = -posterior_covariance @ (flat_jacobian.T @ at_prior)
+    mean = prior.mean.copy()
+    mean[is_free] += change
+    misfit = at_prior + flat_jacobian @ change
+    chi2 = float(misfit @ misfit + change @ precision @ change)
+    log_determinant = np.linalg.slogdet(matrix)[1] + np.linalg.slogdet(prior_covariance)[1]
+    log_evidence = (
+        -0.5 * (chi2 + log_determinant)
+        + log_contact_volume
+        + log_scatter_volume
+        + np.log(hypothesis.probability)
+    )
+    full_covariance = np.zeros_like(covariance)
+    full_covariance[np.ix_(is_free, is_free)] = posterior_covariance
+    return _Posterior(mean, full_covariance, float(log_evidence), chi2)
+
+
+def _redundancy(data: PressData) -> Array:
+    """Return the number of measurements of each press minus the three unknowns of its contact, shape (n,)."""
+    measured = np.isfinite(data.charge_std).sum(axis=1) + np.isfinite(data.contact_std).sum(axis=1)
+    return np.maximum(measured - 3, 0)
+
+
+def _bounded(unknowns: Array, layout: Layout) -> Array:
+    """Return the unknowns with the properties of the film within their bounds."""
+    bounded = unknowns.copy()
+    low, high = layout.prior.bounds
+    bounded[layout.film] = np.clip(bounded[layout.film], low, high)
+    return bounded
+
+
+def is_unexplained(estimation: Estimation, probability: float, ratio: float) -> bool:
+    """Return whether the residuals are too large for any film.
+
+    Args:
+        estimation: Result of the estimator.
+        probability: Probability of such residuals, below which they are too large.
+        ratio: Mean squared residual above which they are too large.
+    """
+    if estimation.redundancy == 0.0:
+        return False
+    limit = max(ratio * estimation.redundancy, float(chdtri(estimation.redundancy, probability)))
+    return estimation.chi2 > limit

@@ -1,0 +1,210 @@
+"""Estimate of a film: a Gaussian distribution of its properties, of its discrepancy, and of what a session adds."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import PressError
+from isocharge.simulate import FilmPrior
+from isocharge.simulate.sensor.film_properties import PRETENSION
+from isocharge.train.calibration.discrepancy import coefficient_count
+from isocharge.train.calibration.press_data import PressData
+
+COEFFICIENT_DRIFT = 0.002
+"""Standard deviation of the change of each coefficient of the discrepancy between two calibrations."""
+
+CREEP_MPa = 0.09
+"""Standard deviation of the change of the pretension between two calibrations whose temperatures are known, MPa."""
+
+
+@dataclass(frozen=True)
+class SessionProperty:
+    """Declaration of one unknown of a session of presses, whose effect on the charges is proportional to its value.
+
+    Attributes:
+        name: Name of the unknown.
+        unit: Unit of its value.
+        stds: Standard deviations of the prior distribution that are considered, with their probabilities.
+        effect: Function that computes the derivatives of the charges, shape (n, n_electrode). Its arguments are the
+            presses, the charges of the film, and the derivatives of the charges with respect to the pretension.
+        caution: Words about a value that is certainly not zero, with the fields `value` and `std`.
+        is_possible: Function that returns whether the presses can have this unknown.
+    """
+
+    name: str
+    unit: str
+    stds: tuple[tuple[float, float], ...]
+    effect: Callable[[PressData, Array, Array], Array]
+    caution: str
+    is_possible: Callable[[PressData], bool] = lambda _: True
+
+
+SESSION = (
+    SessionProperty(
+        "offset",
+        "pC",
+        ((0.0, 0.9), (30.0, 0.1)),
+        lambda data, charge, _: np.ones_like(charge),
+        "all charges of all presses contain an offset of {value:.2g} +- {std:.2g} pC: is the tare right? The model "
+        "expects the same offset in later contacts; after a new tare, calibrate again",
+    ),
+    SessionProperty(
+        "drift",
+        "1",
+        ((0.0, 0.95), (0.15, 0.05)),
+        lambda data, charge, _: data.time[:, None] * charge,
+        "the charges change by a share of {value:.2g} +- {std:.2g} from the first press to the last: does an amplifier "
+        "drift? The standard deviations of the model contain this change",
+    ),
+    SessionProperty(
+        "pretension_per_K",
+        "MPa/K",
+        ((0.4, 1.0),),
+        lambda data, _, tension_slope: data.warming_K[:, None] * tension_slope,
+        "",
+        lambda data: data.mean_C is not None,
+    ),
+    SessionProperty(
+        "friction",
+        "1",
+        ((0.3, 1.0),),
+        lambda data, *_: data.friction_charge,
+        "",
+        lambda data: bool(data.friction_charge.any()),
+    ),
+)
+"""All unknowns of a session, in the order of the vector."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Order of the unknowns in the vector: properties of the film, of the session, coefficients of the discrepancy.
+
+    Attributes:
+        prior: Prior distribution of the properties of the film.
+    """
+
+    prior: FilmPrior
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the unknowns that have names; the coefficients follow them."""
+        return (*self.prior.names, *(one.name for one in SESSION))
+
+    @property
+    def film(self) -> slice:
+        """Properties of the film."""
+        return slice(0, len(self.prior.names))
+
+    @property
+    def session(self) -> slice:
+        """Unknowns of the session."""
+        return slice(self.film.stop, self.film.stop + len(SESSION))
+
+    @property
+    def coefficients(self) -> slice:
+        """Coefficients of the discrepancy."""
+        count = coefficient_count(len(self.prior.sensor.electrode_names))
+        return slice(self.session.stop, self.session.stop + count)
+
+    def index(self, name: str) -> int:
+        """Return the index of a named unknown."""
+        return self.names.index(name)
+
+
+@dataclass(frozen=True)
+class FilmEstimate:
+    """Gaussian distribution of the unknowns of a film.
+
+    Attributes:
+        layout: Order of the unknowns.
+        values: Most probable values, shape (n_unknown,).
+        covariance: Covariance, shape (n_unknown, n_unknown).
+        at_C: Temperature to which the pretension belongs, degrees Celsius; None if it is not known.
+    """
+
+    layout: Layout
+    values: Array
+    covariance: Array
+    at_C: float | None = None
+
+    @property
+    def film_values(self) -> Array:
+        """Properties of the film, shape (n_property,)."""
+        return self.values[self.layout.film]
+
+    def value(self, name: str) -> float:
+        """Return the most probable value of a named unknown."""
+        return float(self.values[self.layout.index(name)])
+
+    def std(self, name: str) -> float:
+        """Return the standard deviation of a named unknown."""
+        index = self.layout.index(name)
+        return float(np.sqrt(self.covariance[index, index]))
+
+    def drifted(self, *, knows_temperature: bool = False) -> "FilmEstimate":
+        """Return the estimate for a later session: the film may have drifted, and the offset and drift are new.
+
+        Args:
+            knows_temperature: Whether the temperature of the later session is known. Only creep then changes the
+                pretension, because the effect of the temperature is computed.
+        """
+        prior = self.layout.prior
+        drift = np.zeros(len(self.values))
+        drift[self.layout.film] = [one.drift for one in prior.properties]
+        drift[self.layout.coefficients] = COEFFICIENT_DRIFT
+        if knows_temperature and self.at_C is not None:
+            drift[self.layout.index(PRETENSION.name)] = CREEP_MPa
+        values = self.values.copy()
+        covariance = self.covariance + np.diag(drift**2)
+        for name in ("offset", "drift", "friction"):
+            index = self.layout.index(name)
+            values[index] = 0.0
+            covariance[index] = covariance[:, index] = 0.0
+        return replace(self, values=values, covariance=covariance)
+
+    def at_temperature(self, at_C: float) -> "FilmEstimate":
+        """Return the estimate of the film at another temperature. Only the pretension changes.
+
+        Args:
+            at_C: The other temperature, degrees Celsius.
+
+        Raises:
+            PressError: If the pretension would be outside its bounds.
+        """
+        if self.at_C is None:
+            return self
+        tension, per_K = self.layout.index(PRETENSION.name), self.layout.index("pretension_per_K")
+        change = np.eye(len(self.values))
+        change[tension, per_K] = at_C - self.at_C
+        values = change @ self.values
+        low, high = PRETENSION.limits
+        if not low <= values[tension] <= high:
+            raise PressError(
+                f"at {at_C:g} C the pretension would be {values[tension]:.2f} MPa; expected {low:g} to {high:g} MPa: a "
+                "temperature nearer to that of the presses"
+            )
+        return replace(self, values=values, covariance=change @ self.covariance @ change.T, at_C=at_C)
+
+    def draw(self, rng: np.random.Generator, count: int) -> Array:
+        """Draw values of all unknowns, shape (count, n_unknown). The properties of the film stay in their bounds."""
+        eigenvalues, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+        values = self.values + rng.standard_normal((count, len(self.values))) @ root.T
+        low, high = self.layout.prior.bounds
+        values[:, self.layout.film] = np.clip(values[:, self.layout.film], low, high)
+        return np.asarray(values)
+
+    def session_cautions(self, certain: float = 3.0) -> Sequence[str]:
+        """Return sentences about unknowns of the session that are certainly not zero.
+
+        Args:
+            certain: Smallest ratio of a value to its standard deviation.
+        """
+        return [
+            one.caution.format(value=self.value(one.name), std=self.std(one.name))
+            for one in SESSION
+            if one.caution and abs(self.value(one.name)) > certain * self.std(one.name) > 0.0
+        ]

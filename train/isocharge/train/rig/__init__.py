@@ -1,1 +1,0 @@
-"""Training data for films that cannot be calibrated, from a simulation that is corrected by measured presses."""
