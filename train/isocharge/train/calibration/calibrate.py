@@ -219,7 +219,7 @@ def _within_domain(
     Raises:
         PressError: If a single press lies outside.
     """
-    domain = problem.domain
+    domain = problem.solved_domain  # presses at the edge may lie outside the working area by their errors
     contact = presses.contact
     low, high = domain.force_range
     is_far = np.hypot(contact[:, 0], contact[:, 1]) > domain.radius  # False for an unknown position
