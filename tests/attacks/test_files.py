@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from attacks.companions import charge_arrays, direction_arrays, film_charge_arrays, pretension_arrays
+from attacks.companions import ELECTRODES, charge_arrays, direction_arrays, film_charge_arrays, pretension_arrays
 from attacks.faults import mutated, with_junk
 from isocharge.common.files import sha256_of
 from isocharge.common.resumable_run import resume_folder
@@ -357,8 +357,8 @@ def test_companion_files_with_faults(name, tmp_path, attack):
     def read(data):
         (tmp_path / name).write_bytes(data)
         if name == "charges.npz":
-            charges = read_charge_series(tmp_path, 3)
-            assert np.isfinite(charges.linearised(np.array([[0.0, 0.0, 0.0], [3.0, -2.0, -1.0]]))[0]).all()
+            charges = read_charge_series(tmp_path, ELECTRODES)
+            assert np.isfinite(charges.linearised(np.array([[0.0, 0.0, 0.5], [3.0, -2.0, 0.1]]))[0]).all()
         elif name == "film_directions.npz":
             directions = read_film_directions(tmp_path, 4)
             log_changes = directions.log_changes(np.array([[0.0, 0.0, 0.5], [30.0, -20.0, 100.0]]))

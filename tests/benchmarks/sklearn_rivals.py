@@ -15,7 +15,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.pipeline import Pipeline
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.charge_map import Domain
+from isocharge.common.contact_domain import Domain
 from isocharge.train.report.gauss_newton import whitening
 
 BATCH = 256

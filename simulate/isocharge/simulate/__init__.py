@@ -20,12 +20,13 @@ with require("simulate"):
     import scipy  # noqa: F401 (all modules need it; the error names the extra)
 
 if TYPE_CHECKING:
+    from isocharge.common.contact_domain import Domain
     from isocharge.simulate.contours.triangulation import Triangulation
     from isocharge.simulate.dataset.sampling import Sweep
     from isocharge.simulate.dataset.shards import Dataset, Samples, read_dataset, write_dataset
     from isocharge.simulate.dataset.sweep import run_sweep
     from isocharge.simulate.execution.workers import dask_workers, local_workers
-    from isocharge.simulate.forward.charge_map import ChargeMap, Domain, FunctionMap
+    from isocharge.simulate.forward.charge_map import ChargeMap, FunctionMap
     from isocharge.simulate.forward.charge_spline import ChargeSpline
     from isocharge.simulate.forward.forward_map import ForwardMap
     from isocharge.simulate.forward.readout import touch_charge

@@ -8,17 +8,14 @@ import numpy as np
 import pytest
 
 from attacks.companions import (
-    charge_arrays,
     direction_arrays,
     film_charge_arrays,
-    linear_series,
     pretension_arrays,
 )
 from isocharge.common.chebyshev_series import Series, position_degrees
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import load_model, write_model
-from isocharge.serve.model.charge_series import ChargeSeries, read_charges
 from isocharge.serve.model.companion_files import read_companion_file
 from isocharge.serve.model.film_charges import FilmChargeSeries, read_film_charges
 from isocharge.serve.model.film_directions import FilmDirections, read_film_directions
@@ -72,47 +69,6 @@ def write_npz(folder, name, arrays):
     """Write arrays to a companion file; `golden.json` is removed, so that only the content is checked."""
     np.savez_compressed(folder / name, **{key: value for key, value in arrays.items() if value is not None})
     (folder / "golden.json").unlink(missing_ok=True)
-
-
-CHARGES = charge_arrays()
-
-
-def test_series_of_charges_is_read(tmp_path):
-    expected = ChargeSeries(Series(linear_series()), 8.0, (0.05, 2.0))
-    (tmp_path / "charges.npz").write_bytes(expected.to_bytes())
-    read = read_charges(tmp_path, 3)
-    np.testing.assert_array_equal(read.series.coefficients, expected.series.coefficients)
-    assert (read.radius_mm, read.force_N) == (8.0, (0.05, 2.0))
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"series": np.full((2, 2, 2, 3), "text")}, "expected real numbers"),
-        ({"series": linear_series().astype(complex)}, "expected real numbers"),
-        ({"series": np.zeros((2, 2, 2, 3), "datetime64[s]")}, "expected real numbers"),
-        ({"series": linear_series()[0, 0]}, "expected an array of shape"),
-        ({"series": np.zeros((0, 0, 0, 3))}, "expected an array of shape"),
-        ({"series": linear_series()[:1, :1]}, "degrees from 1"),
-        ({"series": np.zeros((200, 200, 2, 3))}, "degrees from 1 to 100"),
-        ({"series": np.full((2, 2, 2, 3), np.inf)}, "expected finite numbers"),
-        ({"series": 300.0 * linear_series()}, "finite and positive"),
-        ({"series": 0.0 * linear_series()}, "change with x, y and the force"),
-        ({"series": None}, "the array 'series' is missing"),
-        ({"force_N": np.array([1.0, 1.0000001])}, "at least 1.01 times the smallest"),
-        ({"force_N": np.array([0.0, 1.0])}, "a smallest force above 0"),
-        ({"force_N": np.array([1.0, 0.5])}, "got 1 and 0.5 N"),
-        ({"force_N": np.array([1.0])}, "expected an array of shape"),
-        ({"radius_mm": np.array(np.inf)}, "expected finite numbers"),
-        ({"radius_mm": np.array(1e9)}, "expected a radius up to 10000 mm"),
-        ({"radius_mm": np.array(-1.0)}, "expected a radius"),
-        ({"radius_mm": np.array("8")}, "expected real numbers"),
-    ],
-)
-def test_series_that_describes_no_charges_is_refused(tmp_path, change, reason):
-    write_npz(tmp_path, "charges.npz", CHARGES | change)
-    with pytest.raises(ModelError, match=rf"charges\.npz: .*{reason}.*train again"):
-        read_charges(tmp_path, 3)
 
 
 def test_pretensions_are_read(tmp_path):

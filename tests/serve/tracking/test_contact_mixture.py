@@ -10,7 +10,7 @@ import pytest
 from numpy.polynomial import Polynomial, chebyshev
 
 from isocharge.common.arrays import Array
-from isocharge.common.chebyshev_series import Series
+from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import Chunk, Frame, Predictor, TouchStream, encode_frame
@@ -30,6 +30,9 @@ FOLD = 2.0
 FORCES = (0.05, 2.0)
 """Smallest and largest force, N."""
 
+ELECTRODES = ("A", "B", "C")
+"""Names of the electrodes."""
+
 NOISE = ModelNoise(name="reference", white_pC=1.0, gain=0.002)
 
 MODEL_CONTACT = (0.0,) * 10
@@ -42,8 +45,8 @@ def charges(x, y, force):
     return 2000.0 * (force**0.7 * np.exp([0.0 * x, folded_x, 0.1 * y])).T
 
 
-def folded_series():
-    """Return the function `charges` as a series."""
+def folded_series(**changes):
+    """Return the function `charges` as a series, with changes of some attributes."""
     log_low, log_high = np.log(FORCES)
     coefficients = np.zeros((3, 3, 2, 3))
     coefficients[0, 0, 0, :] = np.log(2000.0) + 0.7 * 0.5 * (log_low + log_high)
@@ -51,7 +54,13 @@ def folded_series():
     folded_x = Polynomial([0.0, 0.1, -0.05 / FOLD])(Polynomial([0.0, RADIUS]))
     coefficients[:, 0, 0, 1] += chebyshev.poly2cheb(folded_x.coef)
     coefficients[0, 1, 0, 2] += 0.1 * RADIUS
-    return ChargeSeries(Series(coefficients), RADIUS, FORCES)
+    attributes = {
+        "domain": Domain(RADIUS, FORCES),
+        "electrodes": ELECTRODES,
+        "coefficients": coefficients[None],
+        "is_folded": True,
+    }
+    return ChargeSeries(**(attributes | changes))
 
 
 def noisy_charges(x, y=1.0, force=0.5, seed=0, gains=(1.0, 1.0, 1.0)):
@@ -90,7 +99,7 @@ def track(x, rate_Hz=1000.0, **options):
 def test_charge_series_equals_the_closed_form_and_is_a_power_of_the_force_outside_its_range():
     contact = np.array([[3.0, -2.0, 0.5], [-5.0, 1.0, 0.01], [0.0, 0.0, 4.0]])
     x, y, force = contact.T
-    charge, slopes = folded_series().linearised(np.column_stack([x, y, np.log(force)]))
+    charge, slopes = folded_series().linearised(contact)
     x_slope, _, log_force_slope = np.moveaxis(slopes, 2, 0)
     assert np.allclose(charge, charges(x, y, force), rtol=1e-12)
     assert np.allclose(log_force_slope, 0.7 * charge, rtol=1e-12)
@@ -258,14 +267,14 @@ def test_stream_keeps_its_model_if_the_charges_npz_of_the_next_model_is_damaged(
         (lambda data: data[::-1], "zip"),
         (lambda data: re.sub(rb"(PK\x01\x02.{4})\0", rb"\g<1>" b"\x01", data, flags=re.DOTALL), "encrypted"),
         (
-            lambda _: ChargeSeries(Series(np.zeros((3, 3, 2, 4))), 6.0, FORCES).to_bytes(),
-            r"shape \(n, n, n, 3\), got \(3, 3, 2, 4\)",
+            lambda _: folded_series(coefficients=np.zeros((1, 3, 3, 2, 4))).to_bytes(),
+            r"shape \(1, n, n, n, 3\), got \(1, 3, 3, 2, 4\)",
         ),
-        (lambda _: ChargeSeries(Series(np.full((3, 3, 2, 3), np.nan)), 6.0, FORCES).to_bytes(), "finite"),
-        (lambda _: ChargeSeries(folded_series().series, 6.0, (2.0, 1.0)).to_bytes(), "got 2 and 1 N"),
+        (lambda _: folded_series(coefficients=np.full((1, 3, 3, 2, 3), np.nan)).to_bytes(), "finite"),
+        (lambda _: folded_series(domain=Domain(6.0, (2.0, 1.0))).to_bytes(), "got 2 and 1 N"),
     ],
 )
 def test_damaged_charges_npz_raises_a_model_error(model, spoil, message):
     put_charges(model, spoil(folded_series().to_bytes()))
     with pytest.raises(ModelError, match=rf"charges\.npz: .*({message}).*train again"):
-        read_charges(model, 3)
+        read_charges(model, ELECTRODES)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from isocharge.common.contact_domain import Domain
 from isocharge.simulate import Circle, ForwardMap, FunctionMap, load_sensor, noise_model
-from isocharge.simulate.forward.charge_map import Domain, within
+from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion, has_mirror, mirror_region
 from isocharge.simulate.identifiability.nearest_contact import search
 from kept import kept

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from tests.train.rig.conftest import DOMAIN, measured_presses, systematic_error
 
+from isocharge.common.contact_domain import Domain
 from isocharge.common.statistics import rms
 from isocharge.simulate import noise_model
-from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.data.presses import draw_contacts
 from isocharge.train.rig import correction as correction_module
 from isocharge.train.rig.corrected_film import correct_film

@@ -12,7 +12,7 @@ from isocharge.serve import MeasuredPresses, Predictor
 from isocharge.simulate import Circle, Domain, ForwardMap, Sweep, load_sensor, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, release
-from isocharge.train.data.charge_field import ChargeField
+from isocharge.train.data.charge_fit import fit_charge_series
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.rig.corrected_film import correct_film
 from kept import kept
@@ -82,7 +82,7 @@ def test_series_of_charges_of_both_signs_agrees_with_the_simulated_charges(film)
     contact = draw_contacts(np.random.default_rng(0), film.domain, 5_000)
     presses = LabelledPresses(contact, film.charges(contact))
     train, validation = np.split(np.arange(5_000), [4_000])
-    field = ChargeField.fit(film.domain, film.electrodes, presses[train], presses[validation])
+    field = fit_charge_series(film.domain, film.electrodes, presses[train], presses[validation])
     assert np.abs(field.charges(contact) - presses.charge).max() < 0.05  # pC: a twentieth of the noise
     is_inner = np.hypot(contact[:, 0], contact[:, 1]) < 0.95 * RADIUS_mm
     inner = contact[is_inner][:200]

@@ -1,29 +1,56 @@
-"""Charges of a film, described by a Chebyshev series in the position and the force of the contact.
+"""Compact charge map of a film, and the file `charges.npz` that contains the map.
 
-A network maps charges to a contact. Near a fold of the forward map, several contacts give the same charges, and a
-network cannot distinguish these contacts. The tracker then compares the measured charges with the charges of this
-series:
+A charge map gives the charges of the electrodes for any contact. This map consists of one value v for each electrode,
+which is a Chebyshev series in the contact:
 
-    ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
+    v_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
 
-where T_i are Chebyshev polynomials, r is the largest distance of a contact from the centre, and l is the logarithm of
-the force, scaled to [-1, 1]. The series is stored in the file `charges.npz`, which is in the same folder as
-`model.onnx`. The file contains three arrays.
+where T_i are Chebyshev polynomials, r is the radius of the domain, and l is the logarithm of the force, scaled to
+[-1, 1]. If all charges are positive, the charge is Q = exp(v). Otherwise, the charge is Q = S(l) v, and the logarithm
+of the typical size S of the charges is a polynomial in l.
 
-- `series`: the coefficients c of the Chebyshev series, shape (degree + 1, degree + 1, force_degree + 1, n_electrode).
-- `radius_mm`: the largest distance r of a contact from the centre, mm.
-- `force_N`: the smallest and the largest force of a contact, N.
+Without pretension, the charge is nearly F^(2/3) g(x, y), with the force F and a smooth function g of the position. The
+value v is therefore smooth, and few terms suffice. Outside the domain, v and ln S are continued linearly from the
+nearest contact in the domain. In the force, the continuation of Q is a power law.
+
+A calibrated film may change. The map then also depends on the state of the film, a vector (t, z_1, ..., z_K):
+
+- t is the change of the mean pretension since the calibration, MPa. The coefficients c are given for several values of
+  t, which are called nodes. Between the nodes, the coefficients are interpolated by a polynomial (Lagrange). A film
+  whose pretension cannot be followed has the single node 0.
+- z_k is the change of the film along direction k, in standard deviations. A direction is a linear combination of
+  properties of the film that remained uncertain after the calibration. A change adds z_k d_ke(x, y, F) to v_e, where
+  d_ke is another Chebyshev series.
+
+The file `charges.npz` is in the same folder as `model.onnx`. It contains these arrays:
+
+    format           version of the format
+    series           coefficients c, shape (n_node, degree + 1, degree + 1, force_degree + 1, n_electrode)
+    node_MPa         values of t at the nodes, shape (n_node,), MPa
+    directions       coefficients of d, shape (degree + 1, degree + 1, force_degree + 1, K, n_electrode); missing if
+                     K = 0. The degrees may differ from those of `series`
+    log_size         Chebyshev coefficients of ln S as a function of l; missing if all charges are positive
+    radius_mm        radius r of the domain, mm
+    force_N          smallest and largest force of the domain, N
+    is_folded        1 if the map has a fold, otherwise 0
+    charge_std       see `ChargeSeries`
+    pretension_MPa   see `ChargeSeries`
+    tension_std_MPa  see `ChargeSeries`
 """
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial import chebyshev
 
 from isocharge.common.arrays import Array
 from isocharge.common.chebyshev_series import Series
+from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError, cut
 from isocharge.common.npz import DAMAGED_FILE_ERRORS, finite_array, finite_number, npz_arrays
 from isocharge.serve.model.companion_files import read_companion_file
@@ -31,154 +58,422 @@ from isocharge.serve.model.companion_files import read_companion_file
 FILE = "charges.npz"
 """Name of the file in a version folder."""
 
-ADVICE = "copy the model's folder again, or train again"
+FORMAT = 2
+"""Version of the format of the file. Files of the first version contain no version."""
+
+ADVICE = "copy the model's folder again, or calibrate or train again"
 """What the user can do about a damaged file, for error messages."""
 
 MAX_DEGREE = 100
-"""Largest degree of a series in a file; `isocharge train` writes degrees up to 30."""
+"""Largest degree of a series in a file."""
+
+MAX_NODES = 50
+"""Largest number of nodes in a file."""
+
+MAX_DIRECTIONS = 100
+"""Largest number of directions in a file."""
+
+MAX_VALUE = 100.0
+"""Largest magnitude of v and of ln S in the domain. The logarithms of charges in pC are between -5 and 12."""
+
+MAX_PRETENSION_MPa = 50.0
+"""Largest magnitude of the numbers in MPa in a file."""
+
+MIN_NODE_DISTANCE_MPa = 1e-3
+"""Smallest distance between two nodes in a file, MPa."""
 
 MAX_RADIUS_mm = 1e4
 """Largest radius in a file, mm."""
 
-MIN_FORCE_RATIO = 1.01
-"""Smallest ratio of the largest force to the smallest force. With equal forces, the scaled logarithm is undefined."""
-
 N_CORNERS = 64
-"""Number of corners of the polygon that encloses the area of a series."""
-
-N_CHECKED_DIRECTIONS = 8
-"""Number of directions in which the charges of a file are checked."""
-
-N_CHECKED_FORCES = 5
-"""Number of forces at which the charges of a file are checked."""
+"""Number of corners of the polygon that encloses the area of a map."""
 
 
-@dataclass(frozen=True)
-class ChargeSeries:
-    """Charges of a film as a function of the contact, for contacts up to a given distance from the centre of the film.
+class ChargeChanges(NamedTuple):
+    """Charges of n contacts, and their derivatives with respect to the contacts and the state of the film.
 
     Attributes:
-        series: Series of ln Q, where Q is the charge in pC.
-        radius_mm: Largest distance of a contact from the centre, mm.
-        force_N: Smallest and largest force, N.
+        charge_pC: Charges, shape (n, n_electrode), pC.
+        by_contact: Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
+        by_state: Derivatives with respect to the state (t, z_1, ..., z_K), shape (n, n_electrode, 1 + K), pC/MPa and
+            pC.
     """
 
-    series: Series
-    radius_mm: float
-    force_N: tuple[float, float]
+    charge_pC: Array
+    by_contact: Array
+    by_state: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChargeSeries:
+    """Compact charge map: charges of a film as a function of the contact and of the state of the film.
+
+    It implements the interface `ChargeMap` of `isocharge.simulate`.
+
+    Attributes:
+        domain: Contacts for which the map is valid.
+        electrodes: Names of the electrodes, in the order of the charges.
+        coefficients: Coefficients of v at each node, shape (n_node, degree + 1, degree + 1, force_degree + 1,
+            n_electrode).
+        node_MPa: Changes t of the mean pretension at the nodes, shape (n_node,), MPa, ascending and containing 0.
+        directions: Coefficients of the changes of v by one unit of each direction, shape (degree + 1, degree + 1,
+            force_degree + 1, K, n_electrode); None if the map has no directions.
+        log_size: Chebyshev coefficients of ln S as a function of l; None if all charges are positive.
+        is_folded: Whether different contacts of the domain have the same charges. A service then tracks contacts with a
+            `ContactMixture`.
+        charge_std: Standard deviation of the part of the charges that the map does not describe, relative to the
+            charges.
+        pretension_MPa: Mean pretension of the film as it was calibrated, MPa.
+        tension_std_MPa: Standard deviation of t when a stream begins, MPa. It includes the uncertainty of the
+            calibration.
+    """
+
+    domain: Domain
+    electrodes: tuple[str, ...]
+    coefficients: Array
+    node_MPa: Array = field(default_factory=lambda: np.zeros(1))
+    directions: Array | None = None
+    log_size: Array | None = None
+    is_folded: bool = False
+    charge_std: float = 0.0
+    pretension_MPa: float = 0.0
+    tension_std_MPa: float = 0.0
+
+    @property
+    def direction_count(self) -> int:
+        """Number K of directions."""
+        return 0 if self.directions is None else self.directions.shape[3]
+
+    @property
+    def calibrated_state(self) -> Array:
+        """State of the film as it was calibrated, shape (1 + K,): zeros."""
+        return np.zeros(1 + self.direction_count)
 
     @property
     def corners_mm(self) -> Array:
-        """Corners (x, y) of a regular polygon that encloses the circle of `radius_mm`, shape (64, 2), mm."""
+        """Corners (x, y) of a regular polygon that encloses the circle of the domain, shape (64, 2), mm."""
         angle = 2.0 * np.pi * np.arange(N_CORNERS) / N_CORNERS
-        corner_distance_mm = self.radius_mm / np.cos(np.pi / N_CORNERS)  # the sides of the polygon touch the circle
+        corner_distance_mm = self.domain.radius / np.cos(np.pi / N_CORNERS)  # the sides of the polygon touch the circle
         return np.asarray(corner_distance_mm * np.column_stack([np.cos(angle), np.sin(angle)]))
 
-    def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Compute the charges of contacts, and the derivatives of the charges with respect to the contacts.
-
-        The series gives ln Q, the logarithm of the charge, as a function of coordinates between -1 and 1. The contacts
-        are converted to these coordinates. Outside the range of forces, ln Q is extrapolated linearly in the logarithm
-        of the force. The slope is taken from the nearest end of the range.
+    def charges(self, contact: Array) -> Array:
+        """Compute the charges of contacts on the calibrated film.
 
         Args:
-            contact: Contacts (x, y, ln F), shape (n, 3), with x and y in mm and F in N.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Charges, shape (n, n_electrode), pC. Derivatives of the charges with respect to x and y (pC/mm) and ln F
-            (pC), shape (n, n_electrode, 3).
+            Charges, shape (n, n_electrode), pC.
         """
-        # Coordinates of the series
-        min_log_force, max_log_force = np.log(self.force_N)
-        centre = np.array([0.0, 0.0, 0.5 * (min_log_force + max_log_force)])
-        scale = np.array([self.radius_mm, self.radius_mm, 0.5 * (max_log_force - min_log_force)])
-        unit_contact = (contact - centre) / scale
+        charge_pC, _ = self.linearised(contact)
+        return charge_pC
 
-        # ln Q, followed by its derivatives with respect to the three coordinates, shape (n, 4, n_electrode). The series
-        # is evaluated at the end of the range of forces if the force is outside this range.
-        values = self.series.values_and_derivatives(unit_contact)
-        log_charge = values[:, 0]
-        log_slopes = values[:, 1:]  # shape (n, 3, n_electrode)
-        log_force_slope = log_slopes[:, -1]  # with respect to the coordinate of the force, shape (n, n_electrode)
+    def derivatives(self, contact: Array) -> Array:
+        """Compute the derivatives of the charges with respect to (x, y, ln F); see `linearised`."""
+        _, by_contact = self.linearised(contact)
+        return by_contact
 
-        unit_force = unit_contact[:, 2:]  # shape (n, 1)
-        distance_from_range = unit_force - np.clip(unit_force, -1.0, 1.0)  # 0 within the range of forces
-        charge_pC = np.exp(log_charge + distance_from_range * log_force_slope)  # shape (n, n_electrode)
+    def linearised(self, contact: Array) -> tuple[Array, Array]:
+        """Compute the charges of contacts on the calibrated film, and the derivatives of the charges.
 
-        # dQ = Q d(ln Q). The division by the scale converts the derivatives with respect to the coordinates into
-        # derivatives with respect to the contact.
-        electrode_slopes = log_slopes.swapaxes(1, 2)  # shape (n, n_electrode, 3)
-        jacobian = charge_pC[:, :, None] * electrode_slopes / scale
-        return charge_pC, jacobian
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Charges, shape (n, n_electrode), pC. Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3),
+            pC/mm, pC/mm and pC.
+        """
+        nearest, excess = self._nearest_in_domain(contact)
+        return self._charges(_continued(self._calibrated.values_and_derivatives(nearest), excess), nearest, excess)
+
+    def changes(self, contact: Array, state: Array) -> ChargeChanges:
+        """Compute the charges of contacts for any state of the film, and the derivatives of the charges.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            state: State (t, z_1, ..., z_K) of the film, shape (1 + K,), or one state for each contact, shape
+                (n, 1 + K), MPa and standard deviations.
+        """
+        n_contact = len(contact)
+        n_electrode = len(self.electrodes)
+        nearest, excess = self._nearest_in_domain(contact)
+        node_values = _continued(self._node_series.values_and_derivatives(nearest), excess)
+        node_values = node_values.reshape(n_contact, 4, -1, n_electrode)
+        states = np.broadcast_to(state, (n_contact, 1 + self.direction_count))
+        weights, weight_slopes = interpolation_weights(self.node_MPa, states[:, 0])  # shape (n, n_node)
+
+        # v with its derivatives with respect to the contact, and the derivatives of v with respect to the state
+        value = np.einsum("nk,nske->nse", weights, node_values)  # shape (n, 4, n_electrode)
+        value_by_state = np.einsum("nk,nke->ne", weight_slopes, node_values[:, 0])[:, :, None]
+        if self._direction_series is not None:
+            direction_values = _continued(self._direction_series.values_and_derivatives(nearest), excess)
+            direction_values = direction_values.reshape(n_contact, 4, -1, n_electrode)
+            value = value + np.einsum("nk,nske->nse", states[:, 1:], direction_values)
+            value_by_state = np.concatenate([value_by_state, direction_values[:, 0].swapaxes(1, 2)], axis=2)
+
+        charge_pC, by_contact = self._charges(value, nearest, excess)
+        charge_per_value = self._charge_per_value(charge_pC, nearest, excess)
+        return ChargeChanges(charge_pC, by_contact, charge_per_value[:, :, None] * value_by_state)
+
+    def at_state(self, state: Array) -> "ChargeSeries":
+        """Return the map of the film in another state, which becomes the calibrated film of the result.
+
+        The result has a single node and no directions. It is evaluated faster than `changes`.
+
+        Args:
+            state: State (t, z_1, ..., z_K) of the film, shape (1 + K,), MPa and standard deviations.
+        """
+        weights, _ = interpolation_weights(self.node_MPa, state[:1])  # shape (1, n_node)
+        coefficients = np.tensordot(weights, self.coefficients, axes=1)
+        if self.directions is not None:
+            change = np.moveaxis(self.directions, 3, 0)
+            coefficients = _sum_of_series(coefficients, np.tensordot(state[None, 1:], change, axes=1))
+        pretension_MPa = self.pretension_MPa + float(state[0])
+        single_node_MPa = np.zeros(1)
+        return replace(
+            self,
+            coefficients=coefficients,
+            node_MPa=single_node_MPa,
+            directions=None,
+            pretension_MPa=pretension_MPa,
+        )
 
     def to_bytes(self) -> bytes:
         """Return the content of the file `charges.npz`."""
+        arrays: dict[str, Any] = {
+            "format": np.array(FORMAT),
+            "series": self.coefficients.astype(np.float32),
+            "node_MPa": self.node_MPa,
+            "radius_mm": np.array(self.domain.radius),
+            "force_N": np.array(self.domain.force_range),
+            "is_folded": np.array(int(self.is_folded)),
+            "charge_std": np.array(self.charge_std),
+            "pretension_MPa": np.array(self.pretension_MPa),
+            "tension_std_MPa": np.array(self.tension_std_MPa),
+        }
+        if self.direction_count > 0:
+            assert self.directions is not None
+            arrays["directions"] = self.directions.astype(np.float32)
+        if self.log_size is not None:
+            arrays["log_size"] = self.log_size
         file = io.BytesIO()
-        np.savez_compressed(
-            file, series=self.series.coefficients, radius_mm=np.array(self.radius_mm), force_N=np.array(self.force_N)
-        )
+        np.savez_compressed(file, **arrays)
         return file.getvalue()
 
+    @cached_property
+    def _calibrated(self) -> Series:
+        """Series of v for the film as it was calibrated."""
+        return Series(self.coefficients[self.node_MPa.searchsorted(0.0)])
 
-def read_charges(version_folder: Path, n_electrode: int) -> ChargeSeries | None:
-    """Read the series in the file `charges.npz` of a model. Return None if the model has no such file.
+    @cached_property
+    def _node_series(self) -> Series:
+        """Series of v at every node. Nodes and electrodes share the last axis."""
+        by_term = np.moveaxis(self.coefficients, 0, 3)
+        return Series(by_term.reshape(*by_term.shape[:3], -1))
+
+    @cached_property
+    def _direction_series(self) -> Series | None:
+        """Series of the changes of v by all directions. Directions and electrodes share the last axis."""
+        if self.direction_count == 0:
+            return None
+        assert self.directions is not None
+        return Series(self.directions.reshape(*self.directions.shape[:3], -1))
+
+    def _nearest_in_domain(self, contact: Array) -> tuple[Array, Array]:
+        """Return the nearest contacts in the domain, and the differences to them, in unit coordinates.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Unit coordinates of the nearest contacts, shape (n, 3), and the differences, shape (n, 3), dimensionless.
+            The differences of contacts in the domain are zero.
+        """
+        unit_contact = self.domain.to_unit(contact)
+        nearest = np.clip(unit_contact, -1.0, 1.0)
+        distance = np.hypot(unit_contact[:, 0], unit_contact[:, 1])
+        nearest[:, :2] = unit_contact[:, :2] / np.maximum(distance, 1.0)[:, None]
+        return nearest, unit_contact - nearest
+
+    def _charges(self, value: Array, nearest: Array, excess: Array) -> tuple[Array, Array]:
+        """Convert values v of the series into charges.
+
+        Args:
+            value: v and its derivatives with respect to the unit coordinates, shape (n, 4, n_electrode).
+            nearest: Nearest contacts in the domain, as `_nearest_in_domain` returns them.
+            excess: Differences to the nearest contacts.
+
+        Returns:
+            The result of `linearised`.
+        """
+        slopes = value[:, 1:].swapaxes(1, 2)  # shape (n, n_electrode, 3)
+        if self.log_size is None:  # Q = exp(v)
+            charge_pC = _limited_exp(value[:, 0])
+            by_unit_contact = charge_pC[:, :, None] * slopes
+        else:  # Q = S(l) v, so the derivative with respect to l is S (v' + (ln S)' v)
+            size_pC, log_size_slope = self._size(nearest, excess)
+            charge_pC = size_pC * value[:, 0]
+            by_unit_contact = size_pC[:, :, None] * slopes
+            by_unit_contact[:, :, 2] += log_size_slope * charge_pC
+        return charge_pC, by_unit_contact / self.domain.scale
+
+    def _charge_per_value(self, charge_pC: Array, nearest: Array, excess: Array) -> Array:
+        """Return the derivative of each charge with respect to its value v, shape (n, n_electrode), pC."""
+        if self.log_size is None:
+            return charge_pC
+        size_pC, _ = self._size(nearest, excess)
+        return np.broadcast_to(size_pC, charge_pC.shape)
+
+    def _size(self, nearest: Array, excess: Array) -> tuple[Array, Array]:
+        """Compute the size S of the charges, pC, and the derivative of ln S with respect to l, each of shape (n, 1)."""
+        assert self.log_size is not None
+        return series_size(self.log_size, nearest[:, 2], excess[:, 2])
+
+
+def series_size(log_size: Array, unit_log_force: Array, excess: Array | float = 0.0) -> tuple[Array, Array]:
+    """Compute the typical size S of charges, and the derivative of ln S with respect to l.
+
+    Args:
+        log_size: Chebyshev coefficients of ln S as a function of l.
+        unit_log_force: Logarithms l of the forces, scaled to [-1, 1], shape (n,).
+        excess: Amount by which l exceeds this range, shape (n,) or a number. ln S is continued linearly.
+
+    Returns:
+        The size S, pC, and the derivative of ln S, dimensionless, each of shape (n, 1).
+    """
+    slope = chebyshev.chebval(unit_log_force, chebyshev.chebder(log_size))
+    log_sizes = chebyshev.chebval(unit_log_force, log_size) + excess * slope
+    return _limited_exp(log_sizes)[:, None], np.asarray(slope, dtype=float)[:, None]
+
+
+def _limited_exp(logarithm: Array) -> Array:
+    """Compute exponential functions. The magnitudes of the arguments are limited to `MAX_VALUE`."""
+    return np.asarray(np.exp(np.clip(logarithm, -MAX_VALUE, MAX_VALUE)))
+
+
+def interpolation_weights(nodes: Array, points: Array) -> tuple[Array, Array]:
+    """Compute the weights of a polynomial interpolation between nodes (Lagrange), and their derivatives.
+
+    Outside the range of the nodes, the interpolation is continued linearly.
+
+    Args:
+        nodes: Nodes, shape (n_node,), ascending.
+        points: Points at which values are interpolated, shape (n,).
+
+    Returns:
+        Weights of the values at the nodes, and the derivatives of the weights with respect to the points, each of shape
+        (n, n_node).
+    """
+    clipped = np.clip(points, nodes[0], nodes[-1])
+    # With the Vandermonde matrix V of the nodes, the weights of a point p are (1, p, p^2, ...) V^-1.
+    scale = max(float(np.abs(nodes).max()), 1e-12)  # of all powers, so that the matrix is well conditioned
+    powers = np.arange(nodes.size)
+    inverse = np.linalg.inv(np.power.outer(nodes / scale, powers))
+    point_powers = np.power.outer(clipped / scale, powers)
+    power_slopes = np.zeros_like(point_powers)
+    power_slopes[:, 1:] = powers[1:] * point_powers[:, :-1] / scale
+    slopes = power_slopes @ inverse
+    return point_powers @ inverse + (points - clipped)[:, None] * slopes, slopes
+
+
+def _continued(values: Array, excess: Array) -> Array:
+    """Continue a series linearly beyond the contacts at which it was evaluated.
+
+    Args:
+        values: Values and derivatives, shape (n, 4, k), as `Series.values_and_derivatives` returns them. The values are
+            changed in place.
+        excess: Differences between the contacts and these evaluated contacts, in unit coordinates, shape (n, 3).
+    """
+    if excess.any():
+        values[:, 0] += np.einsum("ns,nsk->nk", excess, values[:, 1:])
+    return values
+
+
+def _sum_of_series(first: Array, second: Array) -> Array:
+    """Add coefficients of two series whose degrees may differ; all axes but the first and the last contain degrees."""
+    shape = np.maximum(first.shape, second.shape)
+    total = np.zeros(shape)
+    for coefficients in (first, second):
+        total[tuple(slice(0, length) for length in coefficients.shape)] += coefficients
+    return total
+
+
+def read_charges(version_folder: Path, electrodes: tuple[str, ...]) -> ChargeSeries | None:
+    """Read the charge map in the file `charges.npz` of a model. Return None if the model has no such file.
 
     Args:
         version_folder: Folder of the model, which contains `model.onnx`.
-        n_electrode: Number of electrodes of the model.
+        electrodes: Names of the electrodes of the model.
 
     Raises:
-        ModelError: If the file is damaged, belongs to another model, or does not describe the charges of contacts.
+        ModelError: If the file is damaged, has another format, belongs to another model, or does not describe the
+            charges of contacts.
     """
     path = version_folder / FILE
     if not path.exists():
         return None
     data = read_companion_file(version_folder, FILE, ADVICE)
     try:
-        return _charges_from_arrays(npz_arrays(data), n_electrode)
+        return _charges_from_arrays(npz_arrays(data), electrodes)
     except DAMAGED_FILE_ERRORS as error:
         raise ModelError(f"{path}: {cut(str(error))}; {ADVICE}") from error
 
 
-def _charges_from_arrays(arrays: Mapping[str, np.ndarray], n_electrode: int) -> ChargeSeries:
-    """Create the Chebyshev series of the charges from the arrays of a file, and check the series.
-
-    The logarithm of the charge of each electrode is a Chebyshev series in x, y and the logarithm of the force. Along
-    each of these three axes, a series of degree n has n + 1 coefficients.
+def _charges_from_arrays(arrays: Mapping[str, np.ndarray], electrodes: tuple[str, ...]) -> ChargeSeries:
+    """Create the charge map from the arrays of a file, and check the map.
 
     Args:
         arrays: Arrays of the file by name.
-        n_electrode: Number of electrodes of the model.
+        electrodes: Names of the electrodes of the model.
 
     Raises:
-        ValueError: If an array is missing or not valid.
+        ValueError: If an array is missing or not valid, or the arrays do not fit together.
     """
-    coefficients = finite_array(arrays, "series", (None, None, None, n_electrode))
-    x_count, y_count, force_count, _electrode_count = coefficients.shape
-    x_degree = x_count - 1
-    y_degree = y_count - 1
-    force_degree = force_count - 1
-    has_equal_degrees = x_degree == y_degree
-    has_valid_degrees = 1 <= x_degree <= MAX_DEGREE and 1 <= force_degree <= MAX_DEGREE
-    if not (has_equal_degrees and has_valid_degrees):
+    file_format = int(arrays["format"]) if "format" in arrays else 1
+    if file_format != FORMAT:
+        raise ValueError(f"format {file_format} is not supported (this version reads {FORMAT})")
+    node_MPa = finite_array(arrays, "node_MPa", (None,))
+    gaps_MPa = np.diff(node_MPa)
+    if not (
+        node_MPa.size <= MAX_NODES
+        and 0.0 in node_MPa
+        and (gaps_MPa >= MIN_NODE_DISTANCE_MPa).all()
+        and np.abs(node_MPa).max() <= MAX_PRETENSION_MPa
+    ):
         raise ValueError(
-            f"series: expected equal degrees in x and y and degrees from 1 to {MAX_DEGREE}, got {x_degree}, "
-            f"{y_degree} and {force_degree} in the force"
+            f"node_MPa: expected up to {MAX_NODES} rising changes up to {MAX_PRETENSION_MPa:g} MPa with 0 among them, "
+            f"got {cut(str(node_MPa))}"
         )
-    radius_mm, force_N = read_contact_range(arrays)
-    charges = ChargeSeries(Series(coefficients), radius_mm, force_N)
-    _check_charges(charges)
-    return charges
+    series = ChargeSeries(
+        domain=_read_domain(arrays),
+        electrodes=electrodes,
+        coefficients=_read_series(arrays, "series", (node_MPa.size, None, None, None, len(electrodes))),
+        node_MPa=node_MPa,
+        directions=_read_directions(arrays, len(electrodes)),
+        log_size=_read_log_size(arrays),
+        is_folded=_read_number(arrays, "is_folded", 0.0, 1.0) == 1.0,
+        charge_std=_read_number(arrays, "charge_std", 0.0, 1.0),
+        pretension_MPa=_read_number(arrays, "pretension_MPa", -MAX_PRETENSION_MPa, MAX_PRETENSION_MPa),
+        tension_std_MPa=_read_number(arrays, "tension_std_MPa", 0.0, MAX_PRETENSION_MPa),
+    )
+    _check_dependence(series)
+    return series
 
 
-def read_contact_range(arrays: Mapping[str, np.ndarray]) -> tuple[float, tuple[float, float]]:
-    """Read the range of contacts for which a series is valid from the arrays `radius_mm` and `force_N` of a file.
+def _read_number(arrays: Mapping[str, np.ndarray], name: str, smallest: float, largest: float) -> float:
+    """Return the number in an array of a file.
 
-    Args:
-        arrays: Arrays of the file by name.
+    Raises:
+        ValueError: If the array is missing or not a single number, or the number is outside the given range.
+    """
+    value = finite_number(arrays, name)
+    if not smallest <= value <= largest:
+        raise ValueError(f"{name}: expected a number from {smallest:g} to {largest:g}, got {value:g}")
+    return value
 
-    Returns:
-        The largest distance of a contact from the centre, mm, and the smallest and the largest force, N.
+
+def _read_domain(arrays: Mapping[str, np.ndarray]) -> Domain:
+    """Read the contacts for which a map is valid from the arrays `radius_mm` and `force_N` of a file.
 
     Raises:
         ValueError: If an array is missing or not valid.
@@ -187,36 +482,79 @@ def read_contact_range(arrays: Mapping[str, np.ndarray]) -> tuple[float, tuple[f
     if not 0.0 < radius_mm <= MAX_RADIUS_mm:
         raise ValueError(f"radius_mm: expected a radius up to {MAX_RADIUS_mm:g} mm, got {radius_mm:g}")
     min_force_N, max_force_N = finite_array(arrays, "force_N", (2,)).tolist()
-    if not (min_force_N > 0.0 and max_force_N >= MIN_FORCE_RATIO * min_force_N):
+    if not 0.0 < min_force_N <= max_force_N:
         raise ValueError(
-            f"force_N: expected a smallest force above 0 and a largest force of at least {MIN_FORCE_RATIO:g} times the "
-            f"smallest, got {min_force_N:g} and {max_force_N:g} N"
+            "force_N: expected a smallest force above 0 and a largest force that is not smaller, got "
+            f"{min_force_N:g} and {max_force_N:g} N"
         )
-    return radius_mm, (min_force_N, max_force_N)
+    return Domain(radius_mm, (min_force_N, max_force_N))
 
 
-def _check_charges(charges: ChargeSeries) -> None:
-    """For some contacts, check that the charges are finite and positive, and that they depend on the contact.
+def _read_series(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None, ...]) -> Array:
+    """Read the coefficients of Chebyshev series from an array of a file.
 
-    The contacts lie on a circle with half of the largest radius of the series. Several forces are checked at each point
-    of the circle.
+    Args:
+        arrays: Arrays of the file by name.
+        name: Name of the array.
+        shape: Expected shape of the coefficients; None stands for any length.
 
     Raises:
-        ValueError: If a charge or a derivative is not finite, if a charge is not positive, or if all charges are
-            independent of x, of y or of the force.
+        ValueError: If the array is missing, has another shape or too high degrees, or describes too large values.
     """
-    angle = np.linspace(0.0, 2.0 * np.pi, N_CHECKED_DIRECTIONS, endpoint=False)
-    positions_mm = 0.5 * charges.radius_mm * np.column_stack([np.cos(angle), np.sin(angle)])
-    min_force_N, max_force_N = charges.force_N
-    log_forces = np.log(np.geomspace(min_force_N, max_force_N, N_CHECKED_FORCES))
-    contacts = np.array([[x_mm, y_mm, log_force] for x_mm, y_mm in positions_mm for log_force in log_forces])
-    with np.errstate(over="ignore", invalid="ignore"):  # charges that overflow are reported below
-        charge_pC, slopes = charges.linearised(contacts)  # shapes (n, n_electrode) and (n, n_electrode, 3)
+    coefficients = finite_array(arrays, name, shape)
+    degree_axes = (1, 2, 3) if name == "series" else (0, 1, 2)
+    x_degree, y_degree, force_degree = (coefficients.shape[axis] - 1 for axis in degree_axes)
+    if x_degree != y_degree or max(x_degree, force_degree) > MAX_DEGREE:
+        raise ValueError(
+            f"{name}: expected equal degrees in x and y and degrees up to {MAX_DEGREE}, got the shape "
+            f"{coefficients.shape}"
+        )
+    # The magnitude of a Chebyshev polynomial is at most 1. The magnitude of a series is therefore at most the sum of
+    # the magnitudes of its coefficients.
+    largest_value = float(np.abs(coefficients).sum(axis=degree_axes).max())
+    if largest_value > MAX_VALUE:
+        raise ValueError(f"{name}: expected values up to {MAX_VALUE:g}, got up to {largest_value:g}")
+    return coefficients
 
-    is_finite = np.isfinite(charge_pC).all() and np.isfinite(slopes).all()
-    if not (is_finite and (charge_pC > 0.0).all()):
-        raise ValueError("series: expected charges that are finite and positive for every contact")
-    # Largest magnitude of the derivatives with respect to x, y and ln F over all contacts and electrodes, shape (3,)
-    largest_slopes = np.abs(slopes).max(axis=(0, 1))
-    if not (largest_slopes > 0.0).all():
+
+def _read_directions(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Array | None:
+    """Read the coefficients of the directions from a file, or return None if the file contains no directions.
+
+    Raises:
+        ValueError: If the coefficients are not valid.
+    """
+    if "directions" not in arrays:
+        return None
+    directions = _read_series(arrays, "directions", (None, None, None, None, n_electrode))
+    if directions.shape[3] > MAX_DIRECTIONS:
+        raise ValueError(f"directions: expected up to {MAX_DIRECTIONS}, got the shape {directions.shape}")
+    return directions
+
+
+def _read_log_size(arrays: Mapping[str, np.ndarray]) -> Array | None:
+    """Read the coefficients of ln S from a file, or return None if all charges of the map are positive.
+
+    Raises:
+        ValueError: If the coefficients are not valid.
+    """
+    if "log_size" not in arrays:
+        return None
+    log_size = finite_array(arrays, "log_size", (None,))
+    if log_size.size > MAX_DEGREE or np.abs(log_size).sum() > MAX_VALUE:
+        raise ValueError(f"log_size: expected values up to {MAX_VALUE:g}, got the coefficients {cut(str(log_size))}")
+    return log_size
+
+
+def _check_dependence(series: ChargeSeries) -> None:
+    """Check that the charges of the calibrated film depend on x, on y and on the force.
+
+    The force is not checked if the domain has a single force.
+
+    Raises:
+        ValueError: If all charges are independent of x, of y or of the force.
+    """
+    calibrated = series._calibrated.coefficients
+    smallest_N, largest_N = series.domain.force_range
+    depends_on_force = calibrated[:, :, 1:].any() or series.log_size is not None or smallest_N == largest_N
+    if not (calibrated[1:].any() and calibrated[:, 1:].any() and depends_on_force):
         raise ValueError("series: expected charges that change with x, y and the force")

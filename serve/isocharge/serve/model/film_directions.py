@@ -30,9 +30,8 @@ from isocharge.common.arrays import Array
 from isocharge.common.chebyshev_series import Series
 from isocharge.common.errors import ModelError, cut
 from isocharge.common.npz import DAMAGED_FILE_ERRORS, finite_array, npz_arrays
-from isocharge.serve.model.charge_series import read_contact_range
 from isocharge.serve.model.companion_files import read_companion_file
-from isocharge.serve.model.contact_range import clipped_unit_contact
+from isocharge.serve.model.contact_range import clipped_unit_contact, read_contact_range
 
 FILE = "film_directions.npz"
 """Name of the file in a version folder."""

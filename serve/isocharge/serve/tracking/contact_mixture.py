@@ -53,6 +53,7 @@ from isocharge.serve.tracking.mixture_update import (
     LinearisedUpdate,
     Measurement,
     charges_and_jacobian,
+    film_charges,
     limit_iteration_steps,
     linearise_update,
     updated_covariance,
@@ -242,7 +243,7 @@ class ContactMixture:
 
         # Standard deviation of each entry of the state. Each component covers an equal part of the film.
         std = np.empty(N_MOTION + n_electrode)
-        std[POSITION] = self.charges.radius_mm / math.sqrt(N_INITIAL_COMPONENTS)
+        std[POSITION] = self.charges.domain.radius / math.sqrt(N_INITIAL_COMPONENTS)
         std[LOG_FORCE] = INITIAL_LOG_FORCE_STD
         std[VELOCITY] = SPEED_STD
         std[LOG_FORCE_RATE] = FORCE_RATE_STD
@@ -362,7 +363,7 @@ class ContactMixture:
         _sign, log_determinant = np.linalg.slogdet(linearised.innovation_covariance)
         log_weight = prior.log_weight - 0.5 * (squared_distance + log_determinant)
 
-        is_outside_film = np.hypot(states[:, X], states[:, Y]) > MAX_RELATIVE_RADIUS * self.charges.radius_mm
+        is_outside_film = np.hypot(states[:, X], states[:, Y]) > MAX_RELATIVE_RADIUS * self.charges.domain.radius
         log_weight[is_outside_film] = -np.inf
         best = int(log_weight.argmax())  # the most probable component
         is_any_inside = np.isfinite(log_weight[best])
@@ -440,7 +441,7 @@ class ContactMixture:
             Whether the number of folds between `state` and each other state is odd, shape (n,).
         """
         states = np.vstack([state, other_states])
-        _charges, jacobians = self.charges.linearised(states[:, CONTACT])
+        _charges, jacobians = film_charges(self.charges, states)
         state_jacobian = jacobians[0]  # shape (n_electrode, 3)
         other_jacobians = jacobians[1:]
 
@@ -538,10 +539,10 @@ def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
     """
     contact_number = np.arange(N_INITIAL_COMPONENTS)
     angle = GOLDEN_ANGLE * contact_number
-    radius_mm = charges.radius_mm * np.sqrt((contact_number + 0.5) / N_INITIAL_COMPONENTS)
+    radius_mm = charges.domain.radius * np.sqrt((contact_number + 0.5) / N_INITIAL_COMPONENTS)
     x_mm = radius_mm * np.cos(angle)
     y_mm = radius_mm * np.sin(angle)
-    medium_log_force = np.log(charges.force_N).mean()  # of the smallest and the largest force
+    medium_log_force = np.log(charges.domain.force_range).mean()  # of the smallest and the largest force
     log_force = np.full(N_INITIAL_COMPONENTS, medium_log_force)
     return np.column_stack([x_mm, y_mm, log_force])
 
@@ -553,12 +554,12 @@ def contact_mixture(predictor: Predictor) -> ContactMixture | None:
         predictor: The model.
 
     Returns:
-        The mixture; None if the model has no file `charges.npz`.
+        The mixture; None if the model has no file `charges.npz`, or if the map in the file has no fold.
 
     Raises:
         ModelError: If the file `charges.npz` is damaged.
     """
-    charges = read_charges(predictor.folder, len(predictor.metadata.electrodes))
-    if charges is None:
+    charges = read_charges(predictor.folder, predictor.metadata.electrodes)
+    if charges is None or not charges.is_folded:
         return None
     return ContactMixture(charges, predictor.metadata.noise)

@@ -49,6 +49,21 @@ class LinearisedUpdate(NamedTuple):
     weighted_innovation: Array
 
 
+def film_charges(charges: ChargeSeries, states: Array) -> tuple[Array, Array]:
+    """Compute the charges that the film produces for states, and their derivatives with respect to (x, y, ln F).
+
+    Args:
+        charges: Charges that the film produces for every contact.
+        states: States, as `charges_and_jacobian` expects them. Contacts outside the range of forces are allowed.
+
+    Returns:
+        The charges, shape (n, n_electrode), pC, and the derivatives, shape (n, n_electrode, 3).
+    """
+    contacts = states[:, CONTACT].copy()
+    contacts[:, 2] = np.exp(contacts[:, 2])  # a state contains the logarithm of the force
+    return charges.linearised(contacts)
+
+
 def charges_and_jacobian(charges: ChargeSeries, states: Array) -> tuple[Array, Array]:
     """Compute the expected measured charges for states, and their derivatives with respect to the states.
 
@@ -62,7 +77,7 @@ def charges_and_jacobian(charges: ChargeSeries, states: Array) -> tuple[Array, A
     Returns:
         The charges, shape (n, n_electrode), pC, and the derivatives, shape (n, n_electrode, 6 + n_electrode).
     """
-    film_charge_pC, film_jacobian = charges.linearised(states[:, CONTACT])
+    film_charge_pC, film_jacobian = film_charges(charges, states)
     gains = np.exp(states[:, GAINS])  # a state contains the logarithms of the gains
     charge_pC = film_charge_pC * gains
 

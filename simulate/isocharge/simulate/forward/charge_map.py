@@ -9,7 +9,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array
+from isocharge.common.contact_domain import LIMIT_TOLERANCE, Domain, are_within
 from isocharge.common.errors import ChargeError, SceneError
 
 STEPS = (0.05, 0.05, 1e-3)
@@ -20,150 +21,6 @@ ONE_SIDED_STEPS = (0.01, 0.01, 1e-3)
 
 They are smaller than `STEPS`, because the error of a one-sided difference decreases only linearly with the step.
 """
-
-MIN_LOG_FORCE_HALF_WIDTH = 0.05
-"""Smallest half width of a domain in ln F, dimensionless.
-
-If a domain contains a single force, its half width would be zero, and contacts could not be scaled by it.
-"""
-
-LIMIT_TOLERANCE = 1.0 + 1e-9
-"""Factor by which a distance or a force may exceed the limits of a domain, in order to allow for rounding errors."""
-
-
-@dataclass(frozen=True)
-class Domain:
-    """Set of contacts for which a charge map is valid.
-
-    The positions of the contacts lie in a disk around the centre of the film, and the forces lie in an interval.
-
-    Attributes:
-        radius: Largest distance from the centre, mm.
-        force_range: Smallest and largest force, N.
-    """
-
-    radius: float
-    force_range: tuple[float, float]
-
-    @property
-    def centre(self) -> Array:
-        """Centre of the domain in the coordinates x (mm), y (mm) and ln F, where F is the force in N, shape (3,)."""
-        low, high = np.log(self.force_range)
-        return np.array([0.0, 0.0, 0.5 * (low + high)])
-
-    @property
-    def scale(self) -> Array:
-        """Half width of the domain along x (mm), y (mm) and ln F, where F is the force in N, shape (3,)."""
-        low, high = np.log(self.force_range)
-        return np.array([self.radius, self.radius, max(0.5 * (high - low), MIN_LOG_FORCE_HALF_WIDTH)])
-
-    def is_outside(self, contact: Array) -> Booleans:
-        """Return whether each contact lies outside the disk or has a force outside the range of forces.
-
-        Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N. A position or a force that is NaN counts as inside.
-
-        Returns:
-            Whether each contact lies outside, shape (n,).
-        """
-        x, y, force = contact.T
-        low, high = self.force_range
-        return np.asarray((np.hypot(x, y) > self.radius) | (force < low) | (force > high))
-
-    def to_unit(self, contact: Array) -> Array:
-        """Convert contacts (x, y, F) into coordinates (x, y, ln F) that are scaled to the cube [-1, 1]^3.
-
-        Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-
-        Returns:
-            Scaled coordinates, shape (n, 3), dimensionless.
-        """
-        log_contact = np.stack([contact[:, 0], contact[:, 1], np.log(contact[:, 2])], axis=1)
-        return np.asarray((log_contact - self.centre) / self.scale)
-
-    def to_contact(self, unit: Array) -> Array:
-        """Convert the scaled coordinates that `to_unit` returns back into contacts (x, y, F).
-
-        Args:
-            unit: Scaled coordinates, shape (..., 3), dimensionless.
-
-        Returns:
-            Contacts (x, y, F), shape (..., 3), mm and N.
-        """
-        contact: Array = unit * self.scale + self.centre
-        contact[..., 2] = np.exp(contact[..., 2])
-        return contact
-
-    @property
-    def _allowed_positions(self) -> str:
-        """Description of the allowed positions for error messages."""
-        return f"at most {self.radius:g} mm from the centre"
-
-    def within(self, radius: float) -> "Domain":
-        """Return a copy of the domain with another radius (mm) and the same range of forces."""
-        return Domain(radius, self.force_range)
-
-    def contains(self, contact: Array) -> Booleans:
-        """Return whether each contact lies in the domain.
-
-        The comparison allows for rounding errors. A contact that contains NaN lies outside.
-
-        Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-
-        Returns:
-            Whether each contact lies in the domain, shape (n,).
-        """
-        is_in_disk = np.hypot(contact[:, 0], contact[:, 1]) <= self.radius * LIMIT_TOLERANCE
-        return np.asarray(is_in_disk & _are_within(contact[:, 2], self.force_range))
-
-    def check(self, contact: Array, source: str) -> Array:
-        """Convert contacts into an array of floats, and raise an error if a contact lies outside the domain.
-
-        Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            source: Name of the charge map in the error message, such as "forward map".
-
-        Returns:
-            The same contacts as an array of floats, shape (n, 3).
-
-        Raises:
-            SceneError: If the array does not have the shape (n, 3), or a contact lies outside the domain.
-        """
-        contact = as_contacts(contact, source)
-        is_inside = self.contains(contact)
-        if not is_inside.all():
-            first_outside = int(np.argmin(is_inside))  # index of the first False
-            x, y, force = contact[first_outside]
-            low, high = self.force_range
-            raise SceneError(
-                f"press {first_outside} at ({x:.4g}, {y:.4g}) mm with {force:.4g} N is outside the {source}: expected "
-                f"{self._allowed_positions} and {low:g} to {high:g} N"
-            )
-        return contact
-
-
-def as_contacts(contact: Array, source: str) -> Array:
-    """Convert contacts into an array of floats, and check that the array has the shape (n, 3).
-
-    Args:
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        source: Name of the charge map in the error message, such as "forward map".
-
-    Returns:
-        The same contacts as an array of floats, shape (n, 3).
-
-    Raises:
-        SceneError: If the array has another shape.
-    """
-    contact = np.asarray(contact, dtype=float)
-    if contact.ndim != 2 or contact.shape[1] != 3:
-        raise SceneError(
-            f"{source}: expected contacts (x, y, F), shape (n, 3), mm and N, like [[3.0, -2.0, 1.0]], got shape "
-            f"{contact.shape}"
-        )
-    return contact
 
 
 class ChargeMap(Protocol):
@@ -373,7 +230,7 @@ def check_forces(force: Array | float, force_range: tuple[float, float], source:
         SceneError: If a force lies outside the range or is NaN.
     """
     forces = np.atleast_1d(force)
-    is_inside = _are_within(forces, force_range)
+    is_inside = are_within(forces, force_range)
     if not is_inside.all():
         low, high = force_range
         first_outside = int(np.argmin(is_inside))  # index of the first False
@@ -381,19 +238,6 @@ def check_forces(force: Array | float, force_range: tuple[float, float], source:
         raise SceneError(
             f"{name}: expected {low:g} to {high:g} N, which the {source} covers, got {forces[first_outside]:g} N"
         )
-
-
-def _are_within(force: Array, force_range: tuple[float, float]) -> Booleans:
-    """Return whether each force lies in a range.
-
-    The comparison allows for rounding errors. A force that is NaN lies outside the range.
-
-    Args:
-        force: Forces, shape (n,), N.
-        force_range: Smallest and largest force of the range, N.
-    """
-    low, high = force_range
-    return np.asarray((force >= low / LIMIT_TOLERANCE) & (force <= high * LIMIT_TOLERANCE))
 
 
 def check_radius(radius: float, largest: float, source: str) -> None:

@@ -17,7 +17,8 @@ import numpy as np
 import scipy  # scipy.interpolate is imported when it is used
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.simulate.forward.charge_map import ChargeMap, Domain, check_radius
+from isocharge.common.contact_domain import Domain
+from isocharge.simulate.forward.charge_map import ChargeMap, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.numerics.disk import lattice, onto_disk, sunflower

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
+from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import SceneError
 from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
-from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.mesh.template import Template

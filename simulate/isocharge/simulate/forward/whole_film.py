@@ -9,7 +9,7 @@ from concurrent.futures import Executor
 
 import numpy as np
 
-from isocharge.simulate.forward.charge_map import Domain
+from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.family import Family, NodeCount, check_family
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.theory import Theory

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.simulate.forward.charge_map import ChargeMap, Domain, within
+from isocharge.common.contact_domain import Domain
+from isocharge.simulate.forward.charge_map import ChargeMap, within
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.simulate.measuring_chain.noise import NoiseModel

@@ -8,9 +8,9 @@ import numpy as np
 import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array
+from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import InputError
 from isocharge.common.files import read_whole
-from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.family import check_family
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import NOISE_LEVELS

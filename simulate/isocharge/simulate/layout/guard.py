@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.contact_domain import Domain
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import InputError
 from isocharge.common.progress import track
-from isocharge.simulate.forward.charge_map import ChargeMap, Domain
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.whole_film import whole_film_map

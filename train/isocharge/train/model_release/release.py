@@ -15,13 +15,13 @@ import numpy as np
 from msgspec import structs
 
 from isocharge.common.arrays import Array
+from isocharge.common.contact_domain import Domain
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import ModelError
 from isocharge.common.structs import convert
 from isocharge.serve.model.golden import contact_floors
 from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
 from isocharge.serve.model.model_folder import check_target, write_model
-from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
 from isocharge.train.model_release.evaluate import evaluate

@@ -17,7 +17,7 @@ from isocharge.common.arrays import Array
 from isocharge.simulate import ChargeMap, Domain, NoiseModel
 from isocharge.simulate.identifiability.nearest_contact import explain
 from isocharge.train.data.channel_noise import BOTH_SIGNS, MIN_TRANSITION_RATIO, usual_size
-from isocharge.train.data.charge_field import ChargeField
+from isocharge.train.data.charge_fit import fit_charge_series
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses, split_by_position
 
 N_STARTS = 600
@@ -85,7 +85,7 @@ class GaussNewton:
     Args:
         domain: Contacts that can occur.
         noise: Noise whose standard deviation is the unit of the residuals.
-        charge_map: Map from contacts to charges; None to fit a `ChargeField` to the presses.
+        charge_map: Map from contacts to charges; None to fit a `ChargeSeries` to the presses.
         seed: Seed of the random choice of the starts.
     """
 
@@ -113,7 +113,7 @@ class GaussNewton:
             n_electrode = charge.shape[1]
             electrode_names = tuple(str(electrode_index) for electrode_index in range(n_electrode))
             train, validation = split_by_position(presses, VALIDATION_FRACTION, self.seed)
-            self.map_ = ChargeField.fit(self.domain, electrode_names, train, validation)
+            self.map_ = fit_charge_series(self.domain, electrode_names, train, validation)
 
         # Choose some presses at random as starts of the searches. A search begins at the start whose charges are most
         # similar to the measured charges. The tree finds this start by the whitened logarithms of the charges.

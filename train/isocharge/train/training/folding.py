@@ -12,8 +12,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from isocharge.common.arrays import Array
+from isocharge.common.contact_domain import Domain
 from isocharge.common.perceptron import Layer, Perceptron
-from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.training.folded_network import (
     LOG_FORCE,
     LOG_STD,

@@ -22,8 +22,8 @@ from torch import Tensor, nn
 
 from isocharge.common.activations import ACTIVATIONS, TANH, Activation
 from isocharge.common.arrays import Array
+from isocharge.common.contact_domain import Domain
 from isocharge.common.perceptron import Layer, Perceptron
-from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.folded_network import (

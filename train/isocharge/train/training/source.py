@@ -8,8 +8,8 @@ import numpy as np
 from torch import Tensor
 
 from isocharge.common.arrays import Array
+from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import Dataset, Domain, Sensor
-from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.measured_checks import check_measured_dataset
 from isocharge.train.data.presses import LabelledPresses, domain_of, outside_presses_of, presses_of, yield_force_of
 from isocharge.train.training.fitted import Provenance
@@ -85,7 +85,7 @@ class TrainingData:
     test: LabelledPresses | None = None
     teacher: Teacher | None = None
     provenance: Provenance = dataclass_field(default_factory=Provenance)
-    field: ChargeField | None = None
+    field: ChargeSeries | None = None
 
     @classmethod
     def of(cls, dataset: Dataset) -> "TrainingData":

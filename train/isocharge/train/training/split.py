@@ -6,7 +6,8 @@ from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import ChargeMap, Domain, NoiseModel
 from isocharge.simulate.forward.charge_map import within
 from isocharge.train.data.channel_noise import ChannelNoise
-from isocharge.train.data.charge_field import ChargeField, invertible_domain
+from isocharge.train.data.charge_fit import fit_charge_series
+from isocharge.train.data.invertible_domain import invertible_domain
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.presses import LabelledPresses, held_out, split_by_position
 from isocharge.train.training.config import TrainingConfig
@@ -39,7 +40,7 @@ class Split:
             more accurate.
         cautions: Sentences about folds of the map and about contacts with the same charges.
         folded_charges: Approximation of the charges by a series, which includes the region where the map folds; None if
-            the map does not fold or if the charges have both signs.
+            the map does not fold.
     """
 
     domain: Domain
@@ -67,7 +68,7 @@ class Split:
         presses = data.presses
         electrode_names = data.sensor.electrode_names
         field_train, field_validation = split_by_position(presses, training.hold_out, training.seed)
-        first_field = data.field or ChargeField.fit(data.domain, electrode_names, field_train, field_validation)
+        first_field = data.field or fit_charge_series(data.domain, electrode_names, field_train, field_validation)
         domain, cautions = invertible_domain(first_field, presses, misfit_noise(training.noise_model))
         is_folded = domain != data.domain  # `invertible_domain` reduces the domain only if the map folds
         used_presses = presses.within(domain.radius) if is_folded else presses
@@ -79,10 +80,10 @@ class Split:
         # the first field was also fitted to test presses.
         field: ChargeMap = first_field
         if is_folded or presses.measured:
-            second_field = ChargeField.fit(domain, electrode_names, train, validation)
-            is_first_better = is_folded and first_field.error < second_field.error
+            second_field = fit_charge_series(domain, electrode_names, train, validation)
+            is_first_better = is_folded and first_field.charge_std < second_field.charge_std
             field = within(first_field, domain.radius) if is_first_better else second_field
-        folded_charges = first_field.positive_series if is_folded else None  # also None if some charges are negative
+        folded_charges = replace(first_field, is_folded=True) if is_folded else None
         return cls(domain, train, validation, test, field, cautions, folded_charges)
 
     def features(self, noise: NoiseModel) -> WhitenedFeatures:

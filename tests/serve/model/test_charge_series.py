@@ -1,0 +1,243 @@
+"""Charge series against closed forms and finite differences, and the reader of `charges.npz` with damaged files."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from attacks.companions import ELECTRODES, charge_arrays
+from isocharge.common.contact_domain import Domain
+from isocharge.common.errors import ModelError
+from isocharge.serve.model.charge_series import ChargeSeries, interpolation_weights, read_charges
+
+DOMAIN = Domain(8.0, (0.05, 2.0))
+NODES = np.array([-0.5, 0.0, 0.25])
+
+
+def random_series(*, is_signed=False, seed=0):
+    """Return a series with three nodes, two directions of other degrees, and random coefficients."""
+    rng = np.random.default_rng(seed)
+    coefficients = 0.1 * rng.normal(size=(3, 4, 4, 3, 4))
+    coefficients[:, 0, 0, 0] += 5.0 * (not is_signed)
+    coefficients[:, 0, 0, 1] += 1.2 * (not is_signed)
+    degrees = np.arange(4)
+    coefficients[:, degrees[:, None] + degrees > 3] = 0.0
+    directions = 0.05 * rng.normal(size=(2, 2, 1, 2, 4))
+    directions[1, 1] = 0.0
+    return ChargeSeries(
+        domain=DOMAIN,
+        electrodes=ELECTRODES,
+        coefficients=coefficients.astype(np.float32).astype(float),
+        node_MPa=NODES,
+        directions=directions.astype(np.float32).astype(float),
+        log_size=np.array([4.0, 1.0, -0.1]) if is_signed else None,
+        charge_std=0.004,
+        pretension_MPa=0.8,
+        tension_std_MPa=0.1,
+    )
+
+
+def random_contacts(count=20, radius=7.5, seed=1):
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
+    distance = radius * np.sqrt(rng.random(count))
+    return np.column_stack([distance * np.cos(angle), distance * np.sin(angle), np.exp(rng.uniform(-2.9, 0.6, count))])
+
+
+def polynomial_values(series, contact, state):
+    """Compute v with NumPy's polynomials: `chebval3d`, and `polyfit` through the nodes."""
+    unit = series.domain.to_unit(contact)
+    node_values = [np.polynomial.chebyshev.chebval3d(*unit.T, node) for node in series.coefficients]
+    by_node = np.array(node_values)  # shape (n_node, n_electrode, n)
+    polynomial = np.polyfit(series.node_MPa, by_node.reshape(len(by_node), -1), len(by_node) - 1)
+    value = np.polyval(polynomial, state[0]).reshape(by_node.shape[1:])
+    direction_values = np.polynomial.chebyshev.chebval3d(*unit.T, series.directions)  # shape (K, n_electrode, n)
+    return (value + np.tensordot(state[1:], direction_values, axes=1)).T
+
+
+@pytest.mark.parametrize("is_signed", [False, True])
+def test_charges_at_any_state_are_those_of_numpy_polynomials(is_signed):
+    series = random_series(is_signed=is_signed)
+    contact = random_contacts()
+    state = np.array([0.13, 0.7, -1.2])
+    value = polynomial_values(series, contact, state)
+    unit_log_force = series.domain.to_unit(contact)[:, 2]
+    expected = np.exp(value)
+    if is_signed:
+        expected = value * np.exp(np.polynomial.chebyshev.chebval(unit_log_force, series.log_size))[:, None]
+    changes = series.changes(contact, state)
+    np.testing.assert_allclose(changes.charge_pC, expected, rtol=1e-10)
+    np.testing.assert_allclose(series.at_state(state).charges(contact), expected, rtol=1e-10)
+    np.testing.assert_allclose(series.changes(contact, np.zeros(3)).charge_pC, series.charges(contact), rtol=1e-12)
+
+
+@pytest.mark.parametrize("is_signed", [False, True])
+def test_derivatives_are_finite_differences_also_outside_the_range_of_forces(is_signed):
+    series = random_series(is_signed=is_signed)
+    contact = random_contacts()
+    contact[:3, 2] = [1e-3, 0.02, 7.0]
+    state = np.array([-0.2, 0.5, 1.0])
+    changes = series.changes(contact, state)
+    step = 1e-6
+    for number in range(3):
+        up, down = state.copy(), state.copy()
+        up[number] += step
+        down[number] -= step
+        expected = (series.changes(contact, up).charge_pC - series.changes(contact, down).charge_pC) / (2.0 * step)
+        np.testing.assert_allclose(changes.by_state[:, :, number], expected, rtol=1e-6, atol=1e-6)
+    up, down = contact.copy(), contact.copy()
+    up[:, 2] *= np.exp(step)
+    down[:, 2] *= np.exp(-step)
+    expected = (series.changes(up, state).charge_pC - series.changes(down, state).charge_pC) / (2.0 * step)
+    np.testing.assert_allclose(changes.by_contact[:, :, 2], expected, rtol=1e-5, atol=1e-5)
+    inner = contact[3:]
+    for axis in range(2):
+        shift = step * np.eye(3)[axis]
+        expected = (series.changes(inner + shift, state).charge_pC - series.changes(inner - shift, state).charge_pC) / (
+            2.0 * step
+        )
+        np.testing.assert_allclose(changes.by_contact[3:, :, axis], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_charges_beyond_the_domain_continue_linearly_in_position_and_as_a_power_of_the_force():
+    series = random_series()
+    edge = np.array([[8.0, 0.0, 2.0]])
+    charge, slope = series.linearised(edge)
+    log_slope = slope / charge[:, :, None]
+    beyond = series.charges(np.array([[9.0, 0.0, 2.0], [8.0, 0.0, 6.0]]))
+    np.testing.assert_allclose(beyond[0], charge[0] * np.exp(log_slope[0, :, 0]), rtol=1e-10)
+    np.testing.assert_allclose(beyond[1], charge[0] * 3.0 ** log_slope[0, :, 2], rtol=1e-10)
+    assert np.isfinite(series.charges(np.array([[1e9, 0.0, 1e-300], [0.0, -1e9, 1e300]]))).all()
+
+
+def test_states_may_differ_from_contact_to_contact():
+    series = random_series()
+    contact = random_contacts(3)
+    states = np.array([[0.0, 0.0, 0.0], [0.2, 1.0, -1.0], [-0.4, 0.0, 2.0]])
+    together = series.changes(contact, states)
+    for row in range(3):
+        alone = series.changes(contact[row : row + 1], states[row])
+        for joint, single in zip(together, alone, strict=True):
+            np.testing.assert_allclose(joint[row], single[0], rtol=1e-12)
+
+
+def test_interpolation_weights_reproduce_a_cubic_and_continue_linearly():
+    nodes = np.array([-0.6, -0.3, 0.0, 0.5])
+    cubic = np.poly1d([2.0, -1.0, 0.5, 3.0])
+    points = np.array([-0.45, 0.1, 0.9])
+    weights, slopes = interpolation_weights(nodes, points)
+    np.testing.assert_allclose(weights[:2] @ cubic(nodes), cubic(points[:2]), rtol=1e-12)
+    np.testing.assert_allclose(slopes[:2] @ cubic(nodes), cubic.deriv()(points[:2]), rtol=1e-12)
+    np.testing.assert_allclose(weights[2] @ cubic(nodes), cubic(0.5) + 0.4 * cubic.deriv()(0.5), rtol=1e-12)
+    single_weights, single_slopes = interpolation_weights(np.zeros(1), points)
+    np.testing.assert_array_equal(single_weights, np.ones((3, 1)))
+    np.testing.assert_array_equal(single_slopes, np.zeros((3, 1)))
+
+
+@pytest.mark.parametrize("is_signed", [False, True])
+def test_file_is_read_as_it_was_written(tmp_path, is_signed):
+    written = random_series(is_signed=is_signed)
+    (tmp_path / "charges.npz").write_bytes(written.to_bytes())
+    read = read_charges(tmp_path, ELECTRODES)
+    contact = random_contacts()
+    state = np.array([0.1, 1.0, -1.0])
+    np.testing.assert_array_equal(read.changes(contact, state).charge_pC, written.changes(contact, state).charge_pC)
+    for name in ("domain", "electrodes", "is_folded", "charge_std", "pretension_MPa", "tension_std_MPa"):
+        assert getattr(read, name) == getattr(written, name)
+
+
+def test_map_with_a_single_force_is_read_and_does_not_depend_on_the_force(tmp_path):
+    coefficients = np.zeros((1, 2, 2, 1, 4))
+    coefficients[0, 0, 0, 0] = 5.0
+    coefficients[0, 1, 0, 0] = coefficients[0, 0, 1, 0] = 0.1
+    series = ChargeSeries(domain=Domain(8.0, (0.5, 0.5)), electrodes=ELECTRODES, coefficients=coefficients)
+    (tmp_path / "charges.npz").write_bytes(series.to_bytes())
+    read = read_charges(tmp_path, ELECTRODES)
+    charge, slopes = read.linearised(np.array([[4.0, 0.0, 0.5], [4.0, 0.0, 0.9]]))
+    np.testing.assert_allclose(charge, np.exp(5.05), rtol=1e-6)
+    np.testing.assert_array_equal(slopes[:, :, 2], 0.0)
+
+
+def write(folder, arrays):
+    file = io.BytesIO()
+    np.savez_compressed(file, **{name: value for name, value in arrays.items() if value is not None})
+    (folder / "charges.npz").write_bytes(file.getvalue())
+
+
+GOOD = charge_arrays()
+SERIES = GOOD["series"]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"format": None}, r"format 1 is not supported \(this version reads 2\)"),
+        ({"format": np.array(3)}, "format 3 is not supported"),
+        ({"series": np.full(SERIES.shape, "text")}, "expected real numbers"),
+        ({"series": SERIES.astype(complex)}, "expected real numbers"),
+        ({"series": np.zeros(SERIES.shape, "datetime64[s]")}, "expected real numbers"),
+        ({"series": SERIES[0]}, "expected an array of shape"),
+        ({"series": SERIES[:, :, :1]}, "equal degrees in x and y"),
+        ({"series": np.zeros((3, 200, 200, 2, 4))}, "degrees up to 100"),
+        ({"series": np.full(SERIES.shape, np.inf)}, "expected finite numbers"),
+        ({"series": 300.0 * SERIES}, "expected values up to 100"),
+        ({"series": 0.0 * SERIES}, "change with x, y and the force"),
+        ({"series": None}, "the array 'series' is missing"),
+        ({"node_MPa": np.array([-0.5, 0.5, 1.0])}, "with 0 among them"),
+        ({"node_MPa": np.array([0.0, -0.5, 0.5])}, "rising changes"),
+        ({"node_MPa": np.array([-1e-9, 0.0, 0.5])}, "rising changes"),
+        ({"node_MPa": np.array([0.0, 0.5, 1e9])}, "rising changes up to 50 MPa"),
+        ({"node_MPa": np.array([0.0, 0.5])}, r"expected an array of shape \(2, n, n, n, 4\)"),
+        ({"directions": np.zeros((2, 3, 2, 2, 4))}, "directions: expected equal degrees"),
+        ({"directions": np.zeros((1, 1, 1, 200, 4))}, "directions: expected up to 100"),
+        ({"directions": np.zeros((2, 2, 2, 2, 3))}, "expected an array of shape"),
+        ({"log_size": np.full(3, 1e3)}, "log_size: expected values up to 100"),
+        ({"force_N": np.array([0.0, 1.0])}, "a smallest force above 0"),
+        ({"force_N": np.array([1.0, 0.5])}, "got 1 and 0.5 N"),
+        ({"force_N": np.array([1.0])}, "expected an array of shape"),
+        ({"radius_mm": np.array(np.inf)}, "expected finite numbers"),
+        ({"radius_mm": np.array(1e9)}, "expected a radius up to 10000 mm"),
+        ({"radius_mm": np.array(-1.0)}, "expected a radius"),
+        ({"radius_mm": np.array("8")}, "expected real numbers"),
+        ({"charge_std": np.array(2.0)}, "charge_std: expected a number from 0 to 1, got 2"),
+        ({"tension_std_MPa": np.array(-0.1)}, "tension_std_MPa: expected a number from 0"),
+        ({"pretension_MPa": None}, "the array 'pretension_MPa' is missing"),
+    ],
+)
+def test_file_that_describes_no_charges_is_refused(tmp_path, change, reason):
+    write(tmp_path, GOOD | change)
+    with pytest.raises(ModelError, match=rf"charges\.npz: .*{reason}.*train again"):
+        read_charges(tmp_path, ELECTRODES)
+
+
+def test_model_without_the_file_has_no_map(tmp_path):
+    assert read_charges(tmp_path, ELECTRODES) is None
+
+
+numbers = st.floats(width=32, allow_nan=True, allow_infinity=True) | st.sampled_from([0.0, 1.0, -1.0, 1e300])
+
+
+@given(name=st.sampled_from(sorted(GOOD)), entry=st.integers(0, 200), number=numbers)
+def test_file_with_any_number_is_refused_or_gives_finite_charges(tmp_path_factory, name, entry, number):
+    folder = tmp_path_factory.mktemp("model")
+    changed = np.array(GOOD[name], float)
+    changed.flat[entry % changed.size] = number
+    write(folder, GOOD | {name: changed})
+    try:
+        series = read_charges(folder, ELECTRODES)
+    except ModelError:
+        return
+    contact = series.domain.to_contact(np.array([[0.0, 0.0, 0.0], [0.5, -0.5, 1.0], [3.0, 0.0, -2.0]]))
+    changes = series.changes(contact, np.ones(1 + series.direction_count))
+    assert all(np.isfinite(value).all() for value in changes)
+
+
+def test_number_of_directions_and_pretension_of_another_state():
+    series = random_series()
+    assert series.direction_count == 2
+    moved = series.at_state(np.array([0.2, 0.0, 0.0]))
+    assert (moved.direction_count, moved.pretension_MPa) == (0, pytest.approx(1.0))
+    assert replace(series, directions=None).direction_count == 0

@@ -1,0 +1,287 @@
+"""Fits of charge series to presses, by linear least squares.
+
+The training uses a `ChargeSeries` in three searches: for the contact whose charges are nearest to given charges, for
+folds of the map, and for distant contacts with the same charges. For a dataset with several probes, the series
+describes the mean of the charges over the probes.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from scipy.linalg import cho_factor, cho_solve
+
+from isocharge.common.arrays import Array
+from isocharge.common.chebyshev_series import CHUNK_SIZE, chebyshev_terms, position_degrees
+from isocharge.common.contact_domain import Domain
+from isocharge.common.errors import TrainingError
+from isocharge.common.statistics import rms
+from isocharge.serve.model.charge_series import ChargeSeries, series_size
+from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
+
+CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
+"""Degrees in the position and in the force that are tried, in this order, for positive charges."""
+
+TAUT_CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = ((6, 4), (10, 4), (16, 4), (24, 4))
+"""Degrees in the position and in the force that are tried, in this order, for positive charges on taut films.
+
+On taut films, the charges are proportional to the force at small forces, and proportional to the power 2/3 of the force
+at large forces. The logarithm of a charge is therefore not a polynomial of low degree in the logarithm of the force."""
+
+TAUT_ERROR_RATIO = 0.8
+"""Ratio of two errors of the fit below which a film counts as taut.
+
+The ratio is the error with the first of `TAUT_CANDIDATE_DEGREES` divided by the error with the first of
+`CANDIDATE_DEGREES`. On a slack film, a higher degree in the force hardly changes the error, so the ratio is nearly
+one."""
+
+SIGNED_CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = (
+    (6, 1),
+    (6, 4),
+    (8, 8),
+    (12, 8),
+    (16, 8),
+    (20, 8),
+    (24, 6),
+    (24, 8),
+)
+"""Degrees in the position and in the force that are tried, in this order, for charges of both signs.
+
+The degrees in the force are higher than for positive charges. Charges of both signs occur on taut films, on which the
+exponent of the force changes with the force."""
+
+SIZE_DEGREE = 4
+"""Degree of the polynomial that approximates the logarithm of the size S of the charges as a function of l."""
+
+NOISE_CORNER_pC = 500.0
+"""Charge at which both parts of the `reference` noise, 1 pC and 0.2 % of the charge, are equal, pC.
+
+For charges of both signs, the errors of a fit are divided by the root of the sum of the squares of the charge and of
+this value. Charges near zero would otherwise have large relative errors.
+"""
+
+ROWS_PER_TERM = 40
+"""Largest number of presses per coefficient. More presses would improve the fit mostly near the edge of the disk."""
+
+FEWEST_PER_TERM = 8
+"""Smallest number of presses per coefficient. Fewer presses would not determine the slopes near the edge."""
+
+RIDGE = 1e-9
+"""Relative weight of the squared coefficients in the fit (ridge regression).
+
+The ridge is needed because the polynomials are defined on a square, whose corners lie outside the disk and contain no
+presses.
+"""
+
+GOOD_ENOUGH = 1.5e-4
+"""Relative rms error of the charges below which no higher degree is tried, about a tenth of the reference noise."""
+
+
+def fit_charge_series(
+    domain: Domain, electrodes: tuple[str, ...], presses: LabelledPresses, validation: LabelledPresses
+) -> ChargeSeries:
+    """Fit a charge series to presses by least squares, and choose its degrees by the error on other presses.
+
+    Args:
+        domain: Working area and range of forces of the contacts.
+        electrodes: Names of the electrodes, in the order of the charges.
+        presses: Presses to which the series is fitted.
+        validation: Other presses, on which the error is measured.
+
+    Returns:
+        The series with the smallest error among the degrees that were tried. Its `charge_std` is the root mean square
+        of the relative errors on `validation`.
+
+    Raises:
+        TrainingError: If there are too few presses for the smallest degrees.
+    """
+    fitter = _SeriesFitter.prepare(domain, electrodes, presses, validation)
+    candidate_degrees = SIGNED_CANDIDATE_DEGREES if presses.signed else CANDIDATE_DEGREES
+    first_degrees, *further_degrees = candidate_degrees
+    best_series = fitter.fit(*first_degrees)
+    if best_series is None:
+        fewest = FEWEST_PER_TERM * series_term_count(*first_degrees)
+        raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")
+
+    # A taut film, which has a pretension, needs higher degrees in the force. If the first degrees for taut films have a
+    # clearly smaller error, the film is taut.
+    if not presses.signed and best_series.charge_std > GOOD_ENOUGH:
+        first_taut_degrees, *further_taut_degrees = TAUT_CANDIDATE_DEGREES
+        taut_series = fitter.fit(*first_taut_degrees)
+        if taut_series is not None and taut_series.charge_std < TAUT_ERROR_RATIO * best_series.charge_std:
+            best_series = taut_series
+            further_degrees = further_taut_degrees
+
+    # Try the further degrees until the error is small enough, or the presses are too few.
+    for degree, force_degree in further_degrees:
+        if best_series.charge_std < GOOD_ENOUGH:
+            break
+        series = fitter.fit(degree, force_degree)
+        if series is None:  # there are too few presses for this degree and all higher ones
+            break
+        if series.charge_std < best_series.charge_std:
+            best_series = series
+    return best_series
+
+
+def fit_film_series(
+    domain: Domain, electrodes: tuple[str, ...], contact: Array, node_charge: Array, node_MPa: Array
+) -> ChargeSeries:
+    """Fit a charge series to the charges of one film at several pretensions, which are the nodes of the series.
+
+    Every tenth contact is used for the choice of the degrees, which are the same at all nodes.
+
+    Args:
+        domain: Working area and range of forces of the contacts.
+        electrodes: Names of the electrodes, in the order of the charges.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N, in random order.
+        node_charge: Charges of these contacts at each node, shape (n, n_node, n_electrode), pC.
+        node_MPa: Changes of the mean pretension at the nodes, shape (n_node,), MPa, ascending and containing 0.
+
+    Raises:
+        TrainingError: If there are too few contacts for the smallest degrees.
+    """
+    # The fit treats the electrodes of all nodes as electrodes of one film.
+    presses = LabelledPresses(contact, node_charge.reshape(len(contact), -1))
+    names = tuple(f"{node:g} {electrode}" for node in node_MPa for electrode in electrodes)
+    is_validation = np.arange(len(contact)) % 10 == 0
+    all_nodes = fit_charge_series(domain, names, presses[~is_validation], presses[is_validation])
+    by_node = all_nodes.coefficients[0].reshape(*all_nodes.coefficients.shape[1:4], node_MPa.size, len(electrodes))
+    return replace(
+        all_nodes, electrodes=electrodes, coefficients=np.moveaxis(by_node, 3, 0), node_MPa=np.asarray(node_MPa)
+    )
+
+
+@dataclass(frozen=True)
+class _SeriesFitter:
+    """Data for fits of series: presses for the fits, and other presses on which the errors are measured.
+
+    Attributes:
+        domain: Working area and range of forces of the contacts.
+        electrodes: Names of the electrodes, in the order of the charges.
+        unit_contact: Contacts of the fit in unit coordinates, shape (n, 3).
+        target: Values of the series at these contacts, ln Q or Q / S, shape (n, n_electrode).
+        log_size: Coefficients of ln S for charges of both signs; None for positive charges.
+        validation: Presses on which the errors are measured.
+        error_unit: Charges by which the errors are divided, shape (n_validation, n_electrode), pC.
+    """
+
+    domain: Domain
+    electrodes: tuple[str, ...]
+    unit_contact: Array
+    target: Array
+    log_size: Array | None
+    validation: LabelledPresses
+    error_unit: Array
+
+    @classmethod
+    def prepare(
+        cls, domain: Domain, electrodes: tuple[str, ...], presses: LabelledPresses, validation: LabelledPresses
+    ) -> "_SeriesFitter":
+        """Return a fitter with the target values of the series, and with the units in which its errors are measured.
+
+        For positive charges Q, the targets are ln Q, and the errors are relative. For charges of both signs, the
+        targets are Q / S. The typical size S of the charges is a fitted function of the force, and `log_size` contains
+        its coefficients.
+
+        Args:
+            domain: Working area and range of forces of the contacts.
+            electrodes: Names of the electrodes, in the order of the charges.
+            presses: Presses to which series will be fitted.
+            validation: Other presses, on which the errors will be measured.
+        """
+        unit_contact = domain.to_unit(presses.contact)
+        if presses.signed:  # the presses have charges of both signs
+            scaled_log_force = unit_contact[:, 2]
+            log_size = _fit_log_size(scaled_log_force, presses.charge)
+            size, _ = series_size(log_size, scaled_log_force)
+            target = presses.charge / size
+            smallest_error_unit = NOISE_CORNER_pC  # otherwise, charges near zero would have large relative errors
+        else:
+            log_size = None
+            target = np.log(presses.charge)
+            smallest_error_unit = 0.0
+        error_unit = np.hypot(validation.charge, smallest_error_unit)  # |Q| if the smallest unit is zero
+        return cls(domain, electrodes, unit_contact, target, log_size, validation, error_unit)
+
+    def fit(self, degree: int, force_degree: int) -> ChargeSeries | None:
+        """Fit a series with the given degrees, and measure its error on the validation presses.
+
+        The fit uses the first presses, at most `ROWS_PER_TERM` for each term of the series.
+
+        Args:
+            degree: Largest total degree in x and y.
+            force_degree: Largest degree in the logarithm of the force.
+
+        Returns:
+            The fitted series with its error; None if there are fewer than `FEWEST_PER_TERM` presses for each term.
+        """
+        smallest_force, largest_force = self.domain.force_range
+        if smallest_force == largest_force:  # presses with a single force determine no slope in the force
+            force_degree = 0
+        n_term = series_term_count(degree, force_degree)
+        if FEWEST_PER_TERM * n_term > len(self.unit_contact):
+            return None
+        used_rows = slice(0, ROWS_PER_TERM * n_term)
+        coefficients = fit_series(self.unit_contact[used_rows], self.target[used_rows], degree, force_degree)
+        series = ChargeSeries(
+            domain=self.domain, electrodes=self.electrodes, coefficients=coefficients[None], log_size=self.log_size
+        )
+        charge_error = series.charges(self.validation.contact) - self.validation.charge
+        return replace(series, charge_std=rms(charge_error / self.error_unit))
+
+
+def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
+    """Fit a polynomial in l, the scaled logarithm of the force, to ln S, the logarithm of the size of the charges.
+
+    For each press, the size S is the root of the sum of the squared charges, but at least `LOWEST_CHARGE`.
+
+    Args:
+        unit_log_force: Logarithms l of the forces scaled to [-1, 1], shape (n,).
+        charge: Charges, shape (n, n_electrode), pC.
+
+    Returns:
+        Coefficients of the Chebyshev polynomials, shape (SIZE_DEGREE + 1,).
+    """
+    size = np.maximum(np.linalg.norm(charge, axis=1), LOWEST_CHARGE)
+    return np.asarray(chebyshev.chebfit(unit_log_force, np.log(size), SIZE_DEGREE))
+
+
+def series_term_count(degree: int, force_degree: int) -> int:
+    """Return the number of terms of a series, from its total degree in x and y and its degree in the force."""
+    return (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
+
+
+def fit_series(unit_contact: Array, target: Array, degree: int, force_degree: int) -> Array:
+    """Fit a Chebyshev series in position and force by least squares.
+
+    Let the matrix A have one row for each of n contacts and one column for each term of the series. The coefficients c
+    solve the normal equations (A' A + RIDGE n I) c = A' target. The ridge, RIDGE n I, makes the solution unique if the
+    contacts do not determine all coefficients.
+
+    Args:
+        unit_contact: Contacts in unit coordinates, shape (n, 3).
+        target: Values of the series at these contacts, shape (n, k).
+        degree: Largest total degree in x and y.
+        force_degree: Largest degree in the logarithm of the force.
+
+    Returns:
+        Coefficients, shape (degree + 1, degree + 1, force_degree + 1, k).
+    """
+    n_term = series_term_count(degree, force_degree)
+    n_contact = len(unit_contact)
+    normal_matrix = RIDGE * n_contact * np.eye(n_term)
+    right_side = np.zeros((n_term, target.shape[1]))
+    n_chunk = n_contact // CHUNK_SIZE + 1  # chunks limit the memory; "+ 1" rounds up
+    for rows in np.array_split(np.arange(n_contact), n_chunk):
+        position_terms, force_terms = chebyshev_terms(unit_contact[rows], degree, force_degree)
+        # Each column of A is the product of a polynomial in the position and a polynomial in the force.
+        chunk_of_a = (position_terms[:, :, None] * force_terms[:, None, :]).reshape(len(rows), -1)
+        normal_matrix += chunk_of_a.T @ chunk_of_a
+        right_side += chunk_of_a.T @ target[rows]
+
+    # The series also has entries for terms above the total degree, whose coefficients remain zero.
+    solution = cho_solve(cho_factor(normal_matrix), right_side)
+    series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
+    series[position_degrees(degree)] = solution.reshape(-1, force_degree + 1, target.shape[1])
+    return series

@@ -1,0 +1,163 @@
+"""Disk in which the map from contacts to charges is invertible, so that a network can be trained."""
+
+import numpy as np
+
+from isocharge.common.contact_domain import Domain
+from isocharge.common.errors import DatasetError
+from isocharge.serve.model.charge_series import ChargeSeries
+from isocharge.simulate import NoiseModel
+from isocharge.simulate.forward.charge_map import ChargeMap, within
+from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
+from isocharge.simulate.identifiability.working_area import search_working_area
+from isocharge.train.data.presses import LabelledPresses
+
+MAX_ERROR_OF_CERTAIN_FOLD = 3e-4
+"""Largest relative error of the fitted charges at which a fold counts as certain. A poor fit has spurious folds."""
+
+MAX_ERROR_WITHOUT_NOISE = 2e-3
+"""Relative error of a fit above which the charges probably have noise."""
+
+CREDIBLE_FOLD_RATIO = 0.95
+"""Largest ratio of the radius of a fold to the radius of the domain at which a fold of a poor fit counts as real.
+
+Spurious folds lie near the edge of the domain, because there are presses on only one side of the edge."""
+
+CREDIBLE_FOLD_RATIO_WITH_NOISE = 0.8
+"""Ratio that replaces `CREDIBLE_FOLD_RATIO` if the charges have noise, because noise moves spurious folds inwards."""
+
+SEARCHED_RADIUS_RATIO = 0.98
+"""Ratio of the radius within which folds are searched for to the radius of the domain.
+
+At the edge of the domain, the presses do not determine the derivatives of the charges accurately."""
+
+N_PAIR_CONTACTS = 400
+"""Number of contacts for each of which another contact with the same charges is searched for."""
+
+SMALLEST_SHARE = 0.2
+"""Smallest ratio of the radius without folds to the radius of the dataset at which a network can be trained."""
+
+
+def invertible_domain(
+    field: ChargeSeries, presses: LabelledPresses, noise: NoiseModel
+) -> tuple[Domain, tuple[str, ...]]:
+    """Return the disk on which a network is trained, and sentences for the user about ambiguous contacts.
+
+    At a fold, the map from contacts to charges turns back, so that contacts on both sides of the fold have the same
+    charges. There are three cases:
+
+    - The fit is accurate and shows a fold: the disk is reduced to the radius of the fold, and a sentence states this.
+    - The fit is inaccurate, because there are few presses or the charges have noise, and it shows a fold well inside
+      the domain: the disk is not reduced, and a sentence states where the map seems to fold.
+    - Otherwise, the disk is the domain of the field.
+
+    If the charges have little noise and no uncertain fold was found, distant pairs of contacts with the same charges
+    are searched for as well.
+
+    Args:
+        field: Charge field that was fitted to the presses.
+        presses: Presses to which the field was fitted. A sentence states how many of them lie in the disk.
+        noise: Noise of good presses. Charges that differ by less than the noise count as equal.
+
+    Returns:
+        The domain, which is the disk with the range of forces, and the sentences.
+
+    Raises:
+        DatasetError: If the radius of the disk is less than `SMALLEST_SHARE` of the radius of the field.
+    """
+    requested_domain = field.domain
+    fold_radius = _fold_radius(field, noise)  # infinity without a fold
+    has_little_noise = field.charge_std < MAX_ERROR_WITHOUT_NOISE  # the error includes the noise of the charges
+
+    # An inaccurate fit does not prove a fold, so the fold is only reported, and only if it lies well inside the domain.
+    certain_fold_radius = fold_radius
+    if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
+        credible_ratio = CREDIBLE_FOLD_RATIO if has_little_noise else CREDIBLE_FOLD_RATIO_WITH_NOISE
+        if fold_radius < credible_ratio * requested_domain.radius:
+            return requested_domain, (_uncertain_fold_caution(fold_radius, requested_domain.radius),)
+        certain_fold_radius = np.inf  # a fold near the edge is probably not real
+
+    if certain_fold_radius < SMALLEST_SHARE * requested_domain.radius:
+        raise DatasetError(
+            f"the map from contacts to charges folds {certain_fold_radius:g} mm from the centre, of "
+            f"{requested_domain.radius:g} mm asked for: beyond, two contacts give the same charges; add an "
+            "electrode, or take a biaxial film"
+        )
+    # Reduce the domain to a certain fold, and search for pairs of distant contacts with the same charges.
+    domain = requested_domain
+    cautions = []
+    if certain_fold_radius < requested_domain.radius:
+        domain = requested_domain.within(certain_fold_radius)
+        cautions.append(_fold_caution(field, presses, certain_fold_radius))
+    if has_little_noise:
+        searched_field = within(field, SEARCHED_RADIUS_RATIO * domain.radius)  # the field is inaccurate at the edge
+        cautions += _pair_cautions(searched_field, noise)
+    return domain, tuple(cautions)
+
+
+def _pair_cautions(searched_map: ChargeMap, noise: NoiseModel) -> list[str]:
+    """Return a sentence about pairs of distant contacts with the same charges, if such pairs exist.
+
+    Only contacts with the smallest force of the domain are compared.
+
+    Args:
+        searched_map: Map from contacts to charges, in whose domain pairs are searched for.
+        noise: Noise of good presses. Charges that differ by less than the noise count as equal.
+
+    Returns:
+        A list of one sentence, or an empty list.
+    """
+    smallest_force, _ = searched_map.domain.force_range
+    pairs = find_ambiguous_pairs(searched_map, noise, smallest_force, N_PAIR_CONTACTS)
+    if not pairs.summary:
+        return []
+    # The sentence is continued, so it begins in lower case and has no full stop.
+    sentence = pairs.summary[0].lower() + pairs.summary[1:].removesuffix(".")
+    return [f"{sentence}; no model tells which of them it is; see 'isocharge simulate identify'"]
+
+
+def _uncertain_fold_caution(fold_radius: float, requested_radius: float) -> str:
+    """Return a sentence about a fold that the fit shows inside the domain but cannot prove.
+
+    Args:
+        fold_radius: Distance of the fold from the centre, mm.
+        requested_radius: Radius of the domain, mm.
+    """
+    return (
+        f"the map from contacts to charges seems to fold about {fold_radius:.2g} mm from the centre, where two "
+        "contacts give the same charges; the presses cannot tell it for certain, and the model is trained "
+        f"across it, up to {requested_radius:g} mm; see 'isocharge simulate identify', then ask for a smaller "
+        "radius or add an electrode"
+    )
+
+
+def _fold_caution(field: ChargeSeries, presses: LabelledPresses, fold_radius: float) -> str:
+    """Return a sentence that states the radius of a certain fold, to which the domain is reduced.
+
+    The sentence also names the command that tracks contacts beyond the fold.
+
+    Args:
+        field: Charge field, whose domain is not reduced yet.
+        presses: The presses, some of which lie beyond the fold.
+        fold_radius: Distance of the fold from the centre, mm.
+    """
+    requested_radius = field.domain.radius
+    remaining_count = len(presses.within(fold_radius))
+    caution = (
+        f"the map from contacts to charges folds beyond {fold_radius:g} mm: two contacts give the same charges there; "
+        f"the model is trained for {fold_radius:g} mm, not {requested_radius:g} mm, on {remaining_count} of "
+        f"{len(presses)} presses"
+    )
+    return f"{caution}; 'serve stream --track' follows contacts to {requested_radius:g} mm"
+
+
+def _fold_radius(field: ChargeSeries, noise: NoiseModel) -> float:
+    """Return the rounded radius of the largest disk without folds, mm, or infinity if the domain has no fold.
+
+    Args:
+        field: Charge field in whose domain folds are searched for.
+        noise: Noise of good presses.
+    """
+    area = search_working_area(within(field, SEARCHED_RADIUS_RATIO * field.domain.radius), noise, search_pairs=False)
+    if not np.isfinite(area.fold_radius):
+        return np.inf
+    return float(f"{area.unambiguous_radius:.6g}")
