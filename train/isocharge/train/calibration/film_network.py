@@ -1,11 +1,12 @@
-"""Training of the network of a calibrated film.
+"""Charge map and training data of a calibrated film.
 
-The network learns from presses on films that are drawn from the posterior distribution of the calibrated film, with
+The network of a calibrated film learns from presses on films that are drawn from the posterior distribution, with
 noise. Its standard deviations therefore contain the noise and everything that is not known about the film.
 
 The posterior distribution has many unknowns, of which only a few linear combinations change the charges. These
-combinations are called directions. Each direction is a smooth relative change of the charges, which is described by a
-series in the contact (`ChargeField`, `fit_series`).
+combinations are the directions of the compact charge map (`ChargeSeries`), from which both the training and the live
+follower know what is uncertain. The nodes of the map are films with other pretensions. Their charges are those of the
+calibrated film, times the ratio of the charges of axisymmetric films with both pretensions.
 """
 
 import hashlib
@@ -16,19 +17,22 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.chebyshev_series import Series
-from isocharge.simulate import Domain, NoiseModel
+from isocharge.serve.model.charge_series import ChargeSeries, series_size
+from isocharge.simulate import Circle, Domain, ForwardMap, NoiseModel
+from isocharge.simulate.forward.derivative_fields import NODE_COUNT
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
+from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.simulate.solver.friction import MAX_FRICTION
 from isocharge.simulate.solver.stress_limit import yield_force
 from isocharge.train.calibration.discrepancy import terms
-from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.film_charges import FilmCharges, axisymmetric, circle_of
 from isocharge.train.calibration.film_estimate import FilmEstimate
-from isocharge.train.data.charge_field import ChargeField, fit_series
+from isocharge.train.data.charge_fit import fit_film_series, fit_series
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.training.source import TrainingData
 
-SERIES_CONTACTS = 5000
-"""Number of contacts to which the series of the charges is fitted."""
+SERIES_CONTACTS = 4000
+"""Number of contacts to which the series of the charges are fitted."""
 
 DIRECTION_CONTACTS = 1200
 """Number of contacts to which the series of the directions are fitted."""
@@ -39,8 +43,20 @@ DIRECTION_DEGREES = (8, 3)
 MIN_DIRECTION = 0.1
 """Smallest root-mean-square effect of a direction on a charge, in standard deviations of the noise, that is kept."""
 
+NODES_MPa = (-0.7, -0.3, 0.0, 0.4, 0.9)
+"""Changes of the pretension at the nodes of a film that can be followed, MPa."""
+
+MIN_NODE_PRETENSION_MPa = 0.02
+"""Smallest pretension of a film at a node, MPa."""
+
+FEWEST_FOLLOWED = 4
+"""Smallest number of electrodes with which a film can be followed. Three charges only determine the contact."""
+
 PRESSES = 60_000
 """Number of presses from which the network learns."""
+
+CHUNK = 4096
+"""Number of presses that are drawn at the same time, which limits the memory."""
 
 OUTSIDE_PRESSES = 16_384
 """Number of presses outside the working area from which the network learns that they are outside."""
@@ -63,63 +79,41 @@ class SideForces:
     share: float = 0.0
 
 
-@dataclass(frozen=True)
-class CompactCharges:
-    """Charges of a calibrated film and their uncertainty, as series in the contact.
+def compact_charges(
+    charges: FilmCharges, film: FilmEstimate, domain: Domain, noise: NoiseModel, executor: Executor | None
+) -> ChargeSeries:
+    """Compute the compact charge map of an estimated film.
 
-    Attributes:
-        field: Charges of the most probable film.
-        directions: Series of the relative changes of the charges by one standard deviation of each direction. The last
-            axis has n_direction * n_electrode entries.
-        offset: Most probable offset of all charges and its standard deviation, pC.
+    Args:
+        charges: Charges of the solved film and of similar films.
+        film: The estimate.
+        domain: Contacts for which the map is needed. It lies within the domain of `charges`.
+        noise: Noise of the charges, which decides how many directions are needed.
+        executor: Executor that solves the films at the nodes; None for this process.
     """
+    contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
+    charge = _film_charges(charges, film, contact)
+    names = charges.prior.sensor.electrode_names
+    node_MPa = np.zeros(1)
+    if len(names) >= FEWEST_FOLLOWED:
+        lowest = MIN_NODE_PRETENSION_MPa - film.value(PRETENSION.name)
+        node_MPa = np.unique(np.maximum(NODES_MPa, min(lowest, 0.0)))
+    factors = [_tension_factor(charges, film, contact, float(change), executor) for change in node_MPa]
+    series = fit_film_series(domain, names, contact, charge[:, None] * np.stack(factors, axis=1), node_MPa)
 
-    field: ChargeField
-    directions: Series
-    offset: tuple[float, float]
-
-    @classmethod
-    def of(cls, charges: FilmCharges, film: FilmEstimate, domain: Domain, noise: NoiseModel) -> "CompactCharges":
-        """Compute the series of an estimated film.
-
-        Args:
-            charges: Charges of the solved film and of similar films.
-            film: The estimate.
-            domain: Contacts for which the series are needed. It lies within the domain of `charges`.
-            noise: Noise of the charges, which decides how many directions are needed.
-        """
-        rng = np.random.default_rng(SEED)
-        contact = draw_contacts(rng, domain, SERIES_CONTACTS)
-        charge = _film_charges(charges, film, contact)
-        labelled = LabelledPresses(contact, charge)
-        n_fitted = int(0.9 * len(contact))
-        names = charges.prior.sensor.electrode_names
-        field = ChargeField.fit(domain, names, labelled[:n_fitted], labelled[n_fitted:])
-
-        contact = contact[:DIRECTION_CONTACTS]
-        changes = _directions(charges, film, contact, noise)
-        coefficients = fit_series(domain.to_unit(contact), changes.reshape(len(contact), -1), *DIRECTION_DEGREES)
-        return cls(field, Series(coefficients), (film.value("offset"), film.std("offset")))
-
-    def draw(self, rng: np.random.Generator, contact: Array, gain_std: float) -> Array:
-        """Draw the charges of contacts, each on another film of the posterior distribution.
-
-        Args:
-            rng: Random number generator.
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            gain_std: Standard deviation of a common relative change of all charges.
-
-        Returns:
-            Charges without noise, shape (n, n_electrode), pC.
-        """
-        charge = self.field.charges(contact)
-        unit_contact = self.field.domain.to_unit(contact)
-        changes = self.directions.values_and_derivatives(unit_contact)[:, 0].reshape(len(contact), -1, charge.shape[1])
-        deviations = rng.standard_normal(changes.shape[:2])
-        log_change = np.einsum("nk,nke->ne", deviations, changes)
-        log_change += gain_std * rng.standard_normal((len(contact), 1))
-        offset, offset_std = self.offset
-        return np.asarray(charge * np.exp(log_change) + offset + offset_std * rng.standard_normal((len(contact), 1)))
+    contact, charge = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
+    changes = _directions(charges, film, contact, charge, noise)  # shape (n, n_direction, n_electrode), pC
+    unit_contact = domain.to_unit(contact)
+    size = charge if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
+    values = changes / size[:, None]  # a direction changes the value v of the series
+    coefficients = fit_series(unit_contact, values.reshape(len(contact), -1), *DIRECTION_DEGREES)
+    return replace(
+        series,
+        directions=coefficients.reshape(*coefficients.shape[:3], *changes.shape[1:]) if changes.shape[1] else None,
+        charge_std=max(series.charge_std, noise.gain),
+        pretension_MPa=film.value(PRETENSION.name),
+        tension_std_MPa=PRETENSION.drift,
+    )
 
 
 def _film_charges(charges: FilmCharges, film: FilmEstimate, contact: Array) -> Array:
@@ -129,39 +123,68 @@ def _film_charges(charges: FilmCharges, film: FilmEstimate, contact: Array) -> A
     return np.asarray(charge * (1.0 + terms(contact, charges.domain) @ coefficients))
 
 
-def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, noise: NoiseModel) -> Array:
-    """Compute the relative changes of the charges along the directions that are larger than `MIN_DIRECTION`.
+def _tension_factor(
+    charges: FilmCharges, film: FilmEstimate, contact: Array, change_MPa: float, executor: Executor | None
+) -> Array:
+    """Compute the factors by which a change of the pretension multiplies the charges, shape (n, n_electrode).
+
+    The factors are those of an axisymmetric film under a circular probe. A factor is 1 where both charges have
+    different signs.
+    """
+    if change_MPa == 0.0:
+        return np.ones((len(contact), len(charges.prior.sensor.electrode_names)))
+    sensor, probe = charges.prior.film(film.film_values)
+    sensor = axisymmetric(sensor)
+
+    def round_charges(pretension: float) -> Array:
+        """Compute the charges of the axisymmetric film with a pretension."""
+        changed = replace(sensor, film=replace(sensor.film, pretension=pretension))
+        circle: Circle = circle_of(probe)
+        return ForwardMap.build_unchecked(changed, circle, charges.domain, NODE_COUNT, executor=executor).charges(
+            contact
+        )
+
+    pretension = sensor.film.pretension
+    before, after = round_charges(pretension), round_charges(pretension + change_MPa)
+    is_ratio = before * after > 0.0
+    return np.where(is_ratio, after / np.where(is_ratio, before, 1.0), 1.0)
+
+
+def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge: Array, noise: NoiseModel) -> Array:
+    """Compute the changes of the charges along the directions that are larger than `MIN_DIRECTION`.
+
+    Args:
+        charges: Charges of the solved film and of similar films.
+        film: The estimate.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        charge: Their most probable charges, shape (n, n_electrode), pC.
+        noise: Noise of the charges.
 
     Returns:
-        Changes by one standard deviation of each direction, shape (n, n_direction, n_electrode), dimensionless.
+        Changes by one standard deviation of each direction, shape (n, n_direction, n_electrode), pC.
     """
     layout = film.layout
-    charge, jacobian = charges.linearised(film.film_values, contact)
-    size = np.maximum(np.abs(charge), noise.white)
-    relative_jacobian = jacobian / size[:, :, None]
-    n_electrode = charge.shape[1]
-    term_values = terms(contact, charges.domain)
-    own = np.eye(n_electrode)[None, :, None, :] * term_values[:, None, :, None]
-    relative_jacobian = np.concatenate([relative_jacobian, own.reshape(*charge.shape, -1)], axis=2)
+    _, film_jacobian = charges.linearised(film.film_values, contact)
+    own_charge = charge[:, :, None] * np.eye(charge.shape[1])
+    term_jacobian = own_charge[:, :, None, :] * terms(contact, charges.domain)[:, None, :, None]
+    jacobian = np.concatenate([film_jacobian, term_jacobian.reshape(*charge.shape, -1)], axis=2)
 
     # Square root of the covariance of the film's properties and of the coefficients
     unknowns = np.r_[layout.film, layout.coefficients]
     eigenvalues, vectors = np.linalg.eigh(film.covariance[np.ix_(unknowns, unknowns)])
-    root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
-    changes = relative_jacobian @ root  # shape (n, n_electrode, n_unknown)
+    changes = jacobian @ (vectors * np.sqrt(np.maximum(eigenvalues, 0.0)))  # shape (n, n_electrode, n_unknown)
 
-    # Rotate the directions so that they are uncorrelated in units of the noise, and keep the large ones.
-    weight = (np.abs(charge) / noise.sigma(charge))[:, :, None]
-    _, singular_values, rotation = np.linalg.svd((weight * changes).reshape(-1, changes.shape[2]), full_matrices=False)
-    effect = singular_values / np.sqrt(charge.size)
-    kept = rotation[effect > MIN_DIRECTION]
+    # Rotate the directions so that their effects are uncorrelated in units of the noise, and keep the large ones.
+    weighted = (changes / noise.sigma(charge)[:, :, None]).reshape(-1, changes.shape[2])
+    _, singular_values, rotation = np.linalg.svd(weighted, full_matrices=False)
+    kept = rotation[singular_values > MIN_DIRECTION * np.sqrt(charge.size)]
     return np.asarray((changes @ kept.T).swapaxes(1, 2))
 
 
 def training_data(
     charges: FilmCharges,
     film: FilmEstimate,
-    compact: CompactCharges,
+    series: ChargeSeries,
     side_forces: SideForces,
     executor: Executor | None,
 ) -> TrainingData:
@@ -170,15 +193,17 @@ def training_data(
     Args:
         charges: Charges of the solved film and of similar films.
         film: The estimate of the film.
-        compact: The same charges as series.
+        series: The compact charge map of the film.
         side_forces: Side forces of later contacts.
         executor: Executor that solves the presses outside the working area; None for this process.
     """
     rng = np.random.default_rng([SEED, 1])
-    domain = compact.field.domain
+    domain = series.domain
     contact = draw_contacts(rng, domain, PRESSES)
-    drift = np.hypot(film.value("drift"), film.std("drift"))
-    charge = compact.draw(rng, contact, gain_std=float(drift / np.sqrt(12.0)))
+    charge = _drawn_charges(series, rng, contact)
+    drift = np.hypot(film.value("drift"), film.std("drift")) / np.sqrt(12.0)  # all gains of the session can occur
+    charge = charge * (1.0 + drift * rng.standard_normal((PRESSES, 1)))
+    charge = charge + film.value("offset") + film.std("offset") * rng.standard_normal((PRESSES, 1))
     charge = charge + _side_charges(charges, side_forces, rng, contact)
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(
@@ -189,8 +214,18 @@ def training_data(
         sha256=hashlib.sha256(charge.tobytes()).hexdigest(),
         outside=_outside_presses(charges, domain, executor),
         yield_force_N=yield_force(sensor.film, [probe], domain.force_range),
-        field=compact.field,
+        field=series.at_state(series.calibrated_state),
     )
+
+
+def _drawn_charges(series: ChargeSeries, rng: np.random.Generator, contact: Array) -> Array:
+    """Draw the charges of contacts, each on another film of the posterior distribution, shape (n, n_electrode), pC."""
+    drawn = []
+    for chunk in np.array_split(contact, len(contact) // CHUNK + 1):
+        state = rng.standard_normal((len(chunk), 1 + series.direction_count))
+        state[:, 0] = 0.0  # the pretension does not change
+        drawn.append(series.changes(chunk, state).charge_pC)
+    return np.concatenate(drawn)
 
 
 def _side_charges(charges: FilmCharges, side_forces: SideForces, rng: np.random.Generator, contact: Array) -> Array:
@@ -205,7 +240,7 @@ def _side_charges(charges: FilmCharges, side_forces: SideForces, rng: np.random.
     domain = charges.domain
     sample = draw_contacts(rng, domain, DIRECTION_CONTACTS)
 
-    def series_of(values: Array) -> Array:
+    def at_contacts(values: Array) -> Array:
         """Fit a series to values at the sample, shape (n_sample, k), and return its values at the contacts."""
         series = Series(fit_series(domain.to_unit(sample), values, *DIRECTION_DEGREES))
         return series.values_and_derivatives(domain.to_unit(contact))[:, 0]
@@ -213,12 +248,12 @@ def _side_charges(charges: FilmCharges, side_forces: SideForces, rng: np.random.
     coefficient, std = side_forces.friction
     if coefficient > 0.0:
         reference = min(coefficient, MAX_FRICTION)
-        friction_charge = series_of(side_force_map.friction_charges(sample, reference) / reference)
+        friction_charge = at_contacts(side_force_map.friction_charges(sample, reference) / reference)
         drawn = coefficient + std * rng.standard_normal(len(contact))
         has_friction = rng.random(len(contact)) < 0.5
         charge += (drawn * has_friction)[:, None] * friction_charge
     if side_forces.share > 0.0:
-        jacobian = series_of(side_force_map.jacobian(sample).reshape(len(sample), -1)).reshape(*charge.shape, 2)
+        jacobian = at_contacts(side_force_map.jacobian(sample).reshape(len(sample), -1)).reshape(*charge.shape, 2)
         angle = 2.0 * np.pi * rng.random(len(contact))
         direction = np.column_stack([np.cos(angle), np.sin(angle)])
         charge += side_forces.share * contact[:, 2:] * np.einsum("nek,nk->ne", jacobian, direction)
@@ -236,7 +271,7 @@ def _outside_presses(charges: FilmCharges, domain: Domain, executor: Executor | 
         return None
     whole_map = whole_film_map(round_map.sensor, round_map.probe, domain.force_range, executor=executor)
     rng = np.random.default_rng([SEED, 2])
-    contact = draw_contacts(rng, replace(domain, radius=outermost), 4 * OUTSIDE_PRESSES)
+    contact = draw_contacts(rng, Domain(outermost, domain.force_range), 4 * OUTSIDE_PRESSES)
     is_outside = np.hypot(contact[:, 0], contact[:, 1]) > domain.radius
     contact = contact[is_outside][:OUTSIDE_PRESSES]
     return LabelledPresses(contact, whole_map.charges(contact))
