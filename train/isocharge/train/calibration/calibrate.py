@@ -32,7 +32,7 @@ MAX_SOLVED_FILMS = 4
 SAME_FILM_STD = 0.3
 """Largest change of a mechanical property, in prior standard deviations, for which the film is not solved again."""
 
-VISIBLE_ASYMMETRY = 0.01
+VISIBLE_ASYMMETRY = 0.03
 """Relative root-mean-square effect of the imperfections on the charges above which the uneven film itself is solved.
 
 The neglected second-order effect is about the square of this value.
