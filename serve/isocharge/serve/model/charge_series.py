@@ -43,7 +43,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -53,6 +53,7 @@ from isocharge.common.chebyshev_series import Series
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError, cut
 from isocharge.common.npz import DAMAGED_FILE_ERRORS, finite_array, finite_number, npz_arrays
+from isocharge.common.robust_estimate import ModelValues
 from isocharge.serve.model.companion_files import read_companion_file
 
 FILE = "charges.npz"
@@ -87,21 +88,6 @@ MAX_RADIUS_mm = 1e4
 
 N_CORNERS = 64
 """Number of corners of the polygon that encloses the area of a map."""
-
-
-class ChargeChanges(NamedTuple):
-    """Charges of n contacts, and their derivatives with respect to the contacts and the state of the film.
-
-    Attributes:
-        charge_pC: Charges, shape (n, n_electrode), pC.
-        by_contact: Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
-        by_state: Derivatives with respect to the state (t, z_1, ..., z_K), shape (n, n_electrode, 1 + K), pC/MPa and
-            pC.
-    """
-
-    charge_pC: Array
-    by_contact: Array
-    by_state: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,13 +172,16 @@ class ChargeSeries:
         nearest, excess = self._nearest_in_domain(contact)
         return self._charges(_continued(self._calibrated.values_and_derivatives(nearest), excess), nearest, excess)
 
-    def changes(self, contact: Array, state: Array) -> ChargeChanges:
+    def changes(self, contact: Array, state: Array) -> ModelValues:
         """Compute the charges of contacts for any state of the film, and the derivatives of the charges.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             state: State (t, z_1, ..., z_K) of the film, shape (1 + K,), or one state for each contact, shape
                 (n, 1 + K), MPa and standard deviations.
+
+        Returns:
+            Charges, and their derivatives with respect to (x, y, ln F) and with respect to the state.
         """
         n_contact = len(contact)
         n_electrode = len(self.electrodes)
@@ -213,7 +202,7 @@ class ChargeSeries:
 
         charge_pC, by_contact = self._charges(value, nearest, excess)
         charge_per_value = self._charge_per_value(charge_pC, nearest, excess)
-        return ChargeChanges(charge_pC, by_contact, charge_per_value[:, :, None] * value_by_state)
+        return ModelValues(charge_pC, by_contact, charge_per_value[:, :, None] * value_by_state)
 
     def at_state(self, state: Array) -> "ChargeSeries":
         """Return the map of the film in another state, which becomes the calibrated film of the result.

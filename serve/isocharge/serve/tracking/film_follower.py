@@ -1,85 +1,55 @@
 """Correction of contacts for changes of the film. The changes are estimated from ordinary touches.
 
-The charges of four electrodes have one degree of freedom more than a contact (x, y, force). The misfit is the distance
-between the measured charges and the nearest charges that a contact can produce. If the pretension of a film changes,
-for example because the room becomes warmer by 1 K, the misfits of all touches increase. The estimated pretension is the
-pretension for which the misfits of the touches are smallest.
+The charges of four electrodes have one degree of freedom more than a contact (x, y, force). If the pretension of a film
+changes, for example because the room becomes warmer by 1 K, no contact explains the charges of touches exactly. The
+module `isocharge.serve.tracking.film_state` estimates the state of the film, with which the latest touches can be
+explained best. Each touch contributes its average charges of the frames with about the largest force.
 
-The module `isocharge.serve.tracking.film_filter` estimates the pretension. The estimate uses one set of charges of each
-touch, namely the average charges of the frames with about the largest force. The filter also estimates the gains, a
-common offset, and the changes of the film along directions that remained uncertain after the calibration
-(`FilmDirections`). Contacts are corrected for the estimated pretension and for the estimated changes along the
-directions.
+The network was trained for the film as it was calibrated. The charges of a frame are therefore converted into charges
+that the same contact would cause on the calibrated film, and the network computes the contact from the converted
+charges. The conversion depends on the contact, so both are repeated a few times.
 
-If no pretension explains a touch, for example a touch with two contacts, the touch hardly changes the estimate. The
-film is considered lost in three cases.
-
-- No pretension explains the latest touches.
-- A wrong gain of one electrode explains the latest touches far better than any pretension.
-- The charges have a common offset, for example from a warm hand, that is larger than the settings allow.
-
-While the film is lost, contacts are computed with an earlier estimate that does not include the latest touches.
+The film is considered lost if no state explains the latest touches, if the estimated pretension is at the end of the
+range that the model describes, or if the common offset is larger than the settings allow. While the film is lost, the
+estimate from before is used for contacts.
 """
 
 import math
 from collections import deque
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.model.film_directions import read_film_directions
-from isocharge.serve.prediction.contact import Contact, Sensitivity, is_close
+from isocharge.common.errors import ModelError
+from isocharge.serve.model.charge_series import FILE, read_charges
+from isocharge.serve.prediction.contact import Contact, is_close
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.rule import Rule, Setting
-from isocharge.serve.tracking.film_filter import FilmFilter
-from isocharge.serve.tracking.film_state import FilmStateEstimate
-from isocharge.serve.tracking.film_update import TouchResiduals
-from isocharge.serve.tracking.followable_pretensions import followable_pretensions
-from isocharge.serve.tracking.pretension_grid import odds_of_no_change
-from isocharge.serve.tracking.touch_collector import ObservedTouch, TouchCollector
-from isocharge.serve.tracking.touch_misfits import touch_misfits
+from isocharge.serve.tracking.film_state import FilmModel, Touch
+from isocharge.serve.tracking.touch_collector import TouchCollector
 
-RECENT_TOUCHES = 40
+MAX_TOUCHES = 64
+"""Number of the latest touches from which the state is estimated."""
+
+RECENT_TOUCHES = 16
 """Number of the latest touches from which the follower decides whether the film is lost."""
 
-FEWEST_TOUCHES = 12
+FEWEST_TOUCHES = 8
 """Number of touches before the first correction of contacts."""
 
 LARGEST_SQUARE = 9.0
-"""Upper limit of the squared misfit of a touch, relative to the mean square of good touches.
+"""Upper limit of the squared residual of a touch in the decision whether the film is lost, per degree of freedom."""
 
-The limit applies to the decision whether the film is lost. A single touch then has little influence.
-"""
+EXPLAINED_SQUARE = 3.0
+"""Largest mean of the limited squared residuals, per degree of freedom, at which the latest touches are explained."""
 
-EXPLAINED_SQUARE = 1.25
-"""Largest mean of the squared misfits of very many touches that are explained by a pretension."""
+MAX_RELATIVE_OFFSET = 2.0
+"""Magnitude of the common offset, relative to the largest tolerated standard deviation, above which it is too large."""
 
-EXPLAINED_SCATTER = 5.0
-"""Amount by which the sum of n squared misfits may exceed n * EXPLAINED_SQUARE, divided by the square root of n."""
-
-WRONG_GAINS = np.outer([-1.0, 1.0], [0.03, 0.04, 0.06, 0.09]).ravel()
-"""Gain errors of a single electrode that are compared with a change of the pretension."""
-
-WRONG_GAIN_MARGIN = 9.0
-"""Smallest reduction of the sum of squared misfits for which a gain is considered wrong.
-
-The reduction is the smallest sum for any pretension minus the smallest sum for any wrong gain.
-"""
-
-OFFSET_CORRECTION_ERROR = 0.5
-"""Standard deviation of the correction of the pretension for offsets, in units of the correction."""
-
-UNCHANGED_PROBABILITY = 0.2
-"""Probability before the first touch that the pretension has not changed since the calibration."""
-
-SENSITIVITY_STEP_MPa = 0.05
-"""Step of the finite differences with respect to the pretension, MPa."""
-
-SMALLEST_CHANGE_MPa = 0.01
-"""Smallest change of the pretension after which the weights of the model are computed again, MPa."""
+CONVERSIONS = 3
+"""Number of repetitions of the conversion of charges and of the computation of the contact."""
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):
@@ -103,34 +73,26 @@ class FollowedContact(NamedTuple):
 
     Attributes:
         contact: The corrected contact.
-        charge_pC: Charges for which the model with the estimated pretension predicts this contact, shape
-            (n_electrode,), pC.
+        charge_pC: Charges from which the model predicts this contact, shape (n_electrode,), pC.
     """
 
     contact: Contact
     charge_pC: Array
 
 
-class SquaredMisfits(NamedTuple):
-    """Squared misfits of one touch for different hypotheses about the film.
-
-    The squared misfits are relative to the mean squared misfit of good touches. Each value is limited to
-    `LARGEST_SQUARE`.
+class _Conversion(NamedTuple):
+    """Conversion of charges near one contact into charges of the calibrated film: factor * charge + shift.
 
     Attributes:
-        with_gains: Squared misfit at each pretension after a correction for the gains, the offset and the directions,
-            shape (n_pretension,).
-        at_touch_estimate: Element of `with_gains` at the pretension that was estimated at the time of the touch.
-        without_gains: Squared misfit at each pretension after a correction for the offset and the directions, but not
-            for the gains, shape (n_pretension,).
-        wrong_gain: Squared misfit for each wrong gain of each electrode, first with the model of the calibrated film
-            and then with the model of the estimated pretension, shape (2 * n_wrong_gain * n_electrode,).
+        factor: Factors, shape (n_electrode,), dimensionless.
+        shift_pC: Shifts, shape (n_electrode,), pC.
+        contact_shifts: Changes of x (mm), y (mm) and the force (N) by independent errors of the state, shape (3, 3). Each
+            row belongs to one error.
     """
 
-    with_gains: Array
-    at_touch_estimate: float
-    without_gains: Array
-    wrong_gain: Array
+    factor: Array
+    shift_pC: Array
+    contact_shifts: Array
 
 
 class FilmFollower:
@@ -139,8 +101,8 @@ class FilmFollower:
     The methods must be called from one thread. The same sequence of frames always gives bitwise equal contacts.
 
     Attributes:
-        predictor: Model of the film with the estimated pretension.
-        is_lost: Whether the film is lost. The estimate is not updated while the film is lost.
+        predictor: Model of the calibrated film.
+        is_lost: Whether the film is lost.
     """
 
     def __init__(self, predictor: Predictor, rule: FollowRule | None = None, offset_ratio: Array | float = 1.0) -> None:
@@ -153,56 +115,46 @@ class FilmFollower:
                 (n_electrode,), or one number for all electrodes.
 
         Raises:
-            ModelError: If the model has fewer than four electrodes, or has no file of pretensions, or the file of
-                pretensions belongs to another model.
+            ModelError: If the model has fewer than four electrodes, or has no charge map with several pretensions, or
+                the file of the charge map belongs to another model.
         """
-        self._calibrated_predictor = predictor
-        self._pretensions = followable_pretensions(predictor)
-        electrodes = self._pretensions.typical_pC.size
-        self._directions = read_film_directions(predictor.folder, electrodes)
-        self._misfits = touch_misfits(predictor, self._pretensions)
-        self._calibrated_misfits = self._misfits.at_pretension(self._pretensions.calibrated_MPa)
+        electrodes = predictor.metadata.electrodes
+        if len(electrodes) < 4:
+            raise ModelError(
+                f"{predictor.folder}: expected at least four electrodes, got {', '.join(electrodes)}: with as many "
+                "charges as unknowns, a change of the film cannot be told from another contact; follow a film with four "
+                "electrodes or more, or calibrate this one again with --from"
+            )
+        series = read_charges(predictor.folder, electrodes)
+        if series is None or series.node_MPa.size < 2:
+            raise ModelError(
+                f"{predictor.folder}: expected the file {FILE} with the charges of the film at several pretensions; a "
+                "film is followed from a model that `isocharge train calibrate` made of presses on it: calibrate it, or "
+                "again with this version"
+            )
         rule = rule or FollowRule()
-        self._filter = FilmFilter(
-            self._pretensions,
-            self._directions,
-            self._misfits,
-            rule.drift_MPa_per_root_hour,
-            rule.largest_offset_pC,
-            np.broadcast_to(np.asarray(offset_ratio, dtype=float), (electrodes,)),
+        self.predictor = predictor
+        self._series = series
+        self._model = FilmModel(
+            series=series,
+            offset_ratio=np.broadcast_to(np.asarray(offset_ratio, dtype=float), (len(electrodes),)),
+            drift_MPa_per_root_hour=rule.drift_MPa_per_root_hour,
+            largest_offset_pC=rule.largest_offset_pC,
         )
-        self._calibrated_estimate = FilmStateEstimate(
-            pretension_MPa=self._pretensions.calibrated_MPa,
-            std_MPa=self._pretensions.std_MPa,
-            directions=np.zeros(self._directions.count),
-            directions_per_MPa=np.zeros(self._directions.count),
-        )
-        # Each row contains a wrong gain for one electrode, and the gain 1 for all other electrodes. The shape is
-        # (n_wrong_gain * n_electrode, n_electrode).
-        self._wrong_gains = 1.0 + np.kron(np.eye(electrodes), WRONG_GAINS[:, None])
         self._touch_collector = TouchCollector()
         self.reset()
 
     def reset(self) -> None:
         """Discard all touches, and assume again that the film has not changed since the calibration."""
-        self._filter.reset()
-        self.predictor = self._calibrated_predictor
-        self._applied_misfits = self._calibrated_misfits
         self.is_lost = False
-        self._applied_estimate = self._calibrated_estimate
-
-        # Model at a neighbouring pretension, with which the sensitivity of contacts to the pretension is computed.
-        self._neighbouring_model: Predictor | None = None
-        self._neighbouring_step_MPa = SENSITIVITY_STEP_MPa
-
-        # Charge ratios for both models, and the contact for which the ratios were computed; see `_charge_ratios`.
-        self._stored_ratios: tuple[Array, Array] | None = None
-        self._stored_ratios_contact: Contact | None = None
-        self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
+        self._touches: deque[Touch] = deque(maxlen=MAX_TOUCHES)
+        self._contacts = np.empty((0, 3))  # estimated contacts (x, y, ln F) of the touches
+        self._state = np.zeros(self._model.size)  # latest estimate, from which the next search starts
+        self._first_touch_s: float | None = None
         self._touch_count = 0
-        self._recent_misfits: deque[SquaredMisfits] = deque(maxlen=RECENT_TOUCHES)
-        # Estimates after the latest touches. Before the first touches, the film was in the state of the calibration.
-        self._recent_estimates = deque([self._calibrated_estimate] * RECENT_TOUCHES, maxlen=RECENT_TOUCHES)
+        self._applied_state: Array | None = None  # state that contacts are corrected for; None before the first one
+        self._applied_covariance = self._model.prior(0.0).covariance
+        self._discard_conversion()
         self._touch_collector.reset()
 
     def discard_touch(self) -> None:
@@ -212,20 +164,18 @@ class FilmFollower:
     @property
     def film(self) -> FollowedFilm:
         """Present estimate of the film, in the format of a prediction record."""
-        estimate = self._applied_estimate
-        return FollowedFilm(estimate.pretension_MPa, estimate.std_MPa, self._touch_count)
+        change_MPa = 0.0 if self._applied_state is None else float(self._applied_state[0])
+        std_MPa = math.sqrt(self._applied_covariance[0, 0])
+        return FollowedFilm(self._series.pretension_MPa + change_MPa, std_MPa, self._touch_count)
 
     def observe_frame(
         self, charge_pC: Array | None, contact: Contact | None, flags: tuple[str, ...], clock_s: float
     ) -> None:
         """Process the next frame, and update the estimate of the film when a touch ends.
 
-        The estimate is updated with the average charges of the frames with about the largest force, unless the touch is
-        unusable; see `TouchCollector`.
-
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC; None if nothing touches the film.
-            contact: Contact that the model computed from the charges; None if nothing touches the film.
+            contact: Contact after the correction; None if nothing touches the film.
             flags: Flags of the frame.
             clock_s: Time of the frame on a clock that does not jump, s.
         """
@@ -233,250 +183,112 @@ class FilmFollower:
             assert charge_pC is not None  # a frame with a contact has charges
             self._touch_collector.add_frame(contact, charge_pC, flags)
             return
-        touch = self._touch_collector.end_touch(self.predictor)
-        if touch is not None:
-            self.observe_touch(touch, clock_s)
+        peak = self._touch_collector.end_touch()
+        if peak is not None:
+            frame_variance_pC2 = self.predictor.metadata.noise.variance(peak.mean_charge_pC)
+            variance_pC2 = frame_variance_pC2 * peak.relative_noise_variance(frame_variance_pC2)
+            touch_contact = self.predictor.predict(peak.mean_charge_pC)
+            followed = self.follow_contact(touch_contact, peak.mean_charge_pC).contact
+            self.observe_touch(Touch(peak.mean_charge_pC, variance_pC2, np.array(followed[:3]), clock_s))
+
+    def observe_touch(self, touch: Touch) -> None:
+        """Update the estimate of the film with a touch, and decide whether the film is lost."""
+        if self._first_touch_s is None:
+            self._first_touch_s = touch.clock_s
+        lowest, highest = self._model.contact_bounds
+        start = np.array(touch.contact, dtype=float)
+        start[2] = math.log(max(start[2], math.exp(lowest[2])))
+        start = np.clip(start, lowest, highest)
+        self._touches.append(touch)
+        self._touch_count += 1
+        self._contacts = np.vstack([self._contacts, start])[-MAX_TOUCHES:]
+        if len(self._touches) < FEWEST_TOUCHES:
+            return
+
+        elapsed_s = max(touch.clock_s - self._first_touch_s, 0.0)
+        estimate = self._model.estimate(self._touches, self._state, self._contacts, elapsed_s)
+        self._state = estimate.state
+        self._contacts = estimate.contacts
+        recent_squares = np.minimum(estimate.chi2 / estimate.degrees, LARGEST_SQUARE)[-RECENT_TOUCHES:]
+        is_explained = recent_squares.mean() < EXPLAINED_SQUARE
+        self.is_lost = not is_explained or self._is_out_of_range(estimate.state)
+        if self.is_lost:
+            # The film may have changed suddenly. The earlier touches then do not help to find its state.
+            while len(self._touches) > RECENT_TOUCHES:
+                self._touches.popleft()
+            self._contacts = self._contacts[-RECENT_TOUCHES:]
+        else:
+            self._applied_state = estimate.state
+            self._applied_covariance = estimate.covariance
+            self._discard_conversion()
+
+    def _is_out_of_range(self, state: Array) -> bool:
+        """Return whether the pretension is at the end of the range of the model, or the offset is too large."""
+        low_MPa, high_MPa = self._series.node_MPa[[0, -1]]
+        is_pretension_known = low_MPa < state[0] < high_MPa
+        largest_pC = MAX_RELATIVE_OFFSET * self._model.largest_offset_pC
+        return not is_pretension_known or abs(state[self._model.offset]) > max(largest_pC, 1e-3)
 
     def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
         """Correct a contact for the estimated changes of the film.
 
-        The charges of the present film differ from the charges of the film that `predictor` describes. The measured
-        charges are therefore divided by the ratio of the charges of these two films, and the contact is computed again
-        from the quotients. The uncertainty of the pretension is added to the standard deviations of the contact. The
-        effect of this uncertainty on the contact is computed with the model of a neighbouring pretension. Before the
-        first estimate of the film, the contact is returned unchanged.
+        The uncertainty of the state is added to the standard deviations of the contact. Before the first estimate of
+        the film, the contact is returned unchanged.
 
         Args:
             contact: Contact that `predictor` computed from the charges.
             charge_pC: Touch charges, shape (n_electrode,), pC.
         """
-        if self._neighbouring_model is None:  # there is no estimate yet
+        state = self._applied_state
+        if state is None:  # there is no estimate yet
             return FollowedContact(contact, charge_pC)
-        corrected_contact = contact
-        corrected_pC = charge_pC
-        neighbouring_pC = charge_pC  # charges for the model at the neighbouring pretension
-        if self._directions.count > 0:  # without directions, all ratios are 1
-            ratio, neighbouring_ratio = self._charge_ratios(contact)
-            neighbouring_pC = charge_pC / neighbouring_ratio
-            corrected_pC = charge_pC / ratio
-            corrected_contact = self.predictor.predict(corrected_pC)
-        predict_neighbouring = partial(self._neighbouring_model.predict, neighbouring_pC)
-        shift = self._sensitivity.shift(corrected_contact, self._applied_estimate.std_MPa, predict_neighbouring)
-        return FollowedContact(corrected_contact.widened(shift), corrected_pC)
+        if self._conversion is None or not is_close(contact, self._conversion_contact):
+            corrected = contact
+            for _ in range(CONVERSIONS):
+                conversion = self._conversion_at(corrected, state)
+                corrected = self.predictor.predict(conversion.factor * charge_pC + conversion.shift_pC)
+            self._conversion = conversion
+            self._conversion_contact = contact
+        conversion = self._conversion
+        corrected_pC = conversion.factor * charge_pC + conversion.shift_pC
+        corrected = self.predictor.predict(corrected_pC)
+        for x_mm, y_mm, force_N in conversion.contact_shifts.tolist():
+            corrected = corrected.widened((x_mm, y_mm, force_N))
+        return FollowedContact(corrected, corrected_pC)
 
-    def _charge_ratios(self, contact: Contact) -> tuple[Array, Array]:
-        """Return the ratios by which charges are divided before a model computes a contact from them.
+    def _discard_conversion(self) -> None:
+        """Discard the stored conversion, which belongs to an earlier contact or state."""
+        self._conversion: _Conversion | None = None
+        self._conversion_contact: Contact | None = None
 
-        A ratio is a charge of the present film, divided by the charge of the film that the model describes. The ratios
-        depend on the contact and on the estimate of the film. The ratios are therefore stored, and computed again only
-        if the contact has moved or the estimate of the film has changed.
-
-        Args:
-            contact: Contact for which the ratios are needed.
-
-        Returns:
-            Ratios for the model with the estimated pretension, and ratios for the model with the neighbouring
-            pretension, each of shape (n_electrode,).
-        """
-        if self._stored_ratios is None or not is_close(contact, self._stored_ratios_contact):
-            contacts = np.array([contact[:3]])  # one contact (x, y, force), shape (1, 3)
-            log_changes = self._directions.log_changes(contacts)[0]
-            ratio = self._applied_estimate.charge_ratio(log_changes)
-            neighbouring_ratio = self._applied_estimate.charge_ratio(log_changes, self._neighbouring_step_MPa)
-            self._stored_ratios = ratio, neighbouring_ratio
-            self._stored_ratios_contact = contact
-        return self._stored_ratios
-
-    def observe_touch(self, touch: ObservedTouch, clock_s: float) -> None:
-        """Update the estimate of the film with a touch, and decide whether the film is lost.
-
-        The film is lost if no pretension explains the latest touches, if the gain of an electrode seems to be wrong, or
-        if the offsets are too large. When the film becomes lost, the estimate from the time before the latest touches
-        is restored. No estimate is used before `FEWEST_TOUCHES` touches were observed.
+    def _conversion_at(self, contact: Contact, state: Array) -> _Conversion:
+        """Return the conversion of charges near a contact.
 
         Args:
-            touch: The touch.
-            clock_s: Time of the touch on a clock that does not jump, s.
+            contact: Contact on the calibrated film.
+            state: State of the film, shape (n_state,).
         """
-        contacts = np.array([touch.contact[:3]])  # one contact (x, y, force), shape (1, 3)
-        log_changes = self._directions.log_changes(contacts)[0]
-        self._filter.predict(clock_s)
-        residuals = self._filter.update(touch.charge_pC, contacts[0], log_changes, touch.misfit_std)
-        self._touch_count += 1
-        self._recent_misfits.append(self._squared_misfits(touch, log_changes, residuals))
-        if len(self._recent_misfits) < FEWEST_TOUCHES:
-            return
+        model = self._model
+        lowest, highest = model.contact_bounds
+        log_force = math.log(max(contact.force_N, math.exp(lowest[2])))
+        log_contact = np.clip([[contact.x_mm, contact.y_mm, log_force]], lowest, highest)
+        present = model.values(log_contact, state)
+        calibrated = model.values(log_contact, np.zeros_like(state))
+        offset_pC = state[model.offset] * model.offset_ratio
+        calibrated_pC = calibrated.charge_pC[0]
+        if self._series.log_size is None:  # all charges are positive
+            factor = calibrated_pC / (present.charge_pC[0] - offset_pC)
+            shift_pC = -factor * offset_pC
+        else:  # a ratio of charges near zero would be very large or small
+            factor = np.ones_like(calibrated_pC)
+            shift_pC = calibrated_pC - present.charge_pC[0]
 
-        was_lost = self.is_lost
-        self.is_lost = self._is_unexplained() or self._is_gain_wrong() or self._filter.is_offset_too_large
-        if not self.is_lost:
-            estimate = self._estimate()
-            self._recent_estimates.append(estimate)
-            self._apply_estimate(estimate)
-        elif not was_lost:  # the film became lost with this touch
-            earlier_estimate = self._recent_estimates[0]  # before the latest `RECENT_TOUCHES` touches
-            self._apply_estimate(earlier_estimate)
-            # If the film is soon lost again, the same estimate is restored, because the later estimates are doubtful.
-            self._recent_estimates.extend([earlier_estimate] * RECENT_TOUCHES)
-
-    def _squared_misfits(self, touch: ObservedTouch, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
-        """Compute the squared misfits of a touch, which are needed to decide whether the film is lost.
-
-        Each squared misfit is limited to `LARGEST_SQUARE`, so that a single touch has little influence.
-
-        Args:
-            touch: The touch, with the charges Q.
-            log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode). A direction is
-                an uncertain combination of film parameters.
-            residuals: Squared misfits that the filter computed for the touch.
-        """
-        squares_with_gains = np.minimum(residuals.with_gains, LARGEST_SQUARE)  # shape (n_pretension,)
-
-        # Correct the charges for the estimated offset, and for the estimated changes of the film along the directions.
-        direction_means = self._filter.direction_means(self._filter.mean_MPa)
-        corrected_pC = (touch.charge_pC - self._filter.offset_pC) * np.exp(-direction_means @ log_changes)
-        wrong_gain_squares = self._squared_misfits_of_wrong_gains(
-            touch._replace(charge_pC=corrected_pC), residuals.offset_variance
-        )
-        return SquaredMisfits(
-            with_gains=squares_with_gains,
-            at_touch_estimate=float(squares_with_gains[self._filter.nearest_index]),
-            without_gains=np.minimum(residuals.without_gains, LARGEST_SQUARE),
-            wrong_gain=np.minimum(wrong_gain_squares, LARGEST_SQUARE),
-        )
-
-    def _squared_misfits_of_wrong_gains(self, corrected_touch: ObservedTouch, offset_variance: float) -> Array:
-        """Compute the squared misfit of a touch for each hypothesis that the gain of one electrode is wrong.
-
-        Args:
-            corrected_touch: The touch, with charges that are corrected for the offset and the directions.
-            offset_variance: Variance of the misfit that is caused by the deviation of the offset of this touch from
-                the mean offset, relative to the mean squared misfit of good touches.
-
-        Returns:
-            Squared misfits, first at the calibrated pretension and then at the estimated pretension, shape
-            (2 * n_wrong_gain * n_electrode,). They are relative to the mean squared misfit of good touches.
-        """
-        corrected_pC = corrected_touch.charge_pC
-        charges_with_wrong_gain_pC = corrected_pC * self._wrong_gains  # shape (n_wrong_gain * n_electrode, n_electrode)
-        start = np.array(corrected_touch.contact[:3])  # x, y and force
-        no_changes = np.empty((0, corrected_pC.size))  # only the misfit vectors are needed, not their changes
-        squares = []
-        for misfits in (self._calibrated_misfits, self._applied_misfits):  # each has a single pretension
-            linearised = misfits.linearise(charges_with_wrong_gain_pC, start, no_changes)
-            # The shape of the misfit vectors is (n_wrong_gain * n_electrode, n_electrode).
-            misfit_vectors = linearised.vectors[:, 0] / corrected_touch.misfit_std
-            squares.append((misfit_vectors**2).sum(axis=1))
-
-        # The random offset of this touch adds to the variance 1 of a good touch.
-        return np.concatenate(squares) / (1.0 + offset_variance)
-
-    def _is_unexplained(self) -> bool:
-        """Return whether no pretension explains the latest touches.
-
-        The squared misfits of the latest touches are added up in two ways. The first sum uses the present estimate of
-        the pretension for all touches. The second sum uses the estimate at the time of each touch. If the smaller of
-        the two sums exceeds a limit, no pretension explains the touches.
-        """
-        count = len(self._recent_misfits)
-        nearest_index = self._filter.nearest_index
-        sum_at_present_estimate = sum(float(touch.with_gains[nearest_index]) for touch in self._recent_misfits)
-        sum_at_earlier_estimates = sum(touch.at_touch_estimate for touch in self._recent_misfits)
-        largest_explained_sum = EXPLAINED_SQUARE * count + EXPLAINED_SCATTER * math.sqrt(count)
-        return min(sum_at_present_estimate, sum_at_earlier_estimates) > largest_explained_sum
-
-    def _is_gain_wrong(self) -> bool:
-        """Return whether a wrong gain of one electrode explains the latest touches far better than any pretension."""
-        sum_by_pretension = np.sum([touch.without_gains for touch in self._recent_misfits], axis=0)
-        sum_by_wrong_gain = np.sum([touch.wrong_gain for touch in self._recent_misfits], axis=0)
-        return bool(sum_by_wrong_gain.min() < sum_by_pretension.min() - WRONG_GAIN_MARGIN)
-
-    def _estimate(self) -> FilmStateEstimate:
-        """Compute the estimate of the film as an average over two hypotheses.
-
-        The first hypothesis is that the pretension has changed since the calibration. The second hypothesis is that the
-        pretension has not changed. Before the first touch, the second hypothesis has the probability
-        `UNCHANGED_PROBABILITY`. The variance of the result includes the difference between the two hypotheses.
-        """
-        calibrated_MPa = self._pretensions.calibrated_MPa
-        change_MPa = self._filter.mean_MPa - calibrated_MPa
-        variance_MPa2 = self._filter_variance() + self._additional_variance()
-        changed_probability = self._changed_probability()
-
-        # Mean and standard deviation of the mixture of both hypotheses.
-        pretension_MPa = calibrated_MPa + changed_probability * change_MPa
-        variance_between_MPa2 = changed_probability * (1.0 - changed_probability) * change_MPa**2
-        std_MPa = math.sqrt(variance_MPa2 + variance_between_MPa2)
-
-        # Means of the directions at the estimated pretension, and the slopes of the means as finite differences.
-        directions = self._filter.direction_means(pretension_MPa)
-        neighbouring_directions = self._filter.direction_means(pretension_MPa + SENSITIVITY_STEP_MPa)
-        directions_per_MPa = (neighbouring_directions - directions) / SENSITIVITY_STEP_MPa
-        return FilmStateEstimate(pretension_MPa, std_MPa, directions, directions_per_MPa)
-
-    def _filter_variance(self) -> float:
-        """Return the variance of the pretension according to the filter, MPa^2."""
-        deviations_MPa = self._filter.grid_MPa - self._filter.mean_MPa
-        return float(self._filter.pretension_probability @ deviations_MPa**2)
-
-    def _additional_variance(self) -> float:
-        """Return the part of the pretension variance that is caused by errors outside the filter, MPa^2.
-
-        These errors are the errors of the other parameters of the film, and the error of the correction for offsets.
-        """
-        offset_std_MPa = OFFSET_CORRECTION_ERROR * self._filter.offset_correction_MPa
-        return self._pretensions.floor_MPa**2 + offset_std_MPa**2
-
-    def _changed_probability(self) -> float:
-        """Return the probability that the pretension has changed since the calibration."""
-        pretensions = self._pretensions
-        change_MPa = self._filter.grid_MPa - pretensions.calibrated_MPa
-        odds_for_equal_priors = odds_of_no_change(
-            change_MPa, self._filter.pretension_probability, pretensions.std_MPa, self._additional_variance()
-        )
-        # The odds are multiplied by the actual prior odds of the hypothesis that the pretension has not changed.
-        unchanged_odds = odds_for_equal_priors * UNCHANGED_PROBABILITY / (1.0 - UNCHANGED_PROBABILITY)
-        return 1.0 / (1.0 + unchanged_odds)
-
-    def _apply_estimate(self, estimate: FilmStateEstimate) -> None:
-        """Use a new estimate of the film for all later contacts.
-
-        If the pretension has changed by less than `SMALLEST_CHANGE_MPa`, the present pretension and the present models
-        are kept. The other values of the new estimate are used in any case.
-        """
-        self._stored_ratios = None  # the stored ratios of the charges belong to the previous estimate
-        present_MPa = self._applied_estimate.pretension_MPa
-        is_same_pretension = abs(estimate.pretension_MPa - present_MPa) < SMALLEST_CHANGE_MPa
-        if is_same_pretension:
-            self._applied_estimate = estimate._replace(pretension_MPa=present_MPa)
-        else:
-            self._applied_estimate = estimate
-            self.predictor = self._model_with_pretension(estimate.pretension_MPa)
-            self._applied_misfits = self._misfits.at_pretension(estimate.pretension_MPa)
-
-        # The first estimate needs the neighbouring model even if the pretension has not changed.
-        if not is_same_pretension or self._neighbouring_model is None:
-            self._set_neighbouring_model(self._applied_estimate.pretension_MPa)
-
-    def _set_neighbouring_model(self, pretension_MPa: float) -> None:
-        """Create the model of a neighbouring pretension, in order to compute the sensitivity to the pretension.
-
-        The neighbouring pretension is larger than the estimated pretension by `SENSITIVITY_STEP_MPa`. If no weights are
-        available for the larger pretension, the neighbouring pretension is smaller by the same amount.
-
-        Args:
-            pretension_MPa: The estimated pretension, MPa.
-        """
-        step_MPa = SENSITIVITY_STEP_MPa
-        _smallest_MPa, largest_MPa = self._pretensions.range_MPa
-        if pretension_MPa + step_MPa > largest_MPa:
-            step_MPa = -step_MPa
-        self._neighbouring_step_MPa = step_MPa
-        self._neighbouring_model = self._model_with_pretension(pretension_MPa + step_MPa)
-
-        # The stored sensitivity belongs to the previous models. The sign of the step does not affect variances.
-        self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
-
-    def _model_with_pretension(self, pretension_MPa: float) -> Predictor:
-        """Return the model of the calibrated film at the pretension `pretension_MPa`."""
-        return self._calibrated_predictor.with_constants(self._pretensions.constants(pretension_MPa))
+        # An error of the state shifts the contact whose charges are nearest to the converted charges. The norm is that
+        # of the noise of the charges.
+        noise_std_pC = np.sqrt(self.predictor.metadata.noise.variance(calibrated_pC))
+        charge_errors = factor[:, None] * present.by_state[0] @ np.linalg.cholesky(self._applied_covariance)
+        slopes = calibrated.by_contact[0] / noise_std_pC[:, None]
+        errors = np.linalg.pinv(slopes) @ (charge_errors / noise_std_pC[:, None])  # shape (3, n_state)
+        errors[2] *= contact.force_N  # from ln F to F
+        # Three independent errors with the same covariance: the rows of R in the decomposition errors' = Q R
+        return _Conversion(factor, shift_pC, np.linalg.qr(errors.T, mode="r"))

@@ -1,0 +1,327 @@
+"""Robust least squares for a state that many presses share, with an unknown or uncertain contact of each press.
+
+Each of n presses gives the charges q_i of e electrodes. A charge map predicts the charges Q(u_i, s) of a contact u_i and
+a state s. The state contains the unknowns that all presses share, such as the pretension of a film. The estimate
+minimises
+
+    sum_i (nu + m_i) / 2 * ln(1 + chi2_i / nu) + 1/2 (s - s0)' P (s - s0),
+
+    chi2_i = (q_i - Q(u_i, s))' V_i^-1 (q_i - Q(u_i, s)) + sum_k ((u_ik - v_ik) / w_ik)^2.
+
+The first term is the negative logarithm of a Student's t distribution with nu degrees of freedom, so that presses that
+no contact explains (such as a touch with two fingers) hardly change the state. m_i is the number of charges and of
+measured coordinates of the press minus the three coordinates of its contact. v_ik and w_ik are a measured coordinate and
+its standard deviation. The last term is a Gaussian prior with the mean s0 and the precision P.
+
+The minimum is found by damped Gauss-Newton steps with weights that follow from chi2_i (iteratively reweighted least
+squares; Holland and Welsch 1977). The three coordinates of each contact are eliminated by their Schur complement, so
+the time grows linearly with the number of presses.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+
+FIRST_DAMPING = 1e-3
+"""Damping of the first step, relative to the diagonal of the normal matrix."""
+
+DAMPING_FACTOR = 10.0
+"""Factor by which the damping decreases after a successful step, and increases after an unsuccessful one."""
+
+SMALLEST_CONTACT_DAMPING = 1e-9
+"""Smallest damping of the contacts, so that contacts near a fold of the charge map stay finite."""
+
+MAX_REJECTED_STEPS = 6
+"""Number of successive unsuccessful steps after which the search ends."""
+
+
+class ModelValues(NamedTuple):
+    """Charges that a model predicts for n presses, and their derivatives.
+
+    Attributes:
+        charge_pC: Charges, shape (n, e), pC.
+        by_contact: Derivatives with respect to the coordinates of the contact of each press, shape (n, e, 3).
+        by_state: Derivatives with respect to the state, shape (n, e, p).
+    """
+
+    charge_pC: Array
+    by_contact: Array
+    by_state: Array
+
+
+class Prior(NamedTuple):
+    """Prior of the state: independent groups of correlated unknowns, some of which may have a heavy-tailed prior.
+
+    Attributes:
+        mean: Mean of the state, shape (p,).
+        covariance: Covariance of the state, shape (p, p).
+        freedom: Degrees of freedom of the Student's t prior of each unknown, shape (p,); infinity for a Gaussian prior,
+            which is used for all unknowns if it is None. The covariance then contains the squared scale. An unknown with
+            a Student's t prior is independent of the others.
+    """
+
+    mean: Array
+    covariance: Array
+    freedom: Array | None = None
+
+
+class MeasuredContacts(NamedTuple):
+    """Measured coordinates of the contacts.
+
+    Attributes:
+        coordinates: Measured coordinates, shape (n, 3). Those that are not measured are ignored.
+        std: Standard deviations, shape (n, 3); NaN or infinity for a coordinate that is not measured.
+    """
+
+    coordinates: Array
+    std: Array
+
+
+class RobustEstimate(NamedTuple):
+    """Result of `robust_estimate`.
+
+    Attributes:
+        state: Most probable state, shape (p,).
+        covariance: Covariance of the state in the linearised problem, shape (p, p).
+        contacts: Most probable coordinates of the contacts, shape (n, 3).
+        weights: Weight of each press, shape (n,); about 1 for good presses, and small for outliers.
+        chi2: Squared residual chi2_i of each press, shape (n,).
+        degrees: Number m_i of residual degrees of freedom of each press, shape (n,).
+        cost: Minimised function without constants.
+    """
+
+    state: Array
+    covariance: Array
+    contacts: Array
+    weights: Array
+    chi2: Array
+    degrees: Array
+    cost: float
+
+
+def robust_estimate(
+    model: Callable[[Array, Array], ModelValues],
+    charge_pC: Array,
+    covariance_pC2: Array,
+    prior: Prior,
+    start_state: Array,
+    start_contacts: Array,
+    *,
+    measured: MeasuredContacts | None = None,
+    contact_bounds: tuple[Array, Array] = (np.full(3, -np.inf), np.full(3, np.inf)),
+    state_bounds: tuple[Array, Array] | None = None,
+    freedom: float = 4.0,
+    max_steps: int = 20,
+    tolerance: float = 1e-3,
+) -> RobustEstimate:
+    """Estimate the state that many presses share, and the contact of each press.
+
+    Args:
+        model: Function that predicts the charges from contacts, shape (n, 3), and a state, shape (p,). The coordinates
+            of a contact may have any meaning, for example x, y and the logarithm of the force.
+        charge_pC: Measured charges of the presses, shape (n, e), pC.
+        covariance_pC2: Covariances of the charges of each press, shape (n, e, e), pC^2.
+        prior: Prior of the state.
+        start_state: State at which the search starts, shape (p,).
+        start_contacts: Contacts at which the search starts, shape (n, 3).
+        measured: Measured coordinates of the contacts; None if all contacts are unknown.
+        contact_bounds: Smallest and largest coordinates of contacts, each of shape (3,). The contacts are clipped.
+        state_bounds: Smallest and largest values of the state, each of shape (p,). The state is clipped.
+        freedom: Degrees of freedom nu of the distribution of the residuals; infinity for a Gaussian distribution.
+        max_steps: Largest number of steps.
+        tolerance: The search ends when the step of the state is smaller than this number of standard deviations.
+    """
+    problem = _Problem(model, charge_pC, covariance_pC2, prior, measured, freedom)
+    point = problem.evaluate(start_state, start_contacts)
+    damping = FIRST_DAMPING
+    rejected = 0
+    for _ in range(max_steps):
+        state_step, contact_step = problem.step(point, damping)
+        state = _clipped(point.state + state_step, state_bounds)
+        contacts = np.clip(point.contacts + contact_step, *contact_bounds)
+        trial = problem.evaluate(state, contacts)
+        if not trial.cost <= point.cost:  # also if the cost is not a number
+            damping *= DAMPING_FACTOR
+            rejected += 1
+            if rejected > MAX_REJECTED_STEPS:
+                break
+            continue
+        rejected = 0
+        damping /= DAMPING_FACTOR
+        improvement = point.cost - trial.cost
+        point = trial
+        if improvement < tolerance:
+            break
+    normal_matrix, *_ = problem.normal_equations(point, SMALLEST_CONTACT_DAMPING)
+    return RobustEstimate(
+        state=point.state,
+        covariance=np.linalg.inv(normal_matrix),
+        contacts=point.contacts,
+        weights=point.weights,
+        chi2=point.chi2,
+        degrees=problem.degrees,
+        cost=point.cost,
+    )
+
+
+def _clipped(state: Array, bounds: tuple[Array, Array] | None) -> Array:
+    """Move a state into its bounds."""
+    return state if bounds is None else np.clip(state, *bounds)
+
+
+class _Point(NamedTuple):
+    """State and contacts during the search, with the whitened residuals and derivatives.
+
+    Attributes:
+        state: State, shape (p,).
+        contacts: Contacts, shape (n, 3).
+        residual: Whitened residuals of the charges, shape (n, e).
+        by_contact: Whitened derivatives of the charges with respect to the contacts, shape (n, e, 3).
+        by_state: Whitened derivatives of the charges with respect to the state, shape (n, e, p).
+        contact_residual: Measured minus present coordinates over their standard deviations, shape (n, 3).
+        chi2: Squared residuals of the presses, shape (n,).
+        weights: Weights of the presses, shape (n,).
+        cost: Minimised function.
+    """
+
+    state: Array
+    contacts: Array
+    residual: Array
+    by_contact: Array
+    by_state: Array
+    contact_residual: Array
+    chi2: Array
+    weights: Array
+    cost: float
+
+
+class _Problem:
+    """The least squares problem of `robust_estimate`."""
+
+    def __init__(
+        self,
+        model: Callable[[Array, Array], ModelValues],
+        charge_pC: Array,
+        covariance_pC2: Array,
+        prior: Prior,
+        measured: MeasuredContacts | None,
+        freedom: float,
+    ) -> None:
+        """Store the arguments of `robust_estimate`, and compute the factors that divide residuals by their errors."""
+        self._model = model
+        self._charge_pC = charge_pC
+        self._whitening = np.linalg.inv(np.linalg.cholesky(covariance_pC2))  # shape (n, e, e)
+        self._prior = prior
+        self._precision = np.linalg.inv(prior.covariance)
+        self._freedom = freedom
+        n_press, n_electrode = charge_pC.shape
+        self._measured = np.zeros((n_press, 3))
+        self._contact_precision = np.zeros((n_press, 3))  # one over the standard deviations, 0 if not measured
+        if measured is not None:
+            is_measured = np.isfinite(measured.std)
+            self._contact_precision[is_measured] = 1.0 / measured.std[is_measured]
+            self._measured = np.where(is_measured, measured.coordinates, 0.0)
+        measured_count = np.count_nonzero(self._contact_precision, axis=1)
+        self.degrees = n_electrode + measured_count - 3.0
+
+    def evaluate(self, state: Array, contacts: Array) -> _Point:
+        """Evaluate the model, the residuals and the cost at a state and contacts."""
+        values = self._model(contacts, state)
+        residual = (self._whitening @ (self._charge_pC - values.charge_pC)[:, :, None])[:, :, 0]
+        contact_residual = (self._measured - contacts) * self._contact_precision
+        chi2 = (residual**2).sum(axis=1) + (contact_residual**2).sum(axis=1)
+        weights = np.ones(len(chi2))
+        press_cost = 0.5 * chi2
+        if np.isfinite(self._freedom):
+            weights = (self._freedom + self.degrees) / (self._freedom + chi2)
+            press_cost = 0.5 * (self._freedom + self.degrees) * np.log1p(chi2 / self._freedom)
+        return _Point(
+            state=state,
+            contacts=contacts,
+            residual=residual,
+            by_contact=self._whitening @ values.by_contact,
+            by_state=self._whitening @ values.by_state,
+            contact_residual=contact_residual,
+            chi2=chi2,
+            weights=weights,
+            cost=float(press_cost.sum()) + self._prior_cost(state),
+        )
+
+    def _prior_cost(self, state: Array) -> float:
+        """Return the negative logarithm of the prior without its constant."""
+        deviation = state - self._prior.mean
+        if self._prior.freedom is None:
+            return float(0.5 * deviation @ self._precision @ deviation)
+        is_heavy = np.isfinite(self._prior.freedom)
+        gaussian = np.where(is_heavy, 0.0, deviation)
+        freedom = self._prior.freedom[is_heavy]
+        squares = deviation[is_heavy] ** 2 * np.diag(self._precision)[is_heavy]
+        heavy_cost = 0.5 * ((freedom + 1.0) * np.log1p(squares / freedom)).sum()
+        return float(0.5 * gaussian @ self._precision @ gaussian + heavy_cost)
+
+    def _weighted_precision(self, state: Array) -> Array:
+        """Return the precision of the prior, in which unknowns with a heavy-tailed prior have a smaller precision."""
+        if self._prior.freedom is None:
+            return self._precision
+        is_heavy = np.isfinite(self._prior.freedom)
+        freedom = np.where(is_heavy, self._prior.freedom, 1.0)
+        squares = (state - self._prior.mean) ** 2 * np.diag(self._precision)
+        weights = np.where(is_heavy, (freedom + 1.0) / (freedom + squares), 1.0)
+        return np.asarray(self._precision * np.sqrt(np.outer(weights, weights)))
+
+    def normal_equations(self, point: _Point, damping: float) -> tuple[Array, Array, Array, Array]:
+        """Compute the normal equations of a step of the state, from which the contacts are eliminated.
+
+        With the whitened derivatives C_i with respect to the contact and S_i with respect to the state, the contact of a
+        press moves by du_i = (C_i' C_i + D_i)^-1 (C_i' (r_i - S_i ds) + ...) for a step ds of the state.
+
+        Args:
+            point: State and contacts.
+            damping: Damping of the contacts, relative to the diagonal of their normal matrices.
+
+        Returns:
+            Normal matrix, shape (p, p), and right side, shape (p,). Shift of each contact if the state does not change,
+            shape (n, 3), and its derivative with respect to the step of the state with the opposite sign, shape
+            (n, 3, p).
+        """
+        transposed = point.by_contact.swapaxes(1, 2)
+        contact_matrix = transposed @ point.by_contact
+        diagonal = np.einsum("nkk->nk", contact_matrix)
+        diagonal += self._contact_precision**2
+        diagonal *= 1.0 + damping
+        diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + 1e-300
+        right_side = (transposed @ point.residual[:, :, None])[
+            :, :, 0
+        ] + self._contact_precision * point.contact_residual
+        mixed = transposed @ point.by_state  # shape (n, 3, p)
+        solution = np.linalg.solve(contact_matrix, np.concatenate([right_side[:, :, None], mixed], axis=2))
+        contact_shift = solution[:, :, 0]
+        contact_by_state = solution[:, :, 1:]
+
+        # Schur complement: subtract the part that the contacts explain, and add the prior.
+        weighted = point.weights[:, None, None] * point.by_state
+        weighted_mixed = point.weights[:, None, None] * mixed
+        n_state = point.state.size
+        precision = self._weighted_precision(point.state)
+        normal_matrix = (
+            precision
+            + weighted.reshape(-1, n_state).T @ point.by_state.reshape(-1, n_state)
+            - weighted_mixed.reshape(-1, n_state).T @ contact_by_state.reshape(-1, n_state)
+        )
+        gradient = (
+            precision @ (self._prior.mean - point.state)
+            + weighted.reshape(-1, n_state).T @ point.residual.ravel()
+            - weighted_mixed.reshape(-1, n_state).T @ contact_shift.ravel()
+        )
+        symmetric = 0.5 * (normal_matrix + normal_matrix.T)
+        return symmetric, gradient, contact_shift, contact_by_state
+
+    def step(self, point: _Point, damping: float) -> tuple[Array, Array]:
+        """Compute a damped Gauss-Newton step of the state, shape (p,), and of the contacts, shape (n, 3)."""
+        normal_matrix, gradient, contact_shift, contact_by_state = self.normal_equations(point, damping)
+        damped = normal_matrix + damping * np.diag(np.diag(normal_matrix))
+        state_step = np.linalg.solve(damped, gradient)
+        return state_step, contact_shift - contact_by_state @ state_step
