@@ -20,6 +20,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError
+from isocharge.simulate.sensor.film import MIN_PIEZO
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
@@ -138,6 +139,12 @@ def _piezo(**changes: Callable[[float, float], float]) -> Change:
     return change
 
 
+def _d12(described: float, value: float) -> float:
+    """Return a coefficient d12 that is increased by `value`. A sensor does not accept a tiny one, which is zero."""
+    changed = described + value
+    return changed if abs(changed) >= MIN_PIEZO else 0.0
+
+
 def _shift(axis: int) -> Change:
     """Return a function that moves the electrodes along x (0) or y (1)."""
 
@@ -210,7 +217,7 @@ FILM_PROPERTIES = (
     _imperfection("stiffness_xy", "ln(E1 / E2), times the sine of twice its angle", "1", 0.1, _stiffness(1j)),
     _imperfection("oval_x", "e of an oval clamp, times the cosine of twice its angle", "1", 0.006, _oval(1.0)),
     _imperfection("oval_xy", "e of an oval clamp, times the sine of twice its angle", "1", 0.006, _oval(1j)),
-    _imperfection("d12", "d12, by axes that are rotated", "pC/N", 0.3, _piezo(d12=lambda d12, value: d12 + value)),
+    _imperfection("d12", "d12, by axes that are rotated", "pC/N", 0.3, _piezo(d12=_d12)),
     _imperfection("crosstalk", "share of the charge of each other electrode", "1", 0.01, _crosstalk),
 )
 """Properties of every film. The radius of a circular probe and the gains of the electrodes follow them."""
