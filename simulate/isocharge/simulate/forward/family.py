@@ -6,7 +6,7 @@ The solved presses are the nodes of the family. For every other press, the stres
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np

@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -76,11 +77,11 @@ class FilmProperty:
 def _film(**changes: Callable[[float, float], float]) -> Change:
     """Return a function that changes attributes of the film. Each change is a function of the old value and a value."""
 
-    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-        changed = {name: function(getattr(sensor.film, name), value) for name, function in changes.items()}
+    def changed_sensor(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+        changed: dict[str, Any] = {name: change(getattr(sensor.film, name), value) for name, change in changes.items()}
         return replace(sensor, film=replace(sensor.film, **changed)), probe
 
-    return change
+    return changed_sensor
 
 
 def _scaled(described: float, value: float) -> float:
@@ -132,11 +133,11 @@ def _oval(direction: complex) -> Change:
 def _piezo(**changes: Callable[[float, float], float]) -> Change:
     """Return a function that changes piezoelectric coefficients, like `_film`."""
 
-    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-        changed = {name: function(getattr(sensor.piezo, name), value) for name, function in changes.items()}
+    def changed_sensor(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+        changed: dict[str, Any] = {name: change(getattr(sensor.piezo, name), value) for name, change in changes.items()}
         return replace(sensor, piezo=replace(sensor.piezo, **changed)), probe
 
-    return change
+    return changed_sensor
 
 
 def _d12(described: float, value: float) -> float:

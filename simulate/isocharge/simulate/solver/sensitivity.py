@@ -179,6 +179,7 @@ SIDE_FORCE_FIELDS = (
 SIDE_FORCE_IS_ODD = np.array([field.odd for field in SIDE_FORCE_FIELDS])
 """Whether each of `SIDE_FORCE_FIELDS` is odd, shape (2,)."""
 
+
 def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
     """Compute how the side forces in `SIDE_FORCE_FIELDS` change the scaled stress at the nodes.
 

@@ -11,8 +11,8 @@ the errors finite where the map from contacts to charges folds. Noise alone caus
 (J' W J + P)^-1, which is the Cramer-Rao limit.
 
 The information that a press adds about the film hardly depends on its charges. The best next press can therefore be
-chosen before any charge is measured. Several presses are chosen one after the other (greedy A-optimal design, Pukelsheim
-1993).
+chosen before any charge is measured. Several presses are chosen one after the other (greedy A-optimal design,
+Pukelsheim 1993).
 """
 
 from dataclasses import dataclass
@@ -101,7 +101,7 @@ class ContactSensitivity:
         domain_precision = np.diag(3.0 / domain.scale**2)  # the variance of a uniform distribution from -1 to 1 is 1/3
         noise_covariance = np.linalg.inv(slopes.swapaxes(1, 2) @ slopes + domain_precision)
         film_gain = noise_covariance @ slopes.swapaxes(1, 2) @ linearised.jacobian[:, :-3]
-        return cls(film_gain, noise_covariance)
+        return cls(np.asarray(film_gain), np.asarray(noise_covariance))
 
     @property
     def noise_error(self) -> ContactError:

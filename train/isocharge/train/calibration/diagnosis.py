@@ -143,8 +143,8 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
     Args:
         presses: The measured presses.
-        charges: Charges of a film and of similar films. A channel with small charges does not count as dead if one of a few
-            examined films has similarly small charges.
+        charges: Charges of a film and of similar films. A channel with small charges does not count as dead if one of a
+            few examined films has similarly small charges.
 
     Raises:
         PressError: If a channel has no charges, is dead or has the wrong sign.
@@ -406,8 +406,8 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
 def _plausible_electrode_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
     """Find the assignments of charge columns to electrodes that agree best with a few films.
 
-    For each pretension in `PRETENSIONS_MPa`, the columns are assigned to the electrodes of a film with this pretension. The
-    best assignment minimises the sum of squared differences between the logarithms of measured and expected charges.
+    For each pretension in `PRETENSIONS_MPa`, the columns are assigned to the electrodes of a film with this pretension.
+    The best assignment minimises the sum of squared differences between the logarithms of measured and expected charges.
     Before the logarithms are compared, a common factor of all charges is removed.
 
     Args:

@@ -18,6 +18,8 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from isocharge.common.arrays import Array, Booleans
+from isocharge.common.robust_estimate import MeasuredContacts, ModelValues, RobustEstimate, robust_estimate
+from isocharge.common.robust_estimate import Prior as StatePrior
 from isocharge.train.calibration.discrepancy import terms, unit_covariance
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout
@@ -26,14 +28,11 @@ from isocharge.train.calibration.press_data import PressData
 MAX_LOG_FORCE = 20.0
 """Largest logarithm of a force during the search, so that no number overflows."""
 
-MAX_STEPS = 30
-"""Largest number of Gauss-Newton steps."""
+UNKNOWN_CHARGE_STD = 1e9
+"""Standard deviation of a charge that was not measured, pC."""
 
 STEP_TOLERANCE = 0.02
-"""Largest step, in prior standard deviations, after which the search ends."""
-
-LARGEST_STEP = 1.0
-"""Largest step of an unknown, in prior standard deviations. A longer step is shortened."""
+"""Largest step, in posterior standard deviations, after which the search ends."""
 
 DEGREES_OF_FREEDOM = 5.0
 """Degrees of freedom of Student's t distribution, from which the weights of the presses follow."""
@@ -90,9 +89,7 @@ def hypotheses(data: PressData) -> Iterator[Hypothesis]:
     ):
         cases = (imperfections, discrepancy, scatter, *session)
         probability = float(np.prod([case[1] for case in cases]))
-        yield Hypothesis(
-            imperfections[0], discrepancy[0], tuple(one[0] for one in session), scatter[0], probability
-        )
+        yield Hypothesis(imperfections[0], discrepancy[0], tuple(one[0] for one in session), scatter[0], probability)
 
 
 @dataclass(frozen=True)
@@ -201,43 +198,50 @@ class Estimation:
     hypothesis: Hypothesis
 
 
-def linearise(charges: FilmCharges, layout: Layout, data: PressData, unknowns: Array, contact: Array) -> Linearised:
-    """Compute the residuals of presses and their derivatives.
+def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns: Array, contact: Array) -> ModelValues:
+    """Compute the charges of presses for given unknowns, and their derivatives.
 
     Args:
         charges: Charges of a solved film and of similar films.
         layout: Order of the unknowns.
-        data: The presses.
+        data: The presses, from which the effects of the unknowns of the session follow.
         unknowns: Values of the unknowns, shape (n_unknown,).
         contact: Contacts (x, y, ln F), shape (n, 3).
     """
     metric_contact = _in_domain(contact, charges)
     film_values = unknowns[layout.film]
     charge, film_jacobian = charges.linearised(film_values, metric_contact)
-    contact_slopes = charges.contact_slopes(film_values, metric_contact)
     tension_slope = film_jacobian[:, :, layout.index("pretension")]
     session_jacobian = np.stack([one.effect(data, charge, tension_slope) for one in SESSION], axis=2)
 
     # The discrepancy multiplies the charge of its own electrode.
-    n_electrode = charge.shape[1]
     term_values = terms(metric_contact, charges.domain)  # shape (n, n_term)
-    own_charge = charge[:, :, None] * np.eye(n_electrode)
+    own_charge = charge[:, :, None] * np.eye(charge.shape[1])
     coefficient_jacobian = own_charge[:, :, None, :] * term_values[:, None, :, None]
-    coefficient_jacobian = coefficient_jacobian.reshape(*charge.shape, -1)
 
-    jacobian = np.concatenate([film_jacobian, session_jacobian, coefficient_jacobian], axis=2)
+    jacobian = np.concatenate(
+        [film_jacobian, session_jacobian, coefficient_jacobian.reshape(*charge.shape, -1)], axis=2
+    )
     beyond_film = slice(layout.film.stop, None)
-    model_charge = charge + jacobian[:, :, beyond_film] @ unknowns[beyond_film]
+    return ModelValues(
+        charge_pC=charge + jacobian[:, :, beyond_film] @ unknowns[beyond_film],
+        by_contact=charges.contact_slopes(film_values, metric_contact),
+        by_state=jacobian,
+    )
+
+
+def linearise(charges: FilmCharges, layout: Layout, data: PressData, unknowns: Array, contact: Array) -> Linearised:
+    """Compute the residuals of presses and their derivatives; see `model_values`."""
+    model = model_values(charges, layout, data, unknowns, contact)
     weight = 1.0 / data.charge_std
     contact_weight = 1.0 / data.contact_std
-    residual = np.column_stack([weight * (model_charge - data.charge), contact_weight * (contact - data.contact)])
-    count = len(data)
-    padding = np.zeros((count, 3, jacobian.shape[2]))
+    charge_residual = weight * (model.charge_pC - data.charge)
     contact_rows = contact_weight[:, :, None] * np.eye(3)
+    padding = np.zeros((len(data), 3, len(unknowns)))
     return Linearised(
-        residual,
-        np.concatenate([weight[:, :, None] * jacobian, padding], axis=1),
-        np.concatenate([weight[:, :, None] * contact_slopes, contact_rows], axis=1),
+        np.column_stack([charge_residual, contact_weight * (contact - data.contact)]),
+        np.concatenate([weight[:, :, None] * model.by_state, padding], axis=1),
+        np.concatenate([weight[:, :, None] * model.by_contact, contact_rows], axis=1),
     )
 
 
@@ -261,11 +265,10 @@ def estimate(
     layout = prior.layout
     unknowns = prior.mean if start is None else start
     log_contact = data.contact if contact is None else np.column_stack([contact[:, :2], np.log(contact[:, 2])])
-    is_used = np.ones(len(data), dtype=bool)
-
-    unknowns, log_contact, press_chi2 = _search(charges, data, prior, typical(data), unknowns, log_contact, is_used)
+    found = _search(charges, data, prior, unknowns, log_contact)
+    unknowns, log_contact = found.state, found.contacts.copy()
     redundancy = _redundancy(data)
-    is_bad = (redundancy > 0) & (chdtrc(np.maximum(redundancy, 1), press_chi2) < BAD_PROBABILITY)
+    is_bad = (redundancy > 0) & (chdtrc(np.maximum(redundancy, 1), found.chi2) < BAD_PROBABILITY)
     # Presses are bad only if most presses agree with each other. Otherwise, no film explains the presses.
     if is_bad.mean() > 0.5 or len(data) <= FEW_PRESSES:
         is_bad[:] = False
@@ -305,54 +308,50 @@ def estimate(
     )
 
 
-def _search(
-    charges: FilmCharges,
-    data: PressData,
-    prior: Prior,
-    hypothesis: Hypothesis,
-    unknowns: Array,
-    contact: Array,
-    is_used: Booleans,
-) -> tuple[Array, Array, Array]:
-    """Search for the most probable unknowns and contacts under one hypothesis, with robust weights of the presses.
+def _search(charges: FilmCharges, data: PressData, prior: Prior, unknowns: Array, contact: Array) -> RobustEstimate:
+    """Search for the most probable unknowns and contacts under the typical hypothesis, with robust weights.
 
     Args:
         charges: Charges of a solved film and of similar films.
         data: The presses.
         prior: Prior distribution.
-        hypothesis: The hypothesis.
         unknowns: Unknowns from which the search begins.
         contact: Contacts (x, y, ln F) from which it begins.
-        is_used: Whether each press is used.
 
     Returns:
-        The unknowns, the contacts, and the sum of the squared residuals of each press.
+        The result, whose state contains all unknowns.
     """
-    covariance = prior.covariance(hypothesis)
-    std = np.sqrt(np.diag(covariance))
-    is_free = std > 0.0
-    precision = np.linalg.inv(covariance[np.ix_(is_free, is_free)])
-    redundancy = np.maximum(_redundancy(data), 1)
-    press_chi2 = np.zeros(len(data))
-    for step in range(MAX_STEPS):
-        linearised = linearise(charges, prior.layout, data, unknowns, contact)
-        residual, jacobian = linearised.eliminated()
-        press_chi2 = (residual**2).sum(axis=1)
-        weight = (DEGREES_OF_FREEDOM + redundancy) / (DEGREES_OF_FREEDOM + press_chi2) * is_used
-        free_jacobian = jacobian[:, :, is_free]
-        weighted = weight[:, None, None] * free_jacobian
-        matrix = precision + np.einsum("nek,nel->kl", weighted, free_jacobian, optimize=True)
-        gradient = np.einsum("nek,ne->k", weighted, residual) + precision @ (unknowns - prior.mean)[is_free]
-        change = np.zeros(len(unknowns))
-        change[is_free] = -np.linalg.solve(matrix, gradient)
-        named = slice(0, prior.layout.session.stop)
-        relative = np.abs(change[named]) / np.where(std[named] > 0.0, std[named], 1.0)
-        change *= min(1.0, LARGEST_STEP / max(float(relative.max()), 1e-9))
-        contact = contact + linearised.contact_change(change)
-        unknowns = _bounded(unknowns + change, prior.layout)
-        if step > 0 and relative.max() < STEP_TOLERANCE:
-            break
-    return unknowns, contact, press_chi2
+    covariance = prior.covariance(typical(data))
+    is_free = np.diag(covariance) > 0.0
+    layout = prior.layout
+
+    def all_unknowns(free: Array) -> Array:
+        """Return all unknowns, of which those without a prior variance have their mean."""
+        values = prior.mean.copy()
+        values[is_free] = free
+        return values
+
+    def model(contacts: Array, free: Array) -> ModelValues:
+        """Compute charges and their derivatives with respect to the free unknowns."""
+        values = model_values(charges, layout, data, all_unknowns(free), contacts)
+        return values._replace(by_state=values.by_state[:, :, is_free])
+
+    low, high = np.full((2, len(unknowns)), np.inf) * [[-1.0], [1.0]]
+    low[layout.film], high[layout.film] = layout.prior.bounds
+    variance = np.minimum(data.charge_std, UNKNOWN_CHARGE_STD) ** 2
+    found = robust_estimate(
+        model,
+        data.charge,
+        variance[:, :, None] * np.eye(variance.shape[1]),
+        StatePrior(prior.mean[is_free], covariance[np.ix_(is_free, is_free)]),
+        unknowns[is_free],
+        contact,
+        measured=MeasuredContacts(data.contact, data.contact_std),
+        state_bounds=(low[is_free], high[is_free]),
+        freedom=DEGREES_OF_FREEDOM,
+        tolerance=STEP_TOLERANCE,
+    )
+    return found._replace(state=all_unknowns(found.state))
 
 
 @dataclass(frozen=True)
@@ -390,9 +389,9 @@ def _posterior(
         )
         log_scatter_volume = float(np.log(ratio).sum())
     residual, jacobian = linearised.eliminated()
-    log_contact_volume = -0.5 * np.linalg.slogdet(
-        linearised.contact_jacobian.swapaxes(1, 2) @ linearised.contact_jacobian
-    )[1].sum()
+    log_contact_volume = (
+        -0.5 * np.linalg.slogdet(linearised.contact_jacobian.swapaxes(1, 2) @ linearised.contact_jacobian)[1].sum()
+    )
     covariance = prior.covariance(hypothesis)
     is_free = np.diag(covariance) > 0.0
     prior_covariance = covariance[np.ix_(is_free, is_free)]
@@ -408,10 +407,7 @@ def _posterior(
     chi2 = float(misfit @ misfit + change @ precision @ change)
     log_determinant = np.linalg.slogdet(matrix)[1] + np.linalg.slogdet(prior_covariance)[1]
     log_evidence = (
-        -0.5 * (chi2 + log_determinant)
-        + log_contact_volume
-        + log_scatter_volume
-        + np.log(hypothesis.probability)
+        -0.5 * (chi2 + log_determinant) + log_contact_volume + log_scatter_volume + np.log(hypothesis.probability)
     )
     full_covariance = np.zeros_like(covariance)
     full_covariance[np.ix_(is_free, is_free)] = posterior_covariance

@@ -231,9 +231,7 @@ class _Reading:
         and the tensions divided by E. The small effect of the bending is neglected here.
         """
         slopes = self._charges.slopes
-        derivatives = replace(
-            slopes, film=self._read(slopes.film), fields=self._read(slopes.fields)
-        ).jacobian(contact)
+        derivatives = replace(slopes, film=self._read(slopes.film), fields=self._read(slopes.fields)).jacobian(contact)
         force_slope = self.film.derivatives(contact)[:, :, 2]
         derivatives["thickness"] = -force_slope
         tension_part = sum(

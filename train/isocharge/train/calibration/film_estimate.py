@@ -46,7 +46,7 @@ SESSION = (
         "offset",
         "pC",
         ((0.0, 0.9), (30.0, 0.1)),
-        lambda data, charge, _: np.ones_like(charge),
+        lambda _, charge, __: np.ones_like(charge),
         "all charges of all presses contain an offset of {value:.2g} +- {std:.2g} pC: is the tare right? The model "
         "expects the same offset in later contacts; after a new tare, calibrate again",
     ),

@@ -144,9 +144,7 @@ class CalibrationResult:
             "film_error": vars(self.film_error),
             "film_error_before": vars(self.film_error_before),
             "noise_error": vars(self.sensitivity.noise_error),
-            "properties": {
-                name: vars(one) | {"identified": one.identified} for name, one in self.properties.items()
-            },
+            "properties": {name: vars(one) | {"identified": one.identified} for name, one in self.properties.items()},
             "summary": list(self.summary),
             "cautions": list(self.cautions),
         }
