@@ -407,7 +407,8 @@ def _plausible_electrode_orders(presses: MeasuredPresses, charges: FilmCharges) 
     """Find the assignments of charge columns to electrodes that agree best with a few films.
 
     For each pretension in `PRETENSIONS_MPa`, the columns are assigned to the electrodes of a film with this pretension.
-    The best assignment minimises the sum of squared differences between the logarithms of measured and expected charges.
+    The best assignment minimises the sum of squared differences between the logarithms of measured and expected
+    charges.
     Before the logarithms are compared, a common factor of all charges is removed.
 
     Args:
