@@ -69,9 +69,6 @@ release: $(VENV)/installed
 	$(BIN)/isocharge train fit --sensor eight-25um-biaxial --radius 15 -o models/eight-25um-biaxial
 	$(BIN)/isocharge train fit --sensor six-25um-biaxial-30mm --radius 30 -o models/six-25um-biaxial-30mm
 	$(BIN)/isocharge train fit --sensor eight-25um-biaxial-36mm --radius 36 -o models/eight-25um-biaxial-36mm
-	$(BIN)/isocharge train fit --sensor four-25um-biaxial --films -o models/four-25um-biaxial-films
-	$(BIN)/isocharge train fit --sensor three-25um-biaxial --films -o models/three-25um-biaxial-films
-	$(BIN)/isocharge train fit --sensor four-25um-uniaxial --films --radius 7 -o models/four-25um-uniaxial-films
 	$(BIN)/isocharge train distil three-25um-biaxial --int8 -o models/three-25um-biaxial-student
 	$(BIN)/isocharge train distil four-25um-biaxial --int8 -o models/four-25um-biaxial-student
 

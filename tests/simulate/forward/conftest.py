@@ -7,7 +7,6 @@ import pytest
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
-    FilmPrior,
     ForwardMap,
     Resolution,
     Sensor,
@@ -15,8 +14,6 @@ from isocharge.simulate import (
     Theory,
     load_sensor,
 )
-from isocharge.simulate.forward.film_family import FilmFamily
-from isocharge.simulate.sensor.film_prior import FilmSpread
 from kept import kept
 
 
@@ -42,18 +39,3 @@ def near_map(near_electrodes: Sensor) -> ForwardMap:
 @pytest.fixture(scope="session")
 def near_spline(near_map: ForwardMap) -> ChargeSpline:
     return kept(ChargeSpline.of, near_map, spacing=0.25)
-
-
-def narrow_family(prior: FilmPrior) -> FilmFamily:
-    """The family is compared with four direct solves instead of 24."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("isocharge.simulate.forward.film_family.CHECK_COUNT", 4)
-        return FilmFamily.build(prior, radius=3.0, force_range=(0.8, 1.2), counts=(2, 2, 2, 2, 2))
-
-
-@pytest.fixture(scope="session")
-def film_family() -> tuple[FilmPrior, FilmFamily]:
-    """A prior distribution with small standard deviations, and the family of its films."""
-    spread = FilmSpread(pretension=0.2, young=0.02, thickness=0.02, probe_radius=0.03)
-    prior = FilmPrior(load_sensor("three-25um-biaxial"), Circle(1.0), spread)
-    return prior, kept(narrow_family, prior)

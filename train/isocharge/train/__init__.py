@@ -26,19 +26,15 @@ if TYPE_CHECKING:
     from isocharge.common.contact_errors import ContactErrorStatistics
     from isocharge.train.calibration.calibrate import calibrate
     from isocharge.train.calibration.contact_error import ProposedPress, next_presses
-    from isocharge.train.calibration.folder import read_earlier, write_calibration
-    from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
+    from isocharge.train.calibration.film_estimate import FilmEstimate
+    from isocharge.train.calibration.folder import read_earlier, read_moved, write_calibration
+    from isocharge.train.calibration.problem import CalibrationProblem
     from isocharge.train.calibration.result import CalibrationResult
     from isocharge.train.calibration.session import PressSession
     from isocharge.train.data.presses import LabelledPresses
-    from isocharge.train.films.films_file import read_films
-    from isocharge.train.films.films_model import FilmsModel
-    from isocharge.train.films.fit import FilmsConfig, fit_films
-    from isocharge.train.films.release import release_films
     from isocharge.train.model_release.evaluate import evaluate
     from isocharge.train.model_release.release import Release, release
     from isocharge.train.model_release.student import StudentCase, student_config, student_data
-    from isocharge.train.rig.rig_data import Rig, rig_data
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
     from isocharge.train.training.cross_fit import fit_presses
     from isocharge.train.training.fit import fit
@@ -52,8 +48,6 @@ __all__ = [
     "CalibrationResult",
     "ContactErrorStatistics",
     "FilmEstimate",
-    "FilmsConfig",
-    "FilmsModel",
     "FitConfig",
     "Fitted",
     "LabelledPresses",
@@ -62,7 +56,6 @@ __all__ = [
     "ProposedPress",
     "Provenance",
     "Release",
-    "Rig",
     "StudentCase",
     "Teacher",
     "TrainingConfig",
@@ -70,15 +63,12 @@ __all__ = [
     "calibrate",
     "evaluate",
     "fit",
-    "fit_films",
     "fit_presses",
     "load_config",
     "next_presses",
     "read_earlier",
-    "read_films",
+    "read_moved",
     "release",
-    "release_films",
-    "rig_data",
     "student_config",
     "student_data",
     "write_calibration",

@@ -8,7 +8,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE
 from isocharge.serve import Script, VirtualSensor, wander
 from isocharge.serve.virtual_sensor.sensor import Charges
-from isocharge.simulate import Amplifier, ForwardMap, FilmSlopes, load_amplifier
+from isocharge.simulate import Amplifier, FilmSlopes, ForwardMap, load_amplifier
 
 SCRIPT_S = 60.0
 """Length of the random script that a virtual sensor repeats, s."""

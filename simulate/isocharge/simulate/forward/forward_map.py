@@ -174,7 +174,7 @@ class ForwardMap:
         film = sensor.film
         domain = Domain(radius, force_range)
         check_family(film, probe, domain)
-        settings = _family_settings(sensor, probe, domain, settings)
+        family_settings = _family_settings(sensor, probe, domain, settings)
 
         # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared at
         # the check presses, which are solved directly in the first pass of the loop. If the error is very large, the
@@ -185,7 +185,7 @@ class ForwardMap:
         remaining_counts = list(node_counts(film))
         while remaining_counts:
             count = remaining_counts.pop(0)
-            forward_map = cls._solve(sensor, probe, domain, settings, count, executor)
+            forward_map = cls._solve(sensor, probe, domain, family_settings, count, executor)
             if not check_charges:
                 solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
                 check_charges = list(in_order(executor, solve_directly, checks))
@@ -223,8 +223,8 @@ class ForwardMap:
             SolveError: If a press has no equilibrium.
         """
         check_family(sensor.film, probe, domain)
-        settings = _family_settings(sensor, probe, domain, SolveSettings())
-        return cls._solve(sensor, probe, domain, settings, count, executor)
+        family_settings = _family_settings(sensor, probe, domain, SolveSettings())
+        return cls._solve(sensor, probe, domain, family_settings, count, executor)
 
     @classmethod
     def _solve(

@@ -1,5 +1,6 @@
 """`isocharge train calibrate`: calibrate a film with measured presses, and write a model of this film."""
 
+from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -10,15 +11,16 @@ import typer
 
 from isocharge.cli.shared.forward_maps import write_deflection
 from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_press_file
-from isocharge.cli.shared.options import JsonOption, ModelsOption, StressLimitOption, refuse
+from isocharge.cli.shared.options import JsonOption, StressLimitOption, refuse, worker_count
 from isocharge.cli.shared.probe_option import ProbeOption
-from isocharge.cli.shared.terminal import say, show, show_json, this_command
-from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
+from isocharge.cli.shared.terminal import say, show, show_json, shown_progress, this_command
+from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.measured_presses import MAX_TEMPERATURE_C, MIN_TEMPERATURE_C
 from isocharge.serve import MeasuredPresses
-from isocharge.simulate import load_sensor, parse_probe
+from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.simulate.solver.friction import MAX_FRICTION
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
+from isocharge.train.calibration.calibrate import solve_start
 from isocharge.train.calibration.folder import (
     calibration_folder,
     read_earlier,
@@ -26,7 +28,7 @@ from isocharge.train.calibration.folder import (
     result_table,
     write_calibration,
 )
-from isocharge.train.calibration.side_forces import MAX_SIDE_FORCE
+from isocharge.train.calibration.problem import MAX_SIDE_FORCE
 
 
 def calibrate_command(
@@ -53,6 +55,10 @@ def calibrate_command(
         ),
     ] = None,
     probe: ProbeOption = "circle:1.0",
+    radius: Annotated[
+        float,
+        typer.Option("--radius", metavar="MM", help="Radius of the working area, mm: the largest distance of a press."),
+    ] = DEFAULT_RADIUS,
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
     next_count: Annotated[
@@ -101,79 +107,63 @@ def calibrate_command(
             "deviations of the model.",
         ),
     ] = 0.0,
-    models: ModelsOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Calibrate a film: estimate its parameters from measured presses, and write a model of this film.
+    """Calibrate a film: estimate its properties from measured presses, and write a model of this film.
 
+    The film that explains the presses is solved, and a network is trained for it. Any sensor and any probe is possible.
     Three presses are useful, and eight are recommended. For each press, the position or the force must be known, or
-    both. The option --next proposes presses, even before the first press. The command names the parameters that the
+    both. The option --next proposes presses, even before the first press. The command names the properties that the
     presses do not determine.
 
     The command `isocharge train press` records presses at a port, and writes PRESSES.csv.
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
-    # With --from and --temperature but without presses, the parameters of the earlier calibration are computed for the
-    # other temperature. The calibration is then said to be moved to this temperature.
+    # With --from and --temperature but without presses, the film of the earlier calibration is solved at the other
+    # temperature. The calibration is then said to be moved to this temperature.
     is_moved = file is None and earlier is not None and temperature_C is not None
     _check_usage(file, output, next_count, temperature_C, is_moved=is_moved)
     _check_side_forces(file, friction, side_force, is_moved=is_moved)
-
-    # The problem describes the films that the sensor may have. An earlier calibration restricts these films.
-    problem = CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models)
-    problem = replace(problem, stress_limit=stress_limit, friction=friction, side_force=side_force)
+    problem = CalibrationProblem(
+        load_sensor(sensor),
+        parse_probe(probe),
+        radius=radius,
+        stress_limit=stress_limit,
+        friction=friction,
+        side_force=side_force,
+    )
     result: CalibrationResult | None = None  # None if only presses are proposed
-    with calibration_folder(output, problem) if output is not None else nullcontext():
+    proposed_presses: list[ProposedPress] = []
+    with (
+        calibration_folder(output, problem) if output is not None else nullcontext(),
+        shown_progress(),
+        local_workers(worker_count(None)) as executor,
+    ):
         presses = None
         if file is not None:
             presses = read_press_file(file, problem.electrodes, position_std_mm, force_std)
             presses = _with_temperature(presses, temperature_C)
         if is_moved and earlier is not None and temperature_C is not None:  # `is_moved` implies both other conditions
-            result = read_moved(earlier, problem, temperature_C)
+            result = read_moved(earlier, problem, temperature_C, executor)
         elif earlier is not None:
             knows_temperature = presses is not None and presses.knows_temperature
             problem = replace(problem, earlier=read_earlier(earlier, problem, knows_temperature=knows_temperature))
         if presses is not None:
-            result = _calibrate(presses, problem)
+            say(f"fitting the film to {len(presses)} presses")
+            result = calibrate(presses, problem, executor=executor)
+            for caution in result.cautions:
+                say(f"caution: {caution}")
         if result is not None and output is not None:
-            _write(result, output)
-
-    # The next presses are chosen for the calibrated film, or for all possible films if nothing was calibrated.
-    proposed_presses: list[ProposedPress] = []
-    if next_count:
-        film = None if result is None else result.posterior
-        proposed_presses = next_presses(problem, next_count, film, position_std_mm=position_std_mm, force_std=force_std)
+            _write(result, output, executor)
+        if next_count:
+            # The next presses are chosen for the calibrated film, or for the mean film if nothing was calibrated.
+            charges = solve_start(problem, executor) if result is None else result.charges
+            film = None if result is None else result.film
+            proposed_presses = next_presses(
+                problem, charges, next_count, film, position_std_mm=position_std_mm, force_std=force_std
+            )
     _print_result(result, proposed_presses, json=json)
-
-
-def calibrate_into(presses: MeasuredPresses, problem: CalibrationProblem, output: Path, *, json: bool) -> None:
-    """Calibrate a film, write its model, and print the result. The commands `calibrate` and `fit` call this function.
-
-    Args:
-        presses: The measured presses.
-        problem: Description of the films that the sensor may have.
-        output: Folder to write.
-        json: Whether to print one JSON object instead of text.
-    """
-    with calibration_folder(output, problem):
-        result = _calibrate(presses, problem)
-        _write(result, output)
-    _print_result(result, [], json=json)
-
-
-def _calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
-    """Calibrate a film with measured presses, and print the cautions of the calibration.
-
-    Args:
-        presses: The measured presses.
-        problem: Description of the films that the sensor may have.
-    """
-    say(f"fitting the film to {len(presses)} presses")
-    result = calibrate(presses, problem)
-    for caution in result.cautions:
-        say(f"caution: {caution}")
-    return result
 
 
 def _print_result(result: CalibrationResult | None, proposed_presses: list[ProposedPress], *, json: bool) -> None:
@@ -207,11 +197,11 @@ def _with_temperature(presses: MeasuredPresses, temperature_C: float | None) -> 
     return replace(presses, temperature_C=np.full(len(presses), temperature_C))
 
 
-def _write(result: CalibrationResult, folder: Path) -> None:
+def _write(result: CalibrationResult, folder: Path, executor: Executor | None) -> None:
     """Write the model of a calibrated film, and print the name of its version folder."""
-    say("making the model of this film, and measuring its errors")
-    version = write_calibration(result, folder, this_command())
-    sensor, probe = result.film
+    say("training the network of this film")
+    version = write_calibration(result, folder, this_command(), executor=executor)
+    sensor, probe = result.sensor_and_probe
     write_deflection(version, sensor.film, [probe])
     say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
 

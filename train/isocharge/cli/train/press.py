@@ -3,6 +3,7 @@
 import shlex
 import sys
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,22 +12,21 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption
-from isocharge.cli.shared.options import DeviceOption, ModelsOption, StressLimitOption
+from isocharge.cli.shared.options import DeviceOption, StressLimitOption, worker_count
 from isocharge.cli.shared.port_hints import no_frames_advice_added
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json
 from isocharge.cli.train.press_dialogue import Dialogue, OnTaken, Screen
 from isocharge.cli.train.press_events import PressEvents
 from isocharge.common.arrays import Array
-from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
+from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError, PressError, error_prefix
 from isocharge.common.measured_presses import CONTACT, read_press_list
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress
 from isocharge.serve.signal_chain.thermal import ThermalRule
-from isocharge.simulate import load_sensor, parse_probe
+from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.train import CalibrationProblem, read_earlier
-from isocharge.train.calibration.folder import error_table
 from isocharge.train.calibration.press_file import PressFile, open_press_file
 from isocharge.train.calibration.session import PressSession
 
@@ -68,6 +68,10 @@ def press_command(
         ),
     ],
     probe: ProbeOption = "circle:1.0",
+    radius: Annotated[
+        float,
+        typer.Option("--radius", metavar="MM", help="Radius of the working area, mm: the largest distance of a press."),
+    ] = DEFAULT_RADIUS,
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
     device: DeviceOption = None,
@@ -107,7 +111,6 @@ def press_command(
             "(default: the film of the sensor file)",
         ),
     ] = None,
-    models: ModelsOption = None,
     fresh: Annotated[
         bool,
         typer.Option("--fresh", help="Delete the presses in the output file, and begin again. (default: continue)"),
@@ -129,8 +132,7 @@ def press_command(
 
     Example: isocharge train press --port /dev/ttyACM0 --sensor four-25um-biaxial -o presses.csv
     """
-    problem = CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models)
-    problem = replace(problem, stress_limit=stress_limit)
+    problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius=radius, stress_limit=stress_limit)
     if earlier is not None:
         problem = replace(problem, earlier=read_earlier(earlier, problem))
 
@@ -150,8 +152,11 @@ def press_command(
         on_taken = _print_press_and_proposal if contacts is None else _print_press
 
     stds = {"position_std_mm": position_std_mm, "force_std": force_std}
-    with open_press_file(output, problem.sensor, problem.probe, fresh=fresh) as press_file:
-        session = _open_session(press_file, problem, until, stds)
+    with (
+        open_press_file(output, problem.sensor, problem.probe, fresh=fresh) as press_file,
+        local_workers(worker_count(None)) as executor,
+    ):
+        session = _open_session(press_file, problem, until, stds, executor)
         if contacts is not None:
             _check_list(contacts, session, str(press_list))
         try:
@@ -172,7 +177,11 @@ def press_command(
 
 
 def _open_session(
-    press_file: PressFile, problem: CalibrationProblem, until: float, stds: dict[str, float]
+    press_file: PressFile,
+    problem: CalibrationProblem,
+    until: float,
+    stds: dict[str, float],
+    executor: Executor | None,
 ) -> PressSession:
     """Create a session that begins with the presses that are already in the file, and print how many there are.
 
@@ -181,11 +190,13 @@ def _open_session(
         problem: The calibration problem for which the presses are made.
         until: Position error left by the film at which the session ends, as a share of the error by noise alone.
         stds: Standard deviations of the stated positions and forces, by the names of the arguments of `PressSession`.
+        executor: Executor that solves films; None for this process.
     """
     presses = press_file.read(position_std_mm=stds["position_std_mm"], force_std=stds["force_std"])
     if presses is not None:
         say(f"{press_file.path} has {len(presses)} presses; the session continues with them (--fresh deletes them)")
-    return PressSession(problem, save=press_file.write, presses=presses, until=until, **stds)
+    say("solving the film of the sensor file")
+    return PressSession(problem, save=press_file.write, presses=presses, until=until, executor=executor, **stds)
 
 
 def _check_list(contacts: Array, session: PressSession, name: str) -> None:
@@ -290,7 +301,7 @@ def _press_table(session: PressSession, press: SteadyPress) -> dict[str, object]
         "held_s": press.held_s,
         "frames": press.frames,
         "flags": list(press.flags),
-        "error_left": None if result is None else error_table(result.film_error),
+        "error_left": None if result is None else vars(result.film_error),
         "left_out": [] if result is None else list(result.bad_lines),
         "problem": session.refusal or None,
         "enough": session.enough,

@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import MeasuredPresses, row_words
-from isocharge.train.calibration.contact_error import ContactSensitivity
+from isocharge.train.calibration.contact_error import N_CONTACTS, ContactSensitivity, spread_contacts
 from isocharge.train.calibration.diagnosis import (
     FAR_FROM_ALL_FILMS,
     MOSTLY_OUTSIDE,
@@ -22,6 +22,7 @@ from isocharge.train.calibration.diagnosis import (
 )
 from isocharge.train.calibration.estimator import Estimation, estimate, is_unexplained
 from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.press_data import PressData, known_temperatures
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import CalibrationResult
@@ -134,6 +135,19 @@ def solve_start(problem: CalibrationProblem, executor: Executor | None = None) -
     )
 
 
+def solve_film(problem: CalibrationProblem, film: FilmEstimate, executor: Executor | None = None) -> FilmCharges:
+    """Solve an estimated film, with its imperfections if they are visible and with its real probe.
+
+    Args:
+        problem: The calibration problem.
+        film: The estimate.
+        executor: Executor that runs the solves; None for this process.
+    """
+    charges = solve_start(replace(problem, earlier=film), executor)
+    contact = spread_contacts(problem.domain, N_CONTACTS)
+    return charges if _is_exact(charges, film.film_values, contact) else charges.solved(film.film_values, executor)
+
+
 def _fit_even_film(
     problem: CalibrationProblem, data: PressData, charges: FilmCharges, executor: Executor | None
 ) -> _Fit:
@@ -158,8 +172,7 @@ def _fit_uneven_film(problem: CalibrationProblem, data: PressData, fit: _Fit, ex
     """
     for _ in range(2):
         charges, estimation = fit.charges, fit.estimation
-        is_probe_exact = charges.film.probe.is_axisymmetric == charges.prior.probe.is_axisymmetric
-        if is_probe_exact and _asymmetry_effect(charges, estimation) < VISIBLE_ASYMMETRY:
+        if _is_exact(charges, estimation.film.film_values, estimation.contact):
             break
         solved = charges.solved(estimation.film.film_values, executor)
         fit = _Fit(solved, _estimated(problem, data, solved, estimation))
@@ -190,13 +203,20 @@ def _solved_distance(charges: FilmCharges, values: Array) -> float:
     return float(np.abs((values - charges.values)[rows] / prior.std[rows]).max())
 
 
-def _asymmetry_effect(charges: FilmCharges, estimation: Estimation) -> float:
-    """Return the relative rms effect on the charges of the imperfections that the solved film does not have."""
-    values = estimation.film.film_values
-    charge, jacobian = charges.linearised(values, estimation.contact)
+def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
+    """Return whether the solved film has the real probe, and nearly all imperfections of a film.
+
+    Args:
+        charges: The solved film.
+        values: Properties of the film, shape (n_property,).
+        contact: Contacts at which the effect of the missing imperfections is computed, shape (n, 3).
+    """
+    if charges.film.probe.is_axisymmetric != charges.prior.probe.is_axisymmetric:
+        return False
+    charge, jacobian = charges.linearised(values, contact)
     missing = np.where(charges.prior.is_imperfection, values - charges.values, 0.0)
     missing[[charges.prior.index(name) for name in ("d12", "crosstalk")]] = 0.0  # their effect is exact
-    return float(np.linalg.norm(jacobian @ missing) / np.linalg.norm(charge))
+    return bool(np.linalg.norm(jacobian @ missing) < VISIBLE_ASYMMETRY * np.linalg.norm(charge))
 
 
 def _at_temperature_of(problem: CalibrationProblem, presses: MeasuredPresses) -> CalibrationProblem:

@@ -101,7 +101,7 @@ class ContactSensitivity:
         domain_precision = np.diag(3.0 / domain.scale**2)  # the variance of a uniform distribution from -1 to 1 is 1/3
         noise_covariance = np.linalg.inv(slopes.swapaxes(1, 2) @ slopes + domain_precision)
         film_gain = noise_covariance @ slopes.swapaxes(1, 2) @ linearised.jacobian[:, :-3]
-        return cls(np.asarray(film_gain), np.asarray(noise_covariance))
+        return cls(film_gain, np.asarray(noise_covariance))
 
     @property
     def noise_error(self) -> ContactError:
@@ -110,7 +110,19 @@ class ContactSensitivity:
 
     def film_error(self, covariance: Array) -> ContactError:
         """Return the errors that a covariance of the unknowns causes, shape (n_unknown, n_unknown)."""
-        return ContactError.of(self.film_gain @ covariance @ self.film_gain.swapaxes(1, 2))
+        return ContactError.of(self._contact_covariance(covariance))
+
+    def position_errors_mm(self, covariance: Array) -> Array:
+        """Return the position error that a covariance of the unknowns causes at each contact, shape (n,), mm.
+
+        The contacts are those of `spread_contacts`.
+        """
+        variance = np.diagonal(self._contact_covariance(covariance), axis1=1, axis2=2)
+        return np.asarray(np.sqrt(variance[:, :2].sum(axis=1)))
+
+    def _contact_covariance(self, covariance: Array) -> Array:
+        """Return the covariances of contacts (x, y, ln F) that a covariance of the unknowns causes, shape (n, 3, 3)."""
+        return self.film_gain @ covariance @ self.film_gain.swapaxes(1, 2)
 
 
 @dataclass(frozen=True)
@@ -130,6 +142,11 @@ class ProposedPress:
     force_N: float
     position_mm: float
     force_percent: float
+
+    @property
+    def contact(self) -> Array:
+        """The contact (x, y, F), shape (3,), mm and N."""
+        return np.array([self.x_mm, self.y_mm, self.force_N])
 
 
 def next_presses(

@@ -408,8 +408,7 @@ def _plausible_electrode_orders(presses: MeasuredPresses, charges: FilmCharges) 
 
     For each pretension in `PRETENSIONS_MPa`, the columns are assigned to the electrodes of a film with this pretension.
     The best assignment minimises the sum of squared differences between the logarithms of measured and expected
-    charges.
-    Before the logarithms are compared, a common factor of all charges is removed.
+    charges. Before the logarithms are compared, a common factor of all charges is removed.
 
     Args:
         presses: The measured presses, all with a known place and force.

@@ -71,4 +71,5 @@ def unit_covariance(n_electrode: int) -> Array:
     Returns:
         Covariance, shape (n_term * n_electrode, n_term * n_electrode). The index of the electrode changes fastest.
     """
-    return np.asarray(np.kron(np.eye(len(_degrees())), np.eye(n_electrode) + np.ones((n_electrode, n_electrode))))
+    between_electrodes = np.eye(n_electrode) + np.ones((n_electrode, n_electrode))
+    return np.asarray(np.kron(np.eye(len(_degrees())), between_electrodes), dtype=float)

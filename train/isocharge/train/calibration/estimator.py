@@ -417,7 +417,7 @@ def _posterior(
 def _redundancy(data: PressData) -> Array:
     """Return the number of measurements of each press minus the three unknowns of its contact, shape (n,)."""
     measured = np.isfinite(data.charge_std).sum(axis=1) + np.isfinite(data.contact_std).sum(axis=1)
-    return np.maximum(measured - 3, 0)
+    return np.asarray(np.maximum(measured - 3, 0))
 
 
 def _bounded(unknowns: Array, layout: Layout) -> Array:

@@ -1,4 +1,4 @@
-"""Picture of a calibration, with maps of the contact error, intervals of the quantities, and residuals."""
+"""Picture of a calibration, with maps of the contact error, intervals of the properties, and residuals."""
 
 from typing import Any
 
@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from matplotlib.tri import Triangulation
 
+from isocharge.common.arrays import Array
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_layout
-from isocharge.train.calibration.contact_error import ContactError
-from isocharge.train.calibration.quantities import NORMAL_95
+from isocharge.train.calibration.contact_error import N_CONTACTS, PLANNED, ContactError, spread_contacts
 from isocharge.train.calibration.result import CalibrationResult
 
 LEVELS_MM = (0.02, 5.0)
@@ -38,32 +38,39 @@ MAX_TICKS = 20
 def calibration_picture(result: CalibrationResult) -> Figure:
     """Draw the picture of a calibration.
 
-    The picture contains maps of the position error before and after the presses, the intervals of the quantities, and
+    The picture contains maps of the position error before and after the presses, the intervals of the properties, and
     the residuals of the presses.
 
     Args:
         result: Result of the calibration.
     """
     figure = new_figure(11.0, 8.8)
-    (before_axes, after_axes), (quantity_axes, residual_axes) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
-    if result.move_description:
-        before_title = "before it was moved"
-        after_title = "moved to another temperature"
-    else:
-        before_title = "before the presses"
-        after_title = f"after {len(result.presses)} presses"
-    _draw_error(before_axes, result, result.film_error_before, before_title)
-    error_areas = _draw_error(after_axes, result, result.film_error, after_title)
+    (before_axes, after_axes), (property_axes, residual_axes) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
+    is_moved = bool(result.move_text)
+    before = result.problem.prior.covariance(PLANNED)
+    _draw_error(
+        before_axes,
+        result,
+        before,
+        result.film_error_before,
+        "before it was moved" if is_moved else "before the presses",
+    )
+    error_areas = _draw_error(
+        after_axes,
+        result,
+        result.film.covariance,
+        result.film_error,
+        "moved to another temperature" if is_moved else f"after {len(result.presses)} presses",
+    )
     _draw_presses(after_axes, result)
     label = "position error by the film (rms), mm"
     figure.colorbar(
         error_areas, ax=[before_axes, after_axes], label=label, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g"
     )
 
-    _draw_quantities(quantity_axes, result)
+    _draw_properties(property_axes, result)
     _draw_residuals(residual_axes, result)
-    sensor, _ = result.film
-    figure.suptitle(f"calibration of {sensor.name}", fontsize=13)
+    figure.suptitle(f"calibration of {result.problem.sensor.name}", fontsize=13)
     return figure
 
 
@@ -74,8 +81,8 @@ def _draw_presses(axes: Any, result: CalibrationResult) -> None:
         axes: Axes of matplotlib.
         result: Result of the calibration.
     """
-    x, y, _ = result.posterior.contact.T
-    is_bad = result.posterior.bad
+    x, y, _ = result.estimation.contact.T
+    is_bad = result.estimation.is_bad
     axes.plot(x[~is_bad], y[~is_bad], "o", color="white", mec=INK, ms=6, label="presses")
     if is_bad.any():
         axes.plot(x[is_bad], y[is_bad], "X", color=FELT, mec=INK, ms=9, label="left out")
@@ -83,54 +90,55 @@ def _draw_presses(axes: Any, result: CalibrationResult) -> None:
         axes.legend(loc="upper right", fontsize=8)
 
 
-def _draw_error(axes: Any, result: CalibrationResult, error: ContactError, title: str) -> Any:
+def _draw_error(axes: Any, result: CalibrationResult, covariance: Array, error: ContactError, title: str) -> Any:
     """Draw the electrodes and a map of the position error due to the uncertainty of the film.
 
     Args:
         axes: Axes of matplotlib.
         result: The calibration, which defines the contacts of the map.
-        error: Errors of these contacts.
+        covariance: Covariance of the unknowns of the film, shape (n_unknown, n_unknown).
+        error: Root-mean-square errors of all contacts.
         title: Beginning of the title.
 
     Returns:
         The coloured areas, for which a colour bar can be drawn.
     """
     # Neighbouring contacts have different forces. Therefore, the map shows the rms error over several neighbours.
-    x, y, _ = result.sensitivity.contact.T
+    x, y, _ = spread_contacts(result.problem.domain, N_CONTACTS).T
     distance = np.hypot(x[:, None] - x, y[:, None] - y)  # between all pairs of contacts, shape (n, n)
     nearest = np.argsort(distance, axis=1)[:, :NEIGHBOURS]
-    rms_error = np.sqrt((error.each_mm[nearest] ** 2).mean(axis=1))
+    error_mm = result.sensitivity.position_errors_mm(covariance)
+    rms_error = np.sqrt((error_mm[nearest] ** 2).mean(axis=1))
 
     levels = np.geomspace(*LEVELS_MM, 25)
     error_areas = axes.tricontourf(
         Triangulation(x, y), np.clip(rms_error, *LEVELS_MM), levels, norm=LogNorm(), cmap="viridis"
     )
-    sensor, _ = result.film
+    sensor, _ = result.sensor_and_probe
     full_title = f"{title}:\n{error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)"
     draw_layout(axes, sensor, result.problem.domain.radius, full_title)
     return error_areas
 
 
-def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
-    """Draw the 95 % intervals of the quantities before and after the presses.
+def _draw_properties(axes: Any, result: CalibrationResult) -> None:
+    """Draw the 95 % intervals of the properties before and after the presses.
 
-    The horizontal axis shows the difference of each quantity from its prior mean, in prior standard deviations.
+    The horizontal axis shows the difference of each property from its value before the presses, in the standard
+    deviations before the presses.
 
     Args:
         axes: Axes of matplotlib.
         result: Result of the calibration.
     """
-    quantities = list(result.quantities.values())[::-1]  # reversed, because rows are numbered from the bottom
-    # Change of the parameters by the presses, in prior standard deviations. The change of a quantity is a weighted sum
-    # of these changes, because the quantity is a weighted sum of the parameters.
-    scaled_change = (result.posterior.parameters - result.problem.before.parameters) / result.problem.prior.std
-    centre = np.array([quantity.weights @ scaled_change / quantity.before_std for quantity in quantities])
-    half_width = np.array([NORMAL_95 * quantity.std / quantity.before_std for quantity in quantities])
-    row = np.arange(len(quantities))
-    is_identified = np.array([quantity.identified for quantity in quantities])
+    properties = dict(list(result.properties.items())[::-1])  # reversed, because rows are numbered from the bottom
+    prior = result.problem.prior
+    row = np.arange(len(properties))
+    before = {name: float(prior.mean[prior.layout.index(name)]) for name in properties}
+    centre = np.array([(one.value - before[name]) / one.before_std for name, one in properties.items()])
+    half_width = np.array([2.0 * one.std / one.before_std for one in properties.values()])
+    is_identified = np.array([one.identified for one in properties.values()])
 
-    # The 95 % interval before the presses reaches from about -2 to 2 prior standard deviations. The estimate after the
-    # presses is a white mark in the middle of its interval.
+    # The estimate after the presses is a white mark in the middle of its interval.
     axes.barh(row, 4.0, left=-2.0, color=ASSUMED, height=0.72, label="before the presses")
     for is_drawn, colour, label in (
         (is_identified, FITTED, "identified"),
@@ -142,20 +150,21 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
             xerr=half_width[is_drawn],
             fmt="w|",
             ecolor=colour,
-            elinewidth=5,
+            elinewidth=4,
             label=label,
         )
-    for index, quantity in enumerate(quantities):
-        value_text = f"{quantity.value:.3g} ± {quantity.std:.2g}"
-        axes.annotate(value_text, (4.2, index), va="center", fontsize=8, annotation_clip=False)  # right of the axes
+    for index, one in enumerate(properties.values()):
+        unit = "" if one.unit == "1" else f" {one.unit}"
+        value_text = f"{one.value:.2g} ± {one.std:.1g}{unit}"
+        axes.annotate(value_text, (4.2, index), va="center", fontsize=7, annotation_clip=False)  # right of the axes
     axes.set(
-        title="quantities with 95 % intervals",
-        xlabel="difference from the assumed value, in standard deviations",
+        title="properties with 95 % intervals",
+        xlabel="difference from the value before, in standard deviations",
         xlim=(-4.0, 4.0),
         yticks=row,
-        yticklabels=[quantity.name for quantity in quantities],
+        yticklabels=[name.replace("_", " ") for name in properties],
     )
-    axes.tick_params(axis="y", labelsize=8)
+    axes.tick_params(axis="y", labelsize=7)
     axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3)
 
 
@@ -168,10 +177,10 @@ def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
         axes: Axes of matplotlib.
         result: Result of the calibration.
     """
-    posterior = result.posterior
     lines = result.presses.lines
-    relative_residual = np.sqrt(posterior.chi2 / np.maximum(posterior.degrees_of_freedom, 1.0))
-    colours = [FELT if bad else FITTED for bad in posterior.bad]
+    # A press without redundant measurements has no residual.
+    relative_residual = np.sqrt(np.nan_to_num(result.estimation.press_chi2))
+    colours = [FELT if bad else FITTED for bad in result.estimation.is_bad]
     axes.bar(np.arange(len(lines)), np.minimum(relative_residual, MAX_DRAWN_RESIDUAL), color=colours)
     axes.axhline(1.0, color=INK, lw=0.8, ls="--")  # the expected size
     tick_distance = max(1, len(lines) // MAX_TICKS)

@@ -90,3 +90,15 @@ def known_temperatures(presses: MeasuredPresses) -> Array | None:
     index = np.arange(len(presses))
     is_measured = np.isfinite(presses.temperature_C)
     return np.interp(index, index[is_measured], presses.temperature_C[is_measured])
+
+
+def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:
+    """Create an empty list of presses for electrodes with the given names."""
+    return MeasuredPresses(
+        contact=np.empty((0, 3)),
+        charge_pC=np.empty((0, len(electrodes))),
+        position_std_mm=np.empty(0),
+        force_std=np.empty(0),
+        electrodes=electrodes,
+        lines=(),
+    )

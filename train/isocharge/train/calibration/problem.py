@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
+from isocharge.common.errors import SceneError
 from isocharge.simulate import Domain, FilmPrior, NoiseModel, Probe, Sensor, noise_model
 from isocharge.simulate.solver.friction import check_friction
 from isocharge.train.calibration.estimator import Prior
@@ -17,6 +18,9 @@ POSITION_MARGIN_MM = 0.5
 
 FORCE_MARGIN = 1.25
 """Ratio by which the solved forces extend beyond the range of forces, because the forces have errors."""
+
+MAX_SIDE_FORCE = 0.5
+"""Largest side force of a contact, relative to its force, because its effect is computed to first order."""
 
 RIM_MARGIN = 1.3
 """Smallest distance of a solved press from the clamp, in units of the reach of the largest probe."""
@@ -54,6 +58,11 @@ class CalibrationProblem:
     def __post_init__(self) -> None:
         if self.friction:
             check_friction(self.friction)
+        if not 0.0 <= self.side_force <= MAX_SIDE_FORCE:
+            raise SceneError(
+                f"side force: expected a share of the force from 0 to {MAX_SIDE_FORCE:g}, such as 0.1, got "
+                f"{self.side_force}"
+            )
 
     @property
     def electrodes(self) -> tuple[str, ...]:

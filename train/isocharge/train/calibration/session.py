@@ -8,6 +8,7 @@ session.
 import math
 import re
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,10 +17,12 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.train.calibration.calibrate import FEW_PRESSES, calibrate
+from isocharge.train.calibration.calibrate import calibrate, solve_start
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
+from isocharge.train.calibration.estimator import FEW_PRESSES
+from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.press_data import no_presses
-from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
+from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import CalibrationResult
 
 MIN_PRESSES = 2
@@ -161,6 +164,7 @@ class PressSession:
         position_std_mm: float = POSITION_STD_MM,
         force_std: float = FORCE_STD,
         until: float = ENOUGH,
+        executor: Executor | None = None,
     ) -> None:
         """Begin a session, or continue an earlier session.
 
@@ -173,8 +177,11 @@ class PressSession:
             force_std: Standard deviation of the forces of further presses, relative to the force.
             until: Ratio of position errors up to which the session is complete, as `ENOUGH`. With 0, the session is
                 never complete.
+            executor: Executor that runs the solves; None for this process.
         """
         self.problem = problem
+        self._executor = executor
+        self._solved: FilmCharges | None = None  # the film that was solved last, with which the next fit begins
         self._save = save
         self._until = until
         self._stds = {"position_std_mm": position_std_mm, "force_std": force_std}
@@ -197,18 +204,20 @@ class PressSession:
             return self._proposed
 
         skipped_mm = np.reshape(self._skipped_places, (-1, 2))  # shape (0, 2) if no position was rejected
-        film: FilmEstimate
-        if self.result is not None:
-            film = self.result.posterior
-            count = 1
-        else:
-            # There are no presses, or no film explains them. Then all presses are planned from the beginning for the
-            # expected film. The presses so far count as the first presses of this plan, and the next one is proposed.
-            film = self.problem.expected
-            count = len(self) + 1
-        plan = next_presses(self.problem, count, film, avoid_mm=skipped_mm, **self._stds)
+        # If there are no presses, or no film explains them, all presses are planned from the beginning. The presses so
+        # far count as the first presses of this plan, and the next one is proposed.
+        film = None if self.result is None else self.result.film
+        count = 1 if self.result is not None else len(self) + 1
+        plan = next_presses(self.problem, self._charges, count, film, avoid_mm=skipped_mm, **self._stds)
         self._proposed = plan[-1]
         return self._proposed
+
+    @property
+    def _charges(self) -> FilmCharges:
+        """The film that was solved last, or the film of the sensor file."""
+        if self._solved is None:
+            self._solved = solve_start(self.problem, self._executor)
+        return self._solved
 
     @property
     def enough(self) -> bool:
@@ -237,7 +246,6 @@ class PressSession:
             position_std_mm=np.append(presses.position_std_mm, self._stds["position_std_mm"]),
             force_std=np.append(presses.force_std, self._stds["force_std"]),
             temperature_C=_with_unknown_temperature(presses.temperature_C),
-            film_temperature_C=_with_unknown_temperature(presses.film_temperature_C),
             lines=(*presses.lines, len(presses) + 1),
         )
         self._change(extended_presses)
@@ -252,7 +260,7 @@ class PressSession:
         has_one_coordinate = math.isnan(x) != math.isnan(y)
         if has_one_coordinate:
             raise PressError("expected both x and y, or ? for both, got one of them")
-        domain = self.problem.charges.domain
+        domain = self.problem.domain
         if domain.is_outside(contact[None]).any():
             min_force, max_force = domain.force_range
             raise PressError(
@@ -306,9 +314,14 @@ class PressSession:
         if not len(presses):
             return
         try:
-            self.result = calibrate(self.presses, self.problem)
+            # Unevenness is a first-order change here, because the next press must be proposed at once.
+            self.result = calibrate(
+                self.presses, self.problem, executor=self._executor, start=self._charges, accurate=False
+            )
         except PressError as error:
             self.refusal = str(error)
+            return
+        self._solved = self.result.charges
 
     @property
     def summary(self) -> tuple[str, ...]:
