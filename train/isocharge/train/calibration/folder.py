@@ -5,6 +5,7 @@
     FOLDER/<version>/sensor.toml   the calibrated sensor
     FOLDER/<version>/calibration.json    the estimate of the film, and the errors that its uncertainty causes
     FOLDER/<version>/presses.csv   the presses; missing if the calibration was only moved to another temperature
+    FOLDER/<version>/charges.npz   compact charge map of the film, for `serve stream --follow`
     FOLDER/<version>/calibration.png     picture of the calibration
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the files of the last version
 
@@ -28,6 +29,7 @@ from isocharge.common.errors import ModelError, PressError
 from isocharge.common.files import as_output_errors, remove_empty, write_whole
 from isocharge.common.measured_presses import presses_text
 from isocharge.common.resumable_run import locked
+from isocharge.serve.model.charge_series import FILE as CHARGES
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, version_folders
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
@@ -36,7 +38,7 @@ from isocharge.train.calibration.calibration_file import film_table, json_text, 
 from isocharge.train.calibration.contact_error import PLANNED, ContactSensitivity
 from isocharge.train.calibration.estimator import Estimation
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate
-from isocharge.train.calibration.film_network import CompactCharges, SideForces, training_data
+from isocharge.train.calibration.film_network import SideForces, compact_charges, training_data
 from isocharge.train.calibration.press_data import no_presses
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import IDENTIFIED_RATIO, CalibrationResult
@@ -179,13 +181,15 @@ def write_calibration(
 
     check_calibration_folder(folder, result.problem.electrodes)
     problem, film = result.problem, result.film
-    compact = CompactCharges.of(result.charges, film, problem.domain, problem.noise)
+    series = compact_charges(result.charges, film, problem.domain, problem.noise, executor)
     friction = (film.value("friction"), film.std("friction")) if problem.friction else (0.0, 0.0)
     side_forces = SideForces(friction, problem.side_force)
-    fitted = fit(training_data(result.charges, film, compact, side_forces, executor), config)
+    fitted = fit(training_data(result.charges, film, series, side_forces, executor), config)
 
     sensor, _ = result.sensor_and_probe
+    is_folded = CHARGES in fitted.provenance.files
     files = {
+        CHARGES: replace(series, is_folded=is_folded).to_bytes(),
         RESULT: json_text(result_table(result)).encode(),
         SENSOR: sensor_to_toml(sensor).encode(),
         PICTURE: picture_bytes(calibration_picture(result)),
