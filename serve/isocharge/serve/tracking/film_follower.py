@@ -218,8 +218,7 @@ class FilmFollower:
                 self._touches.popleft()
             self._contacts = self._contacts[-RECENT_TOUCHES:]
         else:
-            self._applied_state = estimate.state
-            self._applied_covariance = estimate.covariance
+            self._applied_state, self._applied_covariance = self._model.averaged_over_no_change(estimate, elapsed_s)
             self._discard_conversion()
 
     def _is_out_of_range(self, state: Array) -> bool:

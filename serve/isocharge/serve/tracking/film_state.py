@@ -45,6 +45,12 @@ FORCE_MARGIN = 1.5
 
 SECONDS_PER_HOUR = 3600.0
 
+NO_CHANGE_PROBABILITY = 0.5
+"""Probability before the first touch that the pretension has not changed since the calibration."""
+
+MAX_LOG_ODDS = 50.0
+"""Largest magnitude of the logarithm of odds."""
+
 
 class Touch(NamedTuple):
     """A touch, described by its charges near the largest force.
@@ -188,3 +194,28 @@ class FilmModel:
             contact_bounds=self.contact_bounds,
             state_bounds=self.bounds,
         )
+
+    def averaged_over_no_change(self, estimate: RobustEstimate, elapsed_s: float) -> tuple[Array, Array]:
+        """Return the mean and the covariance of the state if the pretension may not have changed at all.
+
+        The probability of no change is `NO_CHANGE_PROBABILITY` before the touches. The touches change its odds by the
+        ratio of the probability densities of t = 0 after and before them (Savage-Dickey ratio, Dickey 1971).
+
+        Args:
+            estimate: Estimate of the state from touches, with a pretension that has changed.
+            elapsed_s: Time since the stream began, s.
+        """
+        state, covariance = estimate.state, estimate.covariance
+        variance = covariance[0, 0]
+        prior_variance = self.prior(elapsed_s).covariance[0, 0]
+        log_ratio = 0.5 * (np.log(prior_variance / variance) - state[0] ** 2 / variance)
+        log_odds = log_ratio + np.log(NO_CHANGE_PROBABILITY / (1.0 - NO_CHANGE_PROBABILITY))
+        probability = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
+
+        # Without a change, the other unknowns have their conditional distribution for t = 0.
+        gain = covariance[:, 0] / variance
+        shift = gain * state[0]
+        unchanged_covariance = covariance - np.outer(gain, covariance[0])
+        mixed = (1.0 - probability) * covariance + probability * unchanged_covariance
+        mixed += probability * (1.0 - probability) * np.outer(shift, shift)
+        return state - probability * shift, mixed
