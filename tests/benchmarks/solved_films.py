@@ -1,7 +1,7 @@
-"""Films with imperfections that no parameter describes, whose charges are solved in full for every press.
+"""Films with imperfections, whose charges are solved in full for every press.
 
-A calibration uses forward maps of isotropic round films and adds imperfections to first order. These films do not use
-those maps: each press is a separate nonlinear solve of the orthotropic, unevenly stretched film in its oval clamp.
+A calibration uses forward maps. These films do not use those maps: each press is a separate nonlinear solve of the
+orthotropic, unevenly stretched film in its oval clamp.
 """
 
 from concurrent.futures import Executor
@@ -51,9 +51,10 @@ class SolvedFilm:
 def draw_film(problem: CalibrationProblem, seed: int) -> tuple[Sensor, Circle]:
     """Draw a film: the parameters from the prior, and imperfections besides."""
     rng = np.random.default_rng([seed, 49])
-    parameters = problem.prior.draw(rng, 1)[0]
-    parameters[problem.prior.index("pretension")] = rng.uniform(*PRETENSION_MPa)
-    sensor, probe = problem.prior.film(parameters)
+    prior = problem.prior.layout.prior
+    values = prior.draw(rng, 1)[0]
+    values[prior.index("pretension")] = rng.uniform(*PRETENSION_MPa)
+    sensor, probe = prior.film(values)
     angle = rng.uniform(0.0, np.pi, 3)
     unevenness = rng.uniform(*RELATIVE_UNEVENNESS) * sensor.film.pretension
     film = replace(

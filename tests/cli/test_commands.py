@@ -257,18 +257,6 @@ BAD = [
     (("train", "fit", "-o", "OUT"), 2, "InputError: expected either a DATASET folder or a SENSOR"),
     (("train", "fit", "pad.toml", "-o", "OUT"), 2, "SensorError: no sensor 'pad.toml'"),
     (("train", "fit", SENSOR, "--sensor", SENSOR, "-o", "OUT"), 2, f"expected one sensor, got {SENSOR} and"),
-    *(
-        (("train", "fit", *words.split(), "--films", "-o", "OUT"), 2, message)
-        for words, message in [
-            ("", "expected either a DATASET folder or a SENSOR"),
-            (f"{SENSOR} --probe rectangle:4x2", "--films: expected one probe"),
-            ("presses", "--films: expected --sensor SENSOR alone, got presses"),
-            ("--sensor four-25um-biaxial --radius auto", "--films: expected --radius in mm, got auto"),
-            ("--sensor four-25um-biaxial --probe rectangle:4x2", "--films: expected one probe"),
-            ("--sensor four-25um-biaxial --probe circle:1 --probe circle:2", "--films: expected one probe"),
-            ("--sensor four-25um-biaxial --config quick.toml", "--films: expected no --config"),
-        ]
-    ),
     (
         ("train", "distil", "four-25um-biaxial", "-o", "OUT", "--int8", "--config", "quick.toml"),
         2,
@@ -309,10 +297,8 @@ BAD = [
         (("train", "fit", *words.split(), "-o", "OUT"), 2, message)
         for words, message in [
             (f"{__file__} --radius 5", "--radius: belongs to --sensor"),
-            (f"{__file__} --sensor {SENSOR} --radius auto", "--radius: expected a number of mm with measured presses"),
-            (f"{__file__} --sensor {SENSOR} --probe circle:1 --probe circle:2", "--probe: expected the one probe that"),
-            (f"none.csv --sensor {SENSOR}", "none.csv: expected a dataset folder, or a CSV file"),
-            ("/dev/null", "/dev/null: expected --sensor SENSOR for presses that are not in a regular file"),
+            (f"{__file__} --sensor {SENSOR}", "calibrate its film; use `isocharge train calibrate"),
+            (f"none.csv --sensor {SENSOR}", "none.csv: expected a dataset folder or a file of measured presses"),
         ]
     ),
     (("train", "fit", ".", "-o", "OUT"), 2, "DatasetError: . is not a dataset: it has no manifest.json"),

@@ -67,4 +67,4 @@ def fitted(dataset, trained):
 @pytest.fixture(scope="session")
 def problem():
     """The calibration problem of a sensor with four electrodes."""
-    return CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
+    return CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))

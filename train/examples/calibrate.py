@@ -21,8 +21,8 @@ from isocharge.train import CalibrationProblem, calibrate, write_calibration
 
 sensor = load_sensor("four-25um-biaxial")
 presses = read_presses(Path(sys.argv[0]).parent / "presses.csv")
-result = calibrate(presses, CalibrationProblem.of(sensor, Circle(1.0)))
-print(f"{len(presses)} presses: the pretension is {result.film[0].film.pretension:.2f} MPa")
+result = calibrate(presses, CalibrationProblem(sensor, Circle(1.0)))
+print(f"{len(presses)} presses: the pretension is {result.film.value('pretension'):.2f} MPa")
 remaining_error = result.film_error
 print(f"error that the film still causes: {remaining_error.position_mm:.2f} mm, {remaining_error.force_percent:.1f} %")
 for caution in result.cautions:

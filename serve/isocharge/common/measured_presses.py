@@ -2,12 +2,11 @@
 
 For each press, the position, the force or both may also be known. A file of presses is a CSV or Parquet file with the
 columns `x_mm`, `y_mm`, `force_N` and one column for the charges of each electrode in pC. The columns may be in any
-order. An empty cell stands for an unknown value. The file may have four further columns:
+order. An empty cell stands for an unknown value. The file may have three further columns:
 
-    position_std_mm      standard deviation of x and of y, mm
-    force_std            standard deviation of the force relative to the force: 0.01 is 1 %
-    temperature_C        temperature of the ring of the film, degrees Celsius
-    film_temperature_C   temperature of the film itself, or of the air at its surface, degrees Celsius
+    position_std_mm   standard deviation of x and of y, mm
+    force_std         standard deviation of the force relative to the force: 0.01 is 1 %
+    temperature_C     temperature of the ring of the film, degrees Celsius
 
 If the names of the electrodes are given, all other columns are ignored. If no names are given, all columns without
 another meaning are assumed to be electrodes. `isocharge serve predict` also reads files of presses.
@@ -45,7 +44,6 @@ CONTACT = ("x_mm", "y_mm", "force_N")
 UNCERTAINTY = ("position_std_mm", "force_std")
 
 TEMPERATURE = "temperature_C"
-FILM_TEMPERATURE = "film_temperature_C"
 MIN_TEMPERATURE_C = -100.0
 MAX_TEMPERATURE_C = 200.0
 """Range of temperatures that a film of PVDF may have."""
@@ -72,7 +70,6 @@ PRESS_RULES = {
     "position_std_mm": ColumnRule("a positive standard deviation in mm", is_positive=True),
     "force_std": ColumnRule("a positive share of the force up to 1 (0.01 is 1 %)", maximum=1.0, is_positive=True),
     TEMPERATURE: _TEMPERATURE_RULE,
-    FILM_TEMPERATURE: _TEMPERATURE_RULE,
 }
 """The columns of a file of presses that are not electrodes."""
 
@@ -102,9 +99,6 @@ class MeasuredPresses:
         ignored: Names of the columns of the file that were not read.
         temperature_C: Temperature of the ring of the film, shape (n,), degrees Celsius; NaN if unknown. If all
             temperatures are unknown, the attribute may be None.
-        film_temperature_C: Temperature of the film or of the air at its surface, shape (n,), degrees Celsius; NaN if
-            unknown. If all temperatures are unknown, the attribute may be None. Known temperatures of the film are only
-            allowed if `temperature_C` is also given.
         row_noun: What `lines` counts, for messages: "line", "row" or "press".
 
     Raises:
@@ -121,7 +115,6 @@ class MeasuredPresses:
     ignored: tuple[str, ...] = ()
     temperature_C: Array | None = None
     row_noun: str = "line"
-    film_temperature_C: Array | None = None
 
     def __post_init__(self) -> None:
         _check_electrodes(self.electrodes)
@@ -145,7 +138,6 @@ class MeasuredPresses:
             position_std_mm=self.position_std_mm[indices],
             force_std=self.force_std[indices],
             temperature_C=None if self.temperature_C is None else self.temperature_C[indices],
-            film_temperature_C=None if self.film_temperature_C is None else self.film_temperature_C[indices],
             lines=tuple(self.lines[index] for index in indices),
         )
 
@@ -158,11 +150,6 @@ class MeasuredPresses:
     def knows_temperature(self) -> bool:
         """Whether the temperature of the ring is known for at least one press."""
         return self.temperature_C is not None and not bool(np.isnan(self.temperature_C).all())
-
-    @property
-    def knows_film_temperature(self) -> bool:
-        """Whether the temperature of the film itself is known for at least one press."""
-        return self.film_temperature_C is not None and not bool(np.isnan(self.film_temperature_C).all())
 
     def __eq__(self, other: object) -> bool:
         """Return whether the values and the names of the columns are equal. The numbers of the lines are ignored."""
@@ -199,17 +186,15 @@ class MeasuredPresses:
     def columns(self) -> dict[str, Array]:
         """Columns of numbers that a file of these presses has: a dictionary from names to arrays of shape (n,).
 
-        A column of temperatures is omitted if the temperatures of all presses are unknown.
+        The column of temperatures is omitted if the temperatures of all presses are unknown.
         """
         columns = dict(zip(CONTACT, self.contact.T, strict=True))  # x_mm, y_mm and force_N
         columns |= dict(zip(self.electrodes, self.charge_pC.T, strict=True))
         columns |= {"position_std_mm": self.position_std_mm, "force_std": self.force_std}
 
-        # The comparisons with None are redundant, but type checkers need them.
+        # The comparison with None is redundant, but type checkers need it.
         if self.temperature_C is not None and self.knows_temperature:
             columns[TEMPERATURE] = self.temperature_C
-        if self.film_temperature_C is not None and self.knows_film_temperature:
-            columns[FILM_TEMPERATURE] = self.film_temperature_C
         return columns
 
     def _check_shapes(self) -> None:
@@ -227,8 +212,6 @@ class MeasuredPresses:
         }
         if self.temperature_C is not None:
             expected_shapes["temperature_C"] = (press_count,)
-        if self.film_temperature_C is not None:
-            expected_shapes["film_temperature_C"] = (press_count,)
         for name, shape in expected_shapes.items():
             given_shape = getattr(self, name).shape
             if given_shape != shape:
@@ -238,8 +221,8 @@ class MeasuredPresses:
         """Check the values of all presses.
 
         Raises:
-            PressError: If a number is not allowed, if only one of x and y is known, if no charge of a press is known,
-                or if the temperature of the film is known, but the temperature of the ring is not.
+            PressError: If a number is not allowed, if only one of x and y is known, or if no charge of a press is
+                known.
         """
         # The columns have the same rules as the columns of a file, except that all standard deviations must be known.
         rules = PRESS_RULES | dict.fromkeys(self.electrodes, CHARGE_RULE)
@@ -248,11 +231,6 @@ class MeasuredPresses:
         columns = NumberColumns(self.columns, np.array(self.lines, dtype=np.intp), self.row_noun)
         columns.check(rules, where="", error_class=PressError)  # the caller knows the file, if there is one
 
-        if self.knows_film_temperature and not self.knows_temperature:
-            raise PressError(
-                f"{FILM_TEMPERATURE}: expected also the temperature of the ring in the column {TEMPERATURE}, got none; "
-                "measure both, because their difference changes the pretension"
-            )
         x_is_unknown = np.isnan(self.contact[:, CONTACT.index("x_mm")])
         y_is_unknown = np.isnan(self.contact[:, CONTACT.index("y_mm")])
         self._refuse_first(
@@ -339,7 +317,6 @@ def read_presses(
             ignored=ignored_names,
             temperature_C=_none_if_unknown(values[TEMPERATURE]),
             row_noun=columns.row_noun,
-            film_temperature_C=_none_if_unknown(values[FILM_TEMPERATURE]),
         )
 
 

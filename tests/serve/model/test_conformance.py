@@ -16,8 +16,7 @@ MODELS = Path(__file__).parents[3] / "models"
 NAMES = model_names(MODELS)
 
 
-FILMS = ("four-25um-biaxial-films", "three-25um-biaxial-films", "four-25um-uniaxial-films")
-RELEASED = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial", *FILMS)
+RELEASED = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial")
 
 
 @pytest.mark.parametrize("name", RELEASED)

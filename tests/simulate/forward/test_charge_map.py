@@ -24,7 +24,7 @@ def linear(contact: np.ndarray) -> np.ndarray:
     return np.stack([x + 2.0 * y + 3.0 * np.log(force), x * y], axis=1)
 
 
-CHECKED = ("forward map", "spline", "film family")
+CHECKED = ("forward map", "spline")
 """Maps that refuse contacts outside their domain. Other maps evaluate their function there."""
 
 
@@ -32,9 +32,6 @@ CHECKED = ("forward map", "spline", "film family")
 def charge_map(request) -> ChargeMap:
     if request.param == "forward map":
         return request.getfixturevalue("three_map")
-    if request.param == "film family":
-        prior, family = request.getfixturevalue("film_family")
-        return family.forward_map(*prior.film(prior.mean))
     if request.param == "function":
         return FunctionMap(linear, ("A", "B"), DOMAIN)
     spline = request.getfixturevalue("near_spline")

@@ -14,7 +14,6 @@ from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate import (
     Circle,
     Film,
-    FilmPrior,
     ForwardMap,
     Resolution,
     Sensor,
@@ -26,7 +25,6 @@ from isocharge.simulate import (
     touch_charge,
     write_sensor,
 )
-from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.solver.error_estimate import mesh_error
 
 ATMOSPHERE = 0.101325
@@ -212,14 +210,6 @@ def test_forward_map_of_a_film_with_a_closed_back_equals_direct_solves():
     forward_map = ForwardMap.build(sensor, Circle(1.0), 4.0, (0.3, 0.5))
     charge = touch_charge(sensor, press(sensor.film, Circle(1.0), (-2.0, 3.2), 0.35))
     np.testing.assert_allclose(forward_map.charges(np.array([[-2.0, 3.2, 0.35]]))[0], charge, rtol=1e-3)
-
-
-def test_networks_for_all_films_refuse_a_closed_back():
-    sensor = sensor_with(back_volume=CAVITY)
-    with pytest.raises(SceneError, match="expected a vented back without static pressure"):
-        FilmFamily.build(FilmPrior(sensor, Circle(1.0)))
-    with pytest.raises(SensorError, match=r"back volume \(mm\^3\): expected those of"):
-        FilmPrior(sensor_with(), Circle(1.0)).parameters_of(sensor, Circle(1.0))
 
 
 def test_a_linear_theory_with_a_closed_back_raises_a_scene_error():

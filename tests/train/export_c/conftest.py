@@ -161,7 +161,7 @@ def compile_c():
 def exports(tmp_path_factory):
     """Exports of a model with three and of one with four electrodes, for no special board."""
     folder = tmp_path_factory.mktemp("exports")
-    return [export_c(find_model(name), folder / name) for name in ("three-25um-biaxial", "four-25um-biaxial-films")]
+    return [export_c(find_model(name), folder / name) for name in ("three-25um-biaxial", "four-25um-biaxial")]
 
 
 def _pointer(array):

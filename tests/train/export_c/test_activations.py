@@ -14,8 +14,6 @@ from isocharge.common.perceptron import evaluate
 from isocharge.serve import Predictor, find_model, load_model, write_model
 from isocharge.serve.model.pretensions import Pretensions
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config, release
-from isocharge.train.films.conditional_network import ConditionalPerceptron
-from isocharge.train.films.films_model import ConditionalWeights
 from isocharge.train.model_release.onnx_graph import read_graph, write_graph
 from isocharge.train.training.folded_network import MISFIT_UNIT
 from isocharge.train.training.network import TrainablePerceptron
@@ -65,23 +63,6 @@ def test_a_torch_perceptron_and_its_numpy_copy_agree(name):
     with torch.no_grad():
         np.testing.assert_allclose(perceptron(torch.tensor(x)), expected, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(evaluate(perceptron.to_numpy(), x), expected, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ACTIVATIONS)
-def test_the_network_for_all_films_is_the_perceptron_of_each_film(name):
-    torch.manual_seed(0)
-    activation = ACTIVATIONS[name]
-    conditional = ConditionalPerceptron(4, (12, 10), 6, 5, activation).double()
-    for parameter in conditional.parameters():
-        torch.nn.init.normal_(parameter, std=0.3)
-    inputs = torch.randn(3, 20, 4, dtype=torch.float64)
-    contexts = torch.randn(3, 5, dtype=torch.float64)
-    with torch.no_grad():
-        outputs = conditional(inputs, contexts).numpy()
-    weights = ConditionalWeights(conditional.to_arrays(), activation)
-    for film in range(3):
-        perceptron = weights.perceptron(contexts[film].numpy())
-        np.testing.assert_allclose(evaluate(perceptron, inputs[film].numpy()), outputs[film], rtol=1e-7, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ACTIVATIONS)

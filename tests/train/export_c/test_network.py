@@ -18,7 +18,7 @@ from isocharge.train.training.features import signed_features
 FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0, 5.0, 5.0, 5.0])
 """Values of a contact, mm, N, misfit and correlations, below which differences count as absolute differences."""
 
-MODELS = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial-films", "four-25um-biaxial-student")
+MODELS = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial", "four-25um-biaxial-student")
 
 
 def onnxruntime_answers(model, charge_pC):

@@ -7,14 +7,12 @@ import pytest
 from bayes.limit import BayesProblem, bayes_estimate
 
 from isocharge.common.contact_errors import ContactErrorStatistics
-from isocharge.common.statistics import rms
-from isocharge.serve import MeasuredPresses, Predictor
-from isocharge.simulate import Circle, Domain, ForwardMap, Sweep, load_sensor, noise_model, read_dataset
+from isocharge.serve import Predictor
+from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, release
 from isocharge.train.data.charge_fit import fit_charge_series
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
-from isocharge.train.rig.corrected_film import correct_film
 from kept import kept
 
 RADIUS_mm = 1.5
@@ -88,20 +86,3 @@ def test_series_of_charges_of_both_signs_agrees_with_the_simulated_charges(film)
     inner = contact[is_inner][:200]
     expected = film.derivatives(inner)
     assert np.abs(field.derivatives(inner) - expected).max() < 5e-3 * np.abs(expected).max()
-
-
-def test_measured_presses_correct_charges_of_both_signs(film):
-    """All measured charges are 4 % larger than the simulated ones."""
-    contact = draw_contacts(np.random.default_rng(1), Domain(1.4, (0.11, 0.28)), 300)
-    true_charge = 1.04 * film.charges(contact)
-    presses = MeasuredPresses(
-        contact=contact,
-        charge_pC=REFERENCE.add(true_charge, np.random.default_rng(2)),
-        position_std_mm=np.full(300, 1e-4),
-        force_std=np.full(300, 1e-4),
-        electrodes=film.electrodes,
-        lines=tuple(range(2, 302)),
-    )
-    corrected = correct_film(presses, film, film.domain, REFERENCE)
-    assert rms((corrected.charges(contact) - true_charge) / REFERENCE.sigma(true_charge)) < 0.3
-    assert corrected.scatter == pytest.approx(1.0, abs=0.1)

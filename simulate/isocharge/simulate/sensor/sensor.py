@@ -56,7 +56,6 @@ MAX_NAME_LENGTH = 100
 
 RESERVED_NAMES = (
     *("side_mm", "coating_N_per_mm", "x_mm", "y_mm", "force_N", "position_std_mm", "force_std", "temperature_C"),
-    *("film_temperature_C",),
     *("probe", "orientation_deg", "t_us", "t_ms", "t_s", "seq"),
 )
 """Names that an electrode cannot have, because they have another meaning in a file or a frame.
