@@ -378,8 +378,9 @@ def _posterior(
     """
     log_scatter_volume = 0.0
     if hypothesis.force_scatter > 0.0:
-        ratio = data.contact_std[:, 2] / data.with_force_scatter(hypothesis.force_scatter).contact_std[:, 2]
-        ratio = np.where(np.isfinite(data.contact_std[:, 2]), ratio, 1.0)
+        stated_std = data.contact_std[:, 2]
+        scattered_std = data.with_force_scatter(hypothesis.force_scatter).contact_std[:, 2]
+        ratio = np.divide(stated_std, scattered_std, out=np.ones(len(data)), where=np.isfinite(stated_std))
         scale = np.ones_like(linearised.residual)
         scale[:, -1] = ratio
         linearised = Linearised(

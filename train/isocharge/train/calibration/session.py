@@ -260,7 +260,7 @@ class PressSession:
         has_one_coordinate = math.isnan(x) != math.isnan(y)
         if has_one_coordinate:
             raise PressError("expected both x and y, or ? for both, got one of them")
-        domain = self.problem.domain
+        domain = self.problem.solved_domain
         if domain.is_outside(contact[None]).any():
             min_force, max_force = domain.force_range
             raise PressError(

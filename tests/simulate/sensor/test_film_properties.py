@@ -1,0 +1,114 @@
+"""Tests of the properties of real films: each changes what it names, and a new property is one declaration."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from isocharge.common.errors import SceneError
+from isocharge.simulate import Circle, FilmPrior, load_sensor, parse_probe
+from isocharge.simulate.sensor import film_properties
+from isocharge.simulate.sensor.film_properties import FILM_PROPERTIES, LARGEST_PRETENSION, FilmProperty, virtual_film
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
+
+SENSOR = load_sensor("four-25um-biaxial")
+PRIOR = FilmPrior(SENSOR, Circle(1.0))
+
+
+def with_value(name, value):
+    """The sensor and the probe of the described film with one changed property."""
+    values = PRIOR.described
+    values[PRIOR.index(name)] = value
+    return PRIOR.film(values)
+
+
+EXPECTED = {
+    "pretension": (0.7, lambda s, _: s.film.pretension, 0.7),
+    "young": (0.1, lambda s, _: s.film.young / SENSOR.film.young, math.exp(0.1)),
+    "thickness": (-0.1, lambda s, _: s.film.thickness / SENSOR.film.thickness, math.exp(-0.1)),
+    "d31": (0.2, lambda s, _: s.piezo.d31 / SENSOR.piezo.d31, math.exp(0.2)),
+    "d32": (0.2, lambda s, _: s.piezo.d32 / SENSOR.piezo.d32, math.exp(0.2)),
+    "d12": (0.3, lambda s, _: s.piezo.d12, 0.3),
+    "shift_x": (0.3, lambda s, _: s.calibration.shift, (0.3, 0.0)),
+    "shift_y": (0.3, lambda s, _: s.calibration.shift, (0.0, 0.3)),
+    "rotation": (0.02, lambda s, _: s.calibration.rotation, 0.02),
+    "tension_difference": (0.2, lambda s, _: s.film.deviator, (0.2, 0.0)),
+    "tension_shear": (0.2, lambda s, _: s.film.deviator, (0.0, 0.2)),
+    "stiffness_x": (-0.2, lambda s, _: (s.film.young_ratio, s.film.axis), (math.exp(0.2), math.pi / 2.0)),
+    "stiffness_xy": (0.2, lambda s, _: (s.film.young_ratio, s.film.axis), (math.exp(0.2), math.pi / 4.0)),
+    "oval_x": (0.01, lambda s, _: (s.film.oval, s.film.oval_axis), (0.01, 0.0)),
+    "oval_xy": (-0.01, lambda s, _: (s.film.oval, s.film.oval_axis), (0.01, -math.pi / 4.0)),
+    "crosstalk": (0.01, lambda s, _: s.calibration.crosstalk, 0.01),
+    "probe_radius": (0.2, lambda _, p: p.radius, 1.2),
+    "gain A": (0.05, lambda s, _: s.calibration.gain["A"], math.exp(0.05)),
+}
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_each_property_changes_what_it_names_and_nothing_else(name):
+    value, read, expected = EXPECTED[name]
+    sensor, probe = with_value(name, value)
+    np.testing.assert_allclose(read(sensor, probe), expected, rtol=1e-12, atol=1e-15)
+    described = PRIOR.film(PRIOR.described)
+    changed = [
+        key
+        for part, whole in ((sensor, described[0]), (probe, described[1]))
+        for key in vars(whole)
+        if getattr(part, key) != getattr(whole, key)
+    ]
+    assert len(changed) == 1
+
+
+def test_all_properties_are_tested():
+    assert {*PRIOR.names} - {*EXPECTED} == {"gain B", "gain C", "gain D"}
+
+
+def test_described_film_is_that_of_the_sensor_file():
+    assert PRIOR.film(PRIOR.described) == (SENSOR, Circle(1.0))
+
+
+@given(st.integers(0, 10**6), st.booleans())
+def test_drawn_films_are_within_their_bounds_and_survive_a_sensor_file(seed, imperfect):
+    (values,) = PRIOR.draw(np.random.default_rng(seed), 1, imperfect=imperfect)
+    low, high = PRIOR.bounds
+    assert ((low <= values) & (values <= high)).all()
+    assert (values[PRIOR.is_imperfection] != 0.0).any() == imperfect
+    sensor, probe = PRIOR.film(values)
+    assert (sensor.film.young_ratio == 1.0) != imperfect
+    table = sensor_to_dict(sensor)
+    assert sensor_to_dict(sensor_from_dict(table)) == table
+    assert parse_probe(probe.notation).reach == pytest.approx(probe.reach)
+
+
+def test_draws_have_the_mean_and_the_spread_of_the_prior():
+    values = PRIOR.draw(np.random.default_rng(0), 4_000, imperfect=True)
+    assert values[:, 0].max() <= LARGEST_PRETENSION
+    np.testing.assert_allclose(values.mean(axis=0), PRIOR.mean, atol=0.07 * PRIOR.std.max())
+    np.testing.assert_allclose(values.std(axis=0) / PRIOR.std, 1.0, atol=0.1)
+
+
+def test_a_property_is_added_by_one_declaration(monkeypatch):
+    def change(sensor, probe, value):
+        return replace(sensor, film=replace(sensor.film, poisson=sensor.film.poisson + value)), probe
+
+    poisson = FilmProperty("poisson", "Poisson's ratio", "1", 0.02, change, drift=0.0)
+    monkeypatch.setattr(film_properties, "FILM_PROPERTIES", (*FILM_PROPERTIES, poisson))
+    prior = FilmPrior(SENSOR, Circle(1.0))
+    values = prior.described
+    values[prior.index("poisson")] = 0.01
+    assert prior.film(values)[0].film.poisson == pytest.approx(SENSOR.film.poisson + 0.01)
+
+
+def test_only_circular_probes_have_a_radius():
+    prior = FilmPrior(SENSOR, parse_probe("rectangle:4.0x2.0"))
+    assert "probe_radius" not in prior.names
+    with pytest.raises(SceneError, match=f"expected {len(prior.names)} values"):
+        prior.film(PRIOR.described)
+
+
+def test_virtual_film_of_a_seed_is_always_the_same():
+    assert virtual_film(SENSOR, Circle(1.0), 3) == virtual_film(SENSOR, Circle(1.0), 3)
+    assert virtual_film(SENSOR, Circle(1.0), 3) != virtual_film(SENSOR, Circle(1.0), 4)

@@ -1,0 +1,42 @@
+"""Fixtures for the tests of the calibration: a synthetic film in place of a solved film, and a rig that presses it."""
+
+import numpy as np
+import pytest
+from tests.benchmarks.measured_films import measured_presses, with_rig_errors
+from tests.train.calibration.synthetic_film import SyntheticFilm
+
+from isocharge.simulate import Circle, load_sensor
+from isocharge.train import CalibrationProblem
+from isocharge.train.calibration import calibrate as calibrate_module
+from isocharge.train.data.presses import draw_contacts
+
+
+@pytest.fixture(scope="session")
+def problem():
+    return CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
+
+
+@pytest.fixture(scope="session")
+def synthetic(problem):
+    """Charges of similar films by a closed formula."""
+    return SyntheticFilm(problem.prior.layout.prior, problem.solved_domain)
+
+
+@pytest.fixture
+def never_solved(monkeypatch):
+    """The synthetic film is exact for all properties, and is never solved again."""
+    monkeypatch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
+
+
+def rig(problem, charges, count, seed, values=None):
+    """Press a film with the errors of a rig.
+
+    Returns:
+        Properties of the film, shape (n_property,); true contacts, shape (count, 3); and the measured presses.
+    """
+    rng = np.random.default_rng(seed)
+    if values is None:
+        values = problem.prior.layout.prior.draw(rng, 1)[0]
+    contact = draw_contacts(rng, problem.domain, count)
+    charge = problem.noise.add(charges.charges(values, contact), rng)
+    return values, contact, measured_presses(problem, with_rig_errors(contact, rng), charge)

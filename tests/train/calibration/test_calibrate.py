@@ -1,0 +1,167 @@
+"""Tests of `calibrate` on films whose charges are a closed formula: cautions, temperatures, and refused presses."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.benchmarks.measured_films import measured_presses
+from tests.train.calibration.conftest import rig
+
+from isocharge.common.errors import PressError, SceneError
+from isocharge.train import CalibrationProblem, calibrate, next_presses
+
+pytestmark = pytest.mark.usefixtures("never_solved")
+
+
+def fit(presses, problem, synthetic):
+    return calibrate(presses, problem, start=synthetic, accurate=False)
+
+
+def test_errors_become_smaller_and_the_sentences_name_them(problem, synthetic):
+    values, _, presses = rig(problem, synthetic, 12, seed=11)
+    result = fit(presses, problem, synthetic)
+    after, before = result.film_error, result.film_error_before
+    assert after.position_mm < 0.3 * before.position_mm
+    assert after.force_percent < 0.2 * before.force_percent
+    assert f"errors of {after.position_mm:.2g} mm and {after.force_percent:.2g} %" in result.summary[0]
+    assert result.cautions == ()
+    assert result.properties["pretension"].identified
+    std = np.array([one.std for one in result.properties.values()])
+    estimated = np.array([one.value for one in result.properties.values()])
+    assert (np.abs(estimated - values) < 4.0 * std).all()
+    sensor, _ = result.sensor_and_probe
+    assert sensor.film.pretension == result.film.value("pretension")
+
+
+@pytest.mark.parametrize("offset", [10.0, -12.0])
+def test_offset_of_all_charges_is_found_with_its_sign(problem, synthetic, offset):
+    _, _, presses = rig(problem, synthetic, 15, seed=12)
+    result = fit(replace(presses, charge_pC=presses.charge_pC + offset), problem, synthetic)
+    assert abs(result.film.value("offset") - offset) < 4.0 * result.film.std("offset") < 8.0
+    (caution,) = result.cautions
+    assert "contain an offset of" in caution
+    assert re.search(r"offset of (-?\d+)", caution)[1].startswith("-") == (offset < 0.0)
+
+
+def test_bad_press_and_press_outside_are_named_by_their_lines(problem, synthetic):
+    _, _, presses = rig(problem, synthetic, 12, seed=13)
+    presses.contact[4, 1] -= 3.0
+    presses.contact[8] = [9.5, 0.0, 1.0]
+    result = fit(presses, problem, synthetic)
+    assert result.bad_lines == (6,)
+    assert result.cautions[0].startswith("line 10: a calibration takes presses within 8.5 mm")
+    assert any(caution.startswith("line 6: does not agree") for caution in result.cautions)
+
+
+def test_forces_that_scatter_more_than_stated_are_named(problem, synthetic):
+    _, _, presses = rig(problem, synthetic, 25, seed=14)
+    scattered = presses.contact.copy()
+    scattered[:, 2] *= np.exp(0.04 * np.random.default_rng(0).standard_normal(25))
+    result = fit(replace(presses, contact=np.clip(scattered, [-9, -9, 0.05], [9, 9, 2.0])), problem, synthetic)
+    assert any("the forces scatter by about 3 % more than stated" in caution for caution in result.cautions)
+
+
+def test_electrodes_far_from_their_places_are_named(problem, synthetic):
+    values = problem.prior.layout.prior.mean.copy()
+    values[problem.prior.layout.index("shift_x")] = 1.1
+    _, _, presses = rig(problem, synthetic, 20, seed=15, values=values)
+    cautions = fit(presses, problem, synthetic).cautions
+    assert any("is the origin of the stage the centre of the film" in caution for caution in cautions)
+
+
+def test_presses_at_one_place_are_named(problem, synthetic):
+    values, _, _ = rig(problem, synthetic, 1, seed=16)
+    contact = np.column_stack([np.full((4, 2), 2.0), [0.2, 0.5, 1.0, 1.5]])
+    presses = measured_presses(problem, contact, synthetic.charges(values, contact))
+    assert any("at one place" in caution for caution in fit(presses, problem, synthetic).cautions)
+
+
+def test_film_changes_with_the_temperature_and_a_later_calibration_begins_at_the_new_one(problem, synthetic):
+    """The pretension falls by 0.3 MPa/K. The temperatures are measured in the first session and in the second."""
+    prior = problem.prior.layout.prior
+    values = prior.mean.copy()
+    warming = np.linspace(-1.0, 1.0, 24)
+    _, contact, presses = rig(problem, synthetic, 24, seed=17, values=values)
+    charge = []
+    for warming_K, row in zip(warming, contact, strict=True):
+        values[0] = prior.mean[0] - 0.3 * warming_K
+        charge.append(synthetic.charges(values, row[None])[0])
+    presses = replace(presses, charge_pC=np.array(charge), temperature_C=22.0 + warming)
+    film = fit(presses, problem, synthetic).film
+    assert film.at_C == pytest.approx(22.0)
+    assert abs(film.value("pretension_per_K") + 0.3) < 3.0 * film.std("pretension_per_K") < 0.15
+
+    moved = film.at_temperature(24.0)
+    assert moved.value("pretension") == pytest.approx(film.value("pretension") + 2.0 * film.value("pretension_per_K"))
+    assert moved.std("pretension") > film.std("pretension")
+    with pytest.raises(PressError, match=r"at 60 C the pretension would be -\d"):
+        film.at_temperature(60.0)
+
+    # In a later session at 24 degrees, a single press suffices.
+    values[0] = prior.mean[0] - 0.6
+    _, _, later = rig(problem, synthetic, 1, seed=18, values=values)
+    later = replace(later, temperature_C=np.array([24.0]))
+    again = fit(later, replace(problem, earlier=film.drifted(knows_temperature=True)), synthetic).film
+    assert again.at_C == pytest.approx(24.0)
+    assert abs(again.value("pretension") - values[0]) < 3.0 * again.std("pretension") < 0.5
+
+
+def test_continued_calibration_needs_fewer_presses(problem, synthetic):
+    values, _, presses = rig(problem, synthetic, 20, seed=19)
+    earlier = fit(presses, problem, synthetic).film.drifted()
+    values[0] += 0.2 if values[0] < 2.0 else -0.2
+    _, _, three = rig(problem, synthetic, 3, seed=20, values=values)
+    continued = fit(three, replace(problem, earlier=earlier), synthetic)
+    fresh = fit(three, problem, synthetic)
+    assert continued.film_error.position_mm < 0.5 * fresh.film_error.position_mm
+    assert abs(continued.film.value("pretension") - values[0]) < 3.0 * continued.film.std("pretension")
+
+
+def test_proposed_presses_reduce_the_errors_as_announced(problem, synthetic):
+    """The announced errors are those of a calibration with the proposed presses; random presses leave larger ones."""
+    proposed = next_presses(problem, synthetic, 6)
+    errors = [press.position_mm for press in proposed]
+    assert errors == sorted(errors, reverse=True)
+    contact = np.array([press.contact for press in proposed])
+    charge = synthetic.charges(problem.prior.layout.prior.mean, contact)
+    chosen = fit(measured_presses(problem, contact, charge), problem, synthetic).film_error.position_mm
+    assert chosen == pytest.approx(errors[-1], rel=0.6)
+    random_errors = []
+    for seed in range(3):
+        _, _, presses = rig(problem, synthetic, 6, seed, values=problem.prior.layout.prior.mean)
+        random_errors.append(fit(presses, problem, synthetic).film_error.position_mm)
+    assert chosen < np.mean(random_errors)
+
+    avoided = contact[:, :2]
+    others = next_presses(problem, synthetic, 3, avoid_mm=avoided)
+    assert all(np.hypot(*(press.contact[:2] - avoided).T).min() > 1.0 for press in others)
+    everywhere = np.mgrid[-8:9, -8:9].reshape(2, -1).T.astype(float)
+    with pytest.raises(PressError, match="no position for a press is left"):
+        next_presses(problem, synthetic, 1, avoid_mm=everywhere)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p: replace(p, contact=np.full_like(p.contact, np.nan))[np.arange(3)], None),
+        (lambda p: replace(p, contact=p.contact + np.array([20.0, 0.0, 0.0])), "most of them lie outside"),
+        (lambda p: replace(p, contact=p.contact[::-1].copy()), "no film of 'four-25um-biaxial' explains these 12"),
+    ],
+    ids=["unknown", "outside", "mixed up"],
+)
+def test_presses_that_no_film_explains_are_refused(problem, synthetic, change, message):
+    _, _, presses = rig(problem, synthetic, 12, seed=21)
+    changed = change(presses)
+    if message is None:  # four charges of unknown contacts are accepted
+        assert len(fit(changed, problem, synthetic).presses) == 3
+        return
+    with pytest.raises(PressError, match=message):
+        fit(changed, problem, synthetic)
+
+
+def test_problem_refuses_impossible_side_forces_and_friction(problem):
+    with pytest.raises(SceneError, match=r"share of the force from 0 to 0\.5, such as 0\.1, got 0\.7"):
+        CalibrationProblem(problem.sensor, problem.probe, side_force=0.7)
+    with pytest.raises(SceneError, match="friction"):
+        CalibrationProblem(problem.sensor, problem.probe, friction=3.0)

@@ -1,0 +1,107 @@
+"""Tests of calibration.json: round trips, and damaged files."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from isocharge.common.errors import PressError
+from isocharge.simulate import Circle, load_sensor, parse_probe
+from isocharge.train import CalibrationProblem, FilmEstimate
+from isocharge.train.calibration.calibration_file import film_table, json_text, read_film
+from isocharge.train.calibration.contact_error import PLANNED
+
+PROBLEM = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
+
+
+def random_film(seed, at_C=None):
+    """An estimate with random values within the bounds, and a random covariance in which some unknowns are fixed."""
+    rng = np.random.default_rng(seed)
+    layout = PROBLEM.prior.layout
+    values = rng.standard_normal(layout.coefficients.stop)
+    low, high = layout.prior.bounds
+    values[layout.film] = np.clip(values[layout.film], low, high)
+    root = rng.standard_normal((len(values), rng.integers(1, 200))) * np.exp(
+        2.0 * rng.standard_normal((len(values), 1))
+    )
+    root[rng.random(len(values)) < 0.1] = 0.0
+    return FilmEstimate(layout, values, root @ root.T, at_C)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), at_C=st.none() | st.floats(-50.0, 100.0))
+def test_written_films_are_read_again(tmp_path_factory, seed, at_C):
+    path = tmp_path_factory.getbasetemp() / "calibration.json"
+    film = random_film(seed, at_C)
+    path.write_text(json_text(film_table(PROBLEM, film)))
+    read = read_film(path, PROBLEM)
+    np.testing.assert_array_equal(read.values, film.values)
+    std = np.sqrt(np.diag(film.covariance))
+    np.testing.assert_allclose(read.covariance, film.covariance, rtol=0.0, atol=1e-4 * np.outer(std, std).max())
+    assert read.at_C == film.at_C
+    assert np.linalg.eigvalsh(read.covariance)[0] > -1e-9 * (std**2).max()
+
+
+def changed(key, value):
+    """Return a function that changes one entry of a table, whose keys are joined by dots."""
+
+    def change(table):
+        *parents, last = key.split(".")
+        for parent in parents:
+            table = table[parent]
+        table[last] = value
+
+    return change
+
+
+FAULTS = {
+    "older": (changed("format_version", 1), "format_version: expected 2, got 1: .* calibrate again with its presses"),
+    "no version": (lambda table: table.pop("format_version"), "format_version: expected 2, got None"),
+    "sensor": (changed("sensor", "mine"), "sensor: expected four-25um-biaxial, as in this calibration, got mine"),
+    "probe": (changed("probe", "circle:2"), "probe: expected circle:1"),
+    "radius": (changed("radius_mm", 10.0), "radius_mm: expected 8"),
+    "missing": (
+        lambda table: table["unknowns"].pop("young"),
+        "unknowns: expected pretension, young, .*, got pretension",
+    ),
+    "bounds": (
+        changed("unknowns.pretension", {"value": -1.0, "std": 0.1}),
+        r"unknowns\.pretension\.value: expected 0 to",
+    ),
+    "negative": (
+        changed("unknowns.young", {"value": 0.0, "std": -0.1}),
+        r"unknowns\.young\.std: expected a number from 0",
+    ),
+    "text": (changed("at_C", "warm"), "at_C: expected"),
+    "short": (changed("coefficients.std", [1.0]), r"coefficients\.std: expected 124 numbers, .* got 1 numbers"),
+    "rows": (changed("correlations", [[], [0.1, 0.2]]), "correlations: expected 149 rows of 0 to 148 numbers"),
+    "large": (
+        lambda table: changed("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(149)])(table),
+        "positive semidefinite",
+    ),
+    "beyond": (lambda table: table["correlations"][1].__setitem__(0, 1.5), r"correlations\[1\]\[0\]: expected"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_damaged_files_are_refused_with_the_key(tmp_path, name):
+    change, message = FAULTS[name]
+    film = FilmEstimate(PROBLEM.prior.layout, PROBLEM.prior.mean, PROBLEM.prior.covariance(PLANNED))
+    table = json.loads(json_text(film_table(PROBLEM, film)))
+    change(table)
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(table))
+    with pytest.raises(PressError, match=f"calibration.json: .*{message}"):
+        read_film(path, PROBLEM)
+
+
+def test_another_working_area_or_probe_needs_its_own_calibration(tmp_path):
+    path = tmp_path / "calibration.json"
+    path.write_text(json_text(film_table(PROBLEM, random_film(0))))
+    with pytest.raises(PressError, match=r"probe: expected rectangle:4\.0x2\.0"):
+        read_film(path, CalibrationProblem(PROBLEM.sensor, parse_probe("rectangle:4x2")))
+    with pytest.raises(PressError, match="radius_mm: expected 6"):
+        read_film(path, replace(PROBLEM, radius=6.0))

@@ -1,0 +1,64 @@
+"""Tests of the search for mistakes in presses that no film explains, and of the errors that name them."""
+
+import re
+
+import numpy as np
+import pytest
+from tests.benchmarks.measured_films import measured_presses
+from tests.train.calibration.conftest import rig
+
+from isocharge.common.errors import PressError
+from isocharge.train import calibrate
+from isocharge.train.calibration.diagnosis import OFFSET_STD, PRETENSIONS_MPa, find_mistakes, misfit
+from isocharge.train.data.presses import draw_contacts
+
+pytestmark = pytest.mark.usefixtures("never_solved")
+
+EXPLAINED = {
+    "columns": (lambda c, q: (c, q[:, [1, 2, 0, 3]]), "columns are swapped: those named A, B, C, D hold B, C, A, D"),
+    "rotated": (lambda c, q: (c @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), q), "turned by -?90 degrees"),
+    "mirrored": (lambda c, q: (c * [-1.0, 1.0, 1.0], q), "x is mirrored"),
+    "grams": (lambda c, q: (c / [1.0, 1.0, 9.80665e-3], q), "forces are in g, not N"),
+    "millinewtons": (lambda c, q: (c / [1.0, 1.0, 1e-3], q), "forces are in mN, not N"),
+    "centimetres": (lambda c, q: (c / [10.0, 10.0, 1.0], q), "positions are in cm, not mm"),
+    "nanocoulombs": (lambda c, q: (c, q / 1e3), "charges are in nC, not pC"),
+}
+"""Functions that put a mistake into contacts and charges, and the sentence that names the mistake."""
+
+IMPOSSIBLE = {
+    "metres": (lambda c, q: (c / [1e3, 1e3, 1.0], q), "written in metres"),
+    "micrometres": (lambda c, q: (c * [1e3, 1e3, 1.0], q), "off the film"),
+    "dead": (lambda c, q: (c, np.where(np.arange(4) == 2, 0.4, q)), r"electrode 'C' is dead.* 0\.4 pC, 0\.\d+ % of"),
+    "negative": (lambda c, q: (c, q * [1.0, -1.0, 1.0, 1.0]), "electrode 'B': 12 of its 12 charges are negative"),
+    "missing": (lambda c, q: (c, np.where(np.arange(4) == 3, np.nan, q)), "electrode 'D': no press has a charge"),
+    "too strong": (lambda c, q: (c * [1.0, 1.0, 100.0], q), "most of them lie outside"),
+}
+
+
+@pytest.mark.parametrize("name", EXPLAINED)
+def test_mistake_in_the_presses_is_found(problem, synthetic, name):
+    """On this layout, rotated axes and swapped columns have the same effect, so that both are named."""
+    make_mistake, message = EXPLAINED[name]
+    _, _, presses = rig(problem, synthetic, 12, seed=7)
+    assert find_mistakes(presses, synthetic) == []
+    contact, charge = make_mistake(presses.contact, presses.charge_pC)
+    mistakes = find_mistakes(measured_presses(problem, contact, charge), synthetic)
+    assert re.search(message, "; ".join(mistakes))
+
+
+def test_misfit_of_a_common_factor_is_the_square_of_its_logarithm(problem, synthetic):
+    """The charges are three times those of the film with the largest charges."""
+    values = problem.prior.layout.prior.mean.copy()
+    values[problem.prior.layout.index("pretension")] = min(PRETENSIONS_MPa)
+    contact = draw_contacts(np.random.default_rng(3), problem.domain, 10)
+    presses = measured_presses(problem, contact, 3.0 * synthetic.charges(values, contact))
+    assert misfit(presses, synthetic) == pytest.approx((np.log(3.0) / OFFSET_STD) ** 2)
+
+
+@pytest.mark.parametrize("name", IMPOSSIBLE)
+def test_impossible_presses_are_refused_with_the_reason(problem, synthetic, name):
+    make_mistake, message = IMPOSSIBLE[name]
+    _, _, presses = rig(problem, synthetic, 12, seed=7)
+    contact, charge = make_mistake(presses.contact, presses.charge_pC)
+    with pytest.raises(PressError, match=message):
+        calibrate(measured_presses(problem, contact, charge), problem, start=synthetic, accurate=False)

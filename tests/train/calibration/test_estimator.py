@@ -1,0 +1,184 @@
+"""Tests of the estimator of a film on films whose charges are a closed formula."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+from tests.benchmarks.measured_films import measured_presses, with_rig_errors
+from tests.train.calibration.conftest import rig
+
+from isocharge.train.calibration import estimator
+from isocharge.train.calibration.contact_error import ContactSensitivity
+from isocharge.train.calibration.discrepancy import terms
+from isocharge.train.calibration.estimator import Hypothesis, Prior, estimate, hypotheses
+from isocharge.train.calibration.film_estimate import SESSION
+from isocharge.train.calibration.press_data import PressData
+from isocharge.train.data.presses import draw_contacts
+
+ONE = Hypothesis(1.0, 0.003, tuple(20.0 if one.name == "offset" else 0.0 for one in SESSION), 0.0, 1.0)
+"""A hypothesis with an offset and a discrepancy."""
+
+
+@pytest.fixture
+def _one_hypothesis(monkeypatch):
+    """Estimate a film under one hypothesis, with nearly normal weights of the presses."""
+    monkeypatch.setattr(estimator, "hypotheses", lambda _: [ONE])
+    monkeypatch.setattr(estimator, "typical", lambda _: ONE)
+    monkeypatch.setattr(estimator, "DEGREES_OF_FREEDOM", 1e6)
+    monkeypatch.setattr(estimator, "STEP_TOLERANCE", 1e-4)
+
+
+def draw_unknowns(problem, hypothesis, rng):
+    """Draw all unknowns of a film under a hypothesis, within the bounds of the properties."""
+    prior = problem.prior
+    unknowns = rng.multivariate_normal(prior.mean, prior.covariance(hypothesis))
+    low, high = prior.layout.prior.bounds
+    unknowns[prior.layout.film] = np.clip(unknowns[prior.layout.film], low, high)
+    return unknowns
+
+
+def model(problem, synthetic, unknowns, contact):
+    """Charges of contacts (x, y, F) with offset and discrepancy, independent of the estimator."""
+    layout = problem.prior.layout
+    charge = synthetic.charges(unknowns[layout.film], contact)
+    coefficients = unknowns[layout.coefficients].reshape(-1, charge.shape[1])
+    return charge * (1.0 + terms(contact, synthetic.domain) @ coefficients) + unknowns[layout.index("offset")]
+
+
+def presses_on(problem, synthetic, unknowns, count, rng):
+    contact = draw_contacts(rng, problem.domain, count)
+    charge = problem.noise.add(model(problem, synthetic, unknowns, contact), rng)
+    return measured_presses(problem, with_rig_errors(contact, rng), charge)
+
+
+@pytest.mark.usefixtures("_one_hypothesis")
+def test_estimate_minimises_the_sum_of_squares_of_all_unknowns_and_contacts(problem, synthetic):
+    """SciPy searches for the unknowns and the contacts together, of which some were not measured."""
+    rng = np.random.default_rng(1)
+    unknowns = draw_unknowns(problem, ONE, rng)
+    presses = presses_on(problem, synthetic, unknowns, 12, rng)
+    presses.contact[2, :2] = presses.contact[5] = np.nan
+    presses.contact[7, 2] = presses.charge_pC[9, 1] = np.nan
+    data = PressData.of(presses, problem.noise, problem.solved_domain)
+    found = estimate(synthetic, data, problem.prior)
+
+    prior, n_unknown = problem.prior, len(unknowns)
+    covariance = prior.covariance(ONE)
+    is_free = np.diag(covariance) > 0.0
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(is_free, is_free)]))
+
+    def unpacked(parameters):
+        values = prior.mean.copy()
+        values[is_free] += parameters[: is_free.sum()]
+        return values, parameters[is_free.sum() :].reshape(-1, 3)
+
+    def residuals(parameters):
+        values, contact = unpacked(parameters)
+        charge = model(
+            problem, synthetic, values, synthetic.into_domain(contact * [1, 1, 0] + np.exp(contact) * [0, 0, 1])
+        )
+        return np.concatenate(
+            [
+                whitening @ parameters[: is_free.sum()],
+                ((charge - data.charge) / data.charge_std).ravel(),
+                ((contact - data.contact) / data.contact_std).ravel(),
+            ]
+        )
+
+    start = np.concatenate([(found.film.values - prior.mean)[is_free], data.contact.ravel()])
+    solution = least_squares(residuals, start, x_scale="jac", xtol=1e-10, ftol=1e-12)
+    values, contact = unpacked(solution.x)
+    std = np.sqrt(np.diag(found.film.covariance))
+    assert std.shape == (n_unknown,)
+    assert (np.abs(found.film.values - values)[is_free] < 0.05 * std[is_free]).all()
+    np.testing.assert_allclose(found.contact[:, :2], contact[:, :2], atol=0.02)
+    np.testing.assert_allclose(np.log(found.contact[:, 2]), contact[:, 2], atol=0.01)
+
+    # The covariance is that of the unknowns in the inverse of the whole matrix of second derivatives.
+    whole = np.linalg.inv(solution.jac.T @ solution.jac)[: is_free.sum(), : is_free.sum()]
+    given = found.film.covariance[np.ix_(is_free, is_free)]
+    np.testing.assert_allclose(given, whole, atol=0.02 * np.sqrt(np.outer(np.diag(whole), np.diag(whole))).max())
+
+
+@pytest.mark.usefixtures("_one_hypothesis")
+def test_covariance_is_that_of_the_errors_on_drawn_films(problem, synthetic):
+    """The squared error in units of the covariance has the mean of a chi-squared distribution."""
+    is_free = np.diag(problem.prior.covariance(ONE)) > 0.0
+    squared = []
+    for seed in range(40):
+        rng = np.random.default_rng([seed, 2])
+        unknowns = draw_unknowns(problem, ONE, rng)
+        data = PressData.of(presses_on(problem, synthetic, unknowns, 15, rng), problem.noise, problem.solved_domain)
+        film = estimate(synthetic, data, problem.prior).film
+        error = (film.values - unknowns)[is_free]
+        squared.append(error @ np.linalg.solve(film.covariance[np.ix_(is_free, is_free)], error))
+    free_count = int(is_free.sum())
+    assert abs(np.mean(squared) / free_count - 1.0) < 4.0 * np.sqrt(2.0 / free_count / len(squared))
+
+
+def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(problem, synthetic, monkeypatch):
+    """The films are drawn from the hypotheses with their probabilities. To save time, there are only 16 hypotheses."""
+    monkeypatch.setattr(estimator, "IMPERFECTION_SCALES", ((0.1, 0.5), (1.5, 0.5)))
+    monkeypatch.setattr(estimator, "DISCREPANCY_SIZES", ((0.001, 0.5), (0.01, 0.5)))
+    monkeypatch.setattr(estimator, "FORCE_SCATTERS", ((0.0, 1.0),))
+    within = []
+    for seed in range(25):
+        rng = np.random.default_rng([seed, 3])
+        presses = measured_presses(problem, np.tile([0.0, 0.0, 1.0], (8, 1)), np.ones((8, 4)))
+        all_hypotheses = list(hypotheses(PressData.of(presses, problem.noise, problem.domain)))
+        probability = np.array([one.probability for one in all_hypotheses])
+        hypothesis = all_hypotheses[rng.choice(len(all_hypotheses), p=probability / probability.sum())]
+        unknowns = draw_unknowns(problem, hypothesis, rng)
+        data = PressData.of(presses_on(problem, synthetic, unknowns, 8, rng), problem.noise, problem.solved_domain)
+        film = estimate(synthetic, data, problem.prior).film
+        gain = ContactSensitivity.of(problem, synthetic, film.values).film_gain[:, :2]
+        # The offset and the drift of the session are not errors of later contacts in this comparison.
+        lasting = np.r_[problem.prior.layout.film, problem.prior.layout.coefficients]
+        error = gain[:, :, lasting] @ (film.values - unknowns)[lasting]
+        covariance = (
+            gain[:, :, lasting] @ film.covariance[np.ix_(lasting, lasting)] @ gain[:, :, lasting].swapaxes(1, 2)
+        )
+        squared = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(axis=1)
+        within.append((squared < chi2.ppf(0.95, 2)).mean())
+    assert 0.88 < np.mean(within) <= 0.99
+
+
+def test_bad_press_is_left_out_and_hardly_changes_the_estimate(problem, synthetic):
+    values, _, presses = rig(problem, synthetic, 12, seed=4)
+    good = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
+    presses.contact[3, 0] += 3.0
+    found = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
+    assert np.flatnonzero(found.is_bad).tolist() == [3]
+    assert found.press_chi2[3] > 20.0 > good.press_chi2.max()
+    std = np.sqrt(np.diag(good.film.covariance))
+    named = problem.prior.layout.film
+    assert (np.abs(found.film.values - good.film.values)[named] < 1.5 * std[named]).all()
+    assert abs(found.film.value("pretension") - values[0]) < 4.0 * found.film.std("pretension")
+
+
+def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synthetic):
+    """Four charges have one number more than a contact has unknowns, and the estimate before knows the rest."""
+    values, _, presses = rig(problem, synthetic, 20, seed=5)
+    before = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior).film
+    changed = values.copy()
+    changed[0] += 0.3 if values[0] < 2.0 else -0.3
+    _, contact, touches = rig(problem, synthetic, 40, seed=6, values=changed)
+    touches.contact[:] = np.nan
+    prior = Prior(problem.prior.layout, before.drifted())
+    found = estimate(synthetic, PressData.of(touches, problem.noise, problem.solved_domain), prior)
+    std = found.film.std("pretension")
+    assert abs(found.film.value("pretension") - changed[0]) < 3.0 * std
+    assert std < 0.6 * np.sqrt(prior.earlier.covariance[0, 0])
+    assert np.median(np.hypot(*(found.contact - contact)[:, :2].T)) < 0.3
+
+
+def test_without_presses_to_tell_the_estimate_is_the_prior(problem, synthetic):
+    """A single touch at an unknown place changes nothing but the contact."""
+    _, _, presses = rig(problem, synthetic, 1, seed=7)
+    presses.contact[:] = np.nan
+    presses.charge_pC[0, 3] = np.nan  # three charges only determine the contact
+    found = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
+    film = problem.prior.layout.film
+    std = np.sqrt(np.diag(found.film.covariance))[film]
+    assert (std > 0.9 * problem.prior.layout.prior.std * 0.8).all()
+    assert np.isnan(found.press_chi2).all()

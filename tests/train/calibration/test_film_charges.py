@@ -1,0 +1,138 @@
+"""Charges of a solved film and of similar films, compared with direct solves; and whole calibrations of solved films."""
+
+
+import numpy as np
+import pytest
+from tests.benchmarks.measured_films import measured_presses, with_rig_errors
+
+from isocharge.common.contact_errors import position_error
+from isocharge.serve import Predictor
+from isocharge.simulate import Circle, ForwardMap, load_sensor, local_workers, parse_probe, press, touch_charge
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
+from isocharge.train import CalibrationProblem, FitConfig, TrainingConfig, calibrate, write_calibration
+from isocharge.train.calibration.calibrate import solve_start
+from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.data.presses import draw_contacts
+from kept import kept
+
+
+@pytest.fixture(scope="module")
+def solved(problem) -> FilmCharges:
+    """The solved film of the sensor file."""
+    return kept(solve_start, problem)
+
+
+CONTACT = np.array([[3.0, 2.0, 0.5], [-4.0, 5.0, 1.0], [1.0, -6.0, 0.2]])
+
+
+def direct(sensor, probe, contact):
+    """Charges of contacts, each of which is solved."""
+    return np.array(
+        [touch_charge(sensor, press(sensor.film, probe, (x, y), force)) for x, y, force in contact.tolist()]
+    )
+
+
+def test_charges_of_a_similar_film_agree_with_direct_solves(problem, solved):
+    """All properties differ at the same time. The change of the charges is about 20 %."""
+    prior = solved.prior
+    values = prior.mean + 0.3 * prior.std * np.random.default_rng(1).standard_normal(len(prior.names))
+    charge = solved.charges(values, CONTACT)
+    expected = direct(*prior.film(values), CONTACT)
+    change = np.abs(expected / solved.charges(prior.mean, CONTACT) - 1.0)
+    assert change.max() > 0.1
+    np.testing.assert_allclose(charge, expected, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    "name", ["young", "thickness", "d31", "d12", "shift_y", "rotation", "crosstalk", "probe_radius", "gain B"]
+)
+def test_derivatives_are_those_of_direct_solves(solved, name):
+    prior = solved.prior
+    contact = CONTACT[:1]
+    index = prior.index(name)
+    step = 0.1 * prior.std[index]
+    charges = []
+    for sign in (1.0, -1.0):
+        values = prior.mean.copy()
+        values[index] += sign * step
+        charges.append(direct(*prior.film(values), contact))
+    expected = (charges[0] - charges[1]) / (2.0 * step)
+    _, jacobian = solved.linearised(prior.mean, contact)
+    np.testing.assert_allclose(jacobian[:, :, index], expected, atol=0.03 * np.abs(expected).max())
+
+
+def test_contact_slopes_are_differences_of_the_charges(solved):
+    step = 1e-4
+    slopes = solved.contact_slopes(solved.prior.mean, CONTACT)
+    for axis in range(3):
+        above, below = CONTACT.copy(), CONTACT.copy()
+        for contact, sign in ((above, 1.0), (below, -1.0)):
+            contact[:, axis] += sign * step * (CONTACT[:, axis] if axis == 2 else 1.0)
+        difference = (solved.charges(solved.prior.mean, above) - solved.charges(solved.prior.mean, below)) / (2 * step)
+        np.testing.assert_allclose(slopes[:, :, axis], difference, rtol=1e-3, atol=1e-3 * np.abs(slopes).max())
+
+
+def calibrated(problem, sensor, probe, path, count=15, seed=3):
+    """Calibrate a film of which all presses are solved, and return its result and the errors of later contacts."""
+    rng = np.random.default_rng(seed)
+    contact = draw_contacts(rng, problem.domain, count + 40)
+    contact[:, 2] = np.clip(contact[:, 2], 0.15, 1.5)
+    charge = problem.noise.add(direct(sensor, probe, contact), rng)
+    presses = measured_presses(problem, with_rig_errors(contact[:count], rng), charge[:count])
+    quick = FitConfig(training=TrainingConfig(steps=600, misfit_steps=200, misfit_charges=2_000))
+    with local_workers(2) as executor:
+        result = calibrate(presses, problem, executor=executor)
+        write_calibration(result, path, config=quick, executor=executor)
+    answers = Predictor(path).predict_batch(charge[count:])
+    estimate = np.column_stack([answers.x_mm, answers.y_mm, answers.force_N])
+    return result, position_error(estimate, contact[count:]), estimate[:, 2] / contact[count:, 2] - 1.0
+
+
+@pytest.mark.slow
+def test_uneven_film_is_calibrated_and_its_model_finds_contacts(problem, tmp_path):
+    """The film has T1 / T2 = 1.7 and E1 / E2 = 1.3."""
+    prior = problem.prior.layout.prior
+    values = prior.mean.copy()
+    for name, value in (("pretension", 1.0), ("tension_difference", 0.25), ("stiffness_xy", 0.26), ("d31", 0.2)):
+        values[prior.index(name)] = value
+    result, distance, force_error = calibrated(problem, *prior.film(values), tmp_path / "film")
+    for name in ("pretension", "tension_difference", "d31"):
+        assert abs(result.film.value(name) - values[prior.index(name)]) < 4.0 * result.film.std(name)
+    assert np.sqrt(np.mean(distance**2)) < 0.3
+    assert np.sqrt(np.mean(force_error**2)) < 0.03
+
+
+@pytest.mark.slow
+def test_own_layout_with_five_electrodes_and_a_rectangle_is_calibrated(tmp_path):
+    table = sensor_to_dict(load_sensor("four-25um-biaxial"))
+    table["electrodes"]["E"] = [7.5, 7.5]
+    sensor = sensor_from_dict(table | {"name": "five"})
+    probe = parse_probe("rectangle:4.0x2.0")
+    problem = CalibrationProblem(sensor, probe, radius=5.0, force_range=(0.2, 1.5))
+    prior = problem.prior.layout.prior
+    values = prior.mean.copy()
+    values[prior.index("pretension")] = 1.2
+    values[prior.index("shift_x")] = 0.3
+    result, distance, force_error = calibrated(problem, *prior.film(values), tmp_path / "film")
+    assert abs(result.film.value("shift_x") - 0.3) < 4.0 * result.film.std("shift_x")
+    assert np.sqrt(np.mean(distance**2)) < 0.3
+    assert np.sqrt(np.mean(force_error**2)) < 0.03
+
+
+@pytest.mark.slow
+def test_film_with_charges_of_both_signs_is_calibrated():
+    """Light presses on a taut uniaxial film give negative charges."""
+    problem = CalibrationProblem(load_sensor("four-25um-uniaxial"), Circle(1.0), radius=3.0, force_range=(0.1, 0.5))
+    prior = problem.prior.layout.prior
+    values = prior.mean.copy()
+    values[prior.index("pretension")] = 2.6
+    film = ForwardMap.build(*prior.film(values), 3.2, (0.08, 0.6))
+    rng = np.random.default_rng(2)
+    contact = draw_contacts(rng, problem.domain, 15)
+    charge = film.charges(contact)
+    assert 0.05 < (charge < 0.0).mean() < 0.6
+    presses = measured_presses(problem, with_rig_errors(contact, rng), problem.noise.add(charge, rng))
+    result = calibrate(presses, problem)
+    assert abs(result.film.value("pretension") - 2.6) < 4.0 * result.film.std("pretension") < 1.2
+    residual = result.charges.charges(result.film.film_values, contact) - charge
+    assert np.sqrt(np.mean((residual / problem.noise.sigma(charge)) ** 2)) < 10.0

@@ -1,0 +1,113 @@
+"""Tests of the folder of a calibrated film, on a film whose charges are a closed formula, with a short training."""
+
+import json
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from tests.train.calibration.conftest import rig
+
+from isocharge.common.errors import ModelError, OutputExists, PressError
+from isocharge.serve import Predictor, read_presses
+from isocharge.simulate import load_sensor
+from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, calibrate
+from isocharge.train.calibration import calibrate as calibrate_module
+from isocharge.train.calibration import film_network, folder
+from isocharge.train.calibration.folder import calibration_folder, read_earlier, read_moved, write_calibration
+
+QUICK = FitConfig(
+    network=NetworkConfig(hidden=(32, 32), misfit_hidden=(16, 16)),
+    training=TrainingConfig(steps=300, misfit_steps=100, misfit_charges=1_000, batch=256),
+)
+
+
+@pytest.fixture(scope="module")
+def written(problem, synthetic, tmp_path_factory):
+    """Folder of a calibrated film, the result of the calibration, and the properties of the film."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
+        patch.setattr(film_network, "NODES_MPa", (0.0,))
+        patch.setattr(film_network, "PRESSES", 6_000)
+        patch.setattr(film_network, "_outside_presses", lambda *_: None)
+        values, _, presses = rig(problem, synthetic, 20, seed=31)
+        presses = replace(presses, temperature_C=np.linspace(20.0, 23.0, 20))
+        result = calibrate(presses, problem, start=synthetic, accurate=False)
+        path = tmp_path_factory.mktemp("calibrated") / "film"
+        write_calibration(result, path, "make it", config=QUICK)
+        yield SimpleNamespace(path=path, result=result, values=values)
+
+
+def test_model_of_the_folder_finds_contacts_on_the_film(written, problem, synthetic):
+    _, contact, presses = rig(problem, synthetic, 500, seed=32, values=written.values)
+    answers = Predictor(written.path).predict_batch(presses.charge_pC)
+    error = np.hypot(answers.x_mm - contact[:, 0], answers.y_mm - contact[:, 1])
+    assert np.median(error) < 0.3
+    assert np.median(np.abs(answers.force_N / contact[:, 2] - 1.0)) < 0.03
+
+
+def test_folder_contains_the_presses_the_sensor_and_the_estimate(written, problem):
+    version = written.path / "1"
+    assert read_presses(version / "presses.csv", problem.electrodes) == written.result.presses
+    assert load_sensor(version / "sensor.toml").film.pretension == pytest.approx(
+        written.result.film.value("pretension")
+    )
+    film = read_earlier(written.path, problem)
+    drifted = written.result.film.drifted()
+    np.testing.assert_array_equal(film.values, drifted.values)
+    std = np.sqrt(np.diag(drifted.covariance))
+    np.testing.assert_allclose(film.covariance, drifted.covariance, atol=2e-6 * np.outer(std, std).max())
+    table = json.loads((version / "calibration.json").read_text())
+    assert table["film_error"]["position_mm"] == pytest.approx(written.result.film_error.position_mm)
+    card = (version / "card.md").read_text()
+    assert written.result.summary[0] in card
+    for name in ("sensor.toml", "calibration.json", "card.md", "calibration.png"):
+        assert (written.path / name).read_bytes() == (version / name).read_bytes()
+
+
+def test_film_is_moved_to_another_temperature_without_presses(written, problem, synthetic, monkeypatch):
+    monkeypatch.setattr(folder, "solve_film", lambda *_: synthetic)
+    film = written.result.film
+    result = read_moved(written.path, problem, 22.5)
+    expected = film.value("pretension") + (22.5 - film.at_C) * film.value("pretension_per_K")
+    assert result.film.value("pretension") == pytest.approx(expected)
+    assert result.film.at_C == 22.5
+    assert result.summary[0].startswith(f"moved from {film.at_C:.1f} C, film/1, to 22.5 C")
+    assert result.to_dict()["presses"] == 0
+
+
+def test_next_calibration_is_the_next_version_and_stale_files_are_mended(written, problem, tmp_path):
+    path = tmp_path / "film"
+    shutil.copytree(written.path, path)
+    (path / "card.md").write_text("stale")
+    (path / ".2.draft").write_text("half written")
+    with calibration_folder(path, problem):
+        with pytest.raises(OutputExists, match="another process"), calibration_folder(path, problem):
+            pass
+        assert (path / "card.md").read_bytes() == (path / "1" / "card.md").read_bytes()
+        assert not (path / ".2.draft").exists()
+        assert write_calibration(written.result, path, config=QUICK).name == "2"
+    assert (path / "card.md").read_bytes() == (path / "2" / "card.md").read_bytes()
+
+
+def test_unsuitable_folders_are_refused_and_left_as_they_are(written, problem, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    with pytest.raises(ModelError, match="expected a new folder or one of an earlier calibration"):
+        write_calibration(written.result, tmp_path / "mine")
+    other = CalibrationProblem(load_sensor("three-25um-biaxial"), problem.probe)
+    with pytest.raises(ModelError), calibration_folder(written.path, other):
+        pass
+    with pytest.raises(RuntimeError), calibration_folder(tmp_path / "new" / "film", problem):
+        raise RuntimeError
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
+    with pytest.raises(PressError, match=r"calibration\.json"):
+        read_earlier(tmp_path / "mine", problem)
+
+
+def test_film_without_temperatures_cannot_be_moved(written, problem, tmp_path):
+    table = json.loads((written.path / "calibration.json").read_text()) | {"at_C": None}
+    (tmp_path / "calibration.json").write_text(json.dumps(table))
+    with pytest.raises(PressError, match="presses that have a column temperature_C"):
+        read_moved(tmp_path, problem, 22.0)
