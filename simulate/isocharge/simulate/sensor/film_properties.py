@@ -236,6 +236,10 @@ class FilmPrior:
     sensor: Sensor
     probe: Probe
 
+    def __reduce__(self) -> tuple[type["FilmPrior"], tuple[Sensor, Probe]]:
+        """Pickle only the sensor and the probe, because the functions of the properties cannot be pickled."""
+        return FilmPrior, (self.sensor, self.probe)
+
     @cached_property
     def properties(self) -> tuple[FilmProperty, ...]:
         """Declarations of all properties, in the order of the vector of their values."""

@@ -104,7 +104,8 @@ def calibrate(
         if cautions is None:
             raise unexplained_error(ordered_presses, charges, MOSTLY_OUTSIDE)
         check_channels(used_presses, charges)
-        if misfit(used_presses, charges) > SUSPICIOUS_MISFIT and find_mistakes(used_presses, charges):
+        is_suspicious = not _is_one_place(used_presses) and misfit(used_presses, charges) > SUSPICIOUS_MISFIT
+        if is_suspicious and find_mistakes(used_presses, charges):
             raise unexplained_error(used_presses, charges, FAR_FROM_ALL_FILMS)
         data = PressData.of(used_presses, problem.noise, problem.solved_domain)
         fit = _fit_even_film(problem, data, charges, executor)
@@ -310,7 +311,12 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
                 f"{one.meaning}: {film.value(name):.3g} {one.unit}, which is unusually far from the sensor file: is "
                 "the origin of the stage the centre of the film, and are its axes those of the film?"
             )
-    position = presses.contact[np.isfinite(presses.contact[:, 0]), :2]
-    if len(position) and np.ptp(position, axis=0).max() < MIN_POSITION_EXTENT_MM:
+    if _is_one_place(presses):
         cautions.append("all presses are at one place, so they do not determine where the electrodes are")
     return cautions
+
+
+def _is_one_place(presses: MeasuredPresses) -> bool:
+    """Return whether the presses have known positions, which are all at one place."""
+    position = presses.contact[np.isfinite(presses.contact[:, 0]), :2]
+    return len(position) > 0 and float(np.ptp(position, axis=0).max()) < MIN_POSITION_EXTENT_MM
