@@ -1,7 +1,7 @@
 """Robust least squares for a state that many presses share, with an unknown or uncertain contact of each press.
 
-Each of n presses gives the charges q_i of e electrodes. A charge map predicts the charges Q(u_i, s) of a contact u_i and
-a state s. The state contains the unknowns that all presses share, such as the pretension of a film. The estimate
+Each of n presses gives the charges q_i of e electrodes. A charge map predicts the charges Q(u_i, s) of a contact u_i
+and a state s. The state contains the unknowns that all presses share, such as the pretension of a film. The estimate
 minimises
 
     sum_i (nu + m_i) / 2 * ln(1 + chi2_i / nu) + 1/2 (s - s0)' P (s - s0),
@@ -10,8 +10,8 @@ minimises
 
 The first term is the negative logarithm of a Student's t distribution with nu degrees of freedom, so that presses that
 no contact explains (such as a touch with two fingers) hardly change the state. m_i is the number of charges and of
-measured coordinates of the press minus the three coordinates of its contact. v_ik and w_ik are a measured coordinate and
-its standard deviation. The last term is a Gaussian prior with the mean s0 and the precision P.
+measured coordinates of the press minus the three coordinates of its contact. v_ik and w_ik are a measured coordinate
+and its standard deviation. The last term is a Gaussian prior with the mean s0 and the precision P.
 
 The minimum is found by damped Gauss-Newton steps with weights that follow from chi2_i (iteratively reweighted least
 squares; Holland and Welsch 1977). The three coordinates of each contact are eliminated by their Schur complement, so
@@ -59,8 +59,8 @@ class Prior(NamedTuple):
         mean: Mean of the state, shape (p,).
         covariance: Covariance of the state, shape (p, p).
         freedom: Degrees of freedom of the Student's t prior of each unknown, shape (p,); infinity for a Gaussian prior,
-            which is used for all unknowns if it is None. The covariance then contains the squared scale. An unknown with
-            a Student's t prior is independent of the others.
+            which is used for all unknowns if it is None. The covariance then contains the squared scale. An unknown
+            with a Student's t prior is independent of the others.
     """
 
     mean: Array
@@ -158,7 +158,7 @@ def robust_estimate(
     normal_matrix, *_ = problem.normal_equations(point, SMALLEST_CONTACT_DAMPING)
     return RobustEstimate(
         state=point.state,
-        covariance=np.linalg.inv(normal_matrix),
+        covariance=np.asarray(np.linalg.inv(normal_matrix)),
         contacts=point.contacts,
         weights=point.weights,
         chi2=point.chi2,
@@ -265,7 +265,7 @@ class _Problem:
     def _weighted_precision(self, state: Array) -> Array:
         """Return the precision of the prior, in which unknowns with a heavy-tailed prior have a smaller precision."""
         if self._prior.freedom is None:
-            return self._precision
+            return np.asarray(self._precision)
         is_heavy = np.isfinite(self._prior.freedom)
         freedom = np.where(is_heavy, self._prior.freedom, 1.0)
         squares = (state - self._prior.mean) ** 2 * np.diag(self._precision)
@@ -275,8 +275,8 @@ class _Problem:
     def normal_equations(self, point: _Point, damping: float) -> tuple[Array, Array, Array, Array]:
         """Compute the normal equations of a step of the state, from which the contacts are eliminated.
 
-        With the whitened derivatives C_i with respect to the contact and S_i with respect to the state, the contact of a
-        press moves by du_i = (C_i' C_i + D_i)^-1 (C_i' (r_i - S_i ds) + ...) for a step ds of the state.
+        With the whitened derivatives C_i with respect to the contact and S_i with respect to the state, the contact of
+        a press moves by du_i = (C_i' C_i + D_i)^-1 (C_i' (r_i - S_i ds) + ...) for a step ds of the state.
 
         Args:
             point: State and contacts.
@@ -324,4 +324,4 @@ class _Problem:
         normal_matrix, gradient, contact_shift, contact_by_state = self.normal_equations(point, damping)
         damped = normal_matrix + damping * np.diag(np.diag(normal_matrix))
         state_step = np.linalg.solve(damped, gradient)
-        return state_step, contact_shift - contact_by_state @ state_step
+        return np.asarray(state_step), contact_shift - contact_by_state @ state_step

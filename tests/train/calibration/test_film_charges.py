@@ -1,5 +1,4 @@
-"""Charges of a solved film and of similar films, compared with direct solves; and whole calibrations of solved films."""
-
+"""Charges of a solved film and of similar films against direct solves, and calibrations of solved films."""
 
 import numpy as np
 import pytest
@@ -32,7 +31,7 @@ def direct(sensor, probe, contact):
     )
 
 
-def test_charges_of_a_similar_film_agree_with_direct_solves(problem, solved):
+def test_charges_of_a_similar_film_agree_with_direct_solves(solved):
     """All properties differ at the same time. The change of the charges is about 5 %."""
     prior = solved.prior
     values = prior.mean + 0.3 * prior.std * np.random.default_rng(1).standard_normal(len(prior.names))

@@ -86,8 +86,8 @@ class _Conversion(NamedTuple):
     Attributes:
         factor: Factors, shape (n_electrode,), dimensionless.
         shift_pC: Shifts, shape (n_electrode,), pC.
-        contact_shifts: Changes of x (mm), y (mm) and the force (N) by independent errors of the state, shape (3, 3). Each
-            row belongs to one error.
+        contact_shifts: Changes of x (mm), y (mm) and the force (N) by independent errors of the state, shape (3, 3).
+            Each row belongs to one error.
     """
 
     factor: Array
@@ -121,16 +121,16 @@ class FilmFollower:
         electrodes = predictor.metadata.electrodes
         if len(electrodes) < 4:
             raise ModelError(
-                f"{predictor.folder}: expected at least four electrodes, got {', '.join(electrodes)}: with as many "
-                "charges as unknowns, a change of the film cannot be told from another contact; follow a film with four "
-                "electrodes or more, or calibrate this one again with --from"
+                f"{predictor.folder}: expected at least four electrodes, got {', '.join(electrodes)}: three charges "
+                "fit some contact exactly on any film, so touches do not show its changes; update such a film with "
+                "`isocharge train calibrate --from`"
             )
         series = read_charges(predictor.folder, electrodes)
         if series is None or series.node_MPa.size < 2:
             raise ModelError(
                 f"{predictor.folder}: expected the file {FILE} with the charges of the film at several pretensions; a "
-                "film is followed from a model that `isocharge train calibrate` made of presses on it: calibrate it, or "
-                "again with this version"
+                "film is followed from a model that `isocharge train calibrate` made of presses on it: calibrate it, "
+                "or again with this version"
             )
         rule = rule or FollowRule()
         self.predictor = predictor
@@ -154,7 +154,8 @@ class FilmFollower:
         self._touch_count = 0
         self._applied_state: Array | None = None  # state that contacts are corrected for; None before the first one
         self._applied_covariance = self._model.prior(0.0).covariance
-        self._discard_conversion()
+        self._conversion: _Conversion | None = None  # latest conversion of charges, and its contact
+        self._conversion_contact: Contact | None = None
         self._touch_collector.reset()
 
     def discard_touch(self) -> None:
@@ -218,7 +219,9 @@ class FilmFollower:
                 self._touches.popleft()
             self._contacts = self._contacts[-RECENT_TOUCHES:]
         else:
-            self._applied_state, self._applied_covariance = self._model.averaged_over_no_change(estimate, elapsed_s)
+            state, covariance = self._model.averaged_over_no_change(estimate, elapsed_s)
+            self._applied_state = state
+            self._applied_covariance = self._model.touch_covariance(state, covariance)
             self._discard_conversion()
 
     def _is_out_of_range(self, state: Array) -> bool:
@@ -241,14 +244,14 @@ class FilmFollower:
         state = self._applied_state
         if state is None:  # there is no estimate yet
             return FollowedContact(contact, charge_pC)
-        if self._conversion is None or not is_close(contact, self._conversion_contact):
-            corrected = contact
-            for _ in range(CONVERSIONS):
-                conversion = self._conversion_at(corrected, state)
+        conversion = self._conversion
+        if conversion is None or not is_close(contact, self._conversion_contact):
+            conversion = self._conversion_at(contact, state)
+            for _ in range(CONVERSIONS - 1):
                 corrected = self.predictor.predict(conversion.factor * charge_pC + conversion.shift_pC)
+                conversion = self._conversion_at(corrected, state)
             self._conversion = conversion
             self._conversion_contact = contact
-        conversion = self._conversion
         corrected_pC = conversion.factor * charge_pC + conversion.shift_pC
         corrected = self.predictor.predict(corrected_pC)
         for x_mm, y_mm, force_N in conversion.contact_shifts.tolist():
@@ -257,8 +260,8 @@ class FilmFollower:
 
     def _discard_conversion(self) -> None:
         """Discard the stored conversion, which belongs to an earlier contact or state."""
-        self._conversion: _Conversion | None = None
-        self._conversion_contact: Contact | None = None
+        self._conversion = None
+        self._conversion_contact = None
 
     def _conversion_at(self, contact: Contact, state: Array) -> _Conversion:
         """Return the conversion of charges near a contact.
@@ -272,9 +275,10 @@ class FilmFollower:
         log_force = math.log(max(contact.force_N, math.exp(lowest[2])))
         log_contact = np.clip([[contact.x_mm, contact.y_mm, log_force]], lowest, highest)
         present = model.values(log_contact, state)
-        calibrated = model.values(log_contact, np.zeros_like(state))
+        near_contact = log_contact * [1.0, 1.0, 0.0] + [0.0, 0.0, math.exp(log_contact[0, 2])]  # (x, y, F)
+        calibrated_charges_pC, calibrated_slopes_pC = self._series.linearised(near_contact)
         offset_pC = state[model.offset] * model.offset_ratio
-        calibrated_pC = calibrated.charge_pC[0]
+        calibrated_pC = calibrated_charges_pC[0]
         if self._series.log_size is None:  # all charges are positive
             factor = calibrated_pC / (present.charge_pC[0] - offset_pC)
             shift_pC = -factor * offset_pC
@@ -286,8 +290,8 @@ class FilmFollower:
         # of the noise of the charges.
         noise_std_pC = np.sqrt(self.predictor.metadata.noise.variance(calibrated_pC))
         charge_errors = factor[:, None] * present.by_state[0] @ np.linalg.cholesky(self._applied_covariance)
-        slopes = calibrated.by_contact[0] / noise_std_pC[:, None]
+        slopes = calibrated_slopes_pC[0] / noise_std_pC[:, None]
         errors = np.linalg.pinv(slopes) @ (charge_errors / noise_std_pC[:, None])  # shape (3, n_state)
         errors[2] *= contact.force_N  # from ln F to F
         # Three independent errors with the same covariance: the rows of R in the decomposition errors' = Q R
-        return _Conversion(factor, shift_pC, np.linalg.qr(errors.T, mode="r"))
+        return _Conversion(factor, shift_pC, np.asarray(np.linalg.qr(errors.T, mode="r")))

@@ -23,15 +23,21 @@ from isocharge.common.robust_estimate import ModelValues, Prior, RobustEstimate,
 from isocharge.serve.model.charge_series import ChargeSeries
 
 GAIN_STD = 0.003
-"""Scale of the prior of the change of a gain. The prior has heavy tails, because a single gain may change by percents."""
+"""Scale of the prior of the change of a gain. The prior has heavy tails, because one gain may change by percents."""
 
 OFFSET_STD_RATIO = 0.05
 """Scale of the prior of the common offset, relative to the largest offset. The prior has heavy tails."""
 
+SMALLEST_TENSION_STD_MPa = 1e-4
+"""Smallest standard deviation of the prior of the pretension, MPa. The covariance of the prior stays invertible."""
+
+SMALLEST_OFFSET_STD_pC = 1e-3
+"""Smallest scale of the prior of the common offset, pC, for touches without offsets."""
+
 HEAVY_TAIL_FREEDOM = 2.0
 """Degrees of freedom of the heavy-tailed priors (Student's t distribution)."""
 
-OFFSET_SCATTER = 0.3
+OFFSET_SCATTER = 0.5
 """Standard deviation of the offset of a single touch about the common offset, relative to the common offset."""
 
 MAX_DIRECTION = 5.0
@@ -97,7 +103,7 @@ class FilmModel:
     @property
     def offset(self) -> int:
         """Index of the common offset in the state."""
-        return self.gains.stop
+        return int(self.gains.stop)
 
     @property
     def size(self) -> int:
@@ -129,13 +135,24 @@ class FilmModel:
         """
         std = np.ones(self.size)
         drift_MPa = self.drift_MPa_per_root_hour * np.sqrt(elapsed_s / SECONDS_PER_HOUR)
-        std[0] = np.hypot(self.series.tension_std_MPa, drift_MPa)
+        std[0] = max(np.hypot(self.series.tension_std_MPa, drift_MPa), SMALLEST_TENSION_STD_MPa)
         std[self.gains] = GAIN_STD
-        std[self.offset] = OFFSET_STD_RATIO * self.largest_offset_pC + 1e-6
+        std[self.offset] = max(OFFSET_STD_RATIO * self.largest_offset_pC, SMALLEST_OFFSET_STD_pC)
         freedom = np.full(self.size, np.inf)
         freedom[self.gains] = HEAVY_TAIL_FREEDOM
         freedom[self.offset] = HEAVY_TAIL_FREEDOM
         return Prior(np.zeros(self.size), np.diag(std**2), freedom)
+
+    def touch_covariance(self, state: Array, covariance: Array) -> Array:
+        """Return the covariance of the state of a single touch, whose offset scatters about the common offset.
+
+        Args:
+            state: State that many touches share, shape (size,).
+            covariance: Covariance of this state, shape (size, size).
+        """
+        touch_covariance = covariance.copy()
+        touch_covariance[self.offset, self.offset] += (OFFSET_SCATTER * state[self.offset]) ** 2
+        return touch_covariance
 
     @property
     def bounds(self) -> tuple[Array, Array]:

@@ -18,8 +18,8 @@ The first and the last frames of every touch have the flag OUTSIDE. GAP and REPE
 HARMLESS_FLAGS = UNUSED_FRAME_FLAGS | {MISFIT}
 """Flags that do not make the touch of a frame unusable.
 
-If the film has changed, frames have the flag MISFIT. The estimate of the state of the film gives little weight to touches
-that no contact explains.
+If the film has changed, frames have the flag MISFIT. The estimate of the state of the film gives little weight to
+touches that no contact explains.
 """
 
 
