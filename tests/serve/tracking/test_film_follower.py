@@ -1,0 +1,149 @@
+"""Following a film through touches, on a film whose charges are a closed formula and whose model searches exactly."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from isocharge.common.contact_domain import Domain
+from isocharge.common.errors import ModelError
+from isocharge.serve import Contact
+from isocharge.serve.model.charge_series import FILE, ChargeSeries
+from isocharge.serve.tracking.film_follower import FilmFollower
+from isocharge.simulate import noise_model
+
+NOISE = noise_model("reference")
+ELECTRODES = ("A", "B", "C", "D")
+
+
+@pytest.fixture(scope="module")
+def series() -> ChargeSeries:
+    """Charge map of degree 2 whose charges fall with the pretension, most for small forces and near the centre."""
+    rng = np.random.default_rng(0)
+    base = np.zeros((3, 3, 2, 4))
+    base[0, 0, 0], base[0, 0, 1] = 6.0, 1.2
+    base[1, 0, 0], base[0, 1, 0] = [1.0, 0.1, -1.0, -0.1], [0.1, 1.0, -0.1, -1.0]
+    base[2, 0, 0], base[0, 2, 0] = [0.1, -0.12, 0.1, -0.12], [-0.12, 0.1, -0.12, 0.1]
+    tension = np.zeros_like(base)
+    tension[0, 0, 0], tension[0, 0, 1] = [-0.4, -0.35, -0.3, -0.38], 0.1
+    tension[1, 0, 0], tension[0, 1, 0] = [-0.1, 0.02, 0.1, 0.0], [0.02, -0.1, 0.0, 0.1]
+    direction = 0.003 * rng.standard_normal((2, 2, 2, 2, 4))
+    nodes = np.array([-0.7, 0.0, 0.7])
+    return ChargeSeries(
+        domain=Domain(8.0, (0.05, 2.0)),
+        electrodes=ELECTRODES,
+        coefficients=np.stack([base + node * tension for node in nodes]),
+        node_MPa=nodes,
+        directions=direction,
+        charge_std=0.001,
+        pretension_MPa=1.0,
+        tension_std_MPa=0.35,
+    )
+
+
+def model_in(folder, series: ChargeSeries) -> SimpleNamespace:
+    """Return a model of the calibrated film that searches for the nearest contact, and write its charge map."""
+    (folder / FILE).write_bytes(series.to_bytes())
+    calibrated = series.at_state(series.calibrated_state)
+
+    def predict(charge_pC) -> Contact:
+        contact = np.array([0.0, 0.0, np.log(0.5)])
+        for _ in range(12):
+            place = np.array([[contact[0], contact[1], np.exp(contact[2])]])
+            charge, slopes = calibrated.linearised(place)
+            weight = 1.0 / NOISE.sigma(charge[0])
+            step, *_ = np.linalg.lstsq(weight[:, None] * slopes[0], weight * (charge_pC - charge[0]), rcond=None)
+            contact = np.clip(contact + step, [-9.0, -9.0, -4.0], [9.0, 9.0, 2.0])
+        covariance = np.linalg.inv((weight[:, None] * slopes[0]).T @ (weight[:, None] * slopes[0]))
+        std = np.sqrt(np.diag(covariance))
+        force = float(np.exp(contact[2]))
+        return Contact(float(contact[0]), float(contact[1]), force, std[0], std[1], std[2] * force, 0.0)
+
+    return SimpleNamespace(
+        folder=folder, metadata=SimpleNamespace(electrodes=series.electrodes, noise=NOISE), predict=predict
+    )
+
+
+def touches(series, state, gains, rng, count):
+    """Contacts and charges of a changed film."""
+    distance = 6.5 * np.sqrt(rng.random(count))
+    angle = 2.0 * np.pi * rng.random(count)
+    force = np.exp(rng.uniform(np.log(0.1), np.log(1.5), count))
+    contact = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), force])
+    return contact, series.changes(contact, state).charge_pC * gains
+
+
+def followed(model, charge, rng, frames=6) -> FilmFollower:
+    """Return a follower that has observed touches of several frames each."""
+    follower = FilmFollower(model)
+    clock_s = 0.0
+    for row in charge:
+        for frame in NOISE.add(np.repeat(row[None], frames, axis=0), rng):
+            follower.observe_frame(frame, model.predict(frame), (), clock_s)
+            clock_s += 0.01
+        follower.observe_frame(None, None, (), clock_s)
+        clock_s += 1.0
+    return follower
+
+
+def force_errors(follower, model, contact, charge):
+    """Relative errors of the forces, and errors over the stated standard deviations."""
+    answers = [follower.follow_contact(model.predict(row), row).contact for row in charge]
+    error = np.array([answer.force_N for answer in answers]) - contact[:, 2]
+    std = np.array([answer.force_std_N for answer in answers])
+    return error / contact[:, 2], error / std
+
+
+@pytest.mark.parametrize(
+    ("change_MPa", "gain", "largest_error"), [(0.3, 1.0, 0.03), (-0.4, 1.0, 0.03), (0.0, 1.0, 0.01), (0.0, 1.03, 0.03)]
+)
+def test_changes_of_the_film_and_of_a_gain_are_followed(series, tmp_path, change_MPa, gain, largest_error):
+    rng = np.random.default_rng(4)
+    model = model_in(tmp_path, series)
+    state = np.array([change_MPa, 0.7, -0.8])
+    contact, charge = touches(series, state, np.array([gain, 1.0, 1.0, 1.0]), rng, 80)
+    follower = followed(model, charge[:50], rng)
+    assert not follower.is_lost
+    assert abs(follower.film.pretension_MPa - 1.0 - change_MPa) < 3.0 * follower.film.pretension_std_MPa + 0.01
+    relative, normalised = force_errors(follower, model, contact[50:], NOISE.add(charge[50:], rng))
+    assert np.sqrt(np.mean(relative**2)) < largest_error
+    assert np.mean(np.abs(normalised) < 2.0) > 0.85
+    if change_MPa:
+        before, _ = force_errors(FilmFollower(model), model, contact[50:], charge[50:])
+        assert np.sqrt(np.mean(before**2)) > 0.08
+
+
+def test_touches_that_no_film_explains_make_the_film_lost(series, tmp_path):
+    rng = np.random.default_rng(5)
+    model = model_in(tmp_path, series)
+    _, charge = touches(series, series.calibrated_state, np.ones(4), rng, 40)
+    assert followed(model, charge * rng.uniform(0.7, 1.4, charge.shape), rng).is_lost
+    assert not followed(model, charge, rng).is_lost
+
+
+def test_reset_forgets_the_touches(series, tmp_path):
+    rng = np.random.default_rng(6)
+    model = model_in(tmp_path, series)
+    contact, charge = touches(series, np.array([0.3, 0.0, 0.0]), np.ones(4), rng, 20)
+    follower = followed(model, charge, rng)
+    assert follower.film.touches == 20
+    follower.reset()
+    assert follower.film == FilmFollower(model).film
+    raw = model.predict(charge[0])
+    assert follower.follow_contact(raw, charge[0]).contact == raw
+    assert contact.shape == (20, 3)
+
+
+def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
+    single = series.at_state(series.calibrated_state)
+    with pytest.raises(ModelError, match="calibrate"):
+        FilmFollower(model_in(tmp_path, single))
+    three = replace(
+        series,
+        electrodes=ELECTRODES[:3],
+        coefficients=series.coefficients[..., :3],
+        directions=series.directions[..., :3],
+    )
+    with pytest.raises(ModelError, match="four electrodes"):
+        FilmFollower(model_in(tmp_path, three))
