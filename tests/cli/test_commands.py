@@ -287,7 +287,7 @@ BAD = [
     ),
     (("serve", "bench", "nowhere"), 2, "ModelError: "),
     (("serve", "bench", "--seconds", "inf"), 2, "--seconds"),
-    (("serve", "stream", SENSOR, "--port", "-", "--follow"), 2, "its film cannot be followed: 3 charges"),
+    (("serve", "stream", SENSOR, "--port", "-", "--follow"), 2, "expected at least four electrodes, got A, B, C"),
     (
         ("serve", "stream", "four-25um-biaxial", "--port", "-", "--follow"),
         2,

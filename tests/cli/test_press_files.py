@@ -15,7 +15,6 @@ COMMANDS = {
     "predict": ("serve", "predict", "four-25um-biaxial"),
     "check": ("serve", "check", "four-25um-biaxial"),
     "calibrate": ("train", "calibrate", "--sensor", "four-25um-biaxial", "-o", "film"),
-    "fit": ("train", "fit", "--sensor", "four-25um-biaxial", "-o", "models/rig"),
     "fit alone": ("train", "fit", "-o", "models/pad"),
 }
 """Words of the commands, to which the file is appended."""

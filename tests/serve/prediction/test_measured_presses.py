@@ -174,12 +174,12 @@ def test_press_file_with_too_many_presses_is_refused(monkeypatch, read):
         ("A\u2028B",),
         ("\ud800",),
         ("A" * 1001,),
-        tuple(f"Q{number}" for number in range(994)),
+        tuple(f"Q{number}" for number in range(995)),
     ],
 )
 def test_electrodes_that_cannot_be_columns(names):
     one = np.ones(1)
-    with pytest.raises(PressError, match=r"^electrode.*: expected (one|a|at most 993) name"):
+    with pytest.raises(PressError, match=r"^electrode.*: expected (one|a|at most 994) name"):
         MeasuredPresses(np.ones((1, 3)), np.ones((1, len(names))), one, one, names, (1,))
 
 

@@ -12,10 +12,8 @@ from isocharge.common.activations import ACTIVATIONS
 from isocharge.common.errors import ConfigError
 from isocharge.common.perceptron import evaluate
 from isocharge.serve import Predictor, find_model, load_model, write_model
-from isocharge.serve.model.pretensions import Pretensions
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config, release
 from isocharge.train.model_release.onnx_graph import read_graph, write_graph
-from isocharge.train.training.folded_network import MISFIT_UNIT
 from isocharge.train.training.network import TrainablePerceptron
 from isocharge.train.training.split import Split
 
@@ -83,33 +81,6 @@ def test_onnx_and_c_give_the_network(name, build, tmp_path):
     read_network = read_graph(graph, "graph")
     assert read_network.layers.activation.name == name
     check_close(np.concatenate(read_network.predict(charge_pC.astype(float)), axis=1), expected)
-
-
-@pytest.mark.parametrize("name", ACTIVATIONS)
-def test_the_followed_film_has_the_misfit_of_the_network(name):
-    """The weights at both pretensions are those of one network, so the pretension does not change the misfit."""
-    network = random_network(4, (24, 20), (16, 12), activation=ACTIVATIONS[name])
-    layers = network.layers
-    arrays = [array for layer in layers.hidden for array in layer]
-    arrays += [layers.skip, layers.last.bias, layers.last.weight]
-    features = network.features
-    pretensions = Pretensions(
-        node_MPa=np.array([0.5, 1.5]),
-        calibrated_MPa=0.5,
-        std_MPa=0.1,
-        floor_MPa=0.01,
-        misfit_rms=1.0,
-        misfit_unit=MISFIT_UNIT,
-        limits_pC=(float(features.low_pC), float(features.high_pC)),
-        typical_pC=features.typical_pC,
-        weights={f"c{number}": np.stack([array, array]).astype(np.float32) for number, array in enumerate(arrays)},
-        activation=name,
-    )
-    charge_pC = np.random.default_rng(1).uniform(100.0, 3000.0, (20, 4))
-    _, _, expected = network.predict(charge_pC)
-    for charge, (misfit,) in zip(charge_pC, expected, strict=True):
-        given = pretensions.misfits(charge, np.array([0.5, 0.9, 1.5]))
-        np.testing.assert_allclose(given, misfit, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ACTIVATIONS)
