@@ -59,7 +59,7 @@ def test_folder_contains_the_presses_the_sensor_and_the_estimate(written, proble
     std = np.sqrt(np.diag(drifted.covariance))
     np.testing.assert_allclose(film.covariance, drifted.covariance, atol=2e-6 * np.outer(std, std).max())
     table = json.loads((version / "calibration.json").read_text())
-    assert table["film_error"]["position_mm"] == pytest.approx(written.result.film_error.position_mm)
+    assert table["error_left"]["position_mm"] == pytest.approx(written.result.film_error.position_mm)
     card = (version / "card.md").read_text()
     assert written.result.summary[0] in card
     for name in ("sensor.toml", "calibration.json", "card.md", "calibration.png"):
