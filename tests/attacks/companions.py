@@ -31,6 +31,7 @@ def charge_arrays():
         "force_N": np.array([0.05, 2.0]),
         "is_folded": np.array(0),
         "charge_std": np.array(0.003),
+        "offset_pC": np.array(3.0),
         "pretension_MPa": np.array(0.8),
         "tension_std_MPa": np.array(0.1),
     }

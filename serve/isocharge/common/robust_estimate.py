@@ -34,6 +34,12 @@ DAMPING_FACTOR = 10.0
 SMALLEST_CONTACT_DAMPING = 1e-9
 """Smallest damping of the contacts, so that contacts near a fold of the charge map stay finite."""
 
+RELATIVE_RIDGE = 1e-12
+"""Addition to the diagonal of the normal matrix of a contact, relative to its trace, so that it can be inverted."""
+
+SMALLEST_RIDGE = 1e-300
+"""Addition to the diagonal for contacts on which no charge depends."""
+
 MAX_REJECTED_STEPS = 6
 """Number of successive unsuccessful steps after which the search ends."""
 
@@ -132,7 +138,8 @@ def robust_estimate(
         state_bounds: Smallest and largest values of the state, each of shape (p,). The state is clipped.
         freedom: Degrees of freedom nu of the distribution of the residuals; infinity for a Gaussian distribution.
         max_steps: Largest number of steps.
-        tolerance: The search ends when the step of the state is smaller than this number of standard deviations.
+        tolerance: The search ends when a step reduces the minimised function by less than this value. A step of one
+            standard deviation of the state reduces it by about 0.5.
     """
     problem = _Problem(model, charge_pC, covariance_pC2, prior, measured, freedom)
     point = problem.evaluate(start_state, start_contacts)
@@ -210,28 +217,33 @@ class _Problem:
         measured: MeasuredContacts | None,
         freedom: float,
     ) -> None:
-        """Store the arguments of `robust_estimate`, and compute the factors that divide residuals by their errors."""
+        """Compute what stays the same during the search.
+
+        A residual of the charges is whitened: it is multiplied by a matrix that makes its errors independent, with the
+        standard deviation 1. The arguments are those of `robust_estimate`.
+        """
         self._model = model
         self._charge_pC = charge_pC
-        self._whitening = np.linalg.inv(np.linalg.cholesky(covariance_pC2))  # shape (n, e, e)
+        self._whitening = np.linalg.inv(np.linalg.cholesky(covariance_pC2))  # one matrix per press, shape (n, e, e)
         self._prior = prior
         self._precision = np.linalg.inv(prior.covariance)
         self._freedom = freedom
         n_press, n_electrode = charge_pC.shape
         self._measured = np.zeros((n_press, 3))
-        self._contact_precision = np.zeros((n_press, 3))  # one over the standard deviations, 0 if not measured
+        # One over the standard deviations of the measured coordinates; 0 where a coordinate was not measured
+        self._contact_weight = np.zeros((n_press, 3))
         if measured is not None:
             is_measured = np.isfinite(measured.std)
-            self._contact_precision[is_measured] = 1.0 / measured.std[is_measured]
+            self._contact_weight[is_measured] = 1.0 / measured.std[is_measured]
             self._measured = np.where(is_measured, measured.coordinates, 0.0)
-        measured_count = np.count_nonzero(self._contact_precision, axis=1)
+        measured_count = np.count_nonzero(self._contact_weight, axis=1)
         self.degrees = n_electrode + measured_count - 3.0
 
     def evaluate(self, state: Array, contacts: Array) -> _Point:
         """Evaluate the model, the residuals and the cost at a state and contacts."""
         values = self._model(contacts, state)
         residual = (self._whitening @ (self._charge_pC - values.charge_pC)[:, :, None])[:, :, 0]
-        contact_residual = (self._measured - contacts) * self._contact_precision
+        contact_residual = (self._measured - contacts) * self._contact_weight
         chi2 = (residual**2).sum(axis=1) + (contact_residual**2).sum(axis=1)
         weights = np.ones(len(chi2))
         press_cost = 0.5 * chi2
@@ -289,13 +301,12 @@ class _Problem:
         """
         transposed = point.by_contact.swapaxes(1, 2)
         contact_matrix = transposed @ point.by_contact
-        diagonal = np.einsum("nkk->nk", contact_matrix)
-        diagonal += self._contact_precision**2
+        diagonal = np.einsum("nkk->nk", contact_matrix)  # a view, through which the matrices are changed
+        diagonal += self._contact_weight**2
         diagonal *= 1.0 + damping
-        diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + 1e-300
-        right_side = (transposed @ point.residual[:, :, None])[
-            :, :, 0
-        ] + self._contact_precision * point.contact_residual
+        diagonal += RELATIVE_RIDGE * diagonal.sum(axis=1, keepdims=True) + SMALLEST_RIDGE
+        charge_part = (transposed @ point.residual[:, :, None])[:, :, 0]
+        right_side = charge_part + self._contact_weight * point.contact_residual
         mixed = transposed @ point.by_state  # shape (n, 3, p)
         solution = np.linalg.solve(contact_matrix, np.concatenate([right_side[:, :, None], mixed], axis=2))
         contact_shift = solution[:, :, 0]

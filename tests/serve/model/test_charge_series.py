@@ -139,13 +139,13 @@ def test_interpolation_weights_reproduce_a_cubic_and_continue_linearly():
 
 @pytest.mark.parametrize("is_signed", [False, True])
 def test_file_is_read_as_it_was_written(tmp_path, is_signed):
-    written = random_series(is_signed=is_signed)
+    written = replace(random_series(is_signed=is_signed), offset_pC=3.5)
     (tmp_path / "charges.npz").write_bytes(written.to_bytes())
     read = read_charges(tmp_path, ELECTRODES)
     contact = random_contacts()
     state = np.array([0.1, 1.0, -1.0])
     np.testing.assert_array_equal(read.changes(contact, state).charge_pC, written.changes(contact, state).charge_pC)
-    for name in ("domain", "electrodes", "is_folded", "charge_std", "pretension_MPa", "tension_std_MPa"):
+    for name in ("domain", "electrodes", "is_folded", "charge_std", "offset_pC", "pretension_MPa", "tension_std_MPa"):
         assert getattr(read, name) == getattr(written, name)
 
 
@@ -241,3 +241,15 @@ def test_number_of_directions_and_pretension_of_another_state():
     moved = series.at_state(np.array([0.2, 0.0, 0.0]))
     assert (moved.direction_count, moved.pretension_MPa) == (0, pytest.approx(1.0))
     assert replace(series, directions=None).direction_count == 0
+
+
+def test_an_offset_is_added_to_every_charge_and_changes_no_derivative():
+    series = random_series()
+    shifted = replace(series, offset_pC=3.5)
+    contact = random_contacts()
+    state = np.array([0.1, 1.0, -1.0])
+    np.testing.assert_allclose(shifted.charges(contact), series.charges(contact) + 3.5)
+    before, after = series.changes(contact, state), shifted.changes(contact, state)
+    np.testing.assert_allclose(after.charge_pC, before.charge_pC + 3.5)
+    np.testing.assert_array_equal(after.by_state, before.by_state)
+    np.testing.assert_array_equal(after.by_contact, before.by_contact)

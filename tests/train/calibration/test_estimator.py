@@ -25,7 +25,7 @@ def _one_hypothesis(monkeypatch):
     monkeypatch.setattr(estimator, "hypotheses", lambda _: [ONE])
     monkeypatch.setattr(estimator, "typical", lambda _: ONE)
     monkeypatch.setattr(estimator, "DEGREES_OF_FREEDOM", 1e6)
-    monkeypatch.setattr(estimator, "STEP_TOLERANCE", 1e-4)
+    monkeypatch.setattr(estimator, "TOLERANCE", 1e-4)
 
 
 def draw_unknowns(problem, hypothesis, rng):

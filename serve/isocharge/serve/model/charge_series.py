@@ -34,6 +34,7 @@ The file `charges.npz` is in the same folder as `model.onnx`. It contains these 
     force_N          smallest and largest force of the domain, N
     is_folded        1 if the map has a fold, otherwise 0
     charge_std       see `ChargeSeries`
+    offset_pC        charge that is added to Q of each electrode, pC, for example because of a wrong tare
     pretension_MPa   see `ChargeSeries`
     tension_std_MPa  see `ChargeSeries`
 """
@@ -80,6 +81,9 @@ MAX_VALUE = 100.0
 MAX_PRETENSION_MPa = 50.0
 """Largest magnitude of the numbers in MPa in a file."""
 
+MAX_OFFSET_pC = 1e5
+"""Largest magnitude of the offset in a file, pC."""
+
 MIN_NODE_DISTANCE_MPa = 1e-3
 """Smallest distance between two nodes in a file, MPa."""
 
@@ -109,6 +113,7 @@ class ChargeSeries:
             `ContactMixture`.
         charge_std: Standard deviation of the part of the charges that the map does not describe, relative to the
             charges.
+        offset_pC: Charge that is added to the charge of each electrode, pC. A calibration found it in all presses.
         pretension_MPa: Mean pretension of the film as it was calibrated, MPa.
         tension_std_MPa: Standard deviation of t when a stream begins, MPa. It includes the uncertainty of the
             calibration.
@@ -122,6 +127,7 @@ class ChargeSeries:
     log_size: Array | None = None
     is_folded: bool = False
     charge_std: float = 0.0
+    offset_pC: float = 0.0
     pretension_MPa: float = 0.0
     tension_std_MPa: float = 0.0
 
@@ -170,7 +176,9 @@ class ChargeSeries:
             pC/mm, pC/mm and pC.
         """
         nearest, excess = self._nearest_in_domain(contact)
-        return self._charges(_continued(self._calibrated.values_and_derivatives(nearest), excess), nearest, excess)
+        values = _continued(self._calibrated.values_and_derivatives(nearest), excess)
+        charge_pC, by_contact = self._charges(values, nearest, excess)
+        return charge_pC + self.offset_pC, by_contact
 
     def changes(self, contact: Array, state: Array) -> ModelValues:
         """Compute the charges of contacts for any state of the film, and the derivatives of the charges.
@@ -202,7 +210,7 @@ class ChargeSeries:
 
         charge_pC, by_contact = self._charges(value, nearest, excess)
         charge_per_value = self._charge_per_value(charge_pC, nearest, excess)
-        return ModelValues(charge_pC, by_contact, charge_per_value[:, :, None] * value_by_state)
+        return ModelValues(charge_pC + self.offset_pC, by_contact, charge_per_value[:, :, None] * value_by_state)
 
     def at_state(self, state: Array) -> "ChargeSeries":
         """Return the map of the film in another state, which becomes the calibrated film of the result.
@@ -237,6 +245,7 @@ class ChargeSeries:
             "force_N": np.array(self.domain.force_range),
             "is_folded": np.array(int(self.is_folded)),
             "charge_std": np.array(self.charge_std),
+            "offset_pC": np.array(self.offset_pC),
             "pretension_MPa": np.array(self.pretension_MPa),
             "tension_std_MPa": np.array(self.tension_std_MPa),
         }
@@ -285,7 +294,7 @@ class ChargeSeries:
         return nearest, unit_contact - nearest
 
     def _charges(self, value: Array, nearest: Array, excess: Array) -> tuple[Array, Array]:
-        """Convert values v of the series into charges.
+        """Convert values v of the series into charges without the offset.
 
         Args:
             value: v and its derivatives with respect to the unit coordinates, shape (n, 4, n_electrode).
@@ -293,7 +302,7 @@ class ChargeSeries:
             excess: Differences to the nearest contacts.
 
         Returns:
-            The result of `linearised`.
+            Charges without the offset, and their derivatives, as `linearised` returns them.
         """
         slopes = value[:, 1:].swapaxes(1, 2)  # shape (n, n_electrode, 3)
         if self.log_size is None:  # Q = exp(v)
@@ -442,6 +451,7 @@ def _charges_from_arrays(arrays: Mapping[str, np.ndarray], electrodes: tuple[str
         log_size=_read_log_size(arrays),
         is_folded=_read_number(arrays, "is_folded", 0.0, 1.0) == 1.0,
         charge_std=_read_number(arrays, "charge_std", 0.0, 1.0),
+        offset_pC=_read_number(arrays, "offset_pC", -MAX_OFFSET_pC, MAX_OFFSET_pC),
         pretension_MPa=_read_number(arrays, "pretension_MPa", -MAX_PRETENSION_MPa, MAX_PRETENSION_MPa),
         tension_std_MPa=_read_number(arrays, "tension_std_MPa", 0.0, MAX_PRETENSION_MPa),
     )

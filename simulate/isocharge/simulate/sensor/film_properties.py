@@ -11,10 +11,12 @@ itself. A property that depends on the direction has two components, the size of
 sine of twice the angle of its axis.
 """
 
+import cmath
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -74,19 +76,32 @@ class FilmProperty:
         return self.bounds or (self.mean - MAX_DEVIATION * self.std, self.mean + MAX_DEVIATION * self.std)
 
 
-def _film(**changes: Callable[[float, float], float]) -> Change:
-    """Return a function that changes attributes of the film. Each change is a function of the old value and a value."""
+def _changed(component: str, attribute: str, function: Callable[[float, float], float]) -> Change:
+    """Return a function that changes one number of a component of a sensor.
 
-    def changed_sensor(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-        changed: dict[str, Any] = {name: change(getattr(sensor.film, name), value) for name, change in changes.items()}
-        return replace(sensor, film=replace(sensor.film, **changed)), probe
+    Args:
+        component: Attribute of the sensor: "film", "piezo" or "calibration".
+        attribute: Attribute of the component.
+        function: Function of the described number and of the value of the property. It returns the changed number.
+    """
 
-    return changed_sensor
+    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
+        described = getattr(sensor, component)
+        number = function(getattr(described, attribute), value)
+        changed: dict[str, Any] = {component: replace(described, **{attribute: number})}
+        return replace(sensor, **changed), probe
+
+    return change
 
 
 def _scaled(described: float, value: float) -> float:
     """Return a described value whose logarithm is increased by `value`."""
     return described * math.exp(value)
+
+
+def _replaced(_: float, value: float) -> float:
+    """Return `value` itself, whatever was described."""
+    return value
 
 
 def _deviator(component: int) -> Change:
@@ -105,12 +120,8 @@ def _stiffness(direction: complex) -> Change:
 
     def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
         film = sensor.film
-        size = math.log(film.young_ratio) * complex(math.cos(2.0 * film.axis), math.sin(2.0 * film.axis))
-        changed = size + value * direction
-        # At the described size of zero, the axis stays, so that the film remains axisymmetric.
-        axis = film.axis if changed == size else 0.5 * math.atan2(changed.imag, changed.real)
-        ratio = film.young_ratio if changed == size else math.exp(abs(changed))
-        return replace(sensor, film=replace(film, young_ratio=ratio, axis=axis)), probe
+        log_ratio, axis = _increased(math.log(film.young_ratio), film.axis, value * direction)
+        return replace(sensor, film=replace(film, young_ratio=math.exp(log_ratio), axis=axis)), probe
 
     return change
 
@@ -120,24 +131,16 @@ def _oval(direction: complex) -> Change:
 
     def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
         film = sensor.film
-        size = film.oval * complex(math.cos(2.0 * film.oval_axis), math.sin(2.0 * film.oval_axis))
-        changed = size + value * direction
-        if changed == size:
-            return sensor, probe
-        axis = 0.5 * math.atan2(changed.imag, changed.real)
-        return replace(sensor, film=replace(film, oval=abs(changed), oval_axis=axis)), probe
+        oval, axis = _increased(film.oval, film.oval_axis, value * direction)
+        return replace(sensor, film=replace(film, oval=oval, oval_axis=axis)), probe
 
     return change
 
 
-def _piezo(**changes: Callable[[float, float], float]) -> Change:
-    """Return a function that changes piezoelectric coefficients, like `_film`."""
-
-    def changed_sensor(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-        changed: dict[str, Any] = {name: change(getattr(sensor.piezo, name), value) for name, change in changes.items()}
-        return replace(sensor, piezo=replace(sensor.piezo, **changed)), probe
-
-    return changed_sensor
+def _increased(size: float, axis: float, addition: complex) -> tuple[float, float]:
+    """Add to a quantity size * exp(2 i axis), and return its new size and axis. The new size is not negative."""
+    total = cmath.rect(size, 2.0 * axis) + addition
+    return abs(total), 0.5 * cmath.phase(total)
 
 
 def _d12(described: float, value: float) -> float:
@@ -155,18 +158,6 @@ def _shift(axis: int) -> Change:
         return replace(sensor, calibration=replace(sensor.calibration, shift=shift)), probe
 
     return change
-
-
-def _rotation(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-    """Rotate the electrodes by an angle, rad."""
-    calibration = sensor.calibration
-    return replace(sensor, calibration=replace(calibration, rotation=calibration.rotation + value)), probe
-
-
-def _crosstalk(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-    """Increase the crosstalk."""
-    calibration = sensor.calibration
-    return replace(sensor, calibration=replace(calibration, crosstalk=calibration.crosstalk + value)), probe
 
 
 def _probe_radius(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
@@ -196,7 +187,7 @@ PRETENSION = FilmProperty(
     "mean pretension",
     "MPa",
     LARGEST_PRETENSION / math.sqrt(12.0),  # that of the uniform distribution
-    _film(pretension=lambda _, value: value),
+    _changed("film", "pretension", _replaced),
     drift=0.35,  # creep, and a degree of temperature
     mean=0.5 * LARGEST_PRETENSION,
     bounds=(0.0, 4.0),
@@ -205,21 +196,30 @@ PRETENSION = FilmProperty(
 
 FILM_PROPERTIES = (
     PRETENSION,
-    FilmProperty("young", "ln of Young's modulus", "1", 0.2, _film(young=_scaled), 0.006),
-    FilmProperty("thickness", "ln of the thickness", "1", 0.05, _film(thickness=_scaled), 0.002),
-    FilmProperty("d31", "ln of d31", "1", 0.2, _piezo(d31=_scaled), 0.01),
-    FilmProperty("d32", "ln of d32", "1", 0.2, _piezo(d32=_scaled), 0.01),
+    FilmProperty("young", "ln of Young's modulus", "1", 0.2, _changed("film", "young", _scaled), 0.006),
+    FilmProperty("thickness", "ln of the thickness", "1", 0.05, _changed("film", "thickness", _scaled), 0.002),
+    FilmProperty("d31", "ln of d31", "1", 0.2, _changed("piezo", "d31", _scaled), 0.01),
+    FilmProperty("d32", "ln of d32", "1", 0.2, _changed("piezo", "d32", _scaled), 0.01),
     FilmProperty("shift_x", "shift of the electrodes along x", "mm", 0.3, _shift(0), 0.01),
     FilmProperty("shift_y", "shift of the electrodes along y", "mm", 0.3, _shift(1), 0.01),
-    FilmProperty("rotation", "rotation of the electrodes", "rad", math.radians(2.0), _rotation, 0.001),
+    FilmProperty(
+        "rotation",
+        "rotation of the electrodes",
+        "rad",
+        math.radians(2.0),
+        _changed("calibration", "rotation", add),
+        0.001,
+    ),
     _imperfection("tension_difference", "(T11 - T22) / 2", "MPa", 0.25, _deviator(0)),
     _imperfection("tension_shear", "T12", "MPa", 0.15, _deviator(1)),
     _imperfection("stiffness_x", "ln(E1 / E2), times the cosine of twice its angle", "1", 0.15, _stiffness(1.0)),
     _imperfection("stiffness_xy", "ln(E1 / E2), times the sine of twice its angle", "1", 0.1, _stiffness(1j)),
     _imperfection("oval_x", "e of an oval clamp, times the cosine of twice its angle", "1", 0.006, _oval(1.0)),
     _imperfection("oval_xy", "e of an oval clamp, times the sine of twice its angle", "1", 0.006, _oval(1j)),
-    _imperfection("d12", "d12, by axes that are rotated", "pC/N", 0.3, _piezo(d12=_d12)),
-    _imperfection("crosstalk", "share of the charge of each other electrode", "1", 0.01, _crosstalk),
+    _imperfection("d12", "d12, by axes that are rotated", "pC/N", 0.3, _changed("piezo", "d12", _d12)),
+    _imperfection(
+        "crosstalk", "share of the charge of each other electrode", "1", 0.01, _changed("calibration", "crosstalk", add)
+    ),
 )
 """Properties of every film. The radius of a circular probe and the gains of the electrodes follow them."""
 

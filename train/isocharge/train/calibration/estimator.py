@@ -31,8 +31,10 @@ MAX_LOG_FORCE = 20.0
 UNKNOWN_CHARGE_STD = 1e9
 """Standard deviation of a charge that was not measured, pC."""
 
-STEP_TOLERANCE = 0.02
-"""Largest step, in posterior standard deviations, after which the search ends."""
+TOLERANCE = 0.02
+"""Reduction of the minimised function by one step, below which the search ends.
+
+A step of 0.2 posterior standard deviations causes such a reduction."""
 
 DEGREES_OF_FREEDOM = 5.0
 """Degrees of freedom of Student's t distribution, from which the weights of the presses follow."""
@@ -349,7 +351,7 @@ def _search(charges: FilmCharges, data: PressData, prior: Prior, unknowns: Array
         measured=MeasuredContacts(data.contact, data.contact_std),
         state_bounds=(low[is_free], high[is_free]),
         freedom=DEGREES_OF_FREEDOM,
-        tolerance=STEP_TOLERANCE,
+        tolerance=TOLERANCE,
     )
     return found._replace(state=all_unknowns(found.state))
 

@@ -109,7 +109,10 @@ class FilmCharges:
         )
 
     def solved(self, values: Array, executor: Executor | None) -> "FilmCharges":
-        """Solve a similar film accurately, for the probe itself. The derivatives stay those of this film.
+        """Return the charges of a similar film that is solved under the probe itself, also if it is not circular.
+
+        The interpolation of the new forward map is checked. The derivatives with respect to the properties are not
+        computed again; they stay those of this film.
 
         Args:
             values: Properties of the film, shape (n_property,).
@@ -171,11 +174,6 @@ class FilmCharges:
         """
         return _Reading(self, values).film.derivatives(contact)
 
-    def side_charges(self, contact: Array) -> Array:
-        """Compute the derivatives of the charges with respect to the side force (Fx, Fy), shape (n, n_electrode, 2)."""
-        assert self.side_forces is not None
-        return self.side_forces.jacobian(contact)
-
 
 class _Reading:
     """A solved film that is read by electrodes with other properties.
@@ -196,7 +194,6 @@ class _Reading:
         """
         self._charges = charges
         self._prior = charges.prior
-        self._values = values
         is_exact = [name not in MECHANICAL for name in charges.prior.names]
         self.exact = np.flatnonzero(is_exact)
         self._sensor, _ = charges.prior.film(np.where(is_exact, values, charges.values))

@@ -18,7 +18,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.chebyshev_series import Series
 from isocharge.serve.model.charge_series import ChargeSeries, series_size
-from isocharge.simulate import Circle, Domain, ForwardMap, NoiseModel
+from isocharge.simulate import Domain, ForwardMap, NoiseModel
 from isocharge.simulate.forward.derivative_fields import NODE_COUNT
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION
@@ -48,6 +48,9 @@ NODES_MPa = (-0.7, -0.3, 0.0, 0.4, 0.9)
 
 MIN_NODE_PRETENSION_MPa = 0.02
 """Smallest pretension of a film at a node, MPa."""
+
+MIN_NODE_DISTANCE_MPa = 0.1
+"""Smallest distance of the lowest node from the next node, MPa."""
 
 FEWEST_FOLLOWED = 4
 """Smallest number of electrodes with which a film can be followed. Three charges only determine the contact."""
@@ -94,12 +97,9 @@ def compact_charges(
     contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
     charge = _film_charges(charges, film, contact)
     names = charges.prior.sensor.electrode_names
-    node_MPa = np.zeros(1)
-    if len(names) >= FEWEST_FOLLOWED:
-        lowest = MIN_NODE_PRETENSION_MPa - film.value(PRETENSION.name)
-        node_MPa = np.unique(np.maximum(NODES_MPa, min(lowest, 0.0)))
-    factors = [_tension_factor(charges, film, contact, float(change), executor) for change in node_MPa]
-    series = fit_film_series(domain, names, contact, charge[:, None] * np.stack(factors, axis=1), node_MPa)
+    node_MPa = _nodes(film) if len(names) >= FEWEST_FOLLOWED else np.zeros(1)
+    factors = _tension_factors(charges, film, contact, node_MPa, executor)
+    series = fit_film_series(domain, names, contact, charge[:, None] * factors, node_MPa)
 
     contact, charge = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
     changes = _directions(charges, film, contact, charge, noise)  # shape (n, n_direction, n_electrode), pC
@@ -110,7 +110,9 @@ def compact_charges(
     return replace(
         series,
         directions=coefficients.reshape(*coefficients.shape[:3], *changes.shape[1:]) if changes.shape[1] else None,
+        # A film is at most as well described as its charges can be measured.
         charge_std=max(series.charge_std, noise.gain),
+        offset_pC=film.value("offset"),
         pretension_MPa=film.value(PRETENSION.name),
         tension_std_MPa=PRETENSION.drift,
     )
@@ -123,31 +125,51 @@ def _film_charges(charges: FilmCharges, film: FilmEstimate, contact: Array) -> A
     return np.asarray(charge * (1.0 + terms(contact, charges.domain) @ coefficients))
 
 
-def _tension_factor(
-    charges: FilmCharges, film: FilmEstimate, contact: Array, change_MPa: float, executor: Executor | None
+def _nodes(film: FilmEstimate) -> Array:
+    """Return the changes of the pretension at the nodes, of which none makes the film slack, shape (n_node,), MPa."""
+    lowest = MIN_NODE_PRETENSION_MPa - film.value(PRETENSION.name)
+    reachable = [change for change in NODES_MPa if change >= min(lowest, 0.0)]
+    # If the film cannot reach the lowest node, the lowest reachable pretension replaces it.
+    if reachable[0] > NODES_MPa[0] and lowest < reachable[0] - MIN_NODE_DISTANCE_MPa:
+        reachable.insert(0, lowest)
+    return np.array(reachable)
+
+
+def _tension_factors(
+    charges: FilmCharges, film: FilmEstimate, contact: Array, node_MPa: Array, executor: Executor | None
 ) -> Array:
-    """Compute the factors by which a change of the pretension multiplies the charges, shape (n, n_electrode).
+    """Compute the factors by which changes of the pretension multiply the charges.
 
-    The factors are those of an axisymmetric film under a circular probe. A factor is 1 where both charges have
-    different signs.
+    The factors are those of an axisymmetric film under a circular probe. A factor is 1 where the charges before and
+    after the change have different signs.
+
+    Args:
+        charges: Charges of the solved film and of similar films.
+        film: The estimate.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        node_MPa: Changes of the pretension, shape (n_node,), MPa.
+        executor: Executor that solves the films; None for this process.
+
+    Returns:
+        Factors, shape (n, n_node, n_electrode), dimensionless.
     """
-    if change_MPa == 0.0:
-        return np.ones((len(contact), len(charges.prior.sensor.electrode_names)))
     sensor, probe = charges.prior.film(film.film_values)
-    sensor = axisymmetric(sensor)
+    sensor, circle = axisymmetric(sensor), circle_of(probe)
 
-    def round_charges(pretension: float) -> Array:
-        """Compute the charges of the axisymmetric film with a pretension."""
-        changed = replace(sensor, film=replace(sensor.film, pretension=pretension))
-        circle: Circle = circle_of(probe)
-        return ForwardMap.build_unchecked(changed, circle, charges.domain, NODE_COUNT, executor=executor).charges(
-            contact
-        )
+    def charges_after(change_MPa: float) -> Array:
+        """Solve the axisymmetric film after a change of its pretension, and return its charges."""
+        changed_film = replace(sensor.film, pretension=sensor.film.pretension + change_MPa)
+        changed = replace(sensor, film=changed_film)
+        forward_map = ForwardMap.build_unchecked(changed, circle, charges.domain, NODE_COUNT, executor=executor)
+        return forward_map.charges(contact)
 
-    pretension = sensor.film.pretension
-    before, after = round_charges(pretension), round_charges(pretension + change_MPa)
-    is_ratio = before * after > 0.0
-    return np.where(is_ratio, after / np.where(is_ratio, before, 1.0), 1.0)
+    before = charges_after(0.0)
+    factors = np.ones((len(contact), node_MPa.size, before.shape[1]))
+    for node, change_MPa in enumerate(node_MPa.tolist()):
+        if change_MPa != 0.0:
+            after = charges_after(change_MPa)
+            np.divide(after, before, out=factors[:, node], where=before * after > 0.0)
+    return factors
 
 
 def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge: Array, noise: NoiseModel) -> Array:
@@ -203,7 +225,7 @@ def training_data(
     charge = _drawn_charges(series, rng, contact)
     drift = np.hypot(film.value("drift"), film.std("drift")) / np.sqrt(12.0)  # all gains of the session can occur
     charge = charge * (1.0 + drift * rng.standard_normal((PRESSES, 1)))
-    charge = charge + film.value("offset") + film.std("offset") * rng.standard_normal((PRESSES, 1))
+    charge = charge + film.std("offset") * rng.standard_normal((PRESSES, 1))
     charge = charge + _side_charges(charges, side_forces, rng, contact)
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(

@@ -36,10 +36,10 @@ class Application:
             send: Function that sends a part of the response.
 
         Raises:
-            NotImplementedError: If the scope is not an HTTP request. Servers then do not use the ASGI lifespan.
+            ValueError: If the scope is not an HTTP request. A server then knows that there is no ASGI lifespan.
         """
         if scope["type"] != "http":
-            raise NotImplementedError(f"expected an HTTP request, got the scope {scope['type']!r}")
+            raise ValueError(f"expected a scope of the type 'http', got {scope['type']!r}")
         body = await _read_body(receive, self.handler.limits.body_bytes)
         if body is None:
             return
