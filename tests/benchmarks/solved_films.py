@@ -18,14 +18,29 @@ from isocharge.train.data.presses import draw_contacts
 PRETENSION_MPa = (0.6, 1.2)
 """Range of the mean pretensions of the films."""
 
-RELATIVE_UNEVENNESS = (0.1, 0.3)
-"""Range of the uneven part of the tension over its mean: T1 / T2 is then up to 1.9."""
-
-YOUNG_RATIO = (1.05, 1.3)
-"""Range of E1 / E2."""
-
 LARGEST_OVAL = 0.012
 """Largest parameter e of the oval clamp."""
+
+
+@dataclass(frozen=True)
+class Unevenness:
+    """Ranges from which the unevenness of films is drawn.
+
+    Attributes:
+        tension: Uneven part of the tension over its mean; T1 / T2 is (1 + u) / (1 - u).
+        young_ratio: E1 / E2.
+    """
+
+    tension: tuple[float, float]
+    young_ratio: tuple[float, float]
+
+
+FILMS = {
+    "typical": Unevenness((0.1, 0.3), (1.05, 1.3)),
+    "moduli": Unevenness((0.1, 0.1), (1.6, 1.6)),
+    "tension": Unevenness((0.5, 0.5), (1.1, 1.1)),
+}
+"""Kinds of films by name."""
 
 LARGEST_FORCE_N = 1.6
 """Largest force of a press."""
@@ -48,19 +63,19 @@ class SolvedFilm:
     later_charge: np.ndarray
 
 
-def draw_film(problem: CalibrationProblem, seed: int) -> tuple[Sensor, Circle]:
-    """Draw a film: the parameters from the prior, and imperfections besides."""
+def draw_film(problem: CalibrationProblem, kind: Unevenness, seed: int) -> tuple[Sensor, Circle]:
+    """Draw a film: its properties from the prior distribution, and its unevenness from the ranges of a kind."""
     rng = np.random.default_rng([seed, 49])
     prior = problem.prior.layout.prior
     values = prior.draw(rng, 1)[0]
     values[prior.index("pretension")] = rng.uniform(*PRETENSION_MPa)
     sensor, probe = prior.film(values)
     angle = rng.uniform(0.0, np.pi, 3)
-    unevenness = rng.uniform(*RELATIVE_UNEVENNESS) * sensor.film.pretension
+    unevenness = rng.uniform(*kind.tension) * sensor.film.pretension
     film = replace(
         sensor.film,
         deviator=(unevenness * np.cos(2.0 * angle[0]), unevenness * np.sin(2.0 * angle[0])),
-        young_ratio=rng.uniform(*YOUNG_RATIO),
+        young_ratio=rng.uniform(*kind.young_ratio),
         axis=angle[1],
         oval=rng.uniform(0.0, LARGEST_OVAL),
         oval_axis=angle[2],
@@ -84,6 +99,7 @@ def stored_charges(path: Path, contact: np.ndarray) -> np.ndarray | None:
 
 def solved_film(
     problem: CalibrationProblem,
+    kind: Unevenness,
     seed: int,
     change_MPa: float,
     counts: tuple[int, int],
@@ -96,14 +112,15 @@ def solved_film(
 
     Args:
         problem: The films.
+        kind: Kind of the film.
         seed: Seed of the film and of the contacts.
         change_MPa: Change of the pretension after the calibration.
         counts: Number of presses before and after the change.
-        folder: Folder in which solved presses are stored.
+        folder: Folder in which solved presses of this kind of film are stored.
         pool: Processes that solve the presses.
     """
     rng = np.random.default_rng([seed, 50])
-    sensor, probe = draw_film(problem, seed)
+    sensor, probe = draw_film(problem, kind, seed)
     later = replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension + change_MPa))
     arrays = {}
     for prefix, change, film, count in (("", 0.0, sensor, counts[0]), ("later_", change_MPa, later, counts[1])):
