@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from isocharge.common.errors import SceneError
+from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate import Circle, FilmPrior, load_sensor, parse_probe
 from isocharge.simulate.sensor import film_properties
 from isocharge.simulate.sensor.film_properties import FILM_PROPERTIES, LARGEST_PRETENSION, FilmProperty, virtual_film
@@ -112,3 +112,20 @@ def test_only_circular_probes_have_a_radius():
 def test_virtual_film_of_a_seed_is_always_the_same():
     assert virtual_film(SENSOR, Circle(1.0), 3) == virtual_film(SENSOR, Circle(1.0), 3)
     assert virtual_film(SENSOR, Circle(1.0), 3) != virtual_film(SENSOR, Circle(1.0), 4)
+
+
+@pytest.mark.parametrize("name", ["eight-25um-biaxial-36mm", "six-25um-biaxial-30mm", "four-25um-biaxial"])
+def test_electrodes_stay_on_every_film_within_the_bounds(name):
+    """A search for the properties of a film may try each corner of the bounds. A sensor refuses electrodes off it."""
+    prior = FilmPrior(load_sensor(name), Circle(1.0))
+    low, high = prior.bounds
+    is_high = np.random.default_rng(0).random((300, low.size)) < 0.5
+    for corner in np.where(is_high, high, np.maximum(low, [0.1, *low[1:]])):
+        sensor, _ = prior.film(corner)
+        assert 0.0 < sensor.film.inner_radius <= SENSOR.film.radius
+
+
+def test_electrode_near_the_rim_is_refused_with_the_largest_distance():
+    sensor = sensor_from_dict(sensor_to_dict(SENSOR) | {"electrodes": {"side_mm": 3.0, "A": [43.3, 0.0]}})
+    with pytest.raises(SensorError, match=r"within 44\.5 mm.*reaches 44\.83 mm; move it inwards"):
+        FilmPrior(sensor, Circle(1.0))

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import SceneError
+from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate.sensor.film import MIN_PIEZO
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
@@ -35,6 +35,9 @@ MAX_DRAWN_DEVIATION = 2.5
 
 LARGEST_PRETENSION = 3.0
 """Largest pretension of a drawn film, MPa. All values from zero to this pretension are equally likely."""
+
+MIN_RIM_GAP_MM = 0.5
+"""Smallest distance between an electrode and the rim, mm."""
 
 MAX_RADIUS_DEVIATION = 0.5
 """Largest deviation of the radius of a probe, relative to the described radius."""
@@ -236,13 +239,46 @@ class FilmPrior:
     sensor: Sensor
     probe: Probe
 
+    def __post_init__(self) -> None:
+        """Check that the electrodes can move a little without reaching the rim.
+
+        Raises:
+            SensorError: If an electrode is too close to the rim.
+        """
+        if self._rim_gap < MIN_RIM_GAP_MM:
+            film = self.sensor.film
+            raise SensorError(
+                f"{self.sensor.name}: expected electrodes within {film.inner_radius - MIN_RIM_GAP_MM:.4g} mm of the "
+                "centre, because a real electrode lies beside its place and a real clamp is slightly oval; one reaches "
+                f"{film.inner_radius - self._rim_gap:.4g} mm; move it inwards"
+            )
+
     def __reduce__(self) -> tuple[type["FilmPrior"], tuple[Sensor, Probe]]:
         """Pickle only the sensor and the probe, because the functions of the properties cannot be pickled."""
         return FilmPrior, (self.sensor, self.probe)
 
     @cached_property
+    def _rim_gap(self) -> float:
+        """Smallest distance between an electrode and the rim of the described film, mm."""
+        calibration = self.sensor.calibration
+        corners = [calibration.place(np.concatenate(electrode.parts)) for electrode in self.sensor.electrodes]
+        return self.sensor.film.inner_radius - float(np.linalg.norm(np.concatenate(corners), axis=1).max())
+
+    @cached_property
     def properties(self) -> tuple[FilmProperty, ...]:
         """Declarations of all properties, in the order of the vector of their values."""
+        # The shift may use half of the gap between the electrodes and the rim, and an oval clamp the other half. Each
+        # of them has two components.
+        largest_shift = 0.5 * self._rim_gap / math.sqrt(2.0)
+        largest_of = {
+            **dict.fromkeys(("shift_x", "shift_y"), largest_shift),
+            **dict.fromkeys(("oval_x", "oval_xy"), largest_shift / self.sensor.film.radius),
+        }
+        film_properties = []
+        for one in FILM_PROPERTIES:
+            largest = min(largest_of.get(one.name, math.inf), one.limits[1])
+            has_smaller_bounds = one.name in largest_of and largest < one.limits[1]
+            film_properties.append(replace(one, bounds=(-largest, largest)) if has_smaller_bounds else one)
         probe_properties = []
         if isinstance(self.probe, Circle):
             radius = self.probe.radius
@@ -257,7 +293,7 @@ class FilmPrior:
             FilmProperty(f"gain {name}", f"ln of the gain of {name}", "1", 0.05, _gain(name), 0.005)
             for name in self.sensor.electrode_names
         ]
-        return (*FILM_PROPERTIES, *probe_properties, *gains)
+        return (*film_properties, *probe_properties, *gains)
 
     @cached_property
     def names(self) -> tuple[str, ...]:

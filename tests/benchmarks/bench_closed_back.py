@@ -1,0 +1,77 @@
+"""Errors and flags on a film with a closed back: the table of simulate/docs/imperfections_results.md.
+
+    python tests/benchmarks/bench_closed_back.py [--sensor four-25um-biaxial] [--presses 1000] [--json]
+
+A model is trained for a film with a pretension of 0.8 MPa and a vented back. The model then answers presses on the same
+film with a closed cavity behind it. The benchmark takes about two minutes.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from shared import arguments, print_results
+
+from isocharge.common.arrays import Array
+from isocharge.common.contact_errors import force_error_percent, position_error
+from isocharge.common.statistics import rms
+from isocharge.simulate import Circle, ForwardMap, Sensor, Sweep, load_sensor, noise_model
+from isocharge.train import Fitted, LabelledPresses, TrainingData, fit
+
+PROBE = Circle(1.0)
+RADIUS_mm = 8.0
+FORCE_RANGE_N = (0.05, 2.0)
+PRETENSION_MPa = 0.8
+DEPTHS_mm = (2.0, 20.0, 200.0, 2000.0)
+MISFIT_LIMIT = 5.0
+NOISE = noise_model("reference")
+
+
+def with_cavity(sensor: Sensor, depth_mm: float) -> Sensor:
+    """Return a sensor with a closed cavity of the area of the film and a given depth behind it."""
+    return replace(sensor, film=replace(sensor.film, back_volume=depth_mm * np.pi * sensor.film.radius**2))
+
+
+def errors(fitted: Fitted, contact: Array, charge: Array) -> str:
+    """Return the rms errors of a model, and the shares of presses with the flags `misfit` and `outside`."""
+    estimate, _, misfit = fitted.predict(charge)
+    force_percent = force_error_percent(estimate, contact)
+    min_force, max_force = FORCE_RANGE_N
+    is_misfit = misfit[:, 0] > MISFIT_LIMIT
+    is_far = np.hypot(estimate[:, 0], estimate[:, 1]) > fitted.domain.radius
+    is_outside = is_far | (estimate[:, 2] < min_force) | (estimate[:, 2] > max_force)
+    return (
+        f"{rms(position_error(estimate, contact)):.2f} mm, force {rms(force_percent):.1f} % rms, "
+        f"{np.mean(force_percent):+.1f} % on average, misfit {100.0 * np.mean(is_misfit):.0f} %, outside "
+        f"{100.0 * np.mean(is_outside):.0f} %, neither {100.0 * np.mean(~is_misfit & ~is_outside):.0f} %"
+    )
+
+
+def main() -> None:
+    asked = arguments(__doc__, sensor="four-25um-biaxial", presses=1000, json=False)
+    sensor = load_sensor(asked.sensor)
+    sensor = replace(sensor, film=replace(sensor.film, pretension=PRETENSION_MPa))
+    contact = Sweep(0.999 * RADIUS_mm, FORCE_RANGE_N, asked.presses, 1).contacts()
+    vented = ForwardMap.build(sensor, PROBE, RADIUS_mm, FORCE_RANGE_N)
+    training_contact = Sweep(RADIUS_mm, FORCE_RANGE_N, 24_000, 0).contacts()
+    fitted = fit(
+        TrainingData(
+            sensor=sensor,
+            probes=(PROBE.notation,),
+            domain=vented.domain,
+            presses=LabelledPresses(training_contact, vented.charges(training_contact)),
+            sha256="-",
+        )
+    )
+    rng = np.random.default_rng(1)
+    vented_charge = vented.charges(contact)
+    results = []
+    for depth_mm in DEPTHS_mm:
+        charge = ForwardMap.build(with_cavity(sensor, depth_mm), PROBE, RADIUS_mm, FORCE_RANGE_N).charges(contact)
+        low, median, high = np.percentile(charge / vented_charge, [5, 50, 95])
+        ratios = f"charges times {median:.2f} ({low:.2f} to {high:.2f})"
+        results.append(f"{depth_mm:g} mm: {ratios}, {errors(fitted, contact, NOISE.add(charge, rng))}")
+    print_results("closed_back", asked, {"cavity that the model does not know": results})
+
+
+if __name__ == "__main__":
+    main()
