@@ -29,7 +29,11 @@ IMPOSSIBLE = {
     "metres": (lambda c, q: (c / [1e3, 1e3, 1.0], q), "written in metres"),
     "micrometres": (lambda c, q: (c * [1e3, 1e3, 1.0], q), "off the film"),
     "dead": (lambda c, q: (c, np.where(np.arange(4) == 2, 0.4, q)), r"electrode 'C' is dead.* 0\.4 pC, 0\.\d+ % of"),
-    "negative": (lambda c, q: (c, q * [1.0, -1.0, 1.0, 1.0]), "electrode 'B': 12 of its 12 charges are negative"),
+    "negative": (
+        lambda c, q: (c, q * [1.0, -1.0, 1.0, 1.0]),
+        "electrode 'B': 12 of its 12 charges have the opposite sign",
+    ),
+    "all negative": (lambda c, q: (c, -q), "all electrodes have the opposite sign.* d31 and d32"),
     "missing": (lambda c, q: (c, np.where(np.arange(4) == 3, np.nan, q)), "electrode 'D': no press has a charge"),
     "too strong": (lambda c, q: (c * [1.0, 1.0, 100.0], q), "most of them lie outside"),
 }

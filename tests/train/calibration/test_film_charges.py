@@ -1,10 +1,14 @@
 """Charges of a solved film and of similar films against direct solves, and calibrations of solved films."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from tests.benchmarks.measured_films import measured_presses, with_rig_errors
 
 from isocharge.common.contact_errors import position_error
+from isocharge.common.measured_presses import read_presses
 from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, load_sensor, local_workers, parse_probe, press, touch_charge
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
@@ -20,6 +24,8 @@ def solved(problem) -> FilmCharges:
     """The solved film of the sensor file."""
     return kept(solve_start, problem)
 
+
+PRESSES_FILE = Path(__file__).parents[3] / "train" / "examples" / "presses.csv"
 
 CONTACT = np.array([[3.0, 2.0, 0.5], [-4.0, 5.0, 1.0], [1.0, -6.0, 0.2]])
 
@@ -136,3 +142,18 @@ def test_film_with_charges_of_both_signs_is_calibrated():
     assert abs(result.film.value("pretension") - 2.6) < 4.0 * result.film.std("pretension") < 1.2
     residual = result.charges.charges(result.film.film_values, contact) - charge
     assert np.sqrt(np.mean((residual / problem.noise.sigma(charge)) ** 2)) < 10.0
+
+
+@pytest.mark.slow
+def test_negative_coefficients_and_charges_give_the_same_film_as_positive_ones():
+    """The charges are proportional to the coefficients, so both signs must change together."""
+    sensor = load_sensor("four-25um-biaxial")
+    negative = replace(sensor, piezo=replace(sensor.piezo, d31=-sensor.piezo.d31, d32=-sensor.piezo.d32))
+    presses = read_presses(PRESSES_FILE, sensor.electrode_names)
+    opposite = replace(presses, charge_pC=-presses.charge_pC)
+    film = calibrate(presses, CalibrationProblem(sensor, Circle(1.0))).film
+    opposite_film = calibrate(opposite, CalibrationProblem(negative, Circle(1.0))).film
+    count = len(film.film_values)
+    std = np.sqrt(np.diag(film.covariance)[:count])
+    difference = (opposite_film.film_values - film.film_values) / std
+    assert np.abs(difference).max() < 0.2

@@ -22,14 +22,11 @@ MAX_DEAD_RATIO = 0.02
 
 The limit is lower for a channel whose charges are smaller than those of the other channels on some possible film."""
 
-MIN_REVERSED_RATIO = 0.3
-"""Ratio of the median charge of a channel to that of the other channels, above which its sign is checked."""
-
 MIN_TYPICAL_CHARGE_pC = 1e-9
-"""Smallest median charge by which the median charge of another channel is divided, pC."""
+"""Smallest charge by which other charges are divided, pC."""
 
-MAX_NEGATIVE_FRACTION = 0.8
-"""Fraction of negative charges above which a channel counts as reversed."""
+MAX_REVERSED_FRACTION = 0.8
+"""Fraction of charges with the opposite sign to that of every film, above which a channel counts as reversed."""
 
 MIN_POSITION_RANGE_MM = 0.05
 """Smallest credible range of the positions, mm. Positions in a smaller range were probably written in metres."""
@@ -79,8 +76,8 @@ OFFSET_STD = 0.6
 
 The piezoelectric coefficients cause such an offset."""
 
-MIN_CHARGE_pC = 1e-3
-"""Lower limit of charges whose logarithms are compared, pC. Smaller and negative charges are replaced by it."""
+MIN_CHARGE_RATIO = 1e-3
+"""Lower limit of measured divided by expected charges. Smaller ratios and ratios of opposite signs are replaced by it."""
 
 MAX_SQUARED_DEVIATION = 4.0
 """Upper limit of the squared deviation between logarithms of charges, which bounds the effect of outliers."""
@@ -142,7 +139,7 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
     """Raise an error if a channel has no charges, is dead or has the wrong sign.
 
     Args:
-        presses: The measured presses.
+        presses: The measured presses. Only presses with a known place and force show a wrong sign.
         charges: Charges of a film and of similar films. A channel with small charges does not count as dead if one of a
             few examined films has similarly small charges.
 
@@ -154,62 +151,59 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
         if np.isnan(channel_charge).all():
             raise PressError(f"electrode {name!r}: no press has a charge of it; a calibration needs all electrodes")
 
-    ratios = _charge_ratios(charge)
-    smallest_film_ratios = _smallest_film_ratios(presses, charges)
+    placed = presses.placed
+    film_charges = expected_charges(charges, presses.contact[placed])
+    _check_dead_channels(presses, film_charges)
+    _check_signs(presses[placed], film_charges)
+
+
+def _check_dead_channels(presses: MeasuredPresses, film_charges: Array) -> None:
+    """Raise an error if the charges of a channel are far smaller than those of the other channels.
+
+    The limit is lower for a channel that also has small charges on one of the films.
+
+    Args:
+        presses: All measured presses.
+        film_charges: Charges of the presses with a known place and force, on a few films, shape (n_film, n_placed,
+            n_electrode), pC.
+    """
+    smallest_film_ratios = np.ones(len(presses.electrodes))
+    if film_charges.shape[1]:
+        film_ratios = [_charge_ratios(film_charge) for film_charge in film_charges]
+        smallest_film_ratios = np.minimum(np.min(film_ratios, axis=0), 1.0)
+    ratios = _charge_ratios(presses.charge_pC)
     for name, channel_charge, ratio, film_ratio in zip(
-        presses.electrodes, charge.T, ratios, smallest_film_ratios, strict=True
+        presses.electrodes, presses.charge_pC.T, ratios, smallest_film_ratios, strict=True
     ):
-        _check_channel(name, channel_charge, ratio, film_ratio)
+        if ratio < MAX_DEAD_RATIO * film_ratio:
+            raise PressError(
+                f"electrode {name!r} is dead: half of its charges are below "
+                f"{np.nanmedian(np.abs(channel_charge)):.3g} pC, {100.0 * ratio:.2g} % of those of the others; check "
+                "the channel, its cable and its amplifier"
+            )
 
 
-def _smallest_film_ratios(presses: MeasuredPresses, charges: FilmCharges) -> Array:
-    """Return the smallest charge ratio of each channel among a few films.
-
-    The charge ratio of a channel is its typical charge divided by that of the other channels; see `_charge_ratios`. The
-    films have the pretensions in `PRETENSIONS_MPa`. Charge ratios above 1 are replaced by 1.
-
-    Args:
-        presses: The measured presses. The charges of the films are computed for presses with a known place and force.
-        charges: Charges of a film and of similar films.
-
-    Returns:
-        Ratios of charges as `_charge_ratios` returns them, but at most 1, shape (n_electrode,). All ratios are 1 if no
-        press has a known place and force.
-    """
-    placed_contact = presses.contact[presses.placed]
-    if not len(placed_contact):
-        return np.ones(len(presses.electrodes))
-    film_ratios = [_charge_ratios(film_charge) for film_charge in expected_charges(charges, placed_contact)]
-    return np.asarray(np.minimum(np.min(film_ratios, axis=0), 1.0))
-
-
-def _check_channel(name: str, charge: Array, ratio: float, smallest_film_ratio: float) -> None:
-    """Raise an error if a channel is dead or has the wrong sign.
+def _check_signs(presses: MeasuredPresses, film_charges: Array) -> None:
+    """Raise an error if nearly all charges of a channel have the opposite sign to that of every film.
 
     Args:
-        name: Name of the electrode.
-        charge: Charges of the channel, shape (n,), pC; NaN where a charge was not measured.
-        ratio: Typical charge of the channel divided by that of the other channels; see `_charge_ratios`.
-        smallest_film_ratio: Smallest value of this ratio among a few possible films, at most 1.
-
-    Raises:
-        PressError: If the channel is dead or has the wrong sign.
+        presses: The measured presses with a known place and force.
+        film_charges: Charges of these presses on a few films, shape (n_film, n, n_electrode), pC.
     """
-    # The limit is lower for a channel that also has small charges on one of the possible films.
-    if ratio < MAX_DEAD_RATIO * smallest_film_ratio:
+    is_opposite = (presses.charge_pC * film_charges < 0.0).all(axis=0)  # False for NaN
+    opposite_counts = is_opposite.sum(axis=0)
+    measured_counts = np.isfinite(presses.charge_pC).sum(axis=0)
+    reversed_channels = np.flatnonzero(opposite_counts > MAX_REVERSED_FRACTION * measured_counts)
+    if reversed_channels.size == len(presses.electrodes):
         raise PressError(
-            f"electrode {name!r} is dead: half of its charges are below "
-            f"{np.nanmedian(np.abs(charge)):.3g} pC, {100.0 * ratio:.2g} % of those of the others; check "
-            "the channel, its cable and its amplifier"
+            "the charges of all electrodes have the opposite sign to those of the film; exchange the wires, change the "
+            "sign of the charges, or change the signs of d31 and d32 in the sensor file"
         )
-    negative_count = np.sum(charge < 0.0)
-    measured_count = np.sum(np.isfinite(charge))
-    is_mostly_negative = negative_count > MAX_NEGATIVE_FRACTION * measured_count
-    # On taut uniaxial films, a channel with a small ratio may really have negative charges.
-    if is_mostly_negative and ratio > MIN_REVERSED_RATIO:
+    if reversed_channels.size:
+        channel = reversed_channels[0]
         raise PressError(
-            f"electrode {name!r}: {negative_count} of its {measured_count} charges are negative; a press gives a "
-            "positive charge: exchange its wires or its sign"
+            f"electrode {presses.electrodes[channel]!r}: {opposite_counts[channel]} of its {measured_counts[channel]} "
+            "charges have the opposite sign to those of the film; exchange its wires or its sign"
         )
 
 
@@ -333,7 +327,7 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
         return np.inf
     # For each film, the offset is the median over all charges. The scatter is the mean squared deviation from this
     # offset. Both have the shape (n_film,).
-    log_ratio = _log_charge(charge) - _log_charge(expected)  # shape (n_film, n, n_electrode)
+    log_ratio = _log_ratio(charge, expected)  # shape (n_film, n, n_electrode)
     offset = np.nanmedian(log_ratio, axis=(1, 2))
     squared_deviation = np.minimum((log_ratio - offset[:, None, None]) ** 2, MAX_SQUARED_DEVIATION)
     scatter = np.nanmean(squared_deviation, axis=(1, 2))
@@ -341,13 +335,17 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
     return float(np.min(film_misfit))
 
 
-def _log_charge(charge: Array) -> Array:
-    """Return the logarithms of charges. Charges below `MIN_CHARGE_pC` are first set to this limit. NaN remains NaN.
+def _log_ratio(measured: Array, expected: Array) -> Array:
+    """Return the logarithms of measured divided by expected charges. NaN remains NaN.
+
+    Ratios below `MIN_CHARGE_RATIO`, and negative ratios of charges with opposite signs, are first set to this limit.
 
     Args:
-        charge: Charges, an array of any shape, pC.
+        measured: Measured charges, pC.
+        expected: Charges of films, pC, of a shape that can be broadcast with that of the measured charges.
     """
-    return np.asarray(np.log(np.maximum(charge, MIN_CHARGE_pC)))
+    not_zero = np.where(np.abs(expected) < MIN_TYPICAL_CHARGE_pC, MIN_TYPICAL_CHARGE_pC, expected)
+    return np.asarray(np.log(np.maximum(measured / not_zero, MIN_CHARGE_RATIO)))
 
 
 class Correction(NamedTuple):
@@ -419,10 +417,8 @@ def _plausible_electrode_orders(presses: MeasuredPresses, charges: FilmCharges) 
         belong. The set does not include the order in which the columns are written.
     """
     electrode_orders = set()
-    log_measured = _log_charge(presses.charge_pC)
     for expected in expected_charges(charges, presses.contact):
-        log_expected = _log_charge(expected)
-        log_ratio = log_measured[:, :, None] - log_expected[:, None]  # shape (n, n_column, n_electrode)
+        log_ratio = _log_ratio(presses.charge_pC[:, :, None], expected[:, None])  # shape (n, n_column, n_electrode)
         # The median is subtracted, because a common factor of all charges does not matter here. The upper limit of the
         # squared deviations reduces the effect of outliers.
         squared_deviation = np.minimum((log_ratio - np.nanmedian(log_ratio)) ** 2, MAX_SQUARED_DEVIATION)
