@@ -77,7 +77,9 @@ OFFSET_STD = 0.6
 The piezoelectric coefficients cause such an offset."""
 
 MIN_CHARGE_RATIO = 1e-3
-"""Lower limit of measured divided by expected charges. Smaller ratios and ratios of opposite signs are replaced by it."""
+"""Lower limit of measured divided by expected charges.
+
+Smaller ratios and ratios of opposite signs are replaced by it."""
 
 MAX_SQUARED_DEVIATION = 4.0
 """Upper limit of the squared deviation between logarithms of charges, which bounds the effect of outliers."""
