@@ -32,7 +32,10 @@ app = lazy_group(
         "demo": LazyCommand(
             "isocharge.cli.demo.command:demo_command",
             "Run all stages once: simulate a film, train a network, track a virtual sensor, draw a picture.",
-        )
+        ),
+        "verify": LazyCommand(
+            "isocharge.cli.serve.verify:verify_command", "Check that a model folder is complete and unchanged."
+        ),
     },
 )
 app.add_typer(simulate_app, name="simulate")

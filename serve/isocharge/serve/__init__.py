@@ -23,11 +23,13 @@ from isocharge.serve.live.stream import Policy, ReadingStream, TouchStream, stre
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import (
     Model,
+    ModelCheck,
     check_golden,
     find_labelled_model,
     find_model,
     load_checked_model,
     load_model,
+    verify_model,
     write_model,
 )
 from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
@@ -52,6 +54,7 @@ __all__ = [
     "Frame",
     "MeasuredPresses",
     "Model",
+    "ModelCheck",
     "ModelMetadata",
     "Policy",
     "Port",
@@ -84,6 +87,7 @@ __all__ = [
     "read_presses",
     "stream",
     "table_records",
+    "verify_model",
     "wander",
     "write_contacts",
     "write_model",

@@ -16,7 +16,7 @@ name of a model is looked up in four repositories in this order: the repository 
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -28,6 +28,8 @@ from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ModelError, OutputExists, error_prefix, shown
 from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
 from isocharge.common.model_labels import NAME, VERSION
+from isocharge.common.versions import package_version
+from isocharge.serve.model.companion_files import read_companion_file
 from isocharge.serve.model.golden import Golden, check_outputs, contact_floors, make_golden, read_golden
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import (
@@ -273,8 +275,11 @@ def _check_golden_shapes(golden: Golden, metadata: ModelMetadata, path: Path) ->
     check_output_shapes(golden.outputs, len(golden.charge_pC), str(path))
 
 
-def check_golden(model: Model) -> None:
+def check_golden(model: Model) -> str:
     """Check that this machine computes the outputs that are stored in the golden vectors of a model.
+
+    Returns:
+        Sentence that states how many presses agree.
 
     Raises:
         ModelError: If an output differs from the output in `golden.json` by more than the tolerance.
@@ -285,10 +290,54 @@ def check_golden(model: Model) -> None:
         outputs = run(model.session, charge_pC)
     check_output_shapes(outputs, len(charge_pC), where)
     check_outputs(model.golden, outputs, where)
+    return f"this machine computes the outputs in golden.json for {len(charge_pC)} presses"
+
+
+def _check_version(model: Model) -> str:
+    """Check that a version folder has the version number in the metadata, and return a sentence that states it.
+
+    Raises:
+        ModelError: If the name of the folder is another version number.
+    """
+    folder = model.folder
+    is_version_folder = folder.name.isdecimal()
+    if is_version_folder and folder.name != str(model.metadata.version):
+        raise ModelError(
+            f"{folder}: expected version {folder.name}, got {model.metadata.label}; "
+            "move it into a folder of that version, or export it again"
+        )
+    return f"the metadata name the model {model.metadata.label}"
+
+
+def _check_charge_map(model: Model) -> str:
+    """Check that the companion files of a model have the checksums in `golden.json`.
+
+    Returns:
+        Sentence that names the files.
+
+    Raises:
+        ModelError: If a file is missing, is changed, or belongs to another model.
+    """
+    listed_names = model.golden.companion_sha256 or {}
+    names = sorted({*listed_names, *(path.name for path in model.folder.glob("*.npz"))})
+    for name in names:
+        read_companion_file(model.folder, name, "make the model again")
+    if not names:
+        return "the model has no charge map"
+    return f"{', '.join(names)}: as golden.json states"
+
+
+MODEL_CHECKS: Mapping[str, Callable[[Model], str]] = MappingProxyType(
+    {"version": _check_version, "charge map": _check_charge_map, "golden vectors": check_golden}
+)
+"""Checks of a model that was read, by the name of what is checked.
+
+A check returns a sentence that states what it found, or raises a ModelError.
+"""
 
 
 def load_checked_model(folder: Path) -> Model:
-    """Read a version of a model, and check that this machine computes the outputs in its golden vectors.
+    """Read a version of a model, and make all checks of `MODEL_CHECKS`.
 
     Args:
         folder: The version folder, as `find_model` returns it.
@@ -298,14 +347,52 @@ def load_checked_model(folder: Path) -> Model:
             name of the folder is another version number than the number in the metadata.
     """
     model = load_model(folder)
-    is_version_folder = folder.name.isdecimal()
-    if is_version_folder and folder.name != str(model.metadata.version):
-        raise ModelError(
-            f"{folder}: expected version {folder.name}, got {model.metadata.label}; "
-            "move it into a folder of that version, or export it again"
-        )
-    check_golden(model)
+    for check in MODEL_CHECKS.values():
+        check(model)
     return model
+
+
+@dataclass(frozen=True)
+class ModelCheck:
+    """Result of one check of a model folder.
+
+    Attributes:
+        name: What was checked: "graph", "origin" or a key of `MODEL_CHECKS`.
+        fits: Whether the check succeeded.
+        message: Sentence that states what the check found, or what is wrong and how to correct it.
+    """
+
+    name: str
+    fits: bool
+    message: str
+
+
+def verify_model(folder: Path) -> list[ModelCheck]:
+    """Make the checks of `load_checked_model`, and return the result of each check.
+
+    If the graph cannot be read, its check is the only one.
+
+    Args:
+        folder: The version folder, as `find_model` returns it.
+    """
+    try:
+        model = load_model(folder)
+    except ModelError as error:
+        return [ModelCheck("graph", False, str(error))]
+    graph = f"model.onnx has the sha256 {model.golden.sha256} that golden.json states"
+    made_with = model.metadata.made_with
+    origin = (
+        f"isocharge {made_with.get('isocharge', 'of an unknown version')} made the model with the command "
+        f"{made_with.get('command', 'unknown')!r}, from the dataset with the sha256 {model.metadata.dataset_sha256}; "
+        f"this is isocharge {package_version()}"
+    )
+    checks = [ModelCheck("graph", True, graph), ModelCheck("origin", True, origin)]
+    for name, check in MODEL_CHECKS.items():
+        try:
+            checks.append(ModelCheck(name, True, check(model)))
+        except ModelError as error:
+            checks.append(ModelCheck(name, False, str(error)))
+    return checks
 
 
 def write_model(
@@ -325,7 +412,7 @@ def write_model(
         golden_charge_pC: Input charges of the golden vectors, shape (n, electrodes), pC.
         card: Text of the model card.
         companion_files: Contents of companion files for the version folder, by file name. Their checksums are stored in
-            `golden.json`. Servers ignore these files.
+            `golden.json`. Servers only compare these checksums.
 
     Returns:
         The version folder.
