@@ -38,7 +38,6 @@ class SyntheticFilm:
 
     into_domain = FilmCharges.into_domain
     side_forces = None
-    larger_probe = None
 
     @property
     def values(self):

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate.sensor.film import MIN_PIEZO
 from isocharge.simulate.sensor.probe import Circle, Probe
@@ -324,6 +324,19 @@ class FilmPrior:
     def is_imperfection(self) -> Array:
         """Whether each property is an imperfection, shape (n_property,)."""
         return np.array([one.is_imperfection for one in self.properties])
+
+    @cached_property
+    def changes_stress(self) -> Booleans:
+        """Whether each property changes the stress of the film, shape (n_property,).
+
+        The other properties are those of the electrodes and of the piezoelectric coefficients.
+        """
+        changes = []
+        for one in self.properties:
+            values = (one.mean, one.mean + one.std)
+            films = [(sensor.film, probe) for sensor, probe in (one.change(self.sensor, self.probe, v) for v in values)]
+            changes.append(films[0] != films[1])
+        return np.array(changes)
 
     @property
     def described(self) -> Array:

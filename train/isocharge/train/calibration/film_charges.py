@@ -15,16 +15,13 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Piezo, Probe, Sensor, SideForceMap
 from isocharge.simulate.forward.derivative_fields import NODE_COUNT
-from isocharge.simulate.sensor.film_properties import PRETENSION
+from isocharge.simulate.sensor.film_properties import PRETENSION, FilmProperty
 
-RADIUS_STEP = 0.1
-"""Step of the finite difference with respect to the radius of the probe, relative to the radius."""
+SOLVED_STEP = 1.0 / 3.0
+"""Step of the difference quotients for which a film is solved, in prior standard deviations of the property."""
 
-SHIFT_STEP_MM = 0.02
-"""Step of the finite differences with respect to the shift of the electrodes, mm."""
-
-ROTATION_STEP_RAD = 2e-3
-"""Step of the finite difference with respect to the rotation of the electrodes, rad."""
+READING_STEP = 0.05
+"""Step of the difference quotients for which the solved film is only read again, in prior standard deviations."""
 
 MIN_DISTANCE_MM = 1e-9
 """Smallest distance from the centre by which is divided, mm."""
@@ -54,7 +51,8 @@ class FilmCharges:
         film: Forward map of the solved film.
         slopes: Derivatives with respect to the mechanical properties, for the axisymmetric film.
         same_probe: Forward map of the axisymmetric film under a circular probe, with the few nodes of the slopes.
-        larger_probe: The same map for a probe that is larger by `RADIUS_STEP`; None if the probe is not circular.
+        increased: The same map after the increase of a property by `SOLVED_STEP`, by the name of the property. It
+            contains the properties that change the stress and for which no derivative of the stress is computed.
         side_forces: Effect of side forces; None if they are not needed.
     """
 
@@ -63,7 +61,7 @@ class FilmCharges:
     film: ForwardMap
     slopes: FilmSlopes
     same_probe: ForwardMap
-    larger_probe: ForwardMap | None
+    increased: dict[str, ForwardMap]
     side_forces: SideForceMap | None = None
 
     @classmethod
@@ -90,21 +88,28 @@ class FilmCharges:
             SolveError: If a press has no equilibrium.
         """
         even_values = np.where(prior.is_imperfection, 0.0, values)
-        sensor, probe = prior.film(even_values)
-        sensor, circle = axisymmetric(sensor), circle_of(probe)
 
-        def solve(round_probe: Circle) -> ForwardMap:
-            """Solve the presses with a circular probe."""
-            return ForwardMap.build_unchecked(sensor, round_probe, domain, NODE_COUNT, executor=executor)
+        def solve(film_values: Array) -> ForwardMap:
+            """Solve the axisymmetric film with the given properties under the circular probe."""
+            sensor, probe = prior.film(film_values)
+            return ForwardMap.build_unchecked(
+                axisymmetric(sensor), circle_of(probe), domain, NODE_COUNT, executor=executor
+            )
 
-        same_probe = solve(circle)
+        same_probe = solve(even_values)
+        increased = {}
+        for index, name in enumerate(prior.names):
+            if prior.changes_stress[index] and name not in KNOWN_DERIVATIVES:
+                step = np.zeros(len(values))
+                step[index] = SOLVED_STEP * prior.std[index]
+                increased[name] = solve(even_values + step)
         return cls(
             prior=prior,
             values=even_values,
             film=same_probe,
             slopes=FilmSlopes.build(same_probe, executor=executor),
             same_probe=same_probe,
-            larger_probe=solve(Circle((1.0 + RADIUS_STEP) * circle.radius)) if isinstance(probe, Circle) else None,
+            increased=increased,
             side_forces=SideForceMap.build(same_probe, executor=executor) if with_side_forces else None,
         )
 
@@ -194,7 +199,7 @@ class _Reading:
         """
         self._charges = charges
         self._prior = charges.prior
-        is_exact = [name not in MECHANICAL for name in charges.prior.names]
+        is_exact = ~charges.prior.changes_stress
         self.exact = np.flatnonzero(is_exact)
         self._sensor, _ = charges.prior.film(np.where(is_exact, values, charges.values))
         self.film = self._read(charges.film)
@@ -213,13 +218,17 @@ class _Reading:
         Returns:
             Derivatives, shape (n, n_electrode, n_property), pC per unit.
         """
-        derivatives = self._mechanical(contact, charge) | self._coefficients(contact) | self._places(contact)
+        derivatives = self._mechanical(contact, charge) | self._coefficients(contact)
         derivatives["crosstalk"] = charge.sum(axis=1, keepdims=True) - charge
         for electrode, name in enumerate(self._sensor.electrode_names):
             own_charge = np.zeros_like(charge)
             own_charge[:, electrode] = charge[:, electrode]
             derivatives[f"gain {name}"] = own_charge
-        return np.stack([derivatives[name] for name in self._prior.names], axis=2)
+        columns = [
+            derivatives[one.name] if one.name in derivatives else self._read_difference(one, contact)
+            for one in self._prior.properties
+        ]
+        return np.stack(columns, axis=2)
 
     def _mechanical(self, contact: Array, charge: Array) -> dict[str, Array]:
         """Compute the derivatives with respect to the properties that change the stress.
@@ -237,11 +246,10 @@ class _Reading:
             if name in TENSIONS
         )
         derivatives["young"] = charge - force_slope - tension_part
-        same_probe, larger_probe = self._charges.same_probe, self._charges.larger_probe
-        if larger_probe is not None:
-            step = larger_probe.probe.reach - same_probe.probe.reach
-            difference = self._read(larger_probe).charges(contact) - self._read(same_probe).charges(contact)
-            derivatives["probe_radius"] = difference / step
+        same_charge = self._read(self._charges.same_probe).charges(contact)
+        for name, increased in self._charges.increased.items():
+            step = SOLVED_STEP * self._prior.std[self._prior.index(name)]
+            derivatives[name] = (self._read(increased).charges(contact) - same_charge) / step
         return derivatives
 
     def _coefficients(self, contact: Array) -> dict[str, Array]:
@@ -257,20 +265,16 @@ class _Reading:
             derivatives[name] = factor * unit_film.charges(contact)
         return derivatives
 
-    def _places(self, contact: Array) -> dict[str, Array]:
-        """Compute the derivatives with respect to the positions of the electrodes by central differences."""
-        steps = {"shift_x": SHIFT_STEP_MM, "shift_y": SHIFT_STEP_MM, "rotation": ROTATION_STEP_RAD}
-        derivatives = {}
-        for name, step in steps.items():
-            change = self._prior.properties[self._prior.index(name)].change
-            moved = [change(self.film.sensor, self.film.probe, sign * step)[0] for sign in (1.0, -1.0)]
-            forward, backward = (replace(self.film, sensor=sensor).charges(contact) for sensor in moved)
-            derivatives[name] = (forward - backward) / (2.0 * step)
-        return derivatives
+    def _read_difference(self, one: FilmProperty, contact: Array) -> Array:
+        """Compute the derivative with respect to a property that does not change the stress, by central differences."""
+        step = READING_STEP * one.std
+        sensors = [one.change(self.film.sensor, self.film.probe, sign * step)[0] for sign in (1.0, -1.0)]
+        forward, backward = (replace(self.film, sensor=sensor).charges(contact) for sensor in sensors)
+        return np.asarray((forward - backward) / (2.0 * step))
 
 
 TENSIONS = (PRETENSION.name, "tension_difference", "tension_shear")
 """Properties that are tensions, MPa."""
 
-MECHANICAL = (*TENSIONS, "young", "thickness", "stiffness_x", "stiffness_xy", "oval_x", "oval_xy", "probe_radius")
-"""Properties that change the stress."""
+KNOWN_DERIVATIVES = (*TENSIONS, "young", "thickness", "stiffness_x", "stiffness_xy", "oval_x", "oval_xy")
+"""Properties that change the stress, with derivatives that follow from those of the stress."""

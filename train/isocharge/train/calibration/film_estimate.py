@@ -31,6 +31,7 @@ class SessionProperty:
             presses, the charges of the film, and the derivatives of the charges with respect to the pretension.
         caution: Words about a value that is certainly not zero, with the fields `value` and `std`.
         is_possible: Function that returns whether the presses can have this unknown.
+        lasts: Whether the value remains the same in later sessions.
     """
 
     name: str
@@ -39,6 +40,7 @@ class SessionProperty:
     effect: Callable[[PressData, Array, Array], Array]
     caution: str
     is_possible: Callable[[PressData], bool] = lambda _: True
+    lasts: bool = False
 
 
 SESSION = (
@@ -65,6 +67,7 @@ SESSION = (
         lambda data, _, tension_slope: data.warming_K[:, None] * tension_slope,
         "",
         lambda data: data.mean_C is not None,
+        lasts=True,
     ),
     SessionProperty(
         "friction",
@@ -145,7 +148,7 @@ class FilmEstimate:
         return float(np.sqrt(self.covariance[index, index]))
 
     def drifted(self, *, knows_temperature: bool = False) -> "FilmEstimate":
-        """Return the estimate for a later session: the film may have drifted, and the offset and drift are new.
+        """Return the estimate for a later session: the film may have drifted, and the unknowns of the session are new.
 
         Args:
             knows_temperature: Whether the temperature of the later session is known. Only creep then changes the
@@ -159,7 +162,7 @@ class FilmEstimate:
             drift[self.layout.index(PRETENSION.name)] = CREEP_MPa
         values = self.values.copy()
         covariance = self.covariance + np.diag(drift**2)
-        for name in ("offset", "drift", "friction"):
+        for name in (one.name for one in SESSION if not one.lasts):
             index = self.layout.index(name)
             values[index] = 0.0
             covariance[index] = covariance[:, index] = 0.0
