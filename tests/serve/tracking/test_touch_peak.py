@@ -15,8 +15,8 @@ def contact(force_N, x_mm=1.0):
 
 def peak_of(contacts, charges):
     """Return the peak of a touch with these contacts and charges of its frames."""
-    peak = TouchPeak(contacts[0], np.array(charges[0]))
-    for frame_contact, charge in zip(contacts[1:], charges[1:], strict=True):
+    peak = TouchPeak()
+    for frame_contact, charge in zip(contacts, charges, strict=True):
         peak.add_frame(frame_contact, np.array(charge))
     return peak
 
@@ -82,11 +82,12 @@ def test_filtered_noise_is_hardly_reduced_by_the_average():
 
 
 def test_single_frame_has_the_noise_of_a_frame():
-    assert TouchPeak(contact(1.0), np.array([100.0])).relative_noise_variance(np.array([4.0])) == 1.0
+    assert peak_of([contact(1.0)], [[100.0]]).relative_noise_variance(np.array([4.0])) == 1.0
 
 
 def test_given_charges_are_not_changed():
     charge = np.array([100.0])
-    peak = TouchPeak(contact(1.0), charge)
+    peak = TouchPeak()
+    peak.add_frame(contact(1.0), charge)
     peak.add_frame(contact(1.0), np.array([200.0]))
     assert charge[0] == 100.0

@@ -11,10 +11,14 @@ from scipy.signal import lfilter
 from isocharge.serve import Chunk, Contact, Device, Frame, TouchStream, encode_frame
 from isocharge.serve.flags import INVALID
 from isocharge.serve.live.device import device_from_table, with_settings
-from isocharge.serve.tracking.measurement_noise import SCALAR_SHAPE, CovarianceShape, NoiseEstimate
-from isocharge.serve.tracking.motion import MIN_ACCELERATION_SHARE, POSITION_MOTION, MotionModel
 from isocharge.serve.tracking.tracker import TrackRule
-from isocharge.serve.tracking.two_mode_filter import TwoModeFilter
+from isocharge.serve.tracking.two_mode_filter import (
+    MIN_ACCELERATION_SHARE,
+    POSITION_MOTION,
+    MotionModel,
+    NoiseEstimate,
+    TwoModeFilter,
+)
 from stage_runner import new_tracker, track
 
 STD = 0.06
@@ -97,7 +101,7 @@ def test_moving_mode_equals_the_kalman_filter_with_constant_velocity():
     dt = 0.01
     velocity_variance = 400.0
     std = 0.1
-    motion = MotionModel(held_drift=0.0, velocity_variance=velocity_variance, acceleration_density=50.0)
+    motion = MotionModel(held_drift=0.0, velocity_variance=velocity_variance, acceleration_density=50.0, dimensions=1)
     measured = RNG.standard_normal(30) * std + np.linspace(0.0, 1.0, 30)
     two_modes = TwoModeFilter.start(measured[0], std**2, motion)
 
@@ -114,8 +118,9 @@ def test_moving_mode_equals_the_kalman_filter_with_constant_velocity():
         covariance = covariance - np.outer(gain, covariance[0])
 
         two_modes.moving_probability = 1.0 - 1e-9
-        two_modes.noise = NoiseEstimate.start(0j)
-        two_modes.step(value, dt, SCALAR_SHAPE, std**2)
+        two_modes.noise = NoiseEstimate(0.0)
+        two_modes.predict(dt)
+        two_modes.update(value, std**2)
         filtered = [two_modes.moving_value.real, two_modes.velocity.real]
         assert filtered == pytest.approx(mean.tolist(), rel=1e-6, abs=1e-6)
         variances = [two_modes.moving_variance, two_modes.moving_covariance, two_modes.velocity_variance]
@@ -125,7 +130,6 @@ def test_moving_mode_equals_the_kalman_filter_with_constant_velocity():
 @pytest.mark.parametrize(("noise_ratio", "autocorrelation"), [(0.2, 0.0), (1.0, 0.0), (3.0, 0.0), (1.0, 0.5)])
 def test_measurement_noise_is_estimated_during_a_slide(noise_ratio, autocorrelation):
     """A slide of 50 mm/s at uneven times; `autocorrelation` is that of noise that is 1 ms apart."""
-    shape, variance = CovarianceShape.of_position(STD, STD, 0.6)
     estimates = []
     for _ in range(10):
         contacts = noisy_contacts(np.zeros(1500), std=noise_ratio * STD)
@@ -134,10 +138,11 @@ def test_measurement_noise_is_estimated_during_a_slide(noise_ratio, autocorrelat
         positions = noise + 0.05 * np.arange(1500)
         times_ms = np.cumsum(RNG.choice([1, 2, 5], 500))
         latest_ms = times_ms[0]
-        two_modes = TwoModeFilter.start(positions[latest_ms], variance, POSITION_MOTION)
+        two_modes = TwoModeFilter.start(positions[latest_ms], STD**2, POSITION_MOTION)
         for time_ms in times_ms[(times_ms > latest_ms) & (times_ms < 1500)]:
-            if two_modes.step(positions[time_ms], 1e-3 * (time_ms - latest_ms), shape, variance):
-                latest_ms = time_ms
+            two_modes.predict(1e-3 * (time_ms - latest_ms))
+            two_modes.update(positions[time_ms], STD**2)
+            latest_ms = time_ms
         estimates.append(two_modes.noise.relative_variance)
     assert np.mean(estimates) == pytest.approx(noise_ratio**2, rel=0.15, abs=0.02)
 

@@ -8,14 +8,11 @@ that change from frame to frame. The variance of the constant errors is added to
 """
 
 import math
-from typing import NamedTuple
 
 from isocharge.serve.flags import BEYOND, MISFIT, SATURATED
 from isocharge.serve.prediction.contact import Contact
 from isocharge.serve.record.record import TrackedContact
-from isocharge.serve.tracking.measurement_noise import SCALAR_SHAPE, CovarianceShape
-from isocharge.serve.tracking.motion import FORCE_MOTION, POSITION_MOTION, MAX_GAP_s
-from isocharge.serve.tracking.two_mode_filter import Estimate, TwoModeFilter
+from isocharge.serve.tracking.two_mode_filter import FORCE_MOTION, POSITION_MOTION, Estimate, Metric, TwoModeFilter
 
 FLAG_VARIANCE_FACTORS = {SATURATED: 100.0, BEYOND: 100.0, MISFIT: 10.0}
 """Factor by which the variance of a frame is multiplied, for each flag of the frame."""
@@ -26,29 +23,14 @@ MAX_OUTLIERS = 1
 MAX_SPEED_mm_per_s = 300.0
 """Speed, mm/s, that no contact reaches. A position that only a faster contact could have reached is an outlier."""
 
+MAX_GAP_s = 1.0
+"""Time without a frame after which the tracked contact is discarded, s."""
+
 MIN_FORCE_N = 1e-6
 """Smallest force whose logarithm is computed, N."""
 
-
-class MeasuredContact(NamedTuple):
-    """A predicted contact, converted to the quantities that the position filter and the force filter process.
-
-    Attributes:
-        position: Position x + iy, mm.
-        shape: Covariance of the position, scaled to the determinant 1.
-        position_variance: Square root of the determinant of the covariance of the position, mm^2.
-        log_force: Logarithm of the force in N.
-        log_force_std: Standard deviation of the logarithm of the force.
-        white_noise_ratio: Variance of the noise that is independent from frame to frame, divided by the variance that
-            the model states. The ratio exceeds 1 if a flag of the frame increases the noise.
-    """
-
-    position: complex
-    shape: CovarianceShape
-    position_variance: float
-    log_force: float
-    log_force_std: float
-    white_noise_ratio: float
+MIN_UNCORRELATED_SHARE = 1e-6
+"""Smallest value of 1 - r^2, where r is the correlation of x and y. It keeps the covariance invertible."""
 
 
 class ContactFilter:
@@ -71,7 +53,7 @@ class ContactFilter:
         self._force_filter = TwoModeFilter.start(0.0, 1.0, FORCE_MOTION)
         self._tracked: TrackedContact | None = None
         self._outlier_count = 0  # number of outliers in succession
-        self._latest_time_s = 0.0  # time of the latest frame that was no outlier
+        self._latest_time_s = 0.0  # time of the latest frame
 
     def step(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> TrackedContact:
         """Process the next frame, and smooth its position and the logarithm of its force with two filters.
@@ -83,31 +65,41 @@ class ContactFilter:
         if the time since the latest frame is longer than `MAX_GAP_s`, or if the clock was set back. Frames may have the
         same time, for example because they were received together.
 
-        The filters use only the variance of the noise that changes from frame to frame. Smoothing does not reduce
-        errors that are the same in all frames.
-
         Args:
             contact: Contact predicted by the model.
             t_s: Time of the frame on any clock, s.
-            flags: Flags of the frame.
+            flags: Flags of the frame. Some flags increase the variance of the noise, which gives the frame a smaller
+                weight.
 
         Returns:
-            The smoothed contact. If the frame is ignored, it is the smoothed contact of the previous frame.
+            The smoothed contact. If the frame is ignored, it is the smoothed contact of the previous frame. The
+            standard deviations include the constant errors.
         """
-        measured = self._measured_contact(contact, flags)
-        position_variance = measured.white_noise_ratio * measured.position_variance
-        force_variance = measured.white_noise_ratio * measured.log_force_std * measured.log_force_std
-        smoothed_position = None
-        smoothed_log_force = None
+        # Convert the contact to the quantities of the filters, with their variances as stated by the model.
+        position = complex(contact.x_mm, contact.y_mm)
+        position_variance, metric = _position_noise(contact)
+        force_N = max(MIN_FORCE_N, contact.force_N)
+        log_force = math.log(force_N)
+        log_force_variance = (contact.force_std_N / force_N) ** 2
+
+        # Variance of the noise that is independent from frame to frame, relative to the stated variance
+        noise_ratio = 1.0 - self._constant_share
+        for flag in flags:
+            noise_ratio *= FLAG_VARIANCE_FACTORS.get(flag, 1.0)
 
         # Continue the filters. A filter returns None if it rejects its measured value.
-        dt_s = t_s - self._latest_time_s  # since the latest frame that was not ignored
+        smoothed_position = None
+        smoothed_log_force = None
         previous = self._tracked
+        dt_s = t_s - self._latest_time_s
+        self._latest_time_s = t_s
         if previous is not None and 0.0 <= dt_s <= MAX_GAP_s:
-            smoothed_position = self._position_filter.step(measured.position, dt_s, measured.shape, position_variance)
+            self._position_filter.predict(dt_s)
+            self._force_filter.predict(dt_s)
+            smoothed_position = self._position_filter.update(position, noise_ratio * position_variance, metric)
             if smoothed_position is not None:
-                smoothed_log_force = self._force_filter.step(measured.log_force, dt_s, SCALAR_SHAPE, force_variance)
-            elif self._outlier_count < MAX_OUTLIERS and _is_too_far(measured.position, previous, dt_s):
+                smoothed_log_force = self._force_filter.update(log_force, noise_ratio * log_force_variance)
+            elif self._outlier_count < MAX_OUTLIERS and _is_too_far(position, previous, dt_s):
                 self._outlier_count += 1
                 return previous
         self._outlier_count = 0
@@ -115,79 +107,47 @@ class ContactFilter:
         # Start each filter that was not continued. Its first smoothed value is the measured value. If the position was
         # rejected, the force filter was not continued either.
         if smoothed_position is None:
-            self._position_filter = TwoModeFilter.start(measured.position, position_variance, POSITION_MOTION)
-            smoothed_position = Estimate(measured.position, position_variance)
+            smoothed_position = Estimate(position, noise_ratio * position_variance)
+            self._position_filter = TwoModeFilter.start(*smoothed_position, POSITION_MOTION)
         if smoothed_log_force is None:
-            self._force_filter = TwoModeFilter.start(measured.log_force, force_variance, FORCE_MOTION)
-            smoothed_log_force = Estimate(measured.log_force, force_variance)
-        self._latest_time_s = t_s
-        self._tracked = self._tracked_contact(contact, measured, smoothed_position, smoothed_log_force)
-        return self._tracked
+            smoothed_log_force = Estimate(log_force, noise_ratio * log_force_variance)
+            self._force_filter = TwoModeFilter.start(*smoothed_log_force, FORCE_MOTION)
 
-    def _measured_contact(self, contact: Contact, flags: tuple[str, ...]) -> MeasuredContact:
-        """Convert a predicted contact to the quantities that the position filter and the force filter process.
-
-        Args:
-            contact: Contact predicted by the model.
-            flags: Flags of the frame. Some flags increase the variance of the noise, which gives the frame a smaller
-                weight.
-        """
-        correlation = contact.xy_correlation
-        if math.isnan(correlation):  # the model provides no correlations
-            correlation = 0.0
-        shape, position_variance = CovarianceShape.of_position(contact.x_std_mm, contact.y_std_mm, correlation)
-        force_N = max(MIN_FORCE_N, contact.force_N)
-
-        # Variance of the noise that is independent from frame to frame, relative to the stated variance. Flags without
-        # an entry in the table do not change it.
-        white_noise_ratio = 1.0 - self._constant_share
-        for flag in flags:
-            white_noise_ratio *= FLAG_VARIANCE_FACTORS.get(flag, 1.0)
-        return MeasuredContact(
-            position=complex(contact.x_mm, contact.y_mm),
-            shape=shape,
-            position_variance=position_variance,
-            log_force=math.log(force_N),
-            log_force_std=contact.force_std_N / force_N,
-            white_noise_ratio=white_noise_ratio,
-        )
-
-    def _tracked_contact(
-        self, contact: Contact, measured: MeasuredContact, smoothed_position: Estimate, smoothed_log_force: Estimate
-    ) -> TrackedContact:
-        """Return the smoothed contact with standard deviations that include the constant errors of the model.
-
-        The filters smooth only the errors that change from frame to frame. The variance of the constant errors is a
-        fixed fraction of the variance that the model states, and is added to the variance of the smoothed values.
-
-        Args:
-            contact: Contact predicted by the model.
-            measured: The same contact in the form in which the filters process it.
-            smoothed_position: Smoothed position x + iy, mm.
-            smoothed_log_force: Smoothed logarithm of the force.
-        """
-        constant_share = self._constant_share
-        # Standard deviation of the smoothed position, relative to the standard deviation that the model states.
-        std_ratio = math.sqrt(smoothed_position.variance / measured.position_variance + constant_share)
-        constant_log_force_variance = measured.log_force_std * measured.log_force_std * constant_share
-        log_force_std = math.sqrt(smoothed_log_force.variance + constant_log_force_variance)
-        force_N = math.exp(smoothed_log_force.value.real)
+        # Standard deviation of the smoothed position, relative to the standard deviation that the model states
+        std_ratio = math.sqrt(smoothed_position.variance / position_variance + self._constant_share)
+        log_force_std = math.sqrt(smoothed_log_force.variance + self._constant_share * log_force_variance)
+        smoothed_force_N = math.exp(smoothed_log_force.value.real)
 
         # The velocity of a held contact is zero. The mean velocity over both modes is therefore the velocity of the
         # moving mode multiplied by the probability of the moving mode.
         moving_probability = self._position_filter.moving_probability
         velocity = moving_probability * self._position_filter.velocity
-        return TrackedContact(
+        self._tracked = TrackedContact(
             x_mm=smoothed_position.value.real,
             y_mm=smoothed_position.value.imag,
-            force_N=force_N,
+            force_N=smoothed_force_N,
             x_std_mm=contact.x_std_mm * std_ratio,
             y_std_mm=contact.y_std_mm * std_ratio,
-            force_std_N=force_N * log_force_std,
+            force_std_N=smoothed_force_N * log_force_std,
             vx_mm_s=velocity.real,
             vy_mm_s=velocity.imag,
             moving=moving_probability,
         )
+        return self._tracked
+
+
+def _position_noise(contact: Contact) -> tuple[float, Metric]:
+    """Return the root of the determinant of the covariance of a position, mm^2, and the shape of the covariance.
+
+    Args:
+        contact: Contact predicted by the model. A correlation of NaN counts as 0.
+    """
+    correlation = 0.0 if math.isnan(contact.xy_correlation) else contact.xy_correlation
+    root_share = math.sqrt(max(1.0 - correlation * correlation, MIN_UNCORRELATED_SHARE))
+    inverse_xx = contact.y_std_mm / (contact.x_std_mm * root_share)
+    inverse_yy = contact.x_std_mm / (contact.y_std_mm * root_share)
+    skew = complex(0.5 * (inverse_xx - inverse_yy), correlation / root_share)
+    return contact.x_std_mm * contact.y_std_mm * root_share, Metric(0.5 * (inverse_xx + inverse_yy), skew)
 
 
 def _is_too_far(position: complex, previous: TrackedContact, dt_s: float) -> bool:
@@ -195,8 +155,8 @@ def _is_too_far(position: complex, previous: TrackedContact, dt_s: float) -> boo
 
     Args:
         position: Measured position x + iy, mm.
-        previous: Smoothed contact of the latest frame that was no outlier.
-        dt_s: Time since that frame, s.
+        previous: Smoothed contact of the previous frame.
+        dt_s: Time since the previous frame, s.
     """
     distance_mm = abs(position - complex(previous.x_mm, previous.y_mm))
     return distance_mm >= MAX_SPEED_mm_per_s * dt_s

@@ -29,6 +29,7 @@ from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.serve.model.charge_series import ChargeSeries, read_charges
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.tracking.contact_filter import MAX_GAP_s
 from isocharge.serve.tracking.mixture_components import (
     CONTACT,
     GAINS,
@@ -58,7 +59,7 @@ from isocharge.serve.tracking.mixture_update import (
     linearise_update,
     updated_covariance,
 )
-from isocharge.serve.tracking.motion import FORCE_RATE_STD, SPEED_STD, MAX_GAP_s
+from isocharge.serve.tracking.two_mode_filter import FORCE_RATE_STD, SPEED_STD
 
 STEP_s = 0.005
 """Length of the time interval over which charges are averaged, s."""

@@ -28,7 +28,7 @@ from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.tracking.film_state import FilmModel, Touch
-from isocharge.serve.tracking.touch_collector import TouchCollector
+from isocharge.serve.tracking.touch_peak import TouchPeak
 
 MAX_TOUCHES = 64
 """Number of the latest touches from which the state is estimated."""
@@ -141,7 +141,6 @@ class FilmFollower:
             drift_MPa_per_root_hour=rule.drift_MPa_per_root_hour,
             largest_offset_pC=rule.largest_offset_pC,
         )
-        self._touch_collector = TouchCollector()
         self.reset()
 
     def reset(self) -> None:
@@ -156,11 +155,11 @@ class FilmFollower:
         self._applied_covariance = self._model.prior(0.0).covariance
         self._conversion: _Conversion | None = None  # latest conversion of charges, and its contact
         self._conversion_contact: Contact | None = None
-        self._touch_collector.reset()
+        self.discard_touch()
 
     def discard_touch(self) -> None:
         """Discard the frames of the present touch, for example after an outage or a new tare."""
-        self._touch_collector.discard_touch()
+        self._peak = TouchPeak()
 
     @property
     def film(self) -> FollowedFilm:
@@ -182,10 +181,11 @@ class FilmFollower:
         """
         if contact is not None:
             assert charge_pC is not None  # a frame with a contact has charges
-            self._touch_collector.add_frame(contact, charge_pC, flags)
+            self._peak.add_frame(contact, charge_pC, flags)
             return
-        peak = self._touch_collector.end_touch()
-        if peak is not None:
+        peak = self._peak
+        self.discard_touch()
+        if peak.is_usable:
             frame_variance_pC2 = self.predictor.metadata.noise.variance(peak.mean_charge_pC)
             variance_pC2 = frame_variance_pC2 * peak.relative_noise_variance(frame_variance_pC2)
             touch_contact = self.predictor.predict(peak.mean_charge_pC)

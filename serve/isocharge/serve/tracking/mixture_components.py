@@ -10,7 +10,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.serve.prediction.contact import Contact
-from isocharge.serve.tracking.motion import MIN_ACCELERATION_SHARE, POSITION_MOTION
+from isocharge.serve.tracking.two_mode_filter import MIN_ACCELERATION_SHARE, POSITION_MOTION
 
 X = 0
 """Index of the position x in a state, mm."""

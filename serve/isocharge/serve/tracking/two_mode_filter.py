@@ -9,14 +9,15 @@ later.
 A position is represented by a complex number x + iy, and the logarithm of a force by a real number. All covariance
 matrices are assumed to be multiples of the covariance matrix of the measurement. A single number therefore represents
 each matrix, and a step takes only microseconds.
+
+The variance that a model reports applies to the noise with which the model was trained. The actual noise of a board may
+be smaller or larger. The filter estimates the actual noise: noise changes randomly from frame to frame, whereas a
+contact moves smoothly.
 """
 
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
-
-from isocharge.serve.tracking.measurement_noise import CovarianceShape, MIN_INTERVAL_s, NoiseEstimate
-from isocharge.serve.tracking.motion import MIN_ACCELERATION_SHARE, MotionModel
 
 MEAN_HELD_TIME_s = 1.0
 """Mean time for which a contact is held, s."""
@@ -36,17 +37,140 @@ MAX_LOG_LIKELIHOOD_RATIO = 60.0
 MIN_PROBABILITY = 1e-6
 """Smallest probability of a mode."""
 
+MIN_ACCELERATION_SHARE = 0.2
+"""Acceleration density of a slow contact, relative to `MotionModel.acceleration_density`, dimensionless."""
+
+
+class MotionModel(NamedTuple):
+    """Parameters of the process noise of one quantity: a position in mm, or the logarithm of a force.
+
+    Attributes:
+        held_drift: Increase of the variance per second while the contact is held, mm^2/s or 1/s.
+        velocity_variance: Variance of the velocity at the beginning of a movement, mm^2/s^2 or 1/s^2.
+        acceleration_density: Spectral density of the white acceleration of a contact whose squared speed is
+            `velocity_variance`, mm^2/s^3 or 1/s^3. At other speeds the density is proportional to the squared speed,
+            because fast contacts change their velocity more than slow contacts. The density is at least
+            `MIN_ACCELERATION_SHARE` of this value.
+        dimensions: Number of dimensions: 2 for a position, 1 for the logarithm of a force.
+    """
+
+    held_drift: float
+    velocity_variance: float
+    acceleration_density: float
+    dimensions: int
+
+
+SPEED_STD = 30.0
+"""Standard deviation of the velocity along x or y at the beginning of a movement, mm/s."""
+
+FORCE_RATE_STD = 10.0
+"""Standard deviation of the rate of ln F at the beginning of a change of the force, 1/s."""
+
+POSITION_MOTION = MotionModel(5e-4, SPEED_STD**2, acceleration_density=800.0, dimensions=2)
+"""Motion of a finger: a held finger drifts by 0.02 mm in a second, and a moving finger moves at about 30 mm/s."""
+
+FORCE_MOTION = MotionModel(5e-4, FORCE_RATE_STD**2, acceleration_density=1e3, dimensions=1)
+"""Change of ln F: a held force drifts by 2 % in a second, and a changing force grows by a factor of e in 0.1 s."""
+
+
+class Metric(NamedTuple):
+    """Squared length of a difference z = x + iy in units of a covariance with the determinant 1.
+
+    The squared length is `mean * abs(z)**2 + (skew * z**2).real`.
+
+    Attributes:
+        mean: Half of the trace of the inverse covariance C; 1 for equal and independent errors.
+        skew: (C_xx - C_yy) / 2 - i C_xy; 0 for equal and independent errors.
+    """
+
+    mean: float = 1.0
+    skew: complex = 0.0
+
+
+EQUAL_ERRORS = Metric()
+"""Metric for equal and independent errors of x and y, and for real numbers."""
+
 
 class Estimate(NamedTuple):
     """Estimate of a position, or of the logarithm of a force, with its variance.
 
     Attributes:
         value: Position x + iy, mm, or logarithm of the force.
-        variance: Variance of the value, mm^2, or dimensionless for a force.
+        variance: Root of the determinant of the covariance of a position, mm^2, or variance of the logarithm of a
+            force.
     """
 
     value: complex
     variance: float
+
+
+class NoiseEstimate:
+    """Estimate of the noise of measured values, relative to the noise that the model states.
+
+    Attributes:
+        relative_variance: Estimated variance of the noise, relative to the variance stated by the model.
+    """
+
+    PRIOR_FRAMES = 5
+    """Weight of the variance stated by the model in the average, as a number of frames."""
+
+    MAX_FRAMES = 100
+    """Number of frames over which the estimate is averaged."""
+
+    MIN_INTERVAL_s = 0.0045
+    """Time after which the noise of two frames is independent, s. Boards filter their charges over shorter times."""
+
+    MAX_RELATIVE_SQUARE = 6.0
+    """Largest squared residual of a frame, relative to the present estimate. Sudden movements are not noise."""
+
+    RELATIVE_VARIANCES = (0.01, 100.0)
+    """Smallest and largest variance of the noise, relative to the variance stated by the model."""
+
+    def __init__(self, measured: complex) -> None:
+        """Begin with the noise that the model states.
+
+        Args:
+            measured: First measured value: a position x + iy, mm, or the logarithm of a force.
+        """
+        self.relative_variance = 1.0
+        self._frames = self.PRIOR_FRAMES
+        self._measured = measured
+        self._rate = 0j  # rate of change between the latest two measured values
+        self._dt_s = 0.0  # time between these values; 0 if there is only one value
+
+    def update(self, measured: complex, dt_s: float, stated_variance: float, metric: Metric, dimensions: int) -> None:
+        """Compare the next measured value with the linear extrapolation of the two previous values.
+
+        The relative square of a frame is the squared error of the extrapolation, divided by the mean of this square for
+        noise with the stated variance. The estimated relative variance is the mean of the relative squares of the
+        latest frames. The relative square of a single frame is limited, because a sudden movement is not noise.
+
+        Args:
+            measured: The measured value.
+            dt_s: Time since the latest measured value, s, at least `MIN_INTERVAL_s`.
+            stated_variance: Variance of the noise as stated by the model.
+            metric: Shape of the covariance of the noise.
+            dimensions: Number of dimensions of the value.
+        """
+        change = measured - self._measured
+        if self._dt_s > 0.0:  # otherwise there is only one previous value
+            # The error is x2 - (1 + r) x1 + r x0, where x0, x1 and x2 are the latest three values, and r is the ratio
+            # of the two intervals. The noise of the three values is independent. The variance of the error is therefore
+            # the variance of one value times 1 + (1 + r)^2 + r^2.
+            ratio = dt_s / self._dt_s
+            error_variance = dimensions * stated_variance * (1.0 + ratio * ratio + (1.0 + ratio) ** 2)
+            error = change - self._rate * dt_s
+            relative_square = (metric.mean * abs(error) ** 2 + (metric.skew * error * error).real) / error_variance
+            limited_square = min(relative_square, self.MAX_RELATIVE_SQUARE * self.relative_variance)
+
+            # The number of frames is limited, so that the mean follows changes of the noise.
+            self._frames = min(self._frames + 1, self.MAX_FRAMES)
+            mean_square = self.relative_variance + (limited_square - self.relative_variance) / self._frames
+            smallest, largest = self.RELATIVE_VARIANCES
+            self.relative_variance = min(max(mean_square, smallest), largest)
+        self._measured = measured
+        self._rate = change / dt_s
+        self._dt_s = dt_s
 
 
 @dataclass(slots=True)
@@ -57,29 +181,31 @@ class TwoModeFilter:
 
     Attributes:
         motion: Parameters of the process noise.
-        moving_probability: Probability of the moving mode.
         held_value: Value that the held mode estimates.
         held_variance: Variance of `held_value`.
         moving_value: Value that the moving mode estimates.
-        velocity: Rate of change of the value in the moving mode.
         moving_variance: Variance of `moving_value`.
-        moving_covariance: Covariance of `moving_value` and `velocity`.
+        velocity: Rate of change of the value in the moving mode.
         velocity_variance: Variance of `velocity`.
         noise: Estimate of the size of the measurement noise.
+        moving_covariance: Covariance of `moving_value` and `velocity`.
+        moving_probability: Probability of the moving mode.
         noise_age_s: Time since `noise` was last updated, s.
+        metric: Shape of the covariance of the latest measured value.
     """
 
     motion: MotionModel
-    moving_probability: float
     held_value: complex
     held_variance: float
     moving_value: complex
-    velocity: complex
     moving_variance: float
-    moving_covariance: float
+    velocity: complex
     velocity_variance: float
     noise: NoiseEstimate
+    moving_covariance: float = 0.0
+    moving_probability: float = 0.5
     noise_age_s: float = 0.0
+    metric: Metric = EQUAL_ERRORS
 
     @classmethod
     def start(cls, measured: complex, variance: float, motion: MotionModel) -> "TwoModeFilter":
@@ -90,160 +216,114 @@ class TwoModeFilter:
             variance: Variance of the noise of this value.
             motion: Parameters of the process noise.
         """
-        return cls(
-            motion,
-            moving_probability=0.5,
-            held_value=measured,
-            held_variance=variance,
-            moving_value=measured,
-            velocity=measured - measured,  # zero of the same type as the value, real or complex
-            moving_variance=variance,
-            moving_covariance=0.0,
-            velocity_variance=motion.velocity_variance,
-            noise=NoiseEstimate.start(measured),
-        )
+        zero = measured - measured  # of the same type as the value, real or complex
+        noise = NoiseEstimate(measured)
+        return cls(motion, measured, variance, measured, variance, zero, motion.velocity_variance, noise)
 
-    def step(self, measured: complex, dt_s: float, shape: CovarianceShape, stated_variance: float) -> Estimate | None:
-        """Process the next frame: predict both modes, and update both modes with the measured value.
-
-        The method computes minima, maxima and squared distances without calls of `min`, `max` and
-        `CovarianceShape.mean_square`, because the calls would take a third of its time.
+    def predict(self, dt_s: float) -> None:
+        """Mix the two modes, and predict the values of both modes at the next frame.
 
         Args:
-            measured: The measured value of the frame.
-            dt_s: Time since the previous frame, s, not negative.
-            shape: Shape of the covariance of the measured value.
-            stated_variance: Variance of the noise that is independent from frame to frame, as stated by the model. A
-                larger variance gives the frame a smaller weight.
-
-        Returns:
-            The estimate of the value; None if the frame does not belong to the same contact as the previous frames. In
-            this case, the state of the filter is not changed.
+            dt_s: Time until the next frame, s, not negative.
         """
-        inverse_xx, inverse_yy, inverse_xy, dimensions = shape
-        held_drift, initial_velocity_variance, acceleration_density = self.motion
-        noise_variance = stated_variance * self.noise.relative_variance
+        self.noise_age_s += dt_s
+        drift, initial_velocity_variance, acceleration_density, dimensions = self.motion
+        mean, skew = self.metric
 
-        # Probability of each mode at this frame. `started_share` is the probability that a contact that moves now was
-        # held at the previous frame. `stopped_share` is the probability that a contact that is held now was moving.
-        start_probability = dt_s / MEAN_HELD_TIME_s
-        if start_probability > MAX_CHANGE_PROBABILITY:
-            start_probability = MAX_CHANGE_PROBABILITY
-        stop_probability = dt_s / MEAN_MOVING_TIME_s
-        if stop_probability > MAX_CHANGE_PROBABILITY:
-            stop_probability = MAX_CHANGE_PROBABILITY
-        started = (1.0 - self.moving_probability) * start_probability
-        stopped = self.moving_probability * stop_probability
-        moving_probability = self.moving_probability + (started - stopped)
-        started_share = started / moving_probability
-        stopped_share = stopped / (1.0 - moving_probability)
-        continued_share = 1.0 - started_share
+        # Probability of each mode at the next frame. `started` is the probability that a contact that moves then is
+        # held now. `stopped` is the probability that a contact that is held then moves now.
+        moving = self.moving_probability
+        starting = (1.0 - moving) * min(dt_s / MEAN_HELD_TIME_s, MAX_CHANGE_PROBABILITY)
+        stopping = moving * min(dt_s / MEAN_MOVING_TIME_s, MAX_CHANGE_PROBABILITY)
+        moving += starting - stopping
+        self.moving_probability = moving
+        started = starting / moving
+        stopped = stopping / (1.0 - moving)
+        continued = 1.0 - started
 
         # Mixing of the two modes. A movement that has just started has the velocity zero on average.
+        velocity = self.velocity
         difference = self.moving_value - self.held_value
-        x = difference.real
-        y = difference.imag
-        velocity_x = self.velocity.real
-        velocity_y = self.velocity.imag
-        weighted_x = inverse_xx * x + inverse_xy * y
-        weighted_y = inverse_xy * x + inverse_yy * y
-        squared_difference = weighted_x * x + weighted_y * y
-        difference_times_velocity = weighted_x * velocity_x + weighted_y * velocity_y
-        squared_speed = (
-            inverse_xx * velocity_x + 2.0 * inverse_xy * velocity_y
-        ) * velocity_x + inverse_yy * velocity_y * velocity_y
-        held_value = self.held_value + stopped_share * difference
-        held_variance = self.held_variance + stopped_share * (
-            self.moving_variance - self.held_variance + (1.0 - stopped_share) * squared_difference
-        )
-        moving_variance = self.moving_variance + started_share * (
-            self.held_variance - self.moving_variance + continued_share * squared_difference
-        )
-        covariance = self.moving_covariance
-        covariance += started_share * (continued_share * difference_times_velocity - covariance)
-        velocity_variance = self.velocity_variance
-        velocity_variance += started_share * (
-            initial_velocity_variance - velocity_variance + continued_share * squared_speed
-        )
-        velocity = self.velocity * continued_share
+        squared_speed = abs(velocity) ** 2
+        squared_difference = (mean * abs(difference) ** 2 + (skew * difference * difference).real) / dimensions
+        projection = (velocity * (mean * difference.conjugate() + skew * difference)).real / dimensions
+        velocity_spread = (mean * squared_speed + (skew * velocity * velocity).real) / dimensions
+        excess_variance = self.moving_variance - self.held_variance
+        held_variance = self.held_variance + stopped * (excess_variance + (1.0 - stopped) * squared_difference)
+        moving_variance = self.moving_variance - started * (excess_variance - continued * squared_difference)
+        covariance = continued * (self.moving_covariance + started * projection)
+        velocity_variance = continued * (self.velocity_variance + started * velocity_spread)
+        velocity_variance += started * initial_velocity_variance
+        velocity *= continued
 
         # Prediction of both modes. The acceleration density is proportional to the squared speed.
-        relative_density = (
-            continued_share
-            * continued_share
-            * (velocity_x * velocity_x + velocity_y * velocity_y)
-            / initial_velocity_variance
+        relative_density = max(
+            continued * continued * squared_speed / initial_velocity_variance, MIN_ACCELERATION_SHARE
         )
-        if relative_density < MIN_ACCELERATION_SHARE:
-            relative_density = MIN_ACCELERATION_SHARE
         velocity_noise = acceleration_density * relative_density * dt_s
-        held_variance += held_drift * dt_s
-        moving_value = self.moving_value + (velocity * dt_s - started_share * difference)
-        moving_variance += dt_s * (2.0 * covariance + dt_s * (velocity_variance + velocity_noise / 3.0))
-        covariance += dt_s * (velocity_variance + 0.5 * velocity_noise)
-        velocity_variance += velocity_noise
-
-        # Squared Mahalanobis distance of the innovation of each mode.
-        held_innovation = measured - held_value
-        moving_innovation = measured - moving_value
-        held_precision = 1.0 / (held_variance + noise_variance)
-        moving_precision = 1.0 / (moving_variance + noise_variance)
-        x = held_innovation.real
-        y = held_innovation.imag
-        held_square = dimensions * held_precision * ((inverse_xx * x + 2.0 * inverse_xy * y) * x + inverse_yy * y * y)
-        x = moving_innovation.real
-        y = moving_innovation.imag
-        moving_square = (
-            dimensions * moving_precision * ((inverse_xx * x + 2.0 * inverse_xy * y) * x + inverse_yy * y * y)
+        self.held_value += stopped * difference
+        self.held_variance = held_variance + drift * dt_s
+        self.moving_value += velocity * dt_s - started * difference
+        self.moving_variance = moving_variance + dt_s * (
+            2.0 * covariance + dt_s * (velocity_variance + velocity_noise / 3.0)
         )
+        self.moving_covariance = covariance + dt_s * (velocity_variance + 0.5 * velocity_noise)
+        self.velocity = velocity
+        self.velocity_variance = velocity_variance + velocity_noise
+
+    def update(self, measured: complex, stated_variance: float, metric: Metric = EQUAL_ERRORS) -> Estimate | None:
+        """Update the predicted modes and their probabilities with the measured value of the frame.
+
+        Args:
+            measured: The measured value.
+            stated_variance: Variance of the noise that is independent from frame to frame, as stated by the model. A
+                larger variance gives the frame a smaller weight.
+            metric: Shape of the covariance of this noise.
+
+        Returns:
+            The estimate of the value; None if the frame does not belong to the same contact as the previous frames.
+            Nothing is updated in this case.
+        """
+        # Squared Mahalanobis distance of the innovation of each mode
+        noise_variance = stated_variance * self.noise.relative_variance
+        held_innovation = measured - self.held_value
+        moving_innovation = measured - self.moving_value
+        held_precision = 1.0 / (self.held_variance + noise_variance)
+        moving_precision = 1.0 / (self.moving_variance + noise_variance)
+        mean, skew = self.metric = metric
+        held_square = mean * abs(held_innovation) ** 2 + (skew * held_innovation * held_innovation).real
+        held_square *= held_precision
+        moving_square = mean * abs(moving_innovation) ** 2 + (skew * moving_innovation * moving_innovation).real
+        moving_square *= moving_precision
         if held_square > SQUARED_GATE and moving_square > SQUARED_GATE:
             return None
 
-        # Probability of the moving mode by Bayes' theorem.
-        density_ratio = moving_precision / held_precision
-        if dimensions == 1:
-            density_ratio = math.sqrt(density_ratio)
-        log_likelihood_ratio = 0.5 * (held_square - moving_square)
-        if log_likelihood_ratio > MAX_LOG_LIKELIHOOD_RATIO:
-            log_likelihood_ratio = MAX_LOG_LIKELIHOOD_RATIO
-        odds = moving_probability / (1.0 - moving_probability) * density_ratio * math.exp(log_likelihood_ratio)
-        moving_probability = odds / (1.0 + odds)
-        if moving_probability < MIN_PROBABILITY:
-            moving_probability = MIN_PROBABILITY
-        elif moving_probability > 1.0 - MIN_PROBABILITY:
-            moving_probability = 1.0 - MIN_PROBABILITY
+        # Probability of the moving mode by Bayes' theorem
+        dimensions = self.motion.dimensions
+        log_likelihood_ratio = min(0.5 * (held_square - moving_square), MAX_LOG_LIKELIHOOD_RATIO)
+        odds = self.moving_probability / (1.0 - self.moving_probability)
+        odds *= (moving_precision / held_precision) ** (0.5 * dimensions) * math.exp(log_likelihood_ratio)
+        moving = min(max(odds / (1.0 + odds), MIN_PROBABILITY), 1.0 - MIN_PROBABILITY)
+        self.moving_probability = moving
 
-        # Kalman update of each mode.
-        held_gain = held_variance * held_precision
-        held_value += held_gain * held_innovation
-        held_variance = held_gain * noise_variance
-        moving_gain = moving_variance * moving_precision
-        velocity_gain = covariance * moving_precision
-        moving_value += moving_gain * moving_innovation
-        velocity += velocity_gain * moving_innovation
-        velocity_variance -= velocity_gain * covariance
-        moving_variance = moving_gain * noise_variance
-        covariance = velocity_gain * noise_variance
-
-        self.moving_probability = moving_probability
-        self.held_value = held_value
-        self.held_variance = held_variance
-        self.moving_value = moving_value
-        self.velocity = velocity
-        self.moving_variance = moving_variance
-        self.moving_covariance = covariance
-        self.velocity_variance = velocity_variance
-        self.noise_age_s += dt_s
-        if self.noise_age_s >= MIN_INTERVAL_s:
-            self.noise = self.noise.updated(measured, self.noise_age_s, shape, stated_variance)
+        # Kalman update of each mode
+        held_gain = self.held_variance * held_precision
+        self.held_value += held_gain * held_innovation
+        self.held_variance = held_gain * noise_variance
+        moving_gain = self.moving_variance * moving_precision
+        velocity_gain = self.moving_covariance * moving_precision
+        self.moving_value += moving_gain * moving_innovation
+        self.moving_variance = moving_gain * noise_variance
+        self.velocity += velocity_gain * moving_innovation
+        self.velocity_variance -= velocity_gain * self.moving_covariance
+        self.moving_covariance = velocity_gain * noise_variance
+        if self.noise_age_s >= NoiseEstimate.MIN_INTERVAL_s:
+            self.noise.update(measured, self.noise_age_s, stated_variance, metric, dimensions)
             self.noise_age_s = 0.0
 
-        # Mean and variance of the mixture of the two modes.
-        difference = moving_value - held_value
-        x = difference.real
-        y = difference.imag
-        squared_difference = (inverse_xx * x + 2.0 * inverse_xy * y) * x + inverse_yy * y * y
-        variance = held_variance + moving_probability * (
-            moving_variance - held_variance + (1.0 - moving_probability) * squared_difference
-        )
-        return Estimate(held_value + moving_probability * difference, variance)
+        # Mean and variance of the mixture of the two modes
+        difference = self.moving_value - self.held_value
+        squared_difference = (mean * abs(difference) ** 2 + (skew * difference * difference).real) / dimensions
+        excess_variance = self.moving_variance - self.held_variance + (1.0 - moving) * squared_difference
+        variance = self.held_variance + moving * excess_variance
+        return Estimate(self.held_value + moving * difference, variance)
