@@ -104,6 +104,7 @@ def test_table_of_a_board_that_sends_microcoulombs():
         (charges(), "3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')"),
         (charges(hum=9.0), "channel 1 has a hum of 9 pC: put [hum] frequency_Hz = 50 into a device file"),
         (charges(drift=-4.0), "channel 1 drifts by -4 pC/s"),
+        (charges(drift=4.0), "the charges drift by 12 pC/s in total, which the tare cannot follow"),
         (charges(offset=(0.0, 120.0, 0.0)), "channel 2 has 120 pC at rest, but a tare accepts at most 100 pC"),
         (charges(noise=8.0), "channel 1 has a noise of "),
         (lambda k: charges()(3 * k), "798 frames were lost"),

@@ -213,6 +213,20 @@ def test_tare_follows_a_slow_drift_of_an_untouched_film(drift_pC_per_s):
     assert pressed.charge_pC == pytest.approx([500.0] * 3, abs=6.0)
 
 
+@pytest.mark.parametrize("drift_pC_per_s", [4.0, 10.0])
+def test_contact_that_a_fast_drift_begins_has_the_flag_drift(drift_pC_per_s):
+    """The tare cannot follow the drift of an untouched film. A press that follows another press has no flag."""
+    drifting_pC = rest(2000) + drift_pC_per_s * np.arange(2000)[:, None] / RATE_HZ
+    readings = run(drifting_pC)
+    assert readings[-1].is_contact
+    assert all(reading.is_contact == ("drift" in reading.flags) for reading in readings)
+
+    press_pC = 1000.0 * np.interp(np.arange(800), [400, 800], [0.0, 1.0])  # 1.5 pC in a frame, 1500 pC/s in total
+    pressed = run(rest(1600) + np.tile(press_pC, 2)[:, None])
+    assert pressed[-1].is_contact
+    assert not any("drift" in reading.flags for reading in pressed)
+
+
 def test_tare_does_not_follow_a_finger():
     """A held press keeps its charge. A finger that is below the release threshold is not absorbed by the tare."""
     chain = StageRunner()

@@ -3,18 +3,23 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
 from isocharge.common.errors import ChargeError, shown
 from isocharge.common.printable_text import printable
 from isocharge.serve.examination.channel_health import MAINS_HZ, ChannelHealth
 from isocharge.serve.examination.held_press import HeldPress
 from isocharge.serve.examination.listening import Capture
+from isocharge.serve.flags import DRIFT
 from isocharge.serve.live.device import Device
 from isocharge.serve.live.fading import section_text
 from isocharge.serve.port.serial_line import TELNET_ADVICE
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.inflow import LeakSection
+from isocharge.serve.signal_chain.memory import MemoryRule
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.tare import TareRule
+from isocharge.serve.signal_chain.touch import TouchRule
 
 CLEAN_SHARE = 0.99
 """Smallest share of bytes in good frames with a good cable and the right baud rate, dimensionless."""
@@ -113,6 +118,8 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
             yield f"channel {printable(channel.name)} is dead: every value is {channel.offset_pC:g}"
         if findings.unit == "pC":  # the limits of noise, offset, drift and hum are in pC
             yield from _charge_sentences(channel, tare_rule)
+    if findings.unit == "pC":
+        yield from _drift_sentences(findings, tare_rule)
 
 
 def _transmission_sentences(capture: Capture) -> Iterator[str]:
@@ -198,6 +205,30 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
                 f"channel {name} has a hum of {hum_pC:.2g} pC: put [hum] frequency_Hz = {frequency_Hz:g} into a device "
                 "file"
             )
+
+
+def _drift_sentences(findings: BoardFindings, tare_rule: TareRule) -> Iterator[str]:
+    """Yield a sentence if the charges of an untouched film drift faster than the tare can follow.
+
+    The tare follows a drift with its time constant. The total charge then differs from 0 by the total drift times the
+    time constant. If this difference exceeds the touch threshold, a contact begins without a touch.
+
+    Args:
+        findings: Results of the port check.
+        tare_rule: Conditions of the tare, with its time constant.
+    """
+    device = findings.device
+    touch_rule = device.rule(TouchRule)
+    if touch_rule is None or device.rule(LeakSection) is not None or device.rule(MemoryRule) is not None:
+        return
+    total_pC_per_s = sum(channel.drift_pC_per_s or 0.0 for channel in findings.channels)
+    noise_pC = np.array([channel.noise_pC or 0.0 for channel in findings.channels])
+    if total_pC_per_s * tare_rule.relax_s > touch_rule.threshold_pC(noise_pC):
+        yield (
+            f"the charges drift by {total_pC_per_s:.2g} pC/s in total, which the tare cannot follow: an untouched film "
+            f"seems to be touched, and the records have the flag {DRIFT}; let the amplifier warm up, or put [leak] "
+            "with the time constants of the amplifiers into a device file, which also measures the drift at rest"
+        )
 
 
 def held_press_sentences(findings: BoardFindings) -> Iterator[str]:

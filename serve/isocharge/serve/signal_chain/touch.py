@@ -7,10 +7,12 @@ threshold.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
-from isocharge.serve.flags import NEGATIVE
+from isocharge.common.arrays import Array
+from isocharge.serve.flags import DRIFT, NEGATIVE
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.signal_chain.stage import Setup, Stage
@@ -34,9 +36,23 @@ class TouchRule(Rule, frozen=True, kw_only=True):
     floor_pC: Setting = 10.0
     release_share: Setting = 0.05
 
+    def threshold_pC(self, noise_pC: Array) -> float:
+        """Return the touch threshold, pC.
+
+        Args:
+            noise_pC: Standard deviation of the charge of each electrode at rest, shape (n_electrode,), pC.
+        """
+        return self.floor_pC + self.sigmas * math.sqrt(float(np.dot(noise_pC, noise_pC)))
+
 
 SCALE_STD_FACTOR = 2.0
 """Number of common standard deviations of the charges by which the release threshold is raised."""
+
+MAX_RISE_S = 0.2
+"""Longest time in which the total charge of a touch rises from half of the touch threshold to the threshold, s.
+
+A press of a film of 25 um takes this time if its force grows by less than 0.01 N/s. A drift usually takes longer.
+"""
 
 
 class Touch(Stage):
@@ -48,6 +64,9 @@ class Touch(Stage):
     A touch ends when the total charge falls below the release threshold. The release threshold is a given share of the
     peak, plus the uncertainty of the total charge. It is at least half of the touch threshold. The peak is the largest
     total charge that two consecutive frames of the touch have reached. The spike of a single frame is not a peak.
+
+    If the total charge needs longer than `MAX_RISE_S` to rise from half of the touch threshold to the threshold, a
+    drift of the charge at rest may have caused the touch. All frames of the touch then have the flag `drift`.
 
     If the total charge lies below zero by more than the touch threshold, the frame has the flag `negative`.
     """
@@ -70,6 +89,8 @@ class Touch(Stage):
         self._peak_pC = 0.0  # largest total charge in this touch
         self._last_pC = 0.0  # total charge of the latest frame
         self._base_pC = 0.0  # smallest total charge since the last release
+        self._rise_s = 0.0  # time since the total charge has exceeded half of the touch threshold
+        self._has_drifted = False  # whether the total charge rose too slowly at the beginning of this touch
 
     def step(self, frame: Frame) -> None:
         """Determine whether something touches the film in this frame.
@@ -85,14 +106,14 @@ class Touch(Stage):
         else:
             self._detect(self._rule, frame, float(frame.charge_pC.sum()))
         frame.is_contact = self._is_contact
+        if self._is_contact and self._has_drifted:
+            frame.flags.append(DRIFT)
         if self._is_contact and not was_contact and self._offset_stage is not None:
             self._offset_stage.begin_touch(frame)
 
     def _detect(self, rule: TouchRule, frame: Frame, total_pC: float) -> None:
         """Update the state with the total charge of a frame, pC. A press makes the total charge positive."""
-        noise_pC = frame.noise_pC
-        total_noise_pC = math.sqrt(float(np.dot(noise_pC, noise_pC)))  # standard deviation of the total charge at rest
-        touch_threshold_pC = rule.floor_pC + rule.sigmas * total_noise_pC
+        touch_threshold_pC = rule.threshold_pC(frame.noise_pC)
         two_frame_peak_pC = min(total_pC, self._last_pC)  # a spike of a single frame is not a peak
         self._last_pC = total_pC
         if self._is_contact:
@@ -111,7 +132,16 @@ class Touch(Stage):
         if total_pC > self._base_pC + touch_threshold_pC:
             self._is_contact = True
             self._peak_pC = two_frame_peak_pC
+            self._has_drifted = self._rise_s > MAX_RISE_S
+            self._rise_s = 0.0
             return
+        is_rising = total_pC > self._base_pC + 0.5 * touch_threshold_pC
+        self._rise_s = self._rise_s + frame.dt_s if is_rising else 0.0
         self._base_pC = min(self._base_pC, total_pC)
         if total_pC < -touch_threshold_pC:
             frame.flags.append(NEGATIVE)
+
+    @classmethod
+    def c_settings(cls, setup: Setup) -> dict[str, Any]:
+        """Return the settings, and the longest time in which the total charge of a touch rises."""
+        return super().c_settings(setup) | {"max_rise_s": MAX_RISE_S}

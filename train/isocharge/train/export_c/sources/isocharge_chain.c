@@ -45,8 +45,8 @@ static void forget_tare(isocharge_chain *chain)
 #if ISOCHARGE_LEAK_ON
     chain->leak_running = 0;
 #endif
-    chain->contact = chain->below = chain->saturated = 0;
-    chain->peak_pC = chain->last_pC = chain->base_pC = 0;
+    chain->contact = chain->below = chain->saturated = chain->slow = 0;
+    chain->peak_pC = chain->last_pC = chain->base_pC = chain->rise_s = 0;
 #if ISOCHARGE_THERMAL_ON
     chain->drift_pC = chain->drift_pC2 = chain->waited_s = 0;
     chain->blind = 0;
@@ -234,7 +234,7 @@ static void start_leak(isocharge_chain *chain, const real output_pC[N])
 #endif
 
 /* Contact with hysteresis, from the total charge. */
-static void update_contact(isocharge_chain *chain, real total_pC, real decay)
+static void update_contact(isocharge_chain *chain, real total_pC, real decay, real dt_s)
 {
 #if ISOCHARGE_TOUCH_ON
     real squares = 0, threshold;
@@ -245,7 +245,7 @@ static void update_contact(isocharge_chain *chain, real total_pC, real decay)
     if (chain->contact) {
         chain->peak_pC = larger(chain->peak_pC, smaller(total_pC, chain->last_pC));
         if (total_pC < larger((real)ISOCHARGE_TOUCH_RELEASE_SHARE * chain->peak_pC, threshold / 2)) {
-            chain->contact = 0;
+            chain->contact = chain->slow = 0;
             chain->peak_pC = 0;
             chain->base_pC = total_pC;
         }
@@ -253,9 +253,12 @@ static void update_contact(isocharge_chain *chain, real total_pC, real decay)
         chain->base_pC *= decay;
         if (total_pC > chain->base_pC + threshold) {
             chain->contact = 1;
+            chain->slow = chain->rise_s > (real)ISOCHARGE_TOUCH_MAX_RISE_S;
             chain->peak_pC = smaller(total_pC, chain->last_pC);
             chain->base_pC = 0;
+            chain->rise_s = 0;
         } else {
+            chain->rise_s = total_pC > chain->base_pC + threshold / 2 ? chain->rise_s + dt_s : 0;
             chain->base_pC = smaller(chain->base_pC, total_pC);
             chain->below = total_pC < -threshold;
         }
@@ -264,6 +267,7 @@ static void update_contact(isocharge_chain *chain, real total_pC, real decay)
 #else
     (void)total_pC;
     (void)decay;
+    (void)dt_s;
     chain->contact = 1;
 #endif
 }
@@ -333,7 +337,7 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
     EACH(k) charge_pC[k] = output_pC[k];
 #endif
     EACH(k) total_pC += charge_pC[k];
-    update_contact(chain, total_pC, decay);
+    update_contact(chain, total_pC, decay, dt_s);
     chain->saturated = limited || (chain->saturated && chain->contact);
 #if ISOCHARGE_THERMAL_ON
     if (!chain->contact) {
@@ -369,7 +373,8 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
     }
 #endif
     reading->contact = chain->contact;
-    reading->flags |= (chain->saturated ? ISOCHARGE_SATURATED : 0u) | (chain->below ? ISOCHARGE_NEGATIVE : 0u);
+    reading->flags |= (chain->saturated ? ISOCHARGE_SATURATED : 0u) | (chain->below ? ISOCHARGE_NEGATIVE : 0u) |
+                      (chain->slow ? ISOCHARGE_DRIFT : 0u);
 }
 
 void isocharge_chain_advance(isocharge_chain *chain, const isocharge_real value[ISOCHARGE_ELECTRODES], double t_s,

@@ -26,6 +26,7 @@ typedef double isocharge_real;
 #define ISOCHARGE_THERMAL 0x08u      /* the film has warmed or cooled in this press; it was subtracted */
 #define ISOCHARGE_BLIND 0x10u        /* temperature is inseparable from force at this position */
 #define ISOCHARGE_INVALID 0x20u      /* a value cannot be a charge; nothing was computed */
+#define ISOCHARGE_DRIFT 0x80u        /* the contact began so slowly that the charge at rest may have drifted */
 #define ISOCHARGE_TARE_FAILED 0x40u  /* the film was not left alone for as long as the device file waits */
 
 typedef struct {
@@ -57,8 +58,8 @@ typedef struct {
     isocharge_real inflow[ISOCHARGE_ELECTRODES], trusted[ISOCHARGE_ELECTRODES], candidate[ISOCHARGE_ELECTRODES];
     isocharge_real candidate_age_s, learned_s, hold_s;
 #endif
-    int contact, below, saturated;
-    isocharge_real peak_pC, last_pC, base_pC;
+    int contact, below, saturated, slow;
+    isocharge_real peak_pC, last_pC, base_pC, rise_s;
 #if ISOCHARGE_THERMAL_ON
     isocharge_real drift_pC, drift_pC2, waited_s;
     int blind;
