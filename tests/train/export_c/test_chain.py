@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import DeviceError, TareError
 from isocharge.serve import BinaryParser, Predictor, device_from_table, encode_frame
-from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
+from isocharge.serve.flags import BLIND, DRIFT, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import T_US_MODULUS, Frame
 from isocharge.serve.port.source import Chunk
@@ -20,13 +20,13 @@ from isocharge.serve.signal_chain.touch import TouchRule
 from isocharge.train.export_c.folder import device_header
 from stage_runner import StageRunner
 
-BITS = {TARE: 1, SATURATED: 2, NEGATIVE: 4, THERMAL: 8, BLIND: 16, INVALID: 32}
+BITS = {TARE: 1, SATURATED: 2, NEGATIVE: 4, THERMAL: 8, BLIND: 16, INVALID: 32, DRIFT: 128}
 """Bit of each flag in C."""
 
 TARE_FAILED = 64
 """Bit for a tare that failed."""
 
-ALL_BITS = 127
+ALL_BITS = 255
 WARMING_BITS = BITS[THERMAL] | BITS[BLIND]
 """Bits of the flags that depend on the estimated warming."""
 
@@ -181,6 +181,22 @@ def test_single_precision_changes_charges_by_less_than_a_twentieth_of_a_picocoul
     np.testing.assert_array_equal(contact, expected_contact)
     np.testing.assert_array_equal(flags, expected_flags)
     np.testing.assert_allclose(charge, expected_charge, rtol=0, atol=0.05)
+
+
+def test_contact_that_a_drift_begins_has_the_flag_drift_in_c_as_in_python(build):
+    """The zero of the board drifts by 6 pC/s, which the tare cannot follow."""
+    n = 1000
+    dt_s = np.full(n, 1.0 / RATE_Hz)
+    t_s = np.cumsum(dt_s)
+    values = np.random.default_rng(0).standard_normal((n, 4)) + 6.0 * t_s[:, None]
+    never = np.zeros(n, dtype=bool)
+    frames = Frames(values, t_s, dt_s, limited=never, tare=never)
+    _, _, expected_contact, expected_flags = python_chain(device("any board"), frames, None)
+    _, _, contact, flags = build("four-25um-biaxial", device("any board")).chain(*frames)
+    np.testing.assert_array_equal(contact, expected_contact)
+    np.testing.assert_array_equal(flags, expected_flags)
+    np.testing.assert_array_equal((flags & BITS[DRIFT]) != 0, contact)
+    assert contact[-1]
 
 
 @pytest.fixture(scope="module")

@@ -48,10 +48,10 @@ class TouchRule(Rule, frozen=True, kw_only=True):
 SCALE_STD_FACTOR = 2.0
 """Number of common standard deviations of the charges by which the release threshold is raised."""
 
-MAX_RISE_S = 0.2
-"""Longest time in which the total charge of a touch rises from half of the touch threshold to the threshold, s.
+RISE_S = 0.1
+"""Time constant of the mean total charge that shows whether the total charge rises slowly, s.
 
-A press of a film of 25 um takes this time if its force grows by less than 0.01 N/s. A drift usually takes longer.
+The total charge of a press of a film of 25 um rises slowly if its force grows by less than about 0.005 N/s.
 """
 
 
@@ -65,8 +65,9 @@ class Touch(Stage):
     peak, plus the uncertainty of the total charge. It is at least half of the touch threshold. The peak is the largest
     total charge that two consecutive frames of the touch have reached. The spike of a single frame is not a peak.
 
-    If the total charge needs longer than `MAX_RISE_S` to rise from half of the touch threshold to the threshold, a
-    drift of the charge at rest may have caused the touch. All frames of the touch then have the flag `drift`.
+    If the mean total charge of the last `RISE_S` has already exceeded half of the touch threshold when a touch begins,
+    the charge has risen slowly, and a drift of the charge at rest may have caused the touch. All frames of the touch
+    then have the flag `drift`.
 
     If the total charge lies below zero by more than the touch threshold, the frame has the flag `negative`.
     """
@@ -89,7 +90,7 @@ class Touch(Stage):
         self._peak_pC = 0.0  # largest total charge in this touch
         self._last_pC = 0.0  # total charge of the latest frame
         self._base_pC = 0.0  # smallest total charge since the last release
-        self._rise_s = 0.0  # time since the total charge has exceeded half of the touch threshold
+        self._mean_pC = 0.0  # exponential mean of the total charge out of contact
         self._has_drifted = False  # whether the total charge rose too slowly at the beginning of this touch
 
     def step(self, frame: Frame) -> None:
@@ -123,6 +124,7 @@ class Touch(Stage):
             if total_pC < max(release_threshold_pC, 0.5 * touch_threshold_pC):
                 self._is_contact = False
                 self._base_pC = total_pC
+                self._mean_pC = total_pC
             return
 
         # While a finger leaves the film, a positive base must not decay, because this charge still belongs to the
@@ -132,16 +134,14 @@ class Touch(Stage):
         if total_pC > self._base_pC + touch_threshold_pC:
             self._is_contact = True
             self._peak_pC = two_frame_peak_pC
-            self._has_drifted = self._rise_s > MAX_RISE_S
-            self._rise_s = 0.0
+            self._has_drifted = self._mean_pC > self._base_pC + 0.5 * touch_threshold_pC
             return
-        is_rising = total_pC > self._base_pC + 0.5 * touch_threshold_pC
-        self._rise_s = self._rise_s + frame.dt_s if is_rising else 0.0
+        self._mean_pC = total_pC + math.exp(-frame.dt_s / RISE_S) * (self._mean_pC - total_pC)
         self._base_pC = min(self._base_pC, total_pC)
         if total_pC < -touch_threshold_pC:
             frame.flags.append(NEGATIVE)
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
-        """Return the settings, and the longest time in which the total charge of a touch rises."""
-        return super().c_settings(setup) | {"max_rise_s": MAX_RISE_S}
+        """Return the settings, and the time constant of the mean total charge."""
+        return super().c_settings(setup) | {"rise_s": RISE_S}

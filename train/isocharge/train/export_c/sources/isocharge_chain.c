@@ -46,7 +46,7 @@ static void forget_tare(isocharge_chain *chain)
     chain->leak_running = 0;
 #endif
     chain->contact = chain->below = chain->saturated = chain->slow = 0;
-    chain->peak_pC = chain->last_pC = chain->base_pC = chain->rise_s = 0;
+    chain->peak_pC = chain->last_pC = chain->base_pC = chain->mean_pC = 0;
 #if ISOCHARGE_THERMAL_ON
     chain->drift_pC = chain->drift_pC2 = chain->waited_s = 0;
     chain->blind = 0;
@@ -247,18 +247,17 @@ static void update_contact(isocharge_chain *chain, real total_pC, real decay, re
         if (total_pC < larger((real)ISOCHARGE_TOUCH_RELEASE_SHARE * chain->peak_pC, threshold / 2)) {
             chain->contact = chain->slow = 0;
             chain->peak_pC = 0;
-            chain->base_pC = total_pC;
+            chain->base_pC = chain->mean_pC = total_pC;
         }
     } else {
         chain->base_pC *= decay;
         if (total_pC > chain->base_pC + threshold) {
             chain->contact = 1;
-            chain->slow = chain->rise_s > (real)ISOCHARGE_TOUCH_MAX_RISE_S;
+            chain->slow = chain->mean_pC > chain->base_pC + threshold / 2;
             chain->peak_pC = smaller(total_pC, chain->last_pC);
             chain->base_pC = 0;
-            chain->rise_s = 0;
         } else {
-            chain->rise_s = total_pC > chain->base_pC + threshold / 2 ? chain->rise_s + dt_s : 0;
+            chain->mean_pC = total_pC + EXP(-dt_s / (real)ISOCHARGE_TOUCH_RISE_S) * (chain->mean_pC - total_pC);
             chain->base_pC = smaller(chain->base_pC, total_pC);
             chain->below = total_pC < -threshold;
         }

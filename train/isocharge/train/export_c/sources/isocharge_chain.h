@@ -59,7 +59,7 @@ typedef struct {
     isocharge_real candidate_age_s, learned_s, hold_s;
 #endif
     int contact, below, saturated, slow;
-    isocharge_real peak_pC, last_pC, base_pC, rise_s;
+    isocharge_real peak_pC, last_pC, base_pC, mean_pC;
 #if ISOCHARGE_THERMAL_ON
     isocharge_real drift_pC, drift_pC2, waited_s;
     int blind;
