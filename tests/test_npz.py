@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 
-from isocharge.common.npz import DAMAGED_FILE_ERRORS, MAX_ENTRIES, finite_array, finite_number, npz_arrays, text_item
+from isocharge.common.npz import finite_array, finite_number, npz_arrays
 
 MEBIBYTE = 1 << 20
 
@@ -70,17 +70,8 @@ def test_entry_longer_than_the_archive_declares_is_refused():
     data = entry(content)
     size = struct.pack("<I", len(content))
     assert data.count(size) == 2
-    with pytest.raises(DAMAGED_FILE_ERRORS):
+    with pytest.raises(ValueError, match=r"EOF|CRC|Overlapped|reading array data"):
         npz_arrays(bytes(data.replace(size, struct.pack("<I", 200))))
-
-
-def test_large_lzma_dictionary_is_refused():
-    data = entry(npy(np.zeros(100)), method=zipfile.ZIP_LZMA)
-    start = 30 + len("a.npy")
-    assert npz_arrays(bytes(data))["a"].shape == (100,)
-    data[start + 5 : start + 9] = struct.pack("<I", 0xFFFFFFFF)
-    with pytest.raises(ValueError, match="an LZMA dictionary of 4294967295 bytes"):
-        npz_arrays(bytes(data))
 
 
 def with_header(text):
@@ -92,38 +83,23 @@ def with_header(text):
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (with_header("{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000,)}"), "does not fit 16 bytes"),
-        (with_header("{'descr': '<f8', 'fortran_order': False, 'shape': (-2, -1)}"), "does not fit 16 bytes"),
-        (with_header("{'descr': '|O', 'fortran_order': False, 'shape': (2,)}"), "Python objects"),
+        (with_header("{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000,)}"), "allocate|EOF"),
+        (with_header("{'descr': '<f8', 'fortran_order': False, 'shape': (-2, -1)}"), "unknown dimension"),
+        (with_header("{'descr': '|O', 'fortran_order': False, 'shape': (2,)}"), "Object arrays cannot be loaded"),
         (with_header("__import__('os')"), "malformed"),
-        (npy(np.array([{}], dtype=object)), "Python objects"),
-        (b"no array", "magic string"),
-        (b"", "magic string"),
+        (npy(np.array([{}], dtype=object)), "Object arrays cannot be loaded"),
     ],
-    ids=["too long", "negative shape", "objects", "code", "pickle", "other content", "empty"],
+    ids=["too long", "negative shape", "objects", "code", "pickle"],
 )
 def test_entry_that_is_no_array_of_numbers_is_refused(content, reason):
-    with pytest.raises(DAMAGED_FILE_ERRORS, match=reason):
+    with pytest.raises(ValueError, match=reason):
         npz_arrays(bytes(entry(content)))
 
 
-def test_missing_repeated_and_numerous_arrays_are_refused():
-    with pytest.raises(ValueError, match="the array 'b' is missing"):
-        npz_arrays(npz(a=np.zeros(1)), ["b"])
-    with pytest.raises(ValueError, match=f"at most {MAX_ENTRIES} arrays, got 1001"):
-        npz_arrays(npz(False, **{f"a{k}": np.zeros(1) for k in range(1001)}))
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("a.npy", npy(np.zeros(1)))
-        with pytest.warns(UserWarning, match="Duplicate name"):
-            archive.writestr("a.npy", npy(np.ones(1)))
-    with pytest.raises(ValueError, match="the array 'a' is there twice"):
-        npz_arrays(file.getvalue())
-
-
 def test_compression_method_that_numpy_does_not_write_is_refused():
-    with pytest.raises(ValueError, match="the array 'a' has the compression method 12"):
-        npz_arrays(bytes(entry(npy(np.zeros(1)), method=zipfile.ZIP_BZIP2)))
+    for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        with pytest.raises(ValueError, match=f"an array has the compression method {method}"):
+            npz_arrays(bytes(entry(npy(np.zeros(1)), method=method)))
 
 
 ARRAYS = {
@@ -139,7 +115,6 @@ ARRAYS = {
 def test_checked_arrays_are_float64():
     assert finite_array(ARRAYS, "numbers", (2, None)).tolist() == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]
     assert finite_number(ARRAYS, "one") == 2.5
-    assert text_item(ARRAYS, "text") == "some text"
 
 
 @pytest.mark.parametrize(
@@ -159,6 +134,7 @@ def test_array_of_another_kind_is_refused(name, shape, reason):
         finite_array(ARRAYS, name, shape)
 
 
-def test_text_of_another_kind_is_refused():
-    with pytest.raises(ValueError, match="numbers: expected a text"):
-        text_item(ARRAYS, "numbers")
+@pytest.mark.parametrize("content", [b"no array", b""])
+def test_entry_without_an_array_is_no_number(content):
+    with pytest.raises(ValueError, match="a: expected real numbers"):
+        finite_number(npz_arrays(bytes(entry(content, name="a"))), "a")

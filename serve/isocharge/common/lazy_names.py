@@ -1,6 +1,7 @@
 """Public names of a package that are imported from their modules only when they are used for the first time.
 
-A program that reads a dataset therefore does not wait for the import of the solver, nor a calibration for PyTorch.
+A program that reads a dataset therefore does not wait for the import of the solver, a calibration does not wait for
+PyTorch, and a program that predicts contacts does not wait for the servers and the parsers of boards.
 """
 
 import ast
@@ -12,10 +13,10 @@ from importlib import import_module
 from typing import Any
 
 from isocharge.common.extras import require
-from isocharge.common.versions import version_attribute
+from isocharge.common.versions import package_version
 
 
-def lazy_names(package: str, extra: str) -> Callable[[str], Any]:
+def lazy_names(package: str, *extras: str) -> Callable[[str], Any]:
     """Return a function that imports a public name of a package when the name is used for the first time.
 
     The package assigns the function to the name `__getattr__`. Python calls a function of this name for each attribute
@@ -29,9 +30,8 @@ def lazy_names(package: str, extra: str) -> Callable[[str], Any]:
 
     Args:
         package: Name of the package.
-        extra: Extra of pyproject.toml that the package needs.
+        *extras: Extras of pyproject.toml that the package needs.
     """
-    look_up_version = version_attribute(package)
 
     @cache
     def modules() -> dict[str, str]:
@@ -47,10 +47,12 @@ def lazy_names(package: str, extra: str) -> Callable[[str], Any]:
             AttributeError: If the name is not public.
             MissingExtra: If a package of the extra is not installed.
         """
+        if name == "__version__":
+            return package_version()
         namespace = sys.modules[package]
         if name not in namespace.__all__:
-            return look_up_version(name)  # the version, or AttributeError for all other names
-        with require(extra):
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        with require(*extras):
             value = getattr(import_module(modules()[name]), name)
         setattr(namespace, name, value)
         return value

@@ -9,38 +9,42 @@ The packages are arranged in the order in which they process a frame. `serve/REA
 
 from typing import TYPE_CHECKING
 
-from isocharge.common.measured_presses import MeasuredPresses, read_presses, write_presses
-from isocharge.common.versions import version_attribute
-from isocharge.serve.asgi import asgi_app
-from isocharge.serve.examination.port_check import Examination, examine
-from isocharge.serve.frames.binary import BinaryParser, encode_frame
-from isocharge.serve.frames.formats import AutoParser
-from isocharge.serve.frames.frame import Frame
-from isocharge.serve.frames.text_lines import encode_text
-from isocharge.serve.live.device import Device, device_from_table, load_device
-from isocharge.serve.live.steady_press import PressWatch
-from isocharge.serve.live.stream import Policy, ReadingStream, TouchStream, stream
-from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.model_folder import (
-    Model,
-    ModelCheck,
-    check_golden,
-    find_labelled_model,
-    find_model,
-    load_checked_model,
-    load_model,
-    verify_model,
-    write_model,
-)
-from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
-from isocharge.serve.port.source import Chunk, Port, open_source
-from isocharge.serve.prediction.contact import Contact, Contacts, Validity
-from isocharge.serve.prediction.predictor import Predictor
-from isocharge.serve.prediction.press_check import PressCheck, check_presses
-from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
-from isocharge.serve.record.record import PredictionRecord
-from isocharge.serve.virtual_sensor.script import Faults, Script, wander
-from isocharge.serve.virtual_sensor.sensor import VirtualSensor
+from isocharge.common.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from isocharge.common.measured_presses import MeasuredPresses, read_presses, write_presses
+    from isocharge.serve.asgi import asgi_app
+    from isocharge.serve.examination.port_check import Examination, examine
+    from isocharge.serve.frames.binary import BinaryParser, encode_frame
+    from isocharge.serve.frames.formats import AutoParser
+    from isocharge.serve.frames.frame import Frame
+    from isocharge.serve.frames.text_lines import encode_text
+    from isocharge.serve.live.device import Device, device_from_table, load_device
+    from isocharge.serve.live.steady_press import PressWatch
+    from isocharge.serve.live.stream import Policy, ReadingStream, TouchStream, stream
+    from isocharge.serve.model.metadata import ModelMetadata
+    from isocharge.serve.model.model_folder import (
+        Model,
+        ModelCheck,
+        check_golden,
+        find_labelled_model,
+        find_model,
+        load_checked_model,
+        load_model,
+        verify_model,
+        write_model,
+    )
+    from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
+    from isocharge.serve.port.source import Chunk, Port, open_source
+    from isocharge.serve.prediction.contact import Contact, Contacts, Validity
+    from isocharge.serve.prediction.predictor import Predictor
+    from isocharge.serve.prediction.press_check import PressCheck, check_presses
+    from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
+    from isocharge.serve.record.record import PredictionRecord
+    from isocharge.serve.virtual_sensor.script import Faults, Script, wander
+    from isocharge.serve.virtual_sensor.sensor import VirtualSensor
+else:  # hidden from type checkers, which would otherwise accept every misspelt name
+    __getattr__ = lazy_names(__name__)
 
 __all__ = [
     "AutoParser",
@@ -100,8 +104,3 @@ __version__: str
 def __dir__() -> list[str]:
     """Return the public names, so that tab completion suggests no other names."""
     return list(__all__)
-
-
-if not TYPE_CHECKING:  # with __getattr__, a type checker would accept every misspelt name
-    __getattr__ = version_attribute(__name__)
-    del TYPE_CHECKING

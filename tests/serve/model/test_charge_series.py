@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from attacks.companions import ELECTRODES, charge_arrays
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
-from isocharge.serve.model.charge_series import ChargeSeries, interpolation_weights, read_charges
+from isocharge.serve.model.charge_series import ChargeSeries, charges_from_bytes, interpolation_weights, read_charges
 
 DOMAIN = Domain(8.0, (0.05, 2.0))
 NODES = np.array([-0.5, 0.0, 0.25])
@@ -138,10 +138,9 @@ def test_interpolation_weights_reproduce_a_cubic_and_continue_linearly():
 
 
 @pytest.mark.parametrize("is_signed", [False, True])
-def test_file_is_read_as_it_was_written(tmp_path, is_signed):
+def test_file_is_read_as_it_was_written(is_signed):
     written = replace(random_series(is_signed=is_signed), offset_pC=3.5)
-    (tmp_path / "charges.npz").write_bytes(written.to_bytes())
-    read = read_charges(tmp_path, ELECTRODES)
+    read = charges_from_bytes(written.to_bytes(), ELECTRODES)
     contact = random_contacts()
     state = np.array([0.1, 1.0, -1.0])
     np.testing.assert_array_equal(read.changes(contact, state).charge_pC, written.changes(contact, state).charge_pC)
@@ -149,22 +148,21 @@ def test_file_is_read_as_it_was_written(tmp_path, is_signed):
         assert getattr(read, name) == getattr(written, name)
 
 
-def test_map_with_a_single_force_is_read_and_does_not_depend_on_the_force(tmp_path):
+def test_map_with_a_single_force_is_read_and_does_not_depend_on_the_force():
     coefficients = np.zeros((1, 2, 2, 1, 4))
     coefficients[0, 0, 0, 0] = 5.0
     coefficients[0, 1, 0, 0] = coefficients[0, 0, 1, 0] = 0.1
     series = ChargeSeries(domain=Domain(8.0, (0.5, 0.5)), electrodes=ELECTRODES, coefficients=coefficients)
-    (tmp_path / "charges.npz").write_bytes(series.to_bytes())
-    read = read_charges(tmp_path, ELECTRODES)
+    read = charges_from_bytes(series.to_bytes(), ELECTRODES)
     charge, slopes = read.linearised(np.array([[4.0, 0.0, 0.5], [4.0, 0.0, 0.9]]))
     np.testing.assert_allclose(charge, np.exp(5.05), rtol=1e-6)
     np.testing.assert_array_equal(slopes[:, :, 2], 0.0)
 
 
-def write(folder, arrays):
+def packed(arrays):
     file = io.BytesIO()
     np.savez_compressed(file, **{name: value for name, value in arrays.items() if value is not None})
-    (folder / "charges.npz").write_bytes(file.getvalue())
+    return file.getvalue()
 
 
 GOOD = charge_arrays()
@@ -207,10 +205,9 @@ SERIES = GOOD["series"]
         ({"pretension_MPa": None}, "the array 'pretension_MPa' is missing"),
     ],
 )
-def test_file_that_describes_no_charges_is_refused(tmp_path, change, reason):
-    write(tmp_path, GOOD | change)
+def test_file_that_describes_no_charges_is_refused(change, reason):
     with pytest.raises(ModelError, match=rf"charges\.npz: .*{reason}.*train again"):
-        read_charges(tmp_path, ELECTRODES)
+        charges_from_bytes(packed(GOOD | change), ELECTRODES)
 
 
 def test_model_without_the_file_has_no_map(tmp_path):
@@ -221,13 +218,11 @@ numbers = st.floats(width=32, allow_nan=True, allow_infinity=True) | st.sampled_
 
 
 @given(name=st.sampled_from(sorted(GOOD)), entry=st.integers(0, 200), number=numbers)
-def test_file_with_any_number_is_refused_or_gives_finite_charges(tmp_path_factory, name, entry, number):
-    folder = tmp_path_factory.mktemp("model")
+def test_file_with_any_number_is_refused_or_gives_finite_charges(name, entry, number):
     changed = np.array(GOOD[name], float)
     changed.flat[entry % changed.size] = number
-    write(folder, GOOD | {name: changed})
     try:
-        series = read_charges(folder, ELECTRODES)
+        series = charges_from_bytes(packed(GOOD | {name: changed}), ELECTRODES)
     except ModelError:
         return
     contact = series.domain.to_contact(np.array([[0.0, 0.0, 0.0], [0.5, -0.5, 1.0], [3.0, 0.0, -2.0]]))

@@ -1,7 +1,6 @@
 """The file beside a model: its checksum, and the series that it contains."""
 
 import json
-import logging
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from isocharge.common.chebyshev_series import Series, position_degrees
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import load_model, write_model
-from isocharge.serve.model.companion_files import read_companion_file
+from isocharge.serve.model.golden import read_companion_file
 
 ADVICE = "train again"
 
@@ -42,13 +41,12 @@ def test_file_that_the_model_was_not_written_with_is_refused(folder):
         read_companion_file(folder, "other.npz", ADVICE)
 
 
-def test_file_of_a_model_without_checksums_is_read_with_a_warning(folder, caplog):
+def test_model_without_checksums_of_companion_files_is_refused(folder):
     golden = json.loads((folder / "golden.json").read_text("utf-8"))
     del golden["files"]
     (folder / "golden.json").write_text(json.dumps(golden), "utf-8")
-    with caplog.at_level(logging.WARNING):
-        assert read_companion_file(folder, "charges.npz", ADVICE) == b"content"
-    assert "golden.json holds no checksum of this file" in caplog.text
+    with pytest.raises(ModelError, match=r"golden\.json: key 'files' is missing.*copy or export the model again"):
+        read_companion_file(folder, "charges.npz", ADVICE)
 
 
 def test_missing_file_is_named(folder):

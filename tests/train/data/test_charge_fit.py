@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 
 from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.common.statistics import rms
-from isocharge.serve.model.charge_series import read_charges
+from isocharge.serve.model.charge_series import charges_from_bytes
 from isocharge.simulate import Domain, Electrode, Sweep, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.forward.charge_map import differences
@@ -178,13 +178,12 @@ def test_caution_about_a_fold_is_in_log_card_and_metadata(film, sensor, tmp_path
     assert f"- {caution}." in (model.folder / "card.md").read_text("utf-8")
 
 
-def test_charge_series_of_the_whole_domain_is_released_if_the_domain_is_reduced(sensor, trained, tmp_path):
+def test_charge_series_of_the_whole_domain_is_released_if_the_domain_is_reduced(sensor, trained):
     contact = draw_contacts(np.random.default_rng(0), DOMAIN, 3000)
     presses = LabelledPresses(contact, 1000.0 * charges_folded_at(5.0)(*contact.T))
     data = TrainingData(sensor=sensor, probes=("circle:1.0",), domain=DOMAIN, presses=presses, sha256="0" * 64)
     fitted = fit(data, TINY)
-    (tmp_path / "charges.npz").write_bytes(fitted.provenance.files["charges.npz"])
-    series = read_charges(tmp_path, ("A", "B", "C"))
+    series = charges_from_bytes(fitted.provenance.files["charges.npz"], ("A", "B", "C"))
     assert np.allclose(series.charges(contact), presses.charge, rtol=2e-3)
     assert fitted.domain.radius < 5.2 < series.domain.radius
     assert "'serve stream --track' follows contacts to 8 mm" in fitted.cautions[0]

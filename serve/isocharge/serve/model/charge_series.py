@@ -53,9 +53,9 @@ from isocharge.common.arrays import Array
 from isocharge.common.chebyshev_series import Series
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError, cut
-from isocharge.common.npz import DAMAGED_FILE_ERRORS, finite_array, finite_number, npz_arrays
+from isocharge.common.npz import finite_array, finite_number, npz_arrays
 from isocharge.common.robust_estimate import ModelValues
-from isocharge.serve.model.companion_files import read_companion_file
+from isocharge.serve.model.golden import read_companion_file
 
 FILE = "charges.npz"
 """Name of the file in a version folder."""
@@ -410,11 +410,24 @@ def read_charges(version_folder: Path, electrodes: tuple[str, ...]) -> ChargeSer
     path = version_folder / FILE
     if not path.exists():
         return None
-    data = read_companion_file(version_folder, FILE, ADVICE)
+    return charges_from_bytes(read_companion_file(version_folder, FILE, ADVICE), electrodes, str(path))
+
+
+def charges_from_bytes(data: bytes, electrodes: tuple[str, ...], where: str = FILE) -> ChargeSeries:
+    """Create the charge map from the content of a file `charges.npz`, and check the map.
+
+    Args:
+        data: Content of the file.
+        electrodes: Names of the electrodes of the model.
+        where: Path of the file, for the error message.
+
+    Raises:
+        ModelError: If the file is damaged, has another format, or does not describe the charges of contacts.
+    """
     try:
         return _charges_from_arrays(npz_arrays(data), electrodes)
-    except DAMAGED_FILE_ERRORS as error:
-        raise ModelError(f"{path}: {cut(str(error))}; {ADVICE}") from error
+    except (ValueError, TypeError) as error:  # TypeError: the format is not a single number
+        raise ModelError(f"{where}: {cut(str(error))}; {ADVICE}") from error
 
 
 def _charges_from_arrays(arrays: Mapping[str, np.ndarray], electrodes: tuple[str, ...]) -> ChargeSeries:

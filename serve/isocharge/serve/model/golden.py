@@ -12,9 +12,9 @@ where the floor is a constant for each column of the output.
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import onnxruntime as ort
@@ -22,7 +22,7 @@ from msgspec import Meta, Struct
 
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import ModelError
-from isocharge.common.files import sha256_of
+from isocharge.common.files import read_needed, sha256_of
 from isocharge.common.structs import Finite, NotNegative, Text, WrongKey, read_json
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS, run
@@ -79,8 +79,7 @@ class Golden:
         outputs: Outputs of the model by name, each of shape (n, width).
         relative_tolerance: Largest difference of two outputs, relative to max(|output|, floor).
         floors: Floor for each column of an output, by the name of the output.
-        companion_sha256: Checksums of the files that lie beside the model, by file name. None for a model that was
-            written before these files had checksums.
+        companion_sha256: Checksums of the files that lie beside the model, such as `charges.npz`, by file name.
     """
 
     sha256: str
@@ -88,11 +87,11 @@ class Golden:
     outputs: dict[str, Singles]
     relative_tolerance: float
     floors: dict[str, tuple[float, ...]]
-    companion_sha256: Mapping[str, str] | None = None
+    companion_sha256: Mapping[str, str] = field(default_factory=dict)
 
     def to_json(self) -> str:
         """Return the text of `golden.json`."""
-        content: dict[str, Any] = {
+        content = {
             "sha256": self.sha256,
             "tolerance": {
                 "rule": "|a - b| <= relative * max(|b|, floor)",
@@ -101,9 +100,8 @@ class Golden:
             },
             "inputs": {INPUT: self.charge_pC.tolist()},
             "outputs": {name: rows.tolist() for name, rows in self.outputs.items()},
+            "files": dict(self.companion_sha256),
         }
-        if self.companion_sha256 is not None:
-            content["files"] = dict(self.companion_sha256)
         return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
@@ -164,6 +162,38 @@ def read_golden(path: Path) -> Golden:
     )
 
 
+def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
+    """Read a companion file of a model, such as `charges.npz`, and compare it with its checksum in `golden.json`.
+
+    A companion file belongs to one `model.onnx`. A companion file of another model would have the right format but give
+    wrong contacts.
+
+    Args:
+        version_folder: Folder of the model, which contains `model.onnx`.
+        name: Name of the companion file.
+        advice: What the user can do if the file cannot be read, for the error message.
+
+    Returns:
+        The bytes of the file.
+
+    Raises:
+        ModelError: If the file cannot be read, if its checksum differs from the checksum in `golden.json`, or if
+            `golden.json` is missing or damaged, or does not list the file.
+    """
+    path = version_folder / name
+    data = read_needed(path, ModelError, advice)
+    checksums = read_golden(version_folder / "golden.json").companion_sha256
+    # If `golden.json` does not list the file, the comparison with this text fails, and the message contains the text.
+    expected_sha256 = checksums.get(name, "no such file")
+    actual_sha256 = sha256_of(data)
+    if actual_sha256 != expected_sha256:
+        raise ModelError(
+            f"{path}: expected sha256 {expected_sha256:.12} (golden.json), got {actual_sha256:.12}; the file is "
+            f"damaged or belongs to another model: copy the whole folder of the model again, or {advice}"
+        )
+    return data
+
+
 Triple = tuple[Finite, Finite, Finite]
 """Three finite numbers, one for each column of an output."""
 
@@ -211,7 +241,7 @@ class _GoldenFile(Struct):
     inputs: _Inputs
     outputs: _Outputs
     tolerance: _Tolerance
-    files: dict[Text, Text] | None = None
+    files: dict[Text, Text]
 
 
 def _float32_array(rows: Sequence[Sequence[float]]) -> Singles:

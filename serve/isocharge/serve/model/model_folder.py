@@ -29,8 +29,14 @@ from isocharge.common.errors import ModelError, OutputExists, error_prefix, show
 from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
 from isocharge.common.model_labels import NAME, VERSION
 from isocharge.common.versions import package_version
-from isocharge.serve.model.companion_files import read_companion_file
-from isocharge.serve.model.golden import Golden, check_outputs, contact_floors, make_golden, read_golden
+from isocharge.serve.model.golden import (
+    Golden,
+    check_outputs,
+    contact_floors,
+    make_golden,
+    read_companion_file,
+    read_golden,
+)
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import (
     CORRELATION,

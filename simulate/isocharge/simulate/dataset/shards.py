@@ -455,7 +455,7 @@ def _unpack(data: bytes, where: str) -> Samples:
         DatasetError: If the bytes are not an NPZ file with the columns of a shard.
     """
     try:
-        return Samples(**npz_arrays(data, COLUMNS))
-    except Exception as error:  # zipfile, zlib and NumPy raise many types of exceptions
-        reason = cut(str(error) or type(error).__name__)
-        raise DatasetError(f"{where}: not a shard with the columns {', '.join(COLUMNS)}: {reason}") from error
+        arrays = npz_arrays(data)
+        return Samples(**{column: arrays[column] for column in COLUMNS})
+    except (ValueError, KeyError) as error:
+        raise DatasetError(f"{where}: not a shard with the columns {', '.join(COLUMNS)}: {cut(str(error))}") from error
