@@ -48,6 +48,13 @@ def test_charges_of_a_similar_film_agree_with_direct_solves(solved):
     np.testing.assert_allclose(charge, expected, rtol=0.01)
 
 
+def test_no_contacts_give_no_charges(solved):
+    """A file of touches at unknown places contains no press whose charges can be compared with those of a film."""
+    charge, jacobian = solved.linearised(solved.prior.mean, np.empty((0, 3)))
+    assert charge.shape == (0, 4)
+    assert jacobian.shape == (0, 4, len(solved.prior.names))
+
+
 @pytest.mark.parametrize(
     "name", ["young", "thickness", "d31", "d12", "shift_y", "rotation", "crosstalk", "probe_radius", "gain B"]
 )

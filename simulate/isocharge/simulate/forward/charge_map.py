@@ -165,7 +165,8 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
 
     # Evaluate the function once, for the stepped contacts in the order (stepped variable, up or down, contact).
     stepped_contacts = np.stack([contacts_up, contacts_down], axis=1)
-    values = np.asarray(function(stepped_contacts.reshape(-1, 3))).reshape(3, 2, len(contact), -1)
+    stepped_values = np.asarray(function(stepped_contacts.reshape(-1, 3)))
+    values = stepped_values.reshape(3, 2, len(contact), stepped_values.shape[1])
     values_up = values[:, 0]
     values_down = values[:, 1]
     derivatives = (values_up - values_down) / (2.0 * variable_steps)[:, None, None]  # shape (3, n, k)

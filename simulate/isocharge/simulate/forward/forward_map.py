@@ -354,13 +354,13 @@ class ForwardMap:
 
         # The same rule is used for all pairs of a press and an electrode.
         all_pairs = np.ones((position.size, len(rule.count)), dtype=bool)
-        charges = []
+        charges = np.empty((position.size, len(rule.count), is_odd.size))
         with single_threaded_blas():  # faster for the many small matrices of a chunk
             for start in range(0, position.size, CHUNK_SIZE):
                 chunk = slice(start, start + CHUNK_SIZE)
                 rules = ((rule, all_pairs[chunk]),)
-                charges.append(self._integrate_fields(position[chunk], force[chunk], orientation, is_odd, rules))
-        return np.concatenate(charges)
+                charges[chunk] = self._integrate_fields(position[chunk], force[chunk], orientation, is_odd, rules)
+        return charges
 
     def stress_charges_by_force(self, position: Array, is_needed: Booleans) -> Array:
         """Compute the charges that the stress causes at given positions, for all forces of the family at once.
