@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from attacks.companions import ELECTRODES, charge_arrays
 from attacks.faults import mutated, with_junk
 from isocharge.common.files import sha256_of
-from isocharge.common.resumable_run import resume_folder
 from isocharge.serve import (
     Chunk,
     Recorder,
@@ -32,13 +30,11 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.virtual_sensor.script import load_script
 from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
-from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import CalibrationProblem, FilmEstimate, read_earlier
 from isocharge.train.calibration.calibration_file import film_table, json_text
 from isocharge.train.calibration.contact_error import PLANNED
 from isocharge.train.training.config import load_config
-from isocharge.train.training.descent import tensors_from_bytes
 
 ROOT = Path(__file__).parents[2]
 
@@ -356,25 +352,6 @@ def test_a_dataset_with_faults(dataset, attack):
     attack("manifest", read_manifest, lambda rng: json.dumps(with_junk(rng, json.loads(good))).encode(), 5_000)
     path.write_bytes(good)
     attack("shard", read_shard, lambda rng: mutated(rng, good_shard), 5_000)
-
-
-def test_parts_of_runs_with_faults(tmp_path, attack):
-    """Their checksums fit; a part that is garbage is computed again, and the run goes on."""
-    array, state = io.BytesIO(), io.BytesIO()
-    np.save(array, np.arange(12.0).reshape(3, 4))
-    torch.save({"step": 3, "weights": torch.zeros(3)}, state)
-    with resume_folder(tmp_path / "target", {"a": 1}) as run:
-
-        def read_array(data):
-            run.save("solve-0000.npy", data)
-            assert len(list(in_order(run.storing_executor("solve"), lambda job: np.zeros(job), [2]))) == 1
-
-        def read_state(data):
-            run.save("weights", data)
-            run.load("weights", tensors_from_bytes)
-
-        attack("files part", read_array, lambda rng: mutated(rng, array.getvalue()), 2_000)
-        attack("files checkpoint", read_state, lambda rng: mutated(rng, state.getvalue()), 2_000)
 
 
 NOTATIONS = ("circle:1.0", "rectangle:4.0x2.0@30", "triangle:4.0@-3", "ellipse:4.0x2.0@30", "polygon:0,0;1,0;1,1;0,1")

@@ -89,7 +89,7 @@ def test_a_sweep_as_a_table_for_other_programs(command, refused, tmp_path, monke
     assert {path.name for path in tmp_path.iterdir()} == {"a", "a.parquet"}  # said before anything is pressed
 
 
-def test_a_stopped_sweep_says_how_to_go_on_and_leaves_no_process(tmp_path):
+def test_a_stopped_sweep_leaves_no_file_and_no_process(tmp_path):
     """The command is stopped at the first of many shards."""
     process = subprocess.Popen(
         [sys.executable, "-m", "isocharge.cli", *SMALL, "--samples", "1000000", "--workers", "2", "-o", "presses"],
@@ -98,13 +98,12 @@ def test_a_stopped_sweep_says_how_to_go_on_and_leaves_no_process(tmp_path):
         text=True,
         start_new_session=True,
     )
-    assert ends(lambda: not list(tmp_path.glob("presses.part/parts/shard-00000*.sha256")))
+    assert ends(lambda: not list(tmp_path.glob(".*.draft/shard-00000.npz")))
     process.terminate()
     _, err = process.communicate(timeout=60)
     assert process.returncode not in (0, None)
     assert "Traceback" not in err
-    assert "stopped; the finished parts are kept in presses.part, and the same command" in err
-    assert [path.name for path in tmp_path.iterdir()] == ["presses.part"]
+    assert list(tmp_path.iterdir()) == []
     with pytest.raises(ProcessLookupError):
         ends(lambda: os.killpg(process.pid, 0) is None)  # no process of the session is left
 
@@ -118,19 +117,11 @@ def ends(is_so) -> bool:
     return False
 
 
-def test_fresh_throws_an_unfinished_sweep_of_other_settings_away(command, tmp_path):
-    part = tmp_path / "presses.part"
-    for folder in ("parts", "data"):
-        (part / folder).mkdir(parents=True)
-    for name in ("lock", "data/old"):
-        (part / name).touch()
-    (part / "run.json").write_text('{"sweep": {"samples": 7}}')
-    words = ["--samples", 300, "--sampling", "grid", "--orientation", "random", "--workers", 1, "--fresh"]
+def test_sweep_over_a_grid_writes_its_presses_and_warns_of_the_stress(command, tmp_path):
+    words = ["--samples", 300, "--sampling", "grid", "--orientation", "random", "--workers", 1]
     code, _, err = command(*SMALL, *words, "-o", tmp_path / "presses")
     assert code == 0
     assert f"293 presses in {tmp_path / 'presses'}" in err
-    assert not part.exists()
-    assert not (tmp_path / "presses" / "old").exists()
     assert "caution: 1 N under circle:1.0 stress the film to 49 MPa, the limit is 45 MPa" in err
 
 
@@ -323,7 +314,7 @@ BAD = [
     (
         ("simulate", "sweep", SENSOR, "--samples", "50", "-o", "/proc/x"),
         1,
-        "OutputError: /proc/x.part cannot be written",
+        "OutputError: /proc/x cannot be written",
     ),
     (("serve", "predict", SENSOR, "x.csv", "--models", "nope"), 2, "ModelError: nope: expected a folder of models"),
     (("serve", "predict", "no-such-model", "x.csv"), 2, "ModelError"),

@@ -4,6 +4,7 @@ A file or folder that is written appears under its name only when it is complete
 """
 
 import errno
+import fcntl
 import hashlib
 import os
 import secrets
@@ -318,3 +319,34 @@ def flush_to_disk(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Lock a folder for the `with` block, so that no other process can lock the folder.
+
+    If the given path does not exist, it is created as a lock file. The operating system unlocks the folder if this
+    process is killed.
+
+    Args:
+        path: The folder, or a lock file in the folder.
+
+    Raises:
+        OutputExists: If another process has locked the folder.
+    """
+    if path.is_dir():
+        folder = path
+        descriptor = os.open(path, os.O_RDONLY)  # a folder cannot be opened for writing
+    else:
+        folder = path.parent
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises an error at once instead of waiting
+        except BlockingIOError as error:
+            raise OutputExists(
+                f"another process is at work in {folder}; wait for it, or choose another output"
+            ) from error
+        yield
+    finally:
+        os.close(descriptor)  # also unlocks the folder

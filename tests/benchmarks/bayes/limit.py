@@ -63,8 +63,7 @@ def bayes_estimate(
         charge: Touch charges with noise, shape (n, n_electrode), pC.
         charge_map: Map from contacts to charges; None to simulate this map. The range of forces of the map must be
             equal to that of the problem, and the radius of the map must be at least that of the problem.
-        executor: Executor for the solves and integrals; None for this process. The executor of a `ResumableRun` saves
-            completed results.
+        executor: Executor for the solves and integrals; None for this process.
 
     Returns:
         Posterior means (x, y, F), shape (n, 3), and posterior standard deviations, shape (n, 3), mm and N. Instead of

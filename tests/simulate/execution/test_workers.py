@@ -43,7 +43,7 @@ def test_bytes_from_two_workers_are_equal_to_those_from_one_process(tmp_path, ex
         assert sweep_with(executor, tmp_path / "presses") == expected
 
 
-def test_killed_worker_process_raises_workers_lost_and_the_run_can_be_resumed(tmp_path, expected):
+def test_killed_worker_process_raises_workers_lost_and_the_sweep_can_be_repeated(tmp_path, expected):
     killed = []
 
     def kill(title: str, *_) -> None:

@@ -8,14 +8,13 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal, norm
 
-from isocharge.common.errors import ConfigError, InputError, OutputExists, TrainingError
+from isocharge.common.errors import ConfigError, InputError, TrainingError
 from isocharge.common.progress import listening
-from isocharge.common.resumable_run import resume_parts
 from isocharge.simulate import Dataset, Domain, NoiseModel, Samples
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config
 from isocharge.train.training import descent
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.fit import fit_identity, train_network
+from isocharge.train.training.fit import train_network
 from isocharge.train.training.losses import (
     STD_EXPONENT,
     distillation_loss,
@@ -34,7 +33,6 @@ REPORT_EVERY = 20
 @pytest.fixture
 def _short_reports(monkeypatch):
     monkeypatch.setattr(descent, "REPORT_EVERY", REPORT_EVERY)
-    monkeypatch.setattr(descent, "SAVE_EVERY_S", 0.0)
 
 
 def test_a_teacher_answers_in_the_coordinates_of_the_network():
@@ -335,43 +333,6 @@ def test_rounded_weights_are_whole_numbers_times_the_scale_of_their_output(datas
         *_, rounded_last = rounded_perceptron.linear_layers()
         *_, last = perceptron.linear_layers()
         assert not torch.equal(rounded_last.weight, last.weight)  # trained after the rounding
-
-
-class Killed(BaseException):
-    """Stands for a SIGKILL; no code but the test catches it."""
-
-
-LONGER = settings((12, 12), (10, 10), steps=20, misfit_steps=REPORT_EVERY + 10, batch=64)
-
-
-@pytest.mark.usefixtures("split_once", "_short_reports")
-def test_a_killed_training_continues_only_with_its_own_presses_and_settings(dataset, tmp_path, monkeypatch):
-    """Kill the training of the misfit network, and continue without computing the first network and the examples again.
-
-    The kill happens at the first report of the misfit network. Each step is saved, so few steps are trained.
-    """
-
-    def kill(title, *_):
-        if title == "training the misfit network":
-            raise Killed
-
-    data = TrainingData.of(dataset)
-    identity = fit_identity(data, LONGER)
-    with pytest.raises(Killed), listening(kill), resume_parts(tmp_path / "it", identity) as run:
-        weights(dataset, LONGER, run=run)
-    for changed, message in (
-        (fit_identity(data, settings(seed=5)), r"config\.training\..*--fresh"),
-        (fit_identity(replace(data, sha256="another"), LONGER), "dataset_sha256 is"),
-        (fit_identity(replace(data, teacher=Teacher("it/1", "sum", tuple)), LONGER), "teacher_sha256 is"),
-    ):
-        with pytest.raises(OutputExists, match=message), resume_parts(tmp_path / "it", changed):
-            pass
-    whole = weights(dataset, LONGER)
-    calls = []
-    monkeypatch.setattr("isocharge.train.training.misfit_training.draw_misfit_examples", pytest.fail)
-    with listening(lambda *call: calls.append(call)), resume_parts(tmp_path / "it", identity) as run:
-        assert torch.equal(weights(dataset, LONGER, run=run), whole)
-    assert {title for title, *_ in calls} == {"training the misfit network"}
 
 
 CONFIGS = Path(__file__).parents[3] / "train" / "configs"

@@ -3,15 +3,11 @@
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from isocharge.common.deflection_field import read_deflection_field
 from isocharge.serve import load_model
-from isocharge.serve.model.model_folder import triton_config
-from isocharge.train import fit
-from isocharge.train.training.descent import Descent
 from kept import ROOT
 
 FIELD = ROOT / "serve" / "isocharge" / "serve" / "viewer" / "fields" / "film-25um.json"
@@ -25,31 +21,6 @@ steps = 10
 misfit_steps = 10
 misfit_charges = 1000
 """
-
-
-def test_a_finished_training_is_kept_if_the_release_is_refused(dataset_folder, command, refused, tmp_path, monkeypatch):
-    """While a model with three electrodes is trained, another program writes a model with four into its folder."""
-    monkeypatch.chdir(tmp_path)
-    Path("short.toml").write_text(SHORT_CONFIG)
-    model_folder = tmp_path / "models" / "m"
-
-    def fit_slowly(*arguments, **options):
-        result = fit(*arguments, **options)
-        (model_folder / "config.pbtxt").write_text(triton_config("m", 4, correlation=False))
-        return result
-
-    monkeypatch.setattr("isocharge.cli.train.fit.fit", fit_slowly)
-    words = ("train", "fit", dataset_folder, "--config", "short.toml", "-o")
-    refused(*words, "models/m", message="kept in models/m/1.part", code=1)
-    monkeypatch.undo()
-
-    # The training goes on in another folder, without a further step.
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(Descent, "take_step", lambda _: pytest.fail("the training begins again"))
-    (tmp_path / "models" / "other").mkdir()
-    (model_folder / "1.part").rename(tmp_path / "models" / "other" / "1.part")
-    assert command(*words, "models/other")[0] == 0
-    assert load_model(tmp_path / "models" / "other" / "1").metadata.label == "other/1"
 
 
 def test_a_training_on_a_dataset_needs_no_solver(dataset_folder, tmp_path):

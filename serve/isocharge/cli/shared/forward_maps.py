@@ -1,8 +1,8 @@
 """Functions that several commands with forward maps use, for workers, progress, stress and simulated presses."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,7 +12,6 @@ from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
 from isocharge.common.deflection_field import DEFLECTION_FILE
 from isocharge.common.errors import InputError, IsochargeError, SceneError, SolveError
 from isocharge.common.files import write_whole
-from isocharge.common.resumable_run import draft_of
 from isocharge.serve.viewer.messages import included_deflection_field
 from isocharge.simulate import Circle, Dataset, Film, Probe, Sensor, Sweep, noise_model, read_dataset, working_area
 from isocharge.simulate.execution.workers import dask_workers, local_workers
@@ -36,26 +35,6 @@ def executor_for(workers: int | None, cluster: str | None) -> AbstractContextMan
     if workers and cluster:
         raise InputError("expected either --workers or --cluster, got both")
     return dask_workers(cluster) if cluster else local_workers(worker_count(workers))
-
-
-@contextmanager
-def shown_run(target: Path) -> Iterator[None]:
-    """Context manager that shows the progress of a run, which is a long computation that can be stopped and resumed.
-
-    If the user stops the run, or if the run refuses an input, a message states where the finished parts are kept.
-
-    Args:
-        target: File or folder that the run writes.
-    """
-    try:
-        with shown_progress():
-            yield
-    except (KeyboardInterrupt, InputError) as error:
-        draft = draft_of(target)
-        if draft.exists():
-            reason = "stopped" if isinstance(error, KeyboardInterrupt) else "the run failed"
-            say(f"{reason}; the finished parts are kept in {draft}, and the same command resumes the run")
-        raise
 
 
 def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tuple[float, float]) -> float:

@@ -64,11 +64,6 @@ NoiseOption = Annotated[
     ),
 ]
 
-FreshOption = Annotated[
-    bool,
-    typer.Option("--fresh", help="Delete the saved parts of a stopped run, and begin again. (default: resume the run)"),
-]
-
 ConfigOption = Annotated[
     Path | None,
     typer.Option("--config", metavar="FILE", help="Training settings, TOML. (default: those of the released models)"),

@@ -4,10 +4,9 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import executor_for, shown_run, warn_of_stress
+from isocharge.cli.shared.forward_maps import executor_for, warn_of_stress
 from isocharge.cli.shared.options import (
     ForceOption,
-    FreshOption,
     NewFolderOption,
     NoiseOption,
     SensorArgument,
@@ -15,18 +14,16 @@ from isocharge.cli.shared.options import (
     WorkersOption,
 )
 from isocharge.cli.shared.probe_option import ProbeOption
-from isocharge.cli.shared.terminal import say, show
+from isocharge.cli.shared.terminal import say, show, shown_progress
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
-from isocharge.common.resumable_run import prepare_target, resume_parts
+from isocharge.common.files import refuse_existing
 from isocharge.simulate import Circle, load_sensor, noise_model, parse_probe
 from isocharge.simulate.artwork.design_folder import write_design, write_guard_design
 from isocharge.simulate.artwork.leads import straight_leads
-from isocharge.simulate.execution.code_version import code_fingerprint
-from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Nuisances, WeightMap, read_goal
+from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Nuisances, read_goal
 from isocharge.simulate.layout.design import Design, design
 from isocharge.simulate.layout.guard import GuardDesign, design_guard
-from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 
 
 def design_command(
@@ -84,13 +81,11 @@ def design_command(
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the search. Equal seeds give equal designs.")] = 0,
     stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
-    fresh: FreshOption = False,
 ) -> None:
     """Search for the electrode positions with the smallest position errors.
 
     The command writes a sensor file, drawings and the errors into a new folder. The errors are Cramer-Rao limits in mm.
-    Probe radius, pretension and gains are uncertain unless --known is given. If the search is interrupted, the same
-    command resumes the search.
+    Probe radius, pretension and gains are uncertain unless --known is given.
 
     With --guard, the command searches for the position of one further square. The errors in the folder are then caused
     by the noise alone. The folder also contains pictures of the mirror region without and with this square.
@@ -100,7 +95,7 @@ def design_command(
     Example: isocharge simulate design four-25um-biaxial --guard --radius 8 -o guarded
     """
     # Check the options, and describe the search.
-    prepare_target(output)
+    refuse_existing(output)
     footprint = parse_probe(probe)
     if not isinstance(footprint, Circle):
         raise InputError(f"--probe: expected circle:RADIUS, for which layouts are designed, got {probe}")
@@ -127,21 +122,8 @@ def design_command(
     )
     warn_of_stress(case.sensor.film, [footprint], force, stress_limit)
 
-    # Search for the positions, and write the files. An interrupted search is resumed only if all values of `identity`
-    # are unchanged.
-    identity = {
-        "made_by": code_fingerprint(),
-        "sensor": sensor_to_dict(case.sensor),
-        "case": case.to_dict(),
-        "weights": case.goal.table.tolist() if isinstance(case.goal, WeightMap) else None,
-        "guard": guard,
-    }
-    with (
-        shown_run(output),
-        resume_parts(output, identity, fresh=fresh) as run,
-        executor_for(workers, None) as pool,
-    ):
-        executor = run.storing_executor("design", pool)
+    # Search for the positions, and write the files.
+    with shown_progress(), executor_for(workers, None) as executor:
         if guard:
             guard_design = design_guard(case, executor=executor)
             write_guard_design(guard_design, output)

@@ -8,23 +8,21 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from isocharge.cli.shared.forward_maps import executor_for, shown_run, sweep_radius, warn_of_stress, write_deflection
+from isocharge.cli.shared.forward_maps import executor_for, sweep_radius, warn_of_stress, write_deflection
 from isocharge.cli.shared.options import (
     ClusterOption,
     ForceRangeOption,
-    FreshOption,
     RadiusOption,
     SensorArgument,
     StressLimitOption,
     WorkersOption,
 )
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError, OutputExists
 from isocharge.common.extras import require
 from isocharge.common.files import refuse_existing
 from isocharge.common.measured_presses import MAX_ROWS
-from isocharge.common.resumable_run import prepare_target
 from isocharge.serve import MeasuredPresses, write_presses
 from isocharge.simulate import Dataset, Sweep, load_sensor, parse_probe, read_dataset, run_sweep
 from isocharge.simulate.sensor.probe import PROBE_HELP
@@ -90,12 +88,8 @@ def sweep_command(
     stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
-    fresh: FreshOption = False,
 ) -> None:
     """Simulate many presses at different positions and forces, and write their charges as a dataset for training.
-
-    If the run is interrupted, its finished parts remain in DIR.part. The same command then resumes the run. The
-    resulting files have the same bytes as those of a run without interruption.
 
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
@@ -110,14 +104,14 @@ def sweep_command(
         folder = output.with_suffix("")
         has_one_orientation = len(probes) == 1 and orientation is Orientation.fixed
         _check_table(table, folder, samples, has_one_orientation=has_one_orientation)
-    prepare_target(folder)
+    refuse_existing(folder)
 
     _, max_force = force
     warn_of_stress(film_sensor.film, probes, max_force, stress_limit)
-    with shown_run(folder), executor_for(workers, cluster) as executor:
+    with shown_progress(), executor_for(workers, cluster) as executor:
         largest_distance = sweep_radius(radius, film_sensor, probes, force)
         sweep = Sweep(largest_distance, force, samples, seed, orientation.value, sampling.value)
-        run_sweep(folder, film_sensor, probes, sweep, executor=executor, fresh=fresh)
+        run_sweep(folder, film_sensor, probes, sweep, executor=executor)
     write_deflection(folder, film_sensor.film, probes)
     if table is not None:
         write_presses(table, _presses(read_dataset(folder)))

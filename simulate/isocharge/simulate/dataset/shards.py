@@ -15,7 +15,7 @@ presses has the same format, but its manifest has no entries `solver` and `seed`
 
 import io
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -124,72 +124,39 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
         OutputExists: If the folder already exists.
         DatasetError: If a column of a shard has a wrong shape or type, or contains a number that is not finite.
     """
-    # The files are written into a temporary folder, which is renamed to `folder` when the dataset is complete.
-    with new_folder(folder) as temporary_folder:
-        entries = []
-        for index, samples in enumerate(shards):
-            name, data = pack_shard(index, samples, sensor)
-            write_whole(temporary_folder / name, data)
-            n_outside = int(samples.columns()["outside"].sum())
-            entries.append(shard_entry(name, len(samples), n_outside, data))
-        write_manifest(temporary_folder, folder.name, sensor, entries, about)
+    with new_folder(folder) as draft:
+        write_files(draft, folder.name, sensor, shards, about)
     return folder
 
 
-def pack_shard(number: int, samples: Samples, sensor: Sensor) -> tuple[str, bytes]:
-    """Convert samples into the content of the file of a shard.
+def write_files(folder: Path, name: str, sensor: Sensor, shards: Iterable[Samples], about: dict[str, Any]) -> None:
+    """Write the files of a dataset into an empty folder: the shards, the manifest and the data card.
 
     Args:
-        number: Number of the shard, from 0.
-        samples: Samples of the shard.
-        sensor: Sensor to which the charges belong.
-
-    Returns:
-        Name and content of the file.
-
-    Raises:
-        DatasetError: If a column has a wrong shape or type or contains a number that is not finite, or if the file is
-            too large.
-    """
-    name = shard_name(number)
-    _check_samples(samples, len(sensor.electrodes), name)
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **samples.columns())
-    data = buffer.getvalue()
-    if len(data) > MAX_SHARD_BYTES:
-        raise DatasetError(f"{name}: expected at most {MAX_SHARD_BYTES} bytes, got {len(data)}; make smaller shards")
-    return name, data
-
-
-def shard_name(number: int) -> str:
-    """Return the file name of the shard with the given number."""
-    return f"shard-{number:05d}.npz"
-
-
-def shard_entry(name: str, samples: int, outside: int, data: bytes) -> dict[str, Any]:
-    """Return the entry of the manifest that describes a shard.
-
-    Args:
-        name: File name of the shard.
-        samples: Number of samples in the shard.
-        outside: Number of these samples that lie outside the working area.
-        data: Content of the file.
-    """
-    return {"file": name, "samples": samples, "outside": outside, "sha256": sha256_of(data)}
-
-
-def write_manifest(
-    folder: Path, name: str, sensor: Sensor, entries: Sequence[dict[str, Any]], about: dict[str, Any]
-) -> None:
-    """Write the manifest and the data card of a dataset.
-
-    Args:
-        folder: Folder that contains the shards.
+        folder: The empty folder.
         name: Name of the dataset, which may differ from the name of the folder.
         sensor: Sensor to which the charges belong.
-        entries: Entries of the manifest that describe the shards.
-        about: Entries of the manifest about the origin of the samples.
+        shards: Samples of each shard, as for `write_dataset`.
+        about: Entries of the manifest about the origin of the samples, as for `write_dataset`.
+
+    Raises:
+        DatasetError: If a column of a shard has a wrong shape or type or contains a number that is not finite, or if a
+            file is too large.
     """
+    entries: list[dict[str, Any]] = []
+    for index, samples in enumerate(shards):
+        file_name = f"shard-{index:05d}.npz"
+        _check_samples(samples, len(sensor.electrodes), file_name)
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **samples.columns())
+        data = buffer.getvalue()
+        if len(data) > MAX_SHARD_BYTES:
+            raise DatasetError(
+                f"{file_name}: expected at most {MAX_SHARD_BYTES} bytes, got {len(data)}; make smaller shards"
+            )
+        write_whole(folder / file_name, data)
+        n_outside = int(samples.columns()["outside"].sum())
+        entries.append({"file": file_name, "samples": len(samples), "outside": n_outside, "sha256": sha256_of(data)})
     manifest = {
         "format_version": FORMAT_VERSION,
         "package_version": metadata.version("isocharge"),
@@ -198,7 +165,7 @@ def write_manifest(
         **about,
         "columns": COLUMNS,
         "samples": sum(entry["samples"] - entry["outside"] for entry in entries),
-        "shards": list(entries),
+        "shards": entries,
     }
     write_whole(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
     write_whole(folder / "README.md", data_card(name, manifest).encode())

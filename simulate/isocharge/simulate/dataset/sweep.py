@@ -5,13 +5,12 @@ and the clamp, a coarse map of the whole film is built, with a round probe. Its 
 because a network only learns from these presses which charges belong to no contact in its working area.
 
 The division of the work into tasks does not depend on the executor. The files of the dataset are therefore the same for
-every executor. Finished parts are saved in a folder next to the dataset, so that an interrupted run can be resumed.
+every executor. The dataset is written completely or not at all.
 """
 
 import logging
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict
 from itertools import tee
 from pathlib import Path
 from typing import Any
@@ -20,25 +19,20 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import SceneError, SolveError
+from isocharge.common.files import new_folder, refuse_existing
 from isocharge.common.progress import report, reporting_as, second_thread
-from isocharge.common.resumable_run import ResumableRun, output_errors, prepare_target, resume_folder
 from isocharge.simulate.dataset.sampling import SAMPLING_DESCRIPTIONS, Sweep, SweepPresses
 from isocharge.simulate.dataset.shards import (
     Samples,
-    pack_shard,
-    shard_entry,
-    shard_name,
     write_dataset,
-    write_manifest,
+    write_files,
 )
 from isocharge.simulate.execution.blas import single_threaded_blas
-from isocharge.simulate.execution.code_version import code_fingerprint
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.stress_limit import yield_force
 
@@ -67,11 +61,8 @@ def run_sweep(
     *,
     executor: Executor | None = None,
     shard: int = SHARD_SIZE,
-    fresh: bool = False,
 ) -> Path:
     """Compute the charges of the presses of a sweep, and write them as a dataset.
-
-    If a run is interrupted, a call with the same arguments resumes the run.
 
     Args:
         folder: Folder that is created. It must not exist yet.
@@ -82,7 +73,6 @@ def run_sweep(
         executor: Executor that runs the tasks, such as a process pool or the executor of a Dask cluster; None for this
             process. The files do not depend on the executor.
         shard: Number of samples in a shard, which is one file of the dataset.
-        fresh: Whether to delete the saved parts of an interrupted run instead of resuming this run.
 
     Returns:
         Path of the folder.
@@ -90,50 +80,26 @@ def run_sweep(
     Raises:
         SceneError: If a press of the sweep cannot exist.
         SolveError: If a press has no equilibrium, or the interpolation error of a forward map is too large.
-        OutputExists: If the folder already exists, or if there is an interrupted run with different settings. This
-            error is raised before the computation starts.
-        OutputError: If a file cannot be written. The finished parts remain saved.
-        WorkersLost: If the executor loses its workers. The finished parts remain saved.
+        OutputExists: If the folder already exists. This error is raised before the computation starts.
+        OutputError: If a file cannot be written.
+        WorkersLost: If the executor loses its workers.
     """
     folder = Path(folder)
     probes = tuple(probes)
-    prepare_target(folder)
+    refuse_existing(folder)
 
     # The presses are computed before files are written, because SciPy ignores an interrupt during this computation.
     presses = sweep.over(probes)
 
-    # An interrupted run is resumed only if all these values are the same.
-    identity = {
-        "made_by": code_fingerprint(),
-        "sensor": sensor_to_dict(sensor),
-        "probes": [f"{probe.notation}@{np.rad2deg(probe.angle):.12g}" for probe in probes],
-        "sweep": asdict(sweep),
-        "solver": asdict(settings),
-        "shard": shard,
-    }
-
-    # BLAS is faster with one thread, because the matrices are small. At the end of the block, the folder of the run is
-    # renamed to `folder`.
-    with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh) as run, second_thread() as thread:
+    # BLAS is faster with one thread, because the matrices are small.
+    with new_folder(folder) as draft, single_threaded_blas(), second_thread() as thread:
         # The solves of the whole film keep the workers busy while this thread fits the maps of the probes.
-        outside_executor = run.storing_executor("solve-outside", executor)
-        outside_job = thread.submit(outside_map, sensor, probes, sweep, executor=outside_executor)
-        maps = [
-            ForwardMap.build(
-                sensor,
-                probe,
-                sweep.radius,
-                sweep.force_range,
-                settings,
-                executor=run.storing_executor(f"solve-{number:02d}", executor),
-            )
-            for number, probe in enumerate(probes)
-        ]
+        outside_job = thread.submit(outside_map, sensor, probes, sweep, executor=executor)
+        maps = solve_maps(sensor, probes, sweep, settings, executor=executor)
         whole_film = outside_job.result()
         shards = _shards(sweep, presses, shard, whole_film)
-        entries = _finish_shards(run, maps, whole_film, shards, executor)
-        with output_errors(folder):
-            write_manifest(run.data, folder.name, sensor, entries, _manifest_entries(maps, whole_film, sweep))
+        samples = _with_progress(_samples(maps, whole_film, shards, executor), sum(map(len, shards)))
+        write_files(draft, folder.name, sensor, samples, _manifest_entries(maps, whole_film, sweep))
     return folder
 
 
@@ -205,7 +171,7 @@ def outside_samples(sensor: Sensor, probes: Sequence[Probe], sweep: Sweep) -> Sa
 def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
     """Compute the charges of a sweep with given forward maps, and write them as a dataset.
 
-    In contrast to `run_sweep`, the charges are computed in this process, and an interrupted run cannot be resumed.
+    In contrast to `run_sweep`, the charges are computed in this process.
 
     Args:
         folder: Folder that is created. It must not exist yet.
@@ -264,50 +230,14 @@ def _manifest_entries(maps: Sequence[ForwardMap], whole_film: ForwardMap | None,
     }
 
 
-def _finish_shards(
-    run: ResumableRun,
-    maps: Sequence[ForwardMap],
-    whole_film: ForwardMap | None,
-    shards: Sequence[SweepPresses],
-    executor: Executor | None,
-) -> list[dict[str, Any]]:
-    """Compute and save the shards of a sweep that have not been saved yet.
-
-    A shard is one file of the dataset. An interrupted run of the same sweep may have saved some shards. The progress is
-    reported.
-
-    Args:
-        run: Run of the program that computes the sweep. Its folder contains the saved shards.
-        maps: Forward map of each probe.
-        whole_film: Map of the presses outside the radius of the sweep; None if there are none.
-        shards: Presses of each shard.
-        executor: Executor that computes the charges; None for this process.
-
-    Returns:
-        Entries of the manifest that describe all shards, in the order of the shards.
-    """
-    # Load the shards that an interrupted run has saved. The argument `final` states that a shard is a file of the
-    # dataset, and not only an intermediate result.
-    n_press = sum(map(len, shards))
-    entries: dict[int, dict[str, Any]] = {}  # by the index of the shard
-    for index, presses in enumerate(shards):
-        data = run.load(shard_name(index), bytes, final=True)
-        if data is not None:
-            entries[index] = shard_entry(shard_name(index), len(presses), int(presses.is_outside.sum()), data)
-    finished_presses = sum(entry["samples"] for entry in entries.values())
-    missing_shards = [index for index in range(len(shards)) if index not in entries]
+def _with_progress(shards: Iterable[Samples], n_press: int) -> Iterator[Samples]:
+    """Yield the samples of shards, and report how many of the `n_press` presses are finished."""
+    finished_presses = 0
     report("pressing", finished_presses, n_press)
-
-    # Compute and save the missing shards.
-    missing_presses = [shards[index] for index in missing_shards]
-    missing_samples = _samples(maps, whole_film, missing_presses, executor)
-    for index, presses, samples in zip(missing_shards, missing_presses, missing_samples, strict=True):
-        name, data = pack_shard(index, samples, maps[0].sensor)
-        run.save(name, data, final=True)
-        entries[index] = shard_entry(name, len(presses), int(presses.is_outside.sum()), data)
+    for samples in shards:
         finished_presses += len(samples)
         report("pressing", finished_presses, n_press)
-    return [entries[index] for index in sorted(entries)]
+        yield samples
 
 
 def _shards(sweep: Sweep, presses: SweepPresses, size: int, whole_film: ForwardMap | None) -> list[SweepPresses]:

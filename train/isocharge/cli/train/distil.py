@@ -1,23 +1,22 @@
 """`isocharge train distil`: train a small network for microcontrollers on the answers of a model."""
 
+from functools import partial
 from typing import Annotated
 
 import typer
 
 from isocharge.cli.shared.forward_maps import simulated_presses
-from isocharge.cli.shared.options import ConfigOption, FreshOption, JsonOption, ModelArgument, ModelsOption
+from isocharge.cli.shared.options import ConfigOption, JsonOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.terminal import shown_progress
-from isocharge.cli.train.resumable_release import (
+from isocharge.cli.train.train_and_release import (
     ModelFolderOption,
     ReleaseOptions,
     VersionOption,
     train_and_release,
 )
 from isocharge.common.errors import InputError
-from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve import find_model, load_model
-from isocharge.train import Fitted, StudentCase, fit, load_config, release, student_config, student_data
-from isocharge.train.training.fit import fit_identity
+from isocharge.train import StudentCase, fit, load_config, release, student_config, student_data
 
 
 def distil_command(
@@ -30,7 +29,6 @@ def distil_command(
     config: ConfigOption = None,
     models: ModelsOption = None,
     version: VersionOption = 1,
-    fresh: FreshOption = False,
     json: JsonOption = False,
 ) -> None:
     """Train a small network for microcontrollers, with about 5,000 weights and biases, on the answers of MODEL.
@@ -38,9 +36,6 @@ def distil_command(
     The small network, called the student, has the inputs and outputs of MODEL: contact, standard deviations and misfit.
     The student is trained on simulated presses within the working area and the range of forces of MODEL. The command
     `isocharge train export-c` writes the student as C source.
-
-    A run that was stopped leaves models/NAME/VERSION.part. The same command continues a stopped run and makes the same
-    student.
 
     Example: isocharge train distil four-25um-biaxial -o models/four-25um-biaxial-student
     """
@@ -58,16 +53,11 @@ def distil_command(
         fit_config = student_config("float32")
 
     case = StudentCase.of(load_model(model_folder).metadata)
-    options = ReleaseOptions(output, version, fresh=fresh, json=json)
+    options = ReleaseOptions(output, version, json=json)
     version_folder = options.check_version_folder(case.sensor.electrode_names)  # raises before the long computation
 
     # The student is trained on simulated presses and the contacts that the teacher estimates for them.
     with shown_progress():
         presses = simulated_presses(case.sensor, case.probes, case.domain.radius, case.domain.force_range)
     data = student_data(model_folder, presses)
-
-    def train(run: ResumableRun) -> Fitted:
-        """Train the student, and save the state of the training in the run."""
-        return fit(data, fit_config, run=run)
-
-    train_and_release(train, fit_identity(data, fit_config), version_folder, options, release)
+    train_and_release(partial(fit, data, fit_config), version_folder, options, release)

@@ -1,6 +1,7 @@
 """`isocharge train fit`: make a model from a dataset, from measured presses, or from the description of a sensor."""
 
 import shlex
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -10,11 +11,10 @@ from isocharge.cli.shared.forward_maps import simulated_presses, sweep_radius, w
 from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.options import (
     ConfigOption,
-    FreshOption,
     JsonOption,
 )
 from isocharge.cli.shared.terminal import say, shown_progress
-from isocharge.cli.train.resumable_release import (
+from isocharge.cli.train.train_and_release import (
     ModelFolderOption,
     ReleaseOptions,
     VersionOption,
@@ -22,7 +22,6 @@ from isocharge.cli.train.resumable_release import (
 )
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
-from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import (
     built_in_sensors,
@@ -31,9 +30,8 @@ from isocharge.simulate import (
     read_dataset,
 )
 from isocharge.simulate.sensor.probe import PROBE_HELP
-from isocharge.train import FitConfig, Fitted, TrainingData, fit, fit_presses, load_config, release
-from isocharge.train.training.cross_fit import presses_identity, usable_presses
-from isocharge.train.training.fit import fit_identity
+from isocharge.train import FitConfig, TrainingData, fit, fit_presses, load_config, release
+from isocharge.train.training.cross_fit import usable_presses
 
 DEFAULT_PROBE = "circle:1.0"
 """Notation of the probe if `--probe` is not given."""
@@ -82,7 +80,6 @@ def fit_command(
     force_std: ForceStdOption = 0.01,
     config: ConfigOption = None,
     version: VersionOption = 1,
-    fresh: FreshOption = False,
     json: JsonOption = False,
 ) -> None:
     """Train a network on charges, measure its errors, and write a model folder: ONNX file, card, golden vectors.
@@ -95,15 +92,12 @@ def fit_command(
     cross-validation, in which all presses at a place are left out together. If a sensor file describes the film,
     `isocharge train calibrate` needs far fewer presses.
 
-    A run that was stopped leaves models/NAME/VERSION.part. The same command continues a stopped run and makes the same
-    model.
-
     Example: isocharge train fit three-25um-biaxial -o models/three-25um-biaxial
 
     Example: isocharge train fit presses.csv -o models/pad
     """
     notations = probe or [DEFAULT_PROBE]
-    options = ReleaseOptions(output, version, fresh=fresh, json=json)
+    options = ReleaseOptions(output, version, json=json)
     if dataset is not None and _is_sensor(dataset):
         if sensor is not None:
             raise InputError(f"expected one sensor, got {dataset} and --sensor {sensor}; leave one of them out")
@@ -156,11 +150,8 @@ def _release_presses_model(
     version_folder = options.check_version_folder(presses.electrodes)
     sensor_name = options.model_folder.resolve().name  # the sensor has no other name than that of the model
 
-    def train(run: ResumableRun) -> Fitted:
-        """Train the network, and save the state of the training in the run."""
-        return fit_presses(presses, sensor_name, fit_config, probes=notations, run=run)
-
-    train_and_release(train, presses_identity(presses, fit_config), version_folder, options, release)
+    train = partial(fit_presses, presses, sensor_name, fit_config, probes=notations)
+    train_and_release(train, version_folder, options, release)
 
 
 def _release_data_model(
@@ -175,12 +166,7 @@ def _release_data_model(
         dataset: Dataset folder of the training data; None if there is none.
     """
     version_folder = options.check_version_folder(data.sensor.electrode_names)
-
-    def train(run: ResumableRun) -> Fitted:
-        """Train the network, and save the state of the training in the run."""
-        return fit(data, fit_config, run=run)
-
-    train_and_release(train, fit_identity(data, fit_config), version_folder, options, release, dataset)
+    train_and_release(partial(fit, data, fit_config), version_folder, options, release, dataset)
 
 
 def _read_or_simulate_data(dataset: Path | None, sensor: str | None, notations: list[str], radius: str) -> TrainingData:

@@ -26,9 +26,8 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.errors import ModelError, PressError
-from isocharge.common.files import as_output_errors, remove_empty, write_whole
+from isocharge.common.files import as_output_errors, locked, remove_empty, write_whole
 from isocharge.common.measured_presses import presses_text
-from isocharge.common.resumable_run import locked
 from isocharge.serve.model.charge_series import FILE as CHARGES
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, version_folders

@@ -16,7 +16,6 @@ import logging
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from importlib import metadata
 
 import numpy as np
 import torch
@@ -26,7 +25,6 @@ from torch import Tensor
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import PressError, cut
 from isocharge.common.measured_presses import MeasuredPresses, presses_text
-from isocharge.common.resumable_run import ResumableRun
 from isocharge.common.statistics import rms
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
 from isocharge.train.data.measured_checks import check_measured_presses
@@ -90,7 +88,6 @@ def fit_presses(
     config: FitConfig | None = None,
     *,
     probes: tuple[str, ...] = ("unknown",),
-    run: ResumableRun | None = None,
 ) -> Fitted:
     """Train a network on measured presses of any sensor with three to eight channels.
 
@@ -105,7 +102,6 @@ def fit_presses(
         config: Settings. The setting `steps` is the largest number of steps. The settings `noise` and `hold_out` are
             not used.
         probes: Notations of the probes.
-        run: Run that saves the state, so that an interrupted training can be continued.
 
     Returns:
         The network that learned the mean outputs, with everything that a release needs.
@@ -131,7 +127,7 @@ def fit_presses(
         )
         # For the cross-validation, train a network for each fold on the presses of all other folds.
         fold_of_press = folds_by_place(labelled.contact, N_FOLDS)
-        steps = _train_fold_networks(fold_networks, labelled, fold_of_press, noise, training, run)
+        steps = _train_fold_networks(fold_networks, labelled, fold_of_press, noise, training)
         contact, std = _cross_validated_contact(fold_networks, labelled.charge, fold_of_press)
         position_factor, force_factor = std_factors(contact, std, labelled.contact)
         if force_std is not None:
@@ -139,10 +135,9 @@ def fit_presses(
 
         # Train the returned network: its contacts on the mean outputs of the other networks, then its misfits.
         distillation = _distillation_stage(network, fold_networks, labelled, noise, training)
-        train_perceptron(distillation, network.contact, settings, run)
-        draw = partial(_misfit_examples, labelled, domain, noise, training)
-        examples = _saved_or_drawn(draw, run)
-        train_perceptron(misfit_stage(network, examples, training), network.misfit_vector, settings, run)
+        train_perceptron(distillation, network.contact, settings)
+        examples = _misfit_examples(labelled, domain, noise, training)
+        train_perceptron(misfit_stage(network, examples, training), network.misfit_vector, settings)
 
     cross_validated = Answers(
         contact=contact,
@@ -170,20 +165,6 @@ def fit_presses(
         cross_validated=cross_validated,
         is_force_constant=force_std is not None,
     )
-
-
-def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, object]:
-    """Return all values on which the trained weights depend.
-
-    An interrupted training is continued only if its values were the same.
-    """
-    return {
-        "presses_sha256": presses_sha256(presses),
-        "electrodes": list(presses.electrodes),
-        "config": config.to_dict(),
-        "isocharge": metadata.version("isocharge"),
-        "torch": torch.__version__,
-    }
 
 
 def _made_with(
@@ -330,7 +311,6 @@ def _train_fold_networks(
     fold_of_press: Integers,
     noise: ChannelNoise,
     config: TrainingConfig,
-    run: ResumableRun | None,
 ) -> int:
     """Train one network for each fold on the presses of all other folds.
 
@@ -343,7 +323,6 @@ def _train_fold_networks(
         fold_of_press: Index of the fold of each press, shape (n,).
         noise: Noise of the charges.
         config: Largest number of steps, learning rate and seed.
-        run: Run that saves the state; None to save nothing.
 
     Returns:
         Number of steps that was best for the first network.
@@ -369,7 +348,7 @@ def _train_fold_networks(
         named_stage = replace(stage, name=f"contact-{fold_index + 1}-{steps}")
         patience = max(steps // 2, 1)  # the training ends after half of its steps without a better score
         descent = Descent(named_stage, config.learning_rate, patience, config.seed + fold_index)
-        descent.run(run)
+        descent.run()
         return descent
 
     first_network = fold_networks[0]
@@ -527,20 +506,6 @@ def _misfit_examples(
     _, charge = draw_charges(rng, presses.charge[chosen_rows], presses.charge, noise)
     residual = planes.residuals(noise.level(charge))
     return np.stack([charge, residual])
-
-
-def _saved_or_drawn(draw: Callable[[], Array], run: ResumableRun | None) -> Array:
-    """Return the examples that a run has saved. If the run has no examples, draw the examples and save them.
-
-    Args:
-        draw: Function that draws the examples.
-        run: Run that saves the examples; None to save nothing.
-    """
-    if run is None:
-        return draw()
-    # This executor calls `draw` only if the run has not saved a result under this name.
-    examples: Array = run.storing_executor("misfit-charges").submit(draw).result()
-    return examples
 
 
 def _cross_validated_misfit(

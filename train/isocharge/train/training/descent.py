@@ -1,13 +1,11 @@
-"""Training of one network by gradient descent with early stopping and checkpoints.
+"""Training of one network by gradient descent with early stopping.
 
 The usual optimiser is SOAP (`isocharge.train.training.soap`). The learning rate increases during the first tenth of the
 steps and then decreases to zero along a cosine.
 """
 
 import copy
-import io
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, Protocol
@@ -17,7 +15,6 @@ from torch import Tensor, nn
 
 from isocharge.common.errors import TrainingError
 from isocharge.common.progress import report
-from isocharge.common.resumable_run import ResumableRun
 from isocharge.train.training.soap import Soap
 
 RATE_INCREASE_FRACTION = 0.1
@@ -38,9 +35,6 @@ RETRY_RATE_FACTOR = 0.5
 MAX_RETRIES = 8
 """Largest number of losses that are not finite. After more of them, the training is given up."""
 
-SAVE_EVERY_S = 3.0
-"""Time between two checkpoints, s."""
-
 
 class Optimiser(Protocol):
     """An optimiser: `Soap`, or one of PyTorch.
@@ -53,12 +47,6 @@ class Optimiser(Protocol):
 
     def step(self) -> Any:
         """Change the parameters."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state that a checkpoint contains."""
-
-    def load_state_dict(self, state: dict[str, Any], /) -> None:
-        """Continue from a result of `state_dict`."""
 
 
 def soap_optimiser(stage: "TrainingStage") -> list[Optimiser]:
@@ -153,7 +141,7 @@ class Descent:
         self.best_step = 0
         self.best_weights = copy.deepcopy(stage.network.state_dict())
 
-    def run(self, resumable_run: ResumableRun | None = None) -> None:
+    def run(self) -> None:
         """Train the network, and finally restore the weights with the best validation score.
 
         The training ends after all steps of the stage, or earlier if the validation score has not improved in the last
@@ -162,19 +150,9 @@ class Descent:
         If a loss, a gradient or a validation score is not finite, the best weights so far are restored. The training
         continues from them with new optimisers and half of the learning rate.
 
-        Args:
-            resumable_run: Run that saves the state every few seconds. An interrupted training can then be continued,
-                and ends with the same weights. None to save nothing.
-
         Raises:
             TrainingError: If the loss is not finite in more than `MAX_RETRIES` steps, or no validation score is finite.
         """
-        last_save_s = time.monotonic()
-        if resumable_run is not None:
-            state = resumable_run.load(self.stage.name, tensors_from_bytes)  # None if nothing was saved
-            if state is not None:
-                self._restore(state)
-
         validation_interval = min(REPORT_EVERY, self.patience)
         is_stalled = False
         while self.step < self.stage.steps and not is_stalled:
@@ -183,12 +161,7 @@ class Descent:
             if is_last_step or self.step % validation_interval == 0:
                 self._evaluate(loss.item())
                 is_stalled = self._is_stalled()
-            if resumable_run is not None and time.monotonic() - last_save_s >= SAVE_EVERY_S:
-                resumable_run.save(self.stage.name, tensor_bytes(self._state()))
-                last_save_s = time.monotonic()
 
-        if resumable_run is not None:
-            resumable_run.save(self.stage.name, tensor_bytes(self._state()))
         if not math.isfinite(self.best_score):
             raise TrainingError(
                 f"the {self.stage.name} network has no finite validation score after {self.step} steps; lower "
@@ -273,48 +246,6 @@ class Descent:
         """Return whether the validation score has not improved for `patience` steps. Warm-up steps are not counted."""
         first_counted_step = max(self.best_step, self.stage.warm_up_steps)
         return self.step - first_counted_step >= self.patience
-
-    def _state(self) -> dict[str, Any]:
-        """Return the state that a checkpoint contains."""
-        return {
-            "part": self.stage.network.state_dict(),  # the present weights, not the best weights
-            "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
-            "random": self.random.get_state(),
-            "step": self.step,
-            "best": (self.best_score, self.best_step),
-            "rate": (self.rate, self.retry_count),
-            "best_weights": self.best_weights,
-        }
-
-    def _restore(self, state: dict[str, Any]) -> None:
-        """Continue from the state of a checkpoint.
-
-        Args:
-            state: Result of `_state`.
-        """
-        self.stage.network.load_state_dict(state["part"])
-        for optimiser, optimiser_state in zip(self.optimisers, state["optimisers"], strict=True):
-            optimiser.load_state_dict(optimiser_state)
-        self.random.set_state(state["random"])
-        self.step = state["step"]
-        self.best_score, self.best_step = state["best"]
-        self.rate, self.retry_count = state["rate"]
-        self.best_weights = state["best_weights"]
-
-
-def tensor_bytes(state: object) -> bytes:
-    """Convert tensors, numbers and texts to bytes that a `ResumableRun` can save."""
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    return buffer.getvalue()
-
-
-def tensors_from_bytes(data: bytes) -> Any:
-    """Convert the result of `tensor_bytes` back to tensors, numbers and texts.
-
-    The bytes cannot contain code that would be executed.
-    """
-    return torch.load(io.BytesIO(data), weights_only=True)
 
 
 def _relative_rate(progress: float) -> float:

@@ -11,7 +11,6 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from importlib import metadata
 
 import torch
 from threadpoolctl import threadpool_limits
@@ -20,7 +19,6 @@ from torch import Tensor
 from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.errors import ConfigError
 from isocharge.common.progress import second_thread
-from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve.model.charge_series import FILE as CHARGES_FILE
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import Dataset, NoiseModel, Sensor
@@ -72,7 +70,7 @@ N_STD_PRESSES = 30_000
 """Number of presses with noise to which the standard deviations of a trained network are fitted."""
 
 
-def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run: ResumableRun | None = None) -> Fitted:
+def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitted:
     """Train a network on presses, fold it into the form of a release, and calibrate its standard deviations.
 
     A warning is logged if two contacts of the requested domain have the same charges. Another warning is logged if the
@@ -81,7 +79,6 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
     Args:
         source: A dataset, simulated or measured, or other training data, for example of a student.
         config: Sizes, steps, noise and seed; None for the defaults.
-        run: Saves the state, so that an interrupted training can be continued.
 
     Returns:
         The trained network with everything that a release needs.
@@ -95,7 +92,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
     n_electrode = len(data.sensor.electrode_names)
     checked_config = (config or FitConfig()).checked()
     settings = checked_config.for_electrodes(n_electrode)
-    trained = train_network(data, settings, run=run)
+    trained = train_network(data, settings)
 
     # The threshold of the misfit needs many good presses. Of few measured presses, those for training are used, too.
     split = trained.split
@@ -183,23 +180,6 @@ def _provenance(
     return replace(data.provenance, made_with=made_with, files=files)
 
 
-def fit_identity(data: TrainingData, config: FitConfig) -> dict[str, object]:
-    """Return all values on which the trained weights depend.
-
-    An interrupted training is continued only if its values were the same.
-    """
-    identity: dict[str, object] = {
-        "dataset_sha256": data.sha256,
-        "noise": config.training.noise_model.to_dict(),
-        "config": config.to_dict(),
-        "isocharge": metadata.version("isocharge"),
-        "torch": torch.__version__,
-    }
-    if data.teacher is not None:
-        identity["teacher_sha256"] = data.teacher.sha256
-    return identity
-
-
 @dataclass(frozen=True)
 class TrainedNetwork:
     """A trained network in PyTorch, the presses of its training, and the presses outside the working area."""
@@ -209,7 +189,7 @@ class TrainedNetwork:
     outside: OutsidePresses | None
 
 
-def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | None = None) -> TrainedNetwork:
+def train_network(data: TrainingData, config: FitConfig) -> TrainedNetwork:
     """Train the contact perceptron and the misfit perceptron at the same time, in two threads.
 
     The misfit perceptron is trained on examples from the working area and from the rest of the film.
@@ -217,7 +197,6 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
     Args:
         data: Presses, and possibly a teacher.
         config: Sizes, steps, noise and seed.
-        run: Saves the state, so that an interrupted training can be continued.
 
     Raises:
         ConfigError: If the configuration is for another number of electrodes.
@@ -233,14 +212,14 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
             _log.warning("%s", caution)
         features = split.features(misfit_noise(training.noise_model))
         network = InverseNetwork(split.domain, features, config.network)
-        examples = MisfitExamples(split, features, training, run)
+        examples = MisfitExamples(split, features, training)
         inner_examples = examples.inner()
         outside = None if data.presses.measured else OutsidePresses.of(split.domain, data.presses, data.outside)
 
         def train_misfit() -> None:
             """Train the misfit perceptron on examples from the working area and from the rest of the film."""
             all_examples = examples.with_outside(inner_examples, outside)
-            train_perceptron(misfit_stage(network, all_examples, training), network.misfit_vector, config, run)
+            train_perceptron(misfit_stage(network, all_examples, training), network.misfit_vector, config)
 
         # Second thread: train the misfit perceptron. This thread: train the contact perceptron
         misfit_training = executor.submit(train_misfit)
@@ -257,7 +236,7 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
             teacher=data.teacher,
             linear_targets=linear_targets,
         )
-        train_perceptron(stage, network.contact, config, run)
+        train_perceptron(stage, network.contact, config)
         misfit_training.result()
     return TrainedNetwork(network.eval(), split, outside)
 
@@ -295,9 +274,7 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
         torch.set_num_threads(previous_count)
 
 
-def train_perceptron(
-    stage: TrainingStage, perceptron: TrainablePerceptron, config: FitConfig, run: ResumableRun | None
-) -> None:
+def train_perceptron(stage: TrainingStage, perceptron: TrainablePerceptron, config: FitConfig) -> None:
     """Train a perceptron. If the configuration requires it, also round the hidden weights to 8 bits.
 
     After the rounding, the other weights are trained further. In the further training, the steps are counted from the
@@ -307,10 +284,9 @@ def train_perceptron(
         stage: Loss, validation score and number of steps.
         perceptron: The perceptron of the stage.
         config: Form of the weights, learning rate, patience and seed.
-        run: Saves the state, so that an interrupted training can be continued.
     """
     settings = config.training
-    Descent(stage, settings.learning_rate, settings.patience, settings.seed).run(run)
+    Descent(stage, settings.learning_rate, settings.patience, settings.seed).run()
     if config.network.weights != "int8":
         return
 
@@ -327,7 +303,7 @@ def train_perceptron(
         steps=round(ROUNDED_FRACTION * stage.steps),
         warm_up_steps=0,
     )
-    Descent(rounded_stage, settings.learning_rate, settings.patience, settings.seed).run(run)
+    Descent(rounded_stage, settings.learning_rate, settings.patience, settings.seed).run()
 
 
 def contact_stage(

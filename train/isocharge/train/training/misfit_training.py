@@ -4,9 +4,7 @@ An example consists of a set of charges and the residuals of these charges with 
 nearest contact is found by a search.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
@@ -14,7 +12,6 @@ from torch import Tensor
 
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import FEW_ELECTRODES
-from isocharge.common.resumable_run import ResumableRun
 from isocharge.train.data.channel_noise import ChannelNoise, Noise
 from isocharge.train.data.misfit_charges import (
     ExampleOptions,
@@ -67,32 +64,26 @@ It is twice the smallest threshold of the flag `misfit`.
 class MisfitExamples:
     """Source of the examples from which the misfit network learns.
 
-    An example consists of a set of charges and their residuals with respect to the nearest contact. The examples are
-    saved in the run, because the search for the nearest contacts takes a long time.
+    An example consists of a set of charges and their residuals with respect to the nearest contact.
 
     Attributes:
         split: Presses for training, and the charge field in which the search finds the nearest contacts.
         features: Input features of the network. Their limits are also the limits of the charges of both signs.
         config: Noise, number of examples and seed.
-        run: Run that saves the examples; None if they are not saved.
     """
 
     split: Split
     features: WhitenedFeatures
     config: TrainingConfig
-    run: ResumableRun | None
 
     def inner(self) -> Array:
         """Draw examples from presses inside the working area; see `draw_misfit_examples`.
-
-        If the run has saved examples, these are returned instead.
 
         Returns:
             Array of shape (2, n, n_electrode): first the charges, pC, and then their residuals with respect to the
             nearest contact, in standard deviations of the noise.
         """
-        draw = partial(
-            draw_misfit_examples,
+        return draw_misfit_examples(
             self.split.train,
             self.split.field,
             self._noise(),
@@ -100,7 +91,6 @@ class MisfitExamples:
             self.config.seed,
             options=self._options,
         )
-        return self._saved_or_drawn("misfit-charges", draw)
 
     def with_outside(self, inner_examples: Array, outside: OutsidePresses | None) -> Array:
         """Replace a fraction of the examples by examples of presses outside the working area.
@@ -117,8 +107,7 @@ class MisfitExamples:
         seed = self.config.seed
         outside_share = MANY_OUTSIDE_SHARE if self._has_many_electrodes else OUTSIDE_SHARE
         n_outside = round(outside_share * self._example_count)
-        draw = partial(
-            draw_outside_examples,
+        outside_examples = draw_outside_examples(
             outside.train.charge,
             self.split.field,
             self._noise(),
@@ -126,7 +115,6 @@ class MisfitExamples:
             seed,
             options=self._options,
         )
-        outside_examples = self._saved_or_drawn("misfit-outside", draw)
 
         # Arrays of examples have the shape (2, n, n_electrode). The first `n_outside` examples are replaced. The second
         # axis is then shuffled, because the last examples are used for validation.
@@ -170,19 +158,6 @@ class MisfitExamples:
         if self._has_positive_charges:
             return noise
         return ChannelNoise.alike(noise, self.features.charge_features.n_electrode)
-
-    def _saved_or_drawn(self, name: str, draw: Callable[[], Array]) -> Array:
-        """Return the examples that the run has saved under a name. If the run has saved none, draw and save examples.
-
-        Args:
-            name: Name of the examples in the run.
-            draw: Function that draws the examples.
-        """
-        if self.run is None:
-            return draw()
-        # This executor calls `draw` only if the run has not saved a result under this name.
-        examples: Array = self.run.storing_executor(name).submit(draw).result()
-        return examples
 
 
 def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:

@@ -6,7 +6,6 @@ separately. In this basis, Adam therefore comes close to a second-order method (
 algorithm 3). The eigenvectors change slowly, and are updated every few steps by one orthogonal iteration.
 """
 
-import copy
 from collections.abc import Iterable
 from typing import Any
 
@@ -78,14 +77,6 @@ class Soap:
                 state = next(states)
                 if parameter.grad is not None:
                     _update(parameter, parameter.grad, state, group["lr"], group["betas"])
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the moving averages and the eigenvectors of all parameters, for a checkpoint."""
-        return {"states": self._states}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a result of `state_dict`."""
-        self._states = copy.deepcopy(state["states"])
 
 
 def _update(

@@ -1,18 +1,16 @@
-"""Resumable training and release of a model. `isocharge train fit` and `isocharge train distil` use this module."""
+"""Training and release of a model. `isocharge train fit` and `isocharge train distil` use this module."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol, TypeVar
+from typing import Annotated, Protocol, TypeVar
 
 import typer
 
-from isocharge.cli.shared.forward_maps import shown_run, write_deflection
-from isocharge.cli.shared.terminal import say, show_json, this_command
+from isocharge.cli.shared.forward_maps import write_deflection
+from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.deflection_field import DEFLECTION_FILE, read_deflection_field
-from isocharge.common.errors import IsochargeError, OutputError
 from isocharge.common.files import write_whole
-from isocharge.common.resumable_run import ResumableRun, resume_parts
 from isocharge.serve import ModelMetadata
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import parse_probe
@@ -62,13 +60,11 @@ class ReleaseOptions:
     Attributes:
         model_folder: Folder of the model, `models/NAME`.
         version: Number of the version folder.
-        fresh: Whether to delete the state of a stopped run and begin again.
         json: Whether to print the folder and the errors as one JSON object.
     """
 
     model_folder: Path
     version: int
-    fresh: bool
     json: bool
 
     def check_version_folder(self, electrodes: tuple[str, ...]) -> Path:
@@ -85,8 +81,7 @@ class ReleaseOptions:
 
 
 def train_and_release(
-    train: Callable[[ResumableRun], Trained],
-    identity: Mapping[str, Any],
+    train: Callable[[], Trained],
     version_folder: Path,
     options: ReleaseOptions,
     write_release: WriteRelease[Trained],
@@ -94,32 +89,16 @@ def train_and_release(
 ) -> None:
     """Train a network, release it as a version folder, and print its errors.
 
-    If the command is stopped, or if the release is refused, the state of the training is kept beside the version
-    folder, and the same command continues it.
-
     Args:
-        train: Function that trains the network and saves its state in the given run.
-        identity: Everything that determines the weights. A stopped run is only continued if it has the same identity.
+        train: Function that trains the network.
         version_folder: Folder to write, as `ReleaseOptions.check_version_folder` returned it.
         options: Options of the command.
         write_release: Function that writes the version folder.
         dataset: Dataset folder of the training, whose file with the deflection of the film is copied if there is one.
             If it is None, the deflection is computed.
-
-    Raises:
-        OutputError: If the release is refused after the training. The message states where the training is kept.
     """
-    model_folder = version_folder.parent
-    with shown_run(version_folder), resume_parts(version_folder, identity, fresh=options.fresh) as run:
-        trained = train(run)
-        try:
-            released = write_release(trained, model_folder, version=options.version, command=this_command())
-        except IsochargeError as error:
-            other_folder = model_folder.with_name("OTHER")
-            raise OutputError(
-                f"{error}; the finished training is kept in {run.folder}: mend the cause and repeat the command, or "
-                f"move that folder to {other_folder / run.folder.name} and repeat the command with -o {other_folder}"
-            ) from error
+    with shown_progress():
+        released = write_release(train(), version_folder.parent, version=options.version, command=this_command())
     _add_deflection(released, dataset)
     if options.json:
         show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})
