@@ -162,8 +162,6 @@ def test_shards_and_tasks_keep_the_order_of_the_presses(tmp_path):
 
 def test_unwritable_folder_raises_output_error(tmp_path):
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(
-        OutputError, match=r"file/presses cannot be written: Not a directory; choose another output"
-    ):
+    with pytest.raises(OutputError, match=r"file/presses cannot be written: Not a directory; choose another output"):
         run_sweep(tmp_path / "file" / "presses", SENSOR, (Circle(1.0),), small(), QUICK)
     assert (tmp_path / "file").read_text() == "mine"

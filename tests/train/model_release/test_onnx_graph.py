@@ -242,26 +242,28 @@ def add_a_node(model):
     model.graph.node.append(onnx.helper.make_node("Abs", ["misfit"], ["size"]))
 
 
+def remove_a_constant(model):
+    del model.graph.initializer[-3]
+
+
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change",
     [
-        (use_relu, r"expected one of the activations .* after a Gemm, got \['Relu'\]"),
-        (bypass_a_layer, r"expected the node Gemm\(result 0 of node 4, .*, got the node Gemm\(result 0 of node 3"),
-        (
-            split_into_other_widths,
-            r"expected the node Split\(.*\(3,\), \[2, 4, 3\]\).*got the node Split\(.*\[1, 5, 3\]",
-        ),
-        (use_infinite_bias, "expected finite constants"),
-        (use_one_bias_for_all_columns, r"expected a bias for each column of \(3, 16\), got \(1,\)"),
-        (use_another_misfit_unit, r"expected the node Mul\(.*5\.0\).*got the node Mul\(.*6\.0\)"),
-        (add_a_node, r"expected 16 nodes, got 17"),
+        use_relu,
+        bypass_a_layer,
+        split_into_other_widths,
+        use_infinite_bias,
+        use_one_bias_for_all_columns,
+        use_another_misfit_unit,
+        add_a_node,
+        remove_a_constant,
     ],
 )
-def test_a_graph_of_another_program_is_refused(change, message):
+def test_a_graph_of_another_program_is_refused(change):
     model = onnx.load_model_from_string(write_graph(random_network(3, (8, 8), (8, 8)), {}))
     read_graph(model.SerializeToString(), "f")
     change(model)
-    with pytest.raises(ModelError, match=f"^f: .*{message}.*; only models of isocharge can be read"):
+    with pytest.raises(ModelError, match=r"^f: (expected a graph that isocharge has written|not a valid ONNX file)"):
         read_graph(model.SerializeToString(), "f")
 
 

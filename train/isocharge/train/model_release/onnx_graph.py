@@ -1,21 +1,18 @@
 """Writer of the ONNX graph of a network, and reader that recovers the network from such a graph.
 
-The reader extracts the constants of a graph, writes a new graph with these constants, and compares both graphs node by
-node. Therefore, only the writer defines the structure of the graph. The reader refuses graphs that another program
-wrote.
+The reader extracts the constants of a graph, writes a new graph with these constants, and compares both graphs.
+Therefore, only the writer defines the structure of the graph. The reader refuses graphs that another program wrote.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from isocharge.common.activations import ACTIVATIONS, Activation
+from isocharge.common.activations import ACTIVATIONS
 from isocharge.common.arrays import Array
 from isocharge.common.charge_features import ChargeFeatures
 from isocharge.common.errors import ModelError, cut
@@ -25,7 +22,6 @@ from isocharge.train.training.folded_network import (
     COSINES_TO_CORRELATIONS,
     LOG_STD,
     MISFIT_UNIT,
-    N_CONTACT_ANSWERS,
     POSITION,
     FoldedNetwork,
 )
@@ -230,221 +226,53 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
     except Exception as error:  # protobuf's exceptions have no base in onnx
         raise ModelError(f"{where}: not a valid ONNX file ({cut(str(error))})") from error
 
-    versions = {entry.domain: entry.version for entry in model.opset_import}
-    if versions != {"": OPSET}:
-        _refuse(where, f"expected ONNX operators of version {OPSET} alone, got {versions}")
-
-    # A graph that is written for the recovered network must have the same nodes as the file. The nodes are compared
-    # before the counts of the nodes, because a message about the first different node is more helpful.
-    network = _recover_network(model.graph, where)
-    expected_nodes = list(_plain_nodes(_whole_model(network).graph))
-    given_nodes = list(_plain_nodes(model.graph))
-    for expected_node, given_node in zip(expected_nodes, given_nodes, strict=False):
-        if expected_node != given_node:
-            _refuse(where, f"expected the node {expected_node}, got the node {given_node}")
-    if len(expected_nodes) != len(given_nodes):
-        _refuse(where, f"expected {len(expected_nodes)} nodes, got {len(given_nodes)}")
+    try:
+        network = _recover_network(model.graph)
+        is_equal = _whole_model(network).graph == model.graph
+    except (LookupError, ValueError, StopIteration):  # the constants are too few, or their shapes do not fit a network
+        is_equal = False
+    has_operators = [(entry.domain, entry.version) for entry in model.opset_import] == [("", OPSET)]
+    if not (is_equal and has_operators):
+        raise ModelError(f"{where}: expected a graph that isocharge has written, got another graph; export it again")
     return network
 
 
-def _recover_network(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
+def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     """Return the network that a graph of `write_graph` evaluates.
 
+    The constants are taken in the order in which `write_graph` uses them: those of the features, those of the hidden
+    layers, the weights of the skip layer, and the bias and the weights of the last layer.
+
     Args:
         graph: The graph.
-        where: Beginning of the error messages.
 
     Raises:
-        ModelError: If the number or the shapes of the constants do not fit a network.
+        LookupError: If the graph has no activation, or too few constants.
+        ValueError: If the shapes of the constants do not fit a network, or a constant is not finite.
+        StopIteration: If the graph has too few constants.
     """
     operators = [node.op_type for node in graph.node]
-    activation = _hidden_activation(operators, where)
-    constants = _constants_in_order(graph, where)
-    is_signed = operators[:1] == ["Max"]  # the first node of a graph for charges of both signs
+    activations = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
+    activation = activations[operators[operators.index("Gemm") + 1]]
     n_hidden = operators.count(activation.onnx_operator)  # each hidden layer has one activation
-    # The order of the next statements is the order in which `write_graph` uses the constants: those of the features,
-    # those of the hidden layers, the weights of the skip layer, and the bias and the weights of the last layer.
-    try:
-        features = _take_features(constants, is_signed=is_signed)
-        hidden = [Layer(weight=next(constants), bias=next(constants)) for _ in range(n_hidden)]
-        skip = next(constants)
-        bias = next(constants)
-        perceptron = Perceptron(tuple(hidden), Layer(next(constants), bias), skip, activation)
-        next(constants)  # the widths of the split of the answers
-        has_limits = operators.count("Max") > is_signed  # the standard deviations have limits
-        limits = [next(constants), next(constants)] if has_limits else []
-    except StopIteration:
-        _refuse(where, f"expected more constants than these {len(graph.initializer)}")
-    _check_shapes(features, perceptron, where)
-    n_std = LOG_STD.stop - LOG_STD.start
-    if any(limit.shape != (n_std,) for limit in limits):
-        _refuse(where, f"expected {n_std} limits of standard deviations, got {[limit.shape for limit in limits]}")
-    return FoldedNetwork(features, perceptron, np.array(limits) if has_limits else None)
+    is_signed = operators[0] == "Max"  # the first node of a graph for charges of both signs
+    has_limits = operators.count("Max") > is_signed  # the standard deviations have limits
 
-
-def _hidden_activation(operators: Sequence[str], where: str) -> Activation:
-    """Return the activation of the hidden layers, which is the operator after the first linear layer.
-
-    Args:
-        operators: Operators of the nodes, in order.
-        where: Beginning of the error message.
-
-    Raises:
-        ModelError: If this operator is not an activation, or does not exist.
-    """
-    activation_of_operator = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
-    # The operator `Gemm` is a linear layer.
-    operators_after_gemm = [following for operator, following in pairwise(operators) if operator == "Gemm"]
-    first_following = operators_after_gemm[:1]  # empty if no operator follows a Gemm
-    if not first_following or first_following[0] not in activation_of_operator:
-        known_operators = ", ".join(activation_of_operator)
-        _refuse(where, f"expected one of the activations {known_operators} after a Gemm, got {first_following}")
-    return activation_of_operator[first_following[0]]
-
-
-def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
-    """Yield the values of the constants of a graph in the order in which the nodes use them.
-
-    Args:
-        graph: The graph.
-        where: Beginning of the error message about constants that are not finite.
-    """
-    constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
-    for node in graph.node:
-        for name in node.input:
-            if name not in constants:  # the input is the result of another node, or the charges
-                continue
-            if not np.isfinite(constants[name]).all():
-                _refuse(where, f"node {node.op_type} {list(node.output)}: expected finite constants")
-            yield constants[name].astype(float)
-
-
-def _take_features(constants: Iterator[Array], *, is_signed: bool) -> ChargeFeatures:
-    """Read the features from the first constants of a graph.
-
-    Args:
-        constants: Iterator over the constants, which is advanced.
-        is_signed: Whether charges may be negative. Only the features of such charges have a mean.
-
-    Raises:
-        StopIteration: If there are too few constants.
-    """
+    names = [name for node in graph.node for name in node.input]
+    tensors = {tensor.name: numpy_helper.to_array(tensor).astype(float) for tensor in graph.initializer}
+    constants = (np.asarray_chkfinite(tensors[name]) for name in names if name in tensors)
     low = next(constants)
     high = next(constants)
-    inverse_typical = next(constants)
-    mean = next(constants) if is_signed else None
-    return ChargeFeatures(1.0 / inverse_typical, low, high, mean)
-
-
-def _check_shapes(features: ChargeFeatures, perceptron: Perceptron[Array], where: str) -> None:
-    """Raise an error if the shapes of the constants of a network do not fit each other.
-
-    Args:
-        features: Limits, typical charges and means of the features.
-        perceptron: Weights and biases of the layers.
-        where: Beginning of the error messages.
-
-    Raises:
-        ModelError: If the shapes do not fit.
-    """
-    _check_feature_shapes(features, where)
-    n_electrode = features.n_electrode
-    width = n_electrode  # number of inputs of the next layer
-    for layer in (*perceptron.hidden, perceptron.last):
-        if layer.weight.ndim != 2 or layer.weight.shape[0] != width:
-            _refuse(where, f"expected weights for {width} inputs, got an array of shape {layer.weight.shape}")
-        width = layer.weight.shape[1]
-        if layer.bias.shape != (width,):
-            _refuse(where, f"expected a bias for each column of {layer.weight.shape}, got {layer.bias.shape}")
-
-    if perceptron.skip.shape != (n_electrode, width):
-        _refuse(where, f"expected a skip layer of shape {(n_electrode, width)}, got {perceptron.skip.shape}")
-    if width < N_CONTACT_ANSWERS + n_electrode:
-        _refuse(where, f"expected at least {N_CONTACT_ANSWERS} + {n_electrode} answers, got {width}")
-
-
-def _check_feature_shapes(features: ChargeFeatures, where: str) -> None:
-    """Raise an error if the limits, the typical charges and the means of features have wrong shapes.
-
-    The limits of logarithmic features are single numbers. Features of charges of both signs have limits and a mean for
-    each electrode.
-
-    Args:
-        features: The features.
-        where: Beginning of the error message.
-
-    Raises:
-        ModelError: If the shapes do not fit.
-    """
-    n_electrode = features.n_electrode
-    limits_and_means = [features.low_pC, features.high_pC]
-    expected_shapes: list[tuple[int, ...]] = [(), ()]
-    if features.mean is not None:
-        limits_and_means.append(features.mean)
-        expected_shapes = [(n_electrode,)] * len(limits_and_means)
-    given_shapes = [values.shape for values in limits_and_means]
-    if given_shapes != expected_shapes or features.typical_pC.shape != (n_electrode,):
-        _refuse(
-            where, f"expected limits and means of the charges with the shapes {expected_shapes}, got {given_shapes}"
-        )
-
-
-@dataclass(frozen=True)
-class _PlainNode:
-    """Description of a node without the arbitrary names of its tensors.
-
-    Two descriptions are equal if their nodes compute the same results from the same inputs.
-
-    Attributes:
-        operator: The operator.
-        inputs: Description of each input: the name of an input of the graph, the node that computes the tensor, or the
-            values of a constant.
-        outputs: Name of each result of the node that is an output of the graph; None for each other result.
-        attributes: Attributes by name.
-    """
-
-    operator: str
-    inputs: tuple[object, ...]
-    outputs: tuple[str | None, ...]
-    attributes: dict[str, object]
-
-    def __str__(self) -> str:
-        inputs = ", ".join(str(value)[:60] for value in self.inputs)
-        outputs = ", ".join(name or "a result" for name in self.outputs)
-        return f"{self.operator}({inputs}) {self.attributes or ''} to {outputs}"
-
-
-def _plain_nodes(graph: onnx.GraphProto) -> Iterator[_PlainNode]:
-    """Yield a description of each node of a graph, for a comparison with another graph.
-
-    The names of the tensors inside a graph are arbitrary. The name of a constant is replaced by the values of the
-    constant. The name of every other inner tensor is replaced by the number of the node that computes the tensor.
-
-    Args:
-        graph: The graph.
-    """
-    # This dictionary contains the descriptions of all tensors that can be inputs of the next node, by their names.
-    description_of_tensor: dict[str, object] = {tensor.name: tensor.name for tensor in graph.input}
-    for tensor in graph.initializer:
-        description_of_tensor[tensor.name] = _plain_constant(numpy_helper.to_array(tensor))
-    graph_outputs = {tensor.name for tensor in graph.output}
-    for node_index, node in enumerate(graph.node):
-        yield _PlainNode(
-            operator=node.op_type,
-            # An unknown name, such as the empty name of an omitted input, gets the description None.
-            inputs=tuple(description_of_tensor.get(name) for name in node.input),
-            outputs=tuple(name if name in graph_outputs else None for name in node.output),
-            attributes={attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute},
-        )
-        for output_index, name in enumerate(node.output):
-            description_of_tensor[name] = f"result {output_index} of node {node_index}"
-
-
-def _plain_constant(values: NDArray[Any]) -> tuple[object, ...]:
-    """Return the number type, the shape and the numbers of a constant."""
-    return values.dtype.str, values.shape, values.tolist()
-
-
-def _refuse(where: str, reason: str) -> NoReturn:
-    """Raise a ModelError about a graph that was not written by `write_graph`."""
-    raise ModelError(f"{where}: {reason}; only models of isocharge can be read")
+    typical = 1.0 / next(constants)
+    features = ChargeFeatures(typical, low, high, next(constants) if is_signed else None)
+    hidden = [Layer(weight=next(constants), bias=next(constants)) for _ in range(n_hidden)]
+    skip = next(constants)
+    bias = next(constants)
+    last = Layer(weight=next(constants), bias=bias)
+    # ONNX would also repeat a single number for all columns, C does not.
+    if any(layer.bias.shape != layer.weight.shape[1:] for layer in (*hidden, last, Layer(skip, bias))):
+        raise ValueError("expected a bias for each column of the weights")
+    layers = Perceptron(tuple(hidden), last, skip, activation)
+    next(constants)  # the widths of the split of the answers
+    limits = np.array([next(constants), next(constants)]) if has_limits else None
+    return FoldedNetwork(features, layers, limits)
