@@ -45,10 +45,10 @@ BAD_PROBABILITY = 1e-5
 FEW_PRESSES = 3
 """Largest number of presses that counts as few. Among a few presses, a bad press cannot be recognised."""
 
-IMPERFECTION_SCALES = ((0.1, 0.3), (1.0, 0.5), (2.5, 0.2))
+IMPERFECTION_SCALES = ((0.1, 0.2), (1.0, 0.7), (2.5, 0.1))
 """Sizes of the imperfections relative to their prior standard deviations, with their prior probabilities."""
 
-DISCREPANCY_SIZES = ((0.0005, 0.3), (0.003, 0.3), (0.01, 0.3), (0.03, 0.1))
+DISCREPANCY_SIZES = ((0.001, 0.7), (0.005, 0.2), (0.02, 0.1))
 """Sizes of the discrepancy, relative to the charge, with their prior probabilities."""
 
 REMAINING_DISCREPANCY = 0.3
