@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from isocharge.common.activations import TANH
-from isocharge.common.perceptron import Layer, Perceptron
+from isocharge.train.training.activations import TANH
 from isocharge.train.training.features import logarithmic_features
 from isocharge.train.training.folded_network import N_CONTACT_ANSWERS, FoldedNetwork
 from isocharge.train.training.folding import fold
 from isocharge.train.training.network import LARGEST_INT8
+from isocharge.train.training.perceptron import Layer, Perceptron
 
 TYPICAL_pC = 512.0
 """Charge by which each charge is divided, pC."""

@@ -8,13 +8,13 @@ import torch
 from msgspec import structs
 from tests.train.random_networks import random_network
 
-from isocharge.common.activations import ACTIVATIONS
 from isocharge.common.errors import ConfigError
-from isocharge.common.perceptron import evaluate
 from isocharge.serve import Predictor, find_model, load_model, write_model
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config, release
 from isocharge.train.model_release.onnx_graph import read_graph, write_graph
+from isocharge.train.training.activations import ACTIVATIONS
 from isocharge.train.training.network import TrainablePerceptron
+from isocharge.train.training.perceptron import evaluate
 from isocharge.train.training.split import Split
 
 CLOSED_FORMS = {

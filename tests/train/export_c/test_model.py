@@ -7,11 +7,11 @@ import pytest
 from msgspec import structs
 from tests.train.random_networks import random_network
 
-from isocharge.common.activations import TANH
 from isocharge.serve import find_model, load_model, write_model
 from isocharge.serve.prediction.contact import Contacts, Validity
 from isocharge.train.export_c.model_source import FLAG_BITS
 from isocharge.train.model_release.onnx_graph import write_graph
+from isocharge.train.training.activations import TANH
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isocharge.common.activations import Activation
 from isocharge.common.arrays import Singles
 from isocharge.train.export_c.c_text import c_array
+from isocharge.train.training.activations import Activation
 
 N_ROWS = 4
 """Number of rows of the weights whose products are added to the outputs at a time.

@@ -20,7 +20,6 @@ from itertools import cycle, islice, pairwise
 import numpy as np
 
 from isocharge.common.arrays import Array, Singles
-from isocharge.common.charge_features import ChargeFeatures
 from isocharge.serve import Contact, ModelMetadata
 from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
 from isocharge.serve.model.golden import Golden
@@ -28,6 +27,7 @@ from isocharge.serve.model.session import CORRELATION, N_WITHOUT_CORRELATION
 from isocharge.serve.prediction.contact import Contacts, Validity
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
 from isocharge.train.export_c.layer_source import LayerSource, find_blocks
+from isocharge.train.training.charge_features import ChargeFeatures
 from isocharge.train.training.folded_network import (
     COSINES_TO_CORRELATIONS,
     LOG_STD,

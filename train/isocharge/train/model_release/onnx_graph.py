@@ -12,12 +12,11 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from isocharge.common.activations import ACTIVATIONS
 from isocharge.common.arrays import Array
-from isocharge.common.charge_features import ChargeFeatures
 from isocharge.common.errors import ModelError, cut
-from isocharge.common.perceptron import Layer, Perceptron
 from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS
+from isocharge.train.training.activations import ACTIVATIONS
+from isocharge.train.training.charge_features import ChargeFeatures
 from isocharge.train.training.folded_network import (
     COSINES_TO_CORRELATIONS,
     LOG_STD,
@@ -25,6 +24,7 @@ from isocharge.train.training.folded_network import (
     POSITION,
     FoldedNetwork,
 )
+from isocharge.train.training.perceptron import Layer, Perceptron
 
 OPSET = 17
 """Version of the ONNX operators, which runtimes since 2022 support."""

@@ -9,11 +9,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 from msgspec import Meta, json
 from msgspec.structs import replace
 
-from isocharge.common.activations import ACTIVATIONS, TANH
 from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.errors import ConfigError
 from isocharge.common.structs import Settings, WrongKey, convert, read_toml
 from isocharge.simulate import NoiseModel, noise_model
+from isocharge.train.training.activations import ACTIVATIONS, TANH
 
 MAX_ELECTRODES = 64
 """Largest number of electrodes that a configuration can require."""
@@ -70,7 +70,7 @@ class NetworkConfig(Settings, frozen=True):
         misfit_hidden: Widths of the hidden layers of the misfit network, which must have as many hidden layers as the
             contact network; None for the width in `DefaultSizes`.
         electrodes: Number of electrodes that the dataset must have; 0 if every number is allowed.
-        activation: Name of the activation of the hidden layers (`isocharge.common.activations`).
+        activation: Name of the activation of the hidden layers (`isocharge.train.training.activations`).
         weights: "float32", or "int8" to round the weights between hidden layers to 8 bits and then train the other
             weights further. In C, the rounded weights take a quarter of the memory.
     """

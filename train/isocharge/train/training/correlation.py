@@ -22,11 +22,11 @@ from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array, Singles
-from isocharge.common.perceptron import Layer, evaluate_hidden_layers, evaluate_output_layer
 from isocharge.simulate import NoiseModel
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.features import whitening
 from isocharge.train.training.folded_network import N_CONTACT_ANSWERS, FoldedNetwork
+from isocharge.train.training.perceptron import Layer, evaluate_hidden_layers, evaluate_output_layer
 
 _log = logging.getLogger(__name__)
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.charge_features import ChargeFeatures
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
+from isocharge.train.training.charge_features import ChargeFeatures
 
 CLIPPING_MARGIN = 1.0
 """Distance of the clipping limits from the extreme charges of the presses, relative to the range of these charges.

@@ -2,9 +2,9 @@
 
 The network has three parts:
 
-- The input features are functions of the charges (`isocharge.common.charge_features`). For positive charges, they are
+- The input features are functions of the charges (`isocharge.train.training.charge_features`). For positive charges, they are
   logarithms.
-- A perceptron (`isocharge.common.perceptron`) computes a vector from the input features. The entries of this vector are
+- A perceptron (`isocharge.train.training.perceptron`) computes a vector from the input features. The entries of this vector are
   called answers. The whitening of the features and the units of the answers are folded into the first and the last
   layer of the perceptron (`isocharge.train.training.folding`).
 - The output functions convert the answers to position, force, standard deviations, correlations and misfit.
@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.charge_features import ChargeFeatures
-from isocharge.common.perceptron import Layer, Perceptron, evaluate
+from isocharge.train.training.charge_features import ChargeFeatures
+from isocharge.train.training.perceptron import Layer, Perceptron, evaluate
 
 POSITION = slice(0, 2)
 """Columns of the answers with x and y, mm."""

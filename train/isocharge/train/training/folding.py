@@ -13,7 +13,6 @@ from scipy.linalg import block_diag
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
-from isocharge.common.perceptron import Layer, Perceptron
 from isocharge.train.training.folded_network import (
     LOG_FORCE,
     LOG_STD,
@@ -21,6 +20,7 @@ from isocharge.train.training.folded_network import (
     N_CONTACT_ANSWERS,
     UNIT_LOG_STD_RANGE,
 )
+from isocharge.train.training.perceptron import Layer, Perceptron
 
 LOG_FORCE_STD = slice(LOG_STD.stop - 1, LOG_STD.stop)
 """Column of the answers with the logarithm of the standard deviation of the force."""

@@ -20,10 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from isocharge.common.activations import ACTIVATIONS, TANH, Activation
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
-from isocharge.common.perceptron import Layer, Perceptron
+from isocharge.train.training.activations import ACTIVATIONS, TANH, Activation
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.folded_network import (
@@ -35,6 +34,7 @@ from isocharge.train.training.folded_network import (
     FoldedNetwork,
 )
 from isocharge.train.training.folding import fold, linear_answer_map, log_std_limits
+from isocharge.train.training.perceptron import Layer, Perceptron
 from isocharge.train.training.torch_evaluation import evaluate, evaluate_features
 
 LARGEST_INT8 = 127
@@ -66,7 +66,7 @@ MIN_SCALE = 1e-30
 
 
 class TrainablePerceptron(nn.Module):
-    """A perceptron with a skip layer (`isocharge.common.perceptron`).
+    """A perceptron with a skip layer (`isocharge.train.training.perceptron`).
 
     The logarithm of the force is nearly a linear function of the logarithms of the charges. The network must estimate
     the logarithm of the force with an error of about a thousandth of its range. The skip layer learns the linear part

@@ -7,9 +7,9 @@ from statistics import NormalDist
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.perceptron import Layer, Perceptron, evaluate, evaluate_hidden_layers
 from isocharge.train.training.folded_network import LOG_STD, MEAN, FoldedNetwork, relative_log_std
 from isocharge.train.training.folding import transform_inputs
+from isocharge.train.training.perceptron import Layer, Perceptron, evaluate, evaluate_hidden_layers
 
 EXACT_RIDGE = 1e-5
 """Factor of the penalty on squared changes of the weights, for targets without noise.

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from isocharge.common.activations import Activation
 from isocharge.common.arrays import Array
-from isocharge.common.charge_features import ChargeFeatures
-from isocharge.common.perceptron import Layer, Perceptron
+from isocharge.train.training.activations import Activation
+from isocharge.train.training.charge_features import ChargeFeatures
+from isocharge.train.training.perceptron import Layer, Perceptron
 
 
 def evaluate_features(features: ChargeFeatures, charge: Tensor) -> Tensor:

@@ -16,8 +16,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from isocharge.common.activations import Activation
 from isocharge.common.arrays import Array, Singles
+from isocharge.train.training.activations import Activation
 
 Weights = TypeVar("Weights")
 """Type of the arrays of a perceptron: NumPy arrays or PyTorch tensors."""
