@@ -12,10 +12,9 @@ import numpy as np
 from shared import arguments, print_results
 
 from isocharge.common.arrays import Array
-from isocharge.common.contact_errors import force_error_percent, position_error
-from isocharge.common.statistics import rms
 from isocharge.simulate import Circle, ForwardMap, Sensor, Sweep, load_sensor, noise_model
 from isocharge.train import Fitted, LabelledPresses, TrainingData, fit
+from isocharge.train.data.contact_errors import force_error_percent, position_error, rms
 
 PROBE = Circle(1.0)
 RADIUS_mm = 8.0

@@ -28,9 +28,9 @@ from sklearn.neural_network import MLPRegressor
 from sklearn_rivals import SubsetProcess, log_charge_regressor
 
 from isocharge.common.arrays import Array
-from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.simulate import Circle, Domain, Sweep, load_sensor, noise_model
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
+from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fit import contact_stage, threads_and_seed

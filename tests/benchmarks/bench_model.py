@@ -14,10 +14,10 @@ from bayes.limit import BayesProblem, bayes_estimate
 from scipy.stats import norm
 from shared import arguments, print_results
 
-from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
+from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.model_release.evaluate import alarm_threshold
 
 RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"

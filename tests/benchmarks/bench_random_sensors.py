@@ -18,7 +18,6 @@ import numpy as np
 from bayes.limit import BayesProblem, bayes_estimate
 from shared import arguments, print_results
 
-from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import IsochargeError
 from isocharge.simulate import (
@@ -34,6 +33,7 @@ from isocharge.simulate import (
     noise_model,
 )
 from isocharge.train import LabelledPresses, TrainingData, fit
+from isocharge.train.data.contact_errors import ContactErrorStatistics
 
 NOISE = noise_model("reference")
 LARGEST_RATIO = 1.08

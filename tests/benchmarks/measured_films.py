@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from isocharge.common.contact_errors import position_error
-from isocharge.common.statistics import rms
 from isocharge.serve import MeasuredPresses
 from isocharge.train import CalibrationProblem
+from isocharge.train.data.contact_errors import position_error, rms
 
 POSITION_STD_mm = 0.1
 """Standard deviation of x and y of a press, mm."""

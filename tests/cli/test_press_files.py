@@ -7,9 +7,9 @@ import pyarrow
 import pytest
 from pyarrow.parquet import ParquetFile, read_metadata, write_table
 
-from isocharge.common.tables import parquet_table
 from isocharge.serve import Predictor
 from isocharge.serve.prediction.table import BLOCK_ROWS
+from isocharge.serve.presses import parquet_table
 
 COMMANDS = {
     "predict": ("serve", "predict", "four-25um-biaxial"),

@@ -17,10 +17,10 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from isocharge.common.contact_errors import force_error_percent, position_error
 from isocharge.serve import MeasuredPresses, Predictor
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 from isocharge.train import CalibrationProblem, CalibrationResult, calibrate, write_calibration
+from isocharge.train.data.contact_errors import force_error_percent, position_error
 from isocharge.train.data.presses import draw_contacts
 
 CALIBRATED_PRETENSION_MPa = 1.5

@@ -1,6 +1,6 @@
 """Modules that are shared by the packages `simulate`, `train`, `serve` and `cli`.
 
-For example, the modules handle errors, files, tables of numbers and progress.
+For example, the modules handle errors, files and progress.
 
 These modules do not import any other package of isocharge.
 """

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from isocharge.common.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from isocharge.common.measured_presses import MeasuredPresses, read_presses, write_presses
     from isocharge.serve.asgi import asgi_app
     from isocharge.serve.examination.port_check import Examination, examine
     from isocharge.serve.frames.binary import BinaryParser, encode_frame
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     from isocharge.serve.prediction.predictor import Predictor
     from isocharge.serve.prediction.press_check import PressCheck, check_presses
     from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
+    from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses, write_presses
     from isocharge.serve.record.record import PredictionRecord
     from isocharge.serve.virtual_sensor.script import Faults, Script, wander
     from isocharge.serve.virtual_sensor.sensor import VirtualSensor

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import ChargeError, PressError
-from isocharge.common.measured_presses import read_press_list
 from isocharge.serve import read_charges, read_presses
 from isocharge.serve.prediction.table import read_charge_file
+from isocharge.serve.presses.measured_presses import read_press_list
 
 NAMES = ("A", "B", "C")
 ROW = "1,2,3,4,5,6\n"

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from isocharge.common import measured_presses
 from isocharge.common.errors import OutputError, PressError
-from isocharge.common.measured_presses import PRESS_RULES, presses_text, read_press_list, row_words
-from isocharge.common.tables.number_table import LARGEST
 from isocharge.serve import MeasuredPresses, read_presses, write_presses
+from isocharge.serve.presses import measured_presses
+from isocharge.serve.presses.measured_presses import PRESS_RULES, presses_text, read_press_list, row_words
+from isocharge.serve.presses.number_table import LARGEST
 
 NAMES = ("A", "B", "C")
 HEADER = "x_mm,y_mm,force_N,A,B,C"

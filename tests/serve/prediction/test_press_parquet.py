@@ -11,11 +11,11 @@ import pytest
 from pyarrow.parquet import ParquetFile, read_metadata, read_table, write_table
 
 from isocharge.common.errors import ChargeError, PressError
-from isocharge.common.measured_presses import read_press_list
-from isocharge.common.tables import parquet_table
 from isocharge.serve import read_presses, write_presses
 from isocharge.serve.prediction import table as charge_table
 from isocharge.serve.prediction.table import read_charge_file
+from isocharge.serve.presses import parquet_table
+from isocharge.serve.presses.measured_presses import read_press_list
 
 NAMES = ("A", "B", "C")
 

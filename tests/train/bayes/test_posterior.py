@@ -8,9 +8,9 @@ from bayes.limit import BayesProblem, bayes_estimate
 from bayes.posterior import Cells, Posterior
 from scipy import stats
 
-from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.common.errors import ChargeError, InputError
 from isocharge.simulate import Circle, Domain, ForwardMap, NoiseModel, noise_model
+from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.data.presses import draw_contacts
 
 REFERENCE = noise_model("reference")

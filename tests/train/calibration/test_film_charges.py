@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from tests.benchmarks.measured_films import measured_presses, with_rig_errors
 
-from isocharge.common.contact_errors import position_error
-from isocharge.common.measured_presses import read_presses
 from isocharge.serve import Predictor
+from isocharge.serve.presses.measured_presses import read_presses
 from isocharge.simulate import Circle, ForwardMap, load_sensor, local_workers, parse_probe, press, touch_charge
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import CalibrationProblem, FitConfig, TrainingConfig, calibrate, write_calibration
 from isocharge.train.calibration.calibrate import solve_start
 from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.data.contact_errors import position_error
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
 

@@ -8,7 +8,6 @@ import pytest
 from scipy.optimize import minimize
 
 from isocharge.common.errors import DatasetError, TrainingError
-from isocharge.common.statistics import rms
 from isocharge.serve.model.charge_series import charges_from_bytes
 from isocharge.simulate import Domain, Electrode, Sweep, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
@@ -17,6 +16,7 @@ from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.simulate.numerics.disk_least_squares import into_domain
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, release
 from isocharge.train.data.charge_fit import fit_charge_series, fit_film_series
+from isocharge.train.data.contact_errors import rms
 from isocharge.train.data.invertible_domain import invertible_domain
 from isocharge.train.data.misfit_charges import draw_misfit_examples
 from isocharge.train.data.presses import LabelledPresses, draw_contacts

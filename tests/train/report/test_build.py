@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from isocharge.cli.train import report as report_module
-from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.common.errors import DatasetError, ModelError, OutputExists
 from isocharge.serve import benchmark, find_model
 from isocharge.simulate import Sweep, load_sensor, parse_probe
 from isocharge.simulate.dataset.sweep import write_sweep
+from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.report import QUICK, case, evaluation, page, write_report
 from isocharge.train.report.case import EvaluationCase
 from isocharge.train.report.measures import contact_errors

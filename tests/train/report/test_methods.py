@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from isocharge.common.contact_errors import position_error
 from isocharge.common.errors import TrainingError
-from isocharge.common.statistics import rms
 from isocharge.serve import Predictor, find_model
 from isocharge.simulate import FunctionMap, noise_model
+from isocharge.train.data.contact_errors import position_error, rms
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.report.gauss_newton import GaussNewton, Logarithms
 from isocharge.train.report.methods import FittingTask, fit_methods, model_method

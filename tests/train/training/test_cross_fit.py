@@ -8,9 +8,9 @@ import pytest
 
 from isocharge.cli.train import fit as fit_command
 from isocharge.common.errors import PressError, SceneError
-from isocharge.common.measured_presses import write_presses
 from isocharge.serve import Contact, MeasuredPresses, Predictor, find_model, load_model, read_presses
 from isocharge.serve.prediction.press_check import check_presses
+from isocharge.serve.presses.measured_presses import write_presses
 from isocharge.simulate import Domain
 from isocharge.simulate.numerics.polygon import area_of
 from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit_presses

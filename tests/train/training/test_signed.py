@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from bayes.limit import BayesProblem, bayes_estimate
 
-from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, release
 from isocharge.train.data.charge_fit import fit_charge_series
+from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from kept import kept
 

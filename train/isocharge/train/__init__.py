@@ -23,7 +23,6 @@ with require("train"):
     import scipy  # noqa: F401 (all modules need it; the error names the extra)
 
 if TYPE_CHECKING:
-    from isocharge.common.contact_errors import ContactErrorStatistics
     from isocharge.train.calibration.calibrate import calibrate
     from isocharge.train.calibration.contact_error import ProposedPress, next_presses
     from isocharge.train.calibration.film_estimate import FilmEstimate
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from isocharge.train.calibration.problem import CalibrationProblem
     from isocharge.train.calibration.result import CalibrationResult
     from isocharge.train.calibration.session import PressSession
+    from isocharge.train.data.contact_errors import ContactErrorStatistics
     from isocharge.train.data.presses import LabelledPresses
     from isocharge.train.model_release.evaluate import evaluate
     from isocharge.train.model_release.release import Release, release

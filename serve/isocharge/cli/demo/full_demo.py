@@ -15,7 +15,6 @@ from isocharge.cli.demo.played_area import DEFAULT_SENSOR, played_radius_mm
 from isocharge.cli.shared.terminal import say, show, shown_progress, this_command
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.arrays import Array
-from isocharge.common.contact_errors import ContactErrorStatistics, position_error
 from isocharge.common.files import new_folder
 from isocharge.common.progress import track
 from isocharge.serve import Port, PredictionRecord, Predictor, TouchStream, find_model, load_model
@@ -32,6 +31,7 @@ from isocharge.simulate.plots.film import (
     draw_section,
 )
 from isocharge.train import fit, load_config, release
+from isocharge.train.data.contact_errors import ContactErrorStatistics, position_error
 
 SAMPLES = 24_000
 """Number of presses on which the model is trained."""

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.options import JsonOption, ModelArgument, ModelsOption
+from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.terminal import show, show_json
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses

@@ -15,7 +15,6 @@ from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption
 from isocharge.cli.shared.terminal import say, show, show_json
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.files import refuse_existing, write_whole
-from isocharge.common.number_text import parse_number
 from isocharge.common.printable_text import printable
 from isocharge.serve import Examination, Port, Predictor, device_from_table, examine, load_device
 from isocharge.serve.examination.channel_health import ChannelHealth
@@ -25,6 +24,7 @@ from isocharge.serve.examination.listening import BAUDS
 from isocharge.serve.model.model_folder import model_names, repositories
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.port.source import has_speed
+from isocharge.serve.presses.number_text import parse_number
 
 GAIN_METAVAR = "NUMBER|A=..,B=.."
 

@@ -24,8 +24,8 @@ from itertools import zip_longest
 from operator import xor
 from typing import Any, NamedTuple
 
-from isocharge.common.tables.header_advice import OTHER_UNITS
 from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame
+from isocharge.serve.presses.header_advice import OTHER_UNITS
 
 _WORD = r"(?>\w+(?:[./-]\w+)*(?:\[\w*\])*)"
 

@@ -18,7 +18,6 @@ import numpy as np
 
 from isocharge.common.arrays import Booleans
 from isocharge.common.json_values import plain_values
-from isocharge.common.measured_presses import MeasuredPresses, row_words
 from isocharge.serve.flags import MISFIT
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.contact import Validity
@@ -35,6 +34,7 @@ from isocharge.serve.prediction.press_errors import (
     misfit_limit,
     press_errors,
 )
+from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
 
 MIN_PRESSES = 3
 """Smallest number of presses for a verdict. With fewer presses, a single bad press cannot be recognised."""

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.common.measured_presses import MeasuredPresses
 from isocharge.serve.flags import MISFIT, OUTSIDE
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.serve.prediction.contact import MISFIT_LIMIT, Contacts, Validity, inside_polygon
 from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.presses.measured_presses import MeasuredPresses
 
 CHARGE_UNKNOWN = "a charge is unknown"
 CONTACT_UNKNOWN = "neither place nor force is known"

@@ -15,12 +15,12 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Singles
 from isocharge.common.errors import ChargeError
-from isocharge.common.tables.csv_table import CsvTable
-from isocharge.common.tables.number_table import CHARGE_RULE, NumberTable, ignored_columns_message
-from isocharge.common.tables.table_file import open_table
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.presses.csv_table import CsvTable
+from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, ignored_columns_message
+from isocharge.serve.presses.table_file import open_table
 from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
 
 BLOCK_ROWS = 4096

@@ -8,9 +8,9 @@ from operator import itemgetter
 import numpy as np
 
 from isocharge.common.errors import ChargeError, cut, shown
-from isocharge.common.tables.header_advice import OTHER_UNITS, header_advice
-from isocharge.common.tables.number_table import CHARGE_RULE
 from isocharge.serve.frames.frame import Frame
+from isocharge.serve.presses.header_advice import OTHER_UNITS, header_advice
+from isocharge.serve.presses.number_table import CHARGE_RULE
 from isocharge.serve.signal_chain.gain import GainRule
 from isocharge.serve.signal_chain.stage import Setup, Stage
 

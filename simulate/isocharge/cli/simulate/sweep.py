@@ -22,8 +22,8 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAU
 from isocharge.common.errors import InputError, OutputExists
 from isocharge.common.extras import require
 from isocharge.common.files import refuse_existing
-from isocharge.common.measured_presses import MAX_ROWS
 from isocharge.serve import MeasuredPresses, write_presses
+from isocharge.serve.presses.measured_presses import MAX_ROWS
 from isocharge.simulate import Dataset, Sweep, load_sensor, parse_probe, read_dataset, run_sweep
 from isocharge.simulate.sensor.probe import PROBE_HELP
 

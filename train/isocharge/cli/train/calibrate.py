@@ -10,13 +10,13 @@ import numpy as np
 import typer
 
 from isocharge.cli.shared.forward_maps import write_deflection
-from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.options import JsonOption, StressLimitOption, refuse, worker_count
+from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
-from isocharge.common.measured_presses import MAX_TEMPERATURE_C, MIN_TEMPERATURE_C
 from isocharge.serve import MeasuredPresses
+from isocharge.serve.presses.measured_presses import MAX_TEMPERATURE_C, MIN_TEMPERATURE_C
 from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.simulate.solver.friction import MAX_FRICTION
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses

@@ -8,11 +8,11 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.forward_maps import simulated_presses, sweep_radius, warn_of_stress
-from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.options import (
     ConfigOption,
     JsonOption,
 )
+from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.cli.train.train_and_release import (
     ModelFolderOption,

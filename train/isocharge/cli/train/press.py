@@ -11,9 +11,9 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.options import DeviceOption, StressLimitOption, worker_count
 from isocharge.cli.shared.port_hints import no_frames_advice_added
+from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json
 from isocharge.cli.train.press_dialogue import Dialogue, OnTaken, Screen
@@ -21,9 +21,9 @@ from isocharge.cli.train.press_events import PressEvents
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError, PressError, error_prefix
-from isocharge.common.measured_presses import CONTACT, read_press_list
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress
+from isocharge.serve.presses.measured_presses import CONTACT, read_press_list
 from isocharge.serve.signal_chain.thermal import ThermalRule
 from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.train import CalibrationProblem, read_earlier

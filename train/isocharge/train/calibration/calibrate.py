@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.common.measured_presses import MeasuredPresses, row_words
+from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
 from isocharge.train.calibration.contact_error import N_CONTACTS, ContactSensitivity, spread_contacts
 from isocharge.train.calibration.diagnosis import (
     FAR_FROM_ALL_FILMS,

@@ -16,8 +16,8 @@ from msgspec import Meta, Struct
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError, cut, shown
 from isocharge.common.json_values import plain_values
-from isocharge.common.measured_presses import MAX_TEMPERATURE_C, MIN_TEMPERATURE_C
 from isocharge.common.structs import Text, convert, read_json
+from isocharge.serve.presses.measured_presses import MAX_TEMPERATURE_C, MIN_TEMPERATURE_C
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate
 from isocharge.train.calibration.problem import CalibrationProblem
 

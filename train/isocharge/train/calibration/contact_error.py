@@ -21,7 +21,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.common.measured_presses import FORCE_STD, POSITION_STD_MM, MeasuredPresses
+from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.simulate import Domain
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.solver.stress_limit import force_within_stress

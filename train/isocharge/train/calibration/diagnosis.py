@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.common.measured_presses import MeasuredPresses
+from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.train.calibration.film_charges import FilmCharges
 
 MAX_DEAD_RATIO = 0.02

@@ -27,10 +27,10 @@ import numpy as np
 
 from isocharge.common.errors import ModelError, PressError
 from isocharge.common.files import as_output_errors, locked, remove_empty, write_whole
-from isocharge.common.measured_presses import presses_text
 from isocharge.serve.model.charge_series import FILE as CHARGES
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, version_folders
+from isocharge.serve.presses.measured_presses import presses_text
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.calibrate import solve_film
 from isocharge.train.calibration.calibration_file import film_table, json_text, read_film

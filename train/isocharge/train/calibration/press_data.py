@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.common.measured_presses import MeasuredPresses
+from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import Domain, NoiseModel
 
 UNKNOWN_STD = np.inf

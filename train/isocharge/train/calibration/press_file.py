@@ -16,8 +16,8 @@ from typing import Any
 
 from isocharge.common.errors import OutputError, PressError
 from isocharge.common.files import as_output_errors, locked, write_whole
-from isocharge.common.measured_presses import MeasuredPresses, read_presses, write_presses
 from isocharge.common.structs import read_json
+from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses, write_presses
 from isocharge.simulate import Probe, Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.common.measured_presses import MeasuredPresses
+from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import Probe, Sensor
 from isocharge.train.calibration.contact_error import PLANNED, ContactError, ContactSensitivity
 from isocharge.train.calibration.estimator import Estimation

@@ -16,7 +16,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.common.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
+from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.train.calibration.calibrate import calibrate, solve_start
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.estimator import FEW_PRESSES

@@ -15,8 +15,8 @@ from isocharge.common.arrays import Array
 from isocharge.common.chebyshev_series import CHUNK_SIZE, chebyshev_terms, position_degrees
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import TrainingError
-from isocharge.common.statistics import rms
 from isocharge.serve.model.charge_series import ChargeSeries, series_size
+from isocharge.train.data.contact_errors import rms
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 
 CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))

@@ -10,7 +10,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, PressError, shown
-from isocharge.common.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
+from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.simulate import Dataset
 from isocharge.train.data.channel_noise import usual_size
 from isocharge.train.data.measured_sensor import LEAST_RANGE, PressedArea

@@ -13,7 +13,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import DatasetError, PressError, cut, shown
 from isocharge.common.files import sha256_of
-from isocharge.common.measured_presses import CONTACT, MeasuredPresses
+from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses
 from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor, parse_probe
 from isocharge.train.data.channel_noise import Noise
 

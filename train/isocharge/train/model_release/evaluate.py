@@ -6,8 +6,8 @@ from dataclasses import asdict
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.common.contact_errors import ContactErrorStatistics, position_error
 from isocharge.simulate import Dataset, NoiseModel
+from isocharge.train.data.contact_errors import ContactErrorStatistics, position_error
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.fitted import Fitted

@@ -7,9 +7,9 @@ import onnxruntime as ort
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import TrainingError
-from isocharge.common.tables.number_table import LARGEST
 from isocharge.serve.model.golden import FLOORS
 from isocharge.serve.model.session import CORRELATION, open_session, run
+from isocharge.serve.presses.number_table import LARGEST
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from isocharge.common.statistics import rms
 from isocharge.serve import Predictor
 from isocharge.simulate import ChargeSpline, Dataset, limits_at
+from isocharge.train.data.contact_errors import rms
 from isocharge.train.data.presses import LabelledPresses, held_out, is_measured, presses_of
 from isocharge.train.report.case import TEST_RANGE_FACTOR, EvaluationCase, Settings, simulate_presses
 from isocharge.train.report.measures import MethodRecord, measure_methods, round_significant

@@ -9,9 +9,9 @@ from itertools import cycle
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.common.progress import track
 from isocharge.serve.benchmark import Contender, take_turns
+from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.report.methods import Method
 

@@ -24,9 +24,9 @@ from torch import Tensor
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import PressError, cut
-from isocharge.common.measured_presses import MeasuredPresses, presses_text
-from isocharge.common.statistics import rms
+from isocharge.serve.presses.measured_presses import MeasuredPresses, presses_text
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
+from isocharge.train.data.contact_errors import rms
 from isocharge.train.data.measured_checks import check_measured_presses
 from isocharge.train.data.measured_sensor import LEAST_RANGE, MeasuredSensor, PressedArea
 from isocharge.train.data.misfit_charges import draw_charges

@@ -8,9 +8,9 @@ too short, or it has too few weights for its sensor.
 
 import numpy as np
 
-from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.simulate import ChargeMap, NoiseModel
 from isocharge.simulate.identifiability.nearest_contact import nearest_contact
+from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.folded_network import FoldedNetwork
 

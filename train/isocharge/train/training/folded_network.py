@@ -2,11 +2,11 @@
 
 The network has three parts:
 
-- The input features are functions of the charges (`isocharge.train.training.charge_features`). For positive charges, they are
-  logarithms.
-- A perceptron (`isocharge.train.training.perceptron`) computes a vector from the input features. The entries of this vector are
-  called answers. The whitening of the features and the units of the answers are folded into the first and the last
-  layer of the perceptron (`isocharge.train.training.folding`).
+- The input features are functions of the charges (`isocharge.train.training.charge_features`). For positive charges,
+  they are logarithms.
+- A perceptron (`isocharge.train.training.perceptron`) computes a vector from the input features. The entries of this
+  vector are called answers. The whitening of the features and the units of the answers are folded into the first and
+  the last layer of the perceptron (`isocharge.train.training.folding`).
 - The output functions convert the answers to position, force, standard deviations, correlations and misfit.
 
 The ONNX export (`isocharge.train.model_release.onnx_graph`) and the C export (`isocharge.train.export_c.model_source`)

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from isocharge.common.statistics import rms
 from isocharge.simulate import Domain
 from isocharge.train.data.channel_noise import Noise
+from isocharge.train.data.contact_errors import rms
 from isocharge.train.training.correlation import MAX_DEVIATION
 
 WARM_UP_MEAN_WEIGHT = 30.0

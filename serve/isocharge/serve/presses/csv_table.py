@@ -25,9 +25,9 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, shown
-from isocharge.common.number_text import parse_number
-from isocharge.common.tables.header_advice import OTHER_UNITS
-from isocharge.common.tables.number_table import ColumnRule, NumberColumns, NumberTable
+from isocharge.serve.presses.header_advice import OTHER_UNITS
+from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, NumberTable
+from isocharge.serve.presses.number_text import parse_number
 
 _SEPARATORS = ",;\t|"
 """Characters that may separate the columns."""

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.terminal import say
-from isocharge.common.measured_presses import MeasuredPresses, read_presses
-from isocharge.common.tables.number_table import ignored_columns_message
+from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses
+from isocharge.serve.presses.number_table import ignored_columns_message
 
 PositionStdOption = Annotated[
     float,

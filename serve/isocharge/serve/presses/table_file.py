@@ -10,9 +10,9 @@ from pathlib import Path
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.files import as_output_errors, bounded_lines, open_regular, write_whole
-from isocharge.common.tables.csv_table import CsvTable, csv_text
-from isocharge.common.tables.number_table import NumberTable
-from isocharge.common.tables.parquet_table import SUFFIX, ParquetTable, parquet_bytes, require_pyarrow
+from isocharge.serve.presses.csv_table import CsvTable, csv_text
+from isocharge.serve.presses.number_table import NumberTable
+from isocharge.serve.presses.parquet_table import SUFFIX, ParquetTable, parquet_bytes, require_pyarrow
 
 
 def is_parquet(path: Path) -> bool:

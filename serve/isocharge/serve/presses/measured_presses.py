@@ -20,16 +20,16 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError, error_prefix, shown
-from isocharge.common.tables.csv_table import csv_text
-from isocharge.common.tables.header_advice import ColumnMeaning
-from isocharge.common.tables.number_table import (
+from isocharge.serve.presses.csv_table import csv_text
+from isocharge.serve.presses.header_advice import ColumnMeaning
+from isocharge.serve.presses.number_table import (
     CHARGE_RULE,
     MAX_COLUMNS,
     ColumnRule,
     NumberColumns,
     NumberTable,
 )
-from isocharge.common.tables.table_file import open_table, write_columns
+from isocharge.serve.presses.table_file import open_table, write_columns
 
 POSITION_STD_MM = 0.1
 """Default standard deviation of a position, mm. It is typical of a stage that is set by hand."""

@@ -15,7 +15,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, cut, shown
 from isocharge.common.extras import require
-from isocharge.common.tables.number_table import ColumnRule, NumberColumns, NumberTable
+from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, NumberTable
 
 if TYPE_CHECKING:
     from pyarrow import Array as ArrowArray

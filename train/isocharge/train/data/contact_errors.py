@@ -8,7 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.statistics import rms
+
+
+def rms(values: Array) -> float:
+    """Compute the root mean square over all elements of an array."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def position_error(contact: Array, truth: Array) -> Array:

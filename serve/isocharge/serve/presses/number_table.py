@@ -15,7 +15,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import InputError, shown
-from isocharge.common.tables.header_advice import ColumnMeaning, header_advice
+from isocharge.serve.presses.header_advice import ColumnMeaning, header_advice
 
 MAX_COLUMNS = 1_000
 """Largest number of columns of a file."""
