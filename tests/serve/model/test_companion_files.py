@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from isocharge.common.chebyshev_series import Series, position_degrees
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import load_model, write_model
+from isocharge.serve.model.chebyshev_series import Series, position_degrees
 from isocharge.serve.model.golden import read_companion_file
 
 ADVICE = "train again"

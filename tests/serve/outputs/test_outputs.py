@@ -10,8 +10,8 @@ from contextlib import closing
 import pytest
 
 from isocharge.common.errors import InputError
-from isocharge.common.writer_queue import WriterQueue
 from isocharge.serve.outputs.udp_output import UdpOutput
+from isocharge.serve.outputs.writer_queue import WriterQueue
 from isocharge.serve.record.csv_rows import csv_header, csv_row
 from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from isocharge.common.robust_estimate import MeasuredContacts, ModelValues, Prior, robust_estimate
+from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, Prior, robust_estimate
 
 DIRECTION = 0.2 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 STATE_EFFECT = np.array([[0.3, 0.1, 0.2, 0.15], [0.02, -0.05, 0.04, 0.01]])

@@ -23,13 +23,13 @@ from isocharge.cli.shared.live_page import (
 from isocharge.cli.shared.terminal import announce, on_signal, say, unless_hung_up, write_stderr
 from isocharge.common.errors import IsochargeError
 from isocharge.common.extras import require
-from isocharge.common.writer_queue import WriterQueue
 from isocharge.serve.network.address import Address, Tls, Token, check_exposure
 from isocharge.serve.network.browser_check import BrowserCheck
 from isocharge.serve.network.http import Application, HttpServer
 from isocharge.serve.network.model_store import ModelStore, open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.traffic import RequestLog, Traffic
+from isocharge.serve.outputs.writer_queue import WriterQueue
 
 
 def http_command(

@@ -50,12 +50,12 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from isocharge.common.arrays import Array
-from isocharge.common.chebyshev_series import Series
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError, cut
 from isocharge.common.npz import finite_array, finite_number, npz_arrays
-from isocharge.common.robust_estimate import ModelValues
+from isocharge.serve.model.chebyshev_series import Series
 from isocharge.serve.model.golden import read_companion_file
+from isocharge.serve.model.robust_estimate import ModelValues
 
 FILE = "charges.npz"
 """Name of the file in a version folder."""

@@ -14,9 +14,9 @@ from msgspec import Meta, Struct, to_builtins
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, shown
-from isocharge.common.model_labels import ModelName
 from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, NotNegative, Positive, Settings, Text, WrongKey, convert, parse_json
+from isocharge.serve.model.model_labels import ModelName
 
 FORMAT_VERSION = 1
 """Version of the format of the metadata."""

@@ -27,7 +27,6 @@ from numpy.typing import ArrayLike
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ModelError, OutputExists, error_prefix, shown
 from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
-from isocharge.common.model_labels import NAME, VERSION
 from isocharge.common.versions import package_version
 from isocharge.serve.model.golden import (
     Golden,
@@ -38,6 +37,7 @@ from isocharge.serve.model.golden import (
     read_golden,
 )
 from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.model_labels import NAME, VERSION
 from isocharge.serve.model.session import (
     CORRELATION,
     INPUT,

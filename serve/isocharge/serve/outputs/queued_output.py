@@ -3,8 +3,8 @@
 import logging
 from collections.abc import Callable
 
-from isocharge.common.writer_queue import WriterQueue
 from isocharge.serve.outputs.output import Output, discard, output_error
+from isocharge.serve.outputs.writer_queue import WriterQueue
 from isocharge.serve.record.record import PredictionRecord
 
 log = logging.getLogger(__name__)

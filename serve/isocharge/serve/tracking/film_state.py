@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.robust_estimate import ModelValues, Prior, RobustEstimate, robust_estimate
 from isocharge.serve.model.charge_series import ChargeSeries
+from isocharge.serve.model.robust_estimate import ModelValues, Prior, RobustEstimate, robust_estimate
 
 GAIN_STD = 0.003
 """Scale of the prior of the change of a gain. The prior has heavy tails, because one gain may change by percents."""

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.common.robust_estimate import MeasuredContacts, ModelValues, RobustEstimate, robust_estimate
-from isocharge.common.robust_estimate import Prior as StatePrior
+from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, RobustEstimate, robust_estimate
+from isocharge.serve.model.robust_estimate import Prior as StatePrior
 from isocharge.train.calibration.discrepancy import terms, unit_covariance
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout

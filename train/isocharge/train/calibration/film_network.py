@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.chebyshev_series import Series
 from isocharge.serve.model.charge_series import ChargeSeries, series_size
+from isocharge.serve.model.chebyshev_series import Series
 from isocharge.simulate import Domain, ForwardMap, NoiseModel
 from isocharge.simulate.forward.derivative_fields import NODE_COUNT
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
