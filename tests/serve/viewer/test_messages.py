@@ -14,11 +14,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from isocharge.common.deflection_field import points_mm, read_deflection_field
 from isocharge.common.errors import RequestError
 from isocharge.common.structs import parse_json
 from isocharge.serve import find_model, flags, load_model
 from isocharge.serve.record.record import OtherContact, TrackedContact, Tracking
+from isocharge.serve.viewer.deflection_field import read_deflection_field
 from isocharge.serve.viewer.messages import (
     CONTACT_BIT,
     FLAG_BITS,
@@ -37,6 +37,7 @@ from isocharge.serve.viewer.messages import (
     find_deflection_field,
     samples_message,
 )
+from isocharge.simulate.forward.deflection import points_mm
 from kept import ROOT
 
 

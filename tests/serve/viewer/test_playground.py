@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from isocharge.cli.demo.playground_film import FORCE_RANGE_N, PROBE, SENSOR, MAX_DISTANCE_mm, stress_series
 from isocharge.common.errors import InputError, ModelError
-from isocharge.common.stress_series import read_stress_series
 from isocharge.serve import Predictor, find_model, load_model
 from isocharge.serve.viewer.playground_page import MODELS, playground_html
+from isocharge.serve.viewer.stress_series import read_stress_series
 from isocharge.simulate import Circle, ForwardMap, load_sensor, press, touch_charge
-from isocharge.simulate.forward.stress_series import FORCE_RANGE_N, PROBE, SENSOR, MAX_DISTANCE_mm, stress_series
 from kept import ROOT
 
 MAX_SIZE_BYTES = 1_000_000

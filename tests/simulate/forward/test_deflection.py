@@ -9,10 +9,10 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 
 from isocharge.cli.shared.forward_maps import write_deflection
-from isocharge.common.deflection_field import read_deflection_field
 from isocharge.common.errors import InputError
+from isocharge.serve.viewer.deflection_field import FILM_KEYS, DeflectionField, read_deflection_field
 from isocharge.simulate import Circle, deflection, load_sensor, press
-from isocharge.simulate.forward.deflection import deflection_field
+from isocharge.simulate.forward.deflection import deflection_table
 from isocharge.simulate.sensor.sensor_file import film_to_dict, sensor_to_toml
 
 FILM = load_sensor("three-25um-biaxial").film
@@ -21,7 +21,9 @@ PROBE = Circle(1.0)
 
 @pytest.fixture(scope="module")
 def field():
-    return deflection_field(FILM, PROBE, (0.2, 1.0), distances=5)
+    properties = film_to_dict(FILM)
+    table = deflection_table(FILM, PROBE, (0.2, 1.0), distances=5)
+    return DeflectionField(film={key: properties[key] for key in FILM_KEYS}, **table._asdict())
 
 
 def interpolated(field, x_mm, y_mm, distance_mm, force_N):
@@ -66,10 +68,10 @@ def test_deflection_file_round_trip(field, tmp_path):
 
 
 def test_deflection_json_is_written_for_a_film_without_an_included_table(tmp_path, monkeypatch, capsys, command):
-    def quick_field(film, probe):
-        return deflection_field(film, probe, (1.0,), distances=2)
+    def quick_table(film, probe):
+        return deflection_table(film, probe, (1.0,), distances=2)
 
-    monkeypatch.setattr("isocharge.simulate.forward.deflection.deflection_field", quick_field)
+    monkeypatch.setattr("isocharge.simulate.forward.deflection.deflection_table", quick_table)
     path = tmp_path / "deflection.json"
     large_probe = Circle(30.0)  # leaves the film off the centre
     for film, probe in [

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from isocharge.common.deflection_field import read_deflection_field
 from isocharge.serve import load_model
+from isocharge.serve.viewer.deflection_field import read_deflection_field
 from kept import ROOT
 
 FIELD = ROOT / "serve" / "isocharge" / "serve" / "viewer" / "fields" / "film-25um.json"

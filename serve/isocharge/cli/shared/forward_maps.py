@@ -9,9 +9,9 @@ from tempfile import TemporaryDirectory
 from isocharge.cli.shared.options import parse_radius_mm, worker_count
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
-from isocharge.common.deflection_field import DEFLECTION_FILE
 from isocharge.common.errors import InputError, IsochargeError, SceneError, SolveError
 from isocharge.common.files import write_whole
+from isocharge.serve.viewer.deflection_field import DEFLECTION_FILE, FILM_KEYS, DeflectionField
 from isocharge.serve.viewer.messages import included_deflection_field
 from isocharge.simulate import Circle, Dataset, Film, Probe, Sensor, Sweep, noise_model, read_dataset, working_area
 from isocharge.simulate.execution.workers import dask_workers, local_workers
@@ -97,17 +97,19 @@ def write_deflection(folder: Path, film: Film, probes: Iterable[Probe]) -> None:
         film: The film.
         probes: Probes that press the film. The deflection is computed for a round probe of the largest reach.
     """
-    from isocharge.simulate.forward.deflection import deflection_field  # imports the solver
+    from isocharge.simulate.forward.deflection import deflection_table  # imports the solver
 
-    if not film.is_axisymmetric or included_deflection_field(film_to_dict(film)) is not None:
+    properties = film_to_dict(film)
+    if not film.is_axisymmetric or included_deflection_field(properties) is not None:
         return
     probe = Circle(max(probe.reach for probe in probes))
     try:
         with shown_progress():
-            field = deflection_field(film, probe)
+            table = deflection_table(film, probe)
     except (SceneError, SolveError) as error:
         say(f"caution: the live page cannot draw this film in relief: {error}")
         return
+    field = DeflectionField(film={key: properties[key] for key in FILM_KEYS}, **table._asdict())
     write_whole(folder / DEFLECTION_FILE, field.to_bytes())
 
 

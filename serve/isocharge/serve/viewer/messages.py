@@ -48,7 +48,6 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct, to_builtins
 
-from isocharge.common.deflection_field import DEFLECTION_FILE, DeflectionField, read_deflection_field
 from isocharge.common.errors import InputError, RequestError
 from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, WrongKey, convert
@@ -56,6 +55,7 @@ from isocharge.serve.flags import MEANINGS
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.record.fields import Field
 from isocharge.serve.record.record import RECORD_FIELDS, PredictionRecord
+from isocharge.serve.viewer.deflection_field import DEFLECTION_FILE, DeflectionField, read_deflection_field
 
 FLAG_BITS = {word: 1 << position for position, word in enumerate(MEANINGS)}
 """Bit that represents each flag in a sample."""

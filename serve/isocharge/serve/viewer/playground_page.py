@@ -2,7 +2,7 @@
 
 The page shows the contact that a network estimates from the charges of the press. The page is a single file, which
 loads no other files. The file contains the scripts, the networks as compressed ONNX files, and the stress of the film
-as a series. The charges are computed from the series of the stress (see `isocharge.common.stress_series`). The
+as a series. The charges are computed from the series of the stress (see `isocharge.serve.viewer.stress_series`). The
 playground can therefore show every model of a biaxial film whose stress the series describes.
 """
 
@@ -14,11 +14,11 @@ from importlib.resources import as_file, files
 from typing import Any
 
 from isocharge.common.errors import ModelError
-from isocharge.common.stress_series import StressSeries, read_stress_series
 from isocharge.serve.flags import BEYOND, MEANINGS, MISFIT, OUTSIDE, STRESS
 from isocharge.serve.model.model_folder import find_model, load_model
 from isocharge.serve.prediction.contact import Validity
 from isocharge.serve.viewer.messages import describe_film
+from isocharge.serve.viewer.stress_series import StressSeries, read_stress_series
 
 MODELS = ("three-25um-biaxial", "four-25um-biaxial", "eight-25um-biaxial")
 """Names of the released models that the page shows, in the order of its buttons."""

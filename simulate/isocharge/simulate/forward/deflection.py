@@ -1,13 +1,14 @@
 """Table of the deflection of a film under a circular probe. The live page draws the film from the table."""
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 
-from isocharge.common.arrays import Array
-from isocharge.common.deflection_field import FILM_KEYS, DeflectionField, points_mm
+from isocharge.common.arrays import Array, Complexes
 from isocharge.common.progress import track
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Circle
-from isocharge.simulate.sensor.sensor_file import film_to_dict
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
 from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.press import press
@@ -37,9 +38,28 @@ The radius is less than 1, because rounding could move points on the rim out of 
 """
 
 
-def deflection_field(
+class DeflectionTable(NamedTuple):
+    """Table of the deflection of one film under one probe.
+
+    Attributes:
+        probe_radius_mm: Radius of the round probe, mm.
+        force_N: Forces in increasing order, N.
+        distance_mm: Distances of the probe from the centre in increasing order from 0, mm.
+        rings: Radii of the rings around the origin, before the automorphism (`points_mm`), from 0 to 1, in film radii.
+        deflection_mm: Deflections, shape (forces, distances, rings, angles), mm, positive in the direction of the push.
+            The angles range from 0 (outwards) to pi. The other half of the film is the mirror image.
+    """
+
+    probe_radius_mm: float
+    force_N: tuple[float, ...]
+    distance_mm: tuple[float, ...]
+    rings: tuple[float, ...]
+    deflection_mm: Array
+
+
+def deflection_table(
     film: Film, probe: Circle, forces: tuple[float, ...] = FORCES, *, distances: int = DISTANCES
-) -> DeflectionField:
+) -> DeflectionTable:
     """Compute a table of the deflection of a film under a circular probe.
 
     The table contains presses with several forces at several distances from the centre of the film. For each press, the
@@ -72,9 +92,7 @@ def deflection_field(
         for force_index, force in enumerate(forces):
             equilibrium = press(film, probe, (distance, 0.0), force, SolveSettings(ACCURACY), start=equilibrium)
             deflections[force_index, distance_index] = _deflection_on_rings(equilibrium, distance, rings)
-    properties = film_to_dict(film)
-    return DeflectionField(
-        film={key: properties[key] for key in FILM_KEYS},
+    return DeflectionTable(
         probe_radius_mm=probe.radius,
         force_N=forces,
         distance_mm=tuple(press_distances),
@@ -83,10 +101,39 @@ def deflection_field(
     )
 
 
+def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, rings: Array, angles: int) -> Complexes:
+    """For a probe on the x axis, compute the points at which a deflection field contains the deflection.
+
+    The points lie on rings. Rings around the origin are mapped to rings around the probe by the disk automorphism
+
+        z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
+
+    where p is the distance of the probe from the centre and r is the radius of the probe, both in film radii. This
+    value of the shift c maps a circle around the origin to the edge of the probe.
+
+    Args:
+        radius_mm: Radius of the film, mm.
+        probe_radius_mm: Radius of the probe, mm.
+        distance_mm: Distance of the probe from the centre, mm.
+        rings: Radii of the rings around the origin, before the automorphism, shape (rings,), in film radii.
+        angles: Number of angles, which range from 0 to pi.
+
+    Returns:
+        Points x + i y, shape (rings, angles), mm.
+    """
+    # Positions of the two edges of the probe on the x axis, in film radii
+    probe_outer_edge = (distance_mm + probe_radius_mm) / radius_mm
+    probe_inner_edge = (distance_mm - probe_radius_mm) / radius_mm
+    shift = math.tanh(0.5 * (math.atanh(probe_outer_edge) + math.atanh(probe_inner_edge)))
+
+    directions = np.exp(1j * np.linspace(0.0, math.pi, angles))
+    points_around_origin = rings[:, None] * directions  # shape (rings, angles), in film radii
+    points_around_probe = (points_around_origin + shift) / (1.0 + shift * points_around_origin)
+    return np.asarray(radius_mm * points_around_probe)
+
+
 def _deflection_on_rings(equilibrium: Equilibrium, distance: float, rings: Array) -> Array:
     """Compute the deflection of the film on rings around the probe.
-
-    The module `isocharge.common.deflection_field` defines the rings.
 
     Args:
         equilibrium: Equilibrium of the film under the press.

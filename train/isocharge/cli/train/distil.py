@@ -16,7 +16,7 @@ from isocharge.cli.train.train_and_release import (
 )
 from isocharge.common.errors import InputError
 from isocharge.serve import find_model, load_model
-from isocharge.train import StudentCase, fit, load_config, release, student_config, student_data
+from isocharge.train import StudentCase, fit, load_config, student_config, student_data
 
 
 def distil_command(
@@ -60,4 +60,4 @@ def distil_command(
     with shown_progress():
         presses = simulated_presses(case.sensor, case.probes, case.domain.radius, case.domain.force_range)
     data = student_data(model_folder, presses)
-    train_and_release(partial(fit, data, fit_config), version_folder, options, release)
+    train_and_release(partial(fit, data, fit_config), version_folder, options)

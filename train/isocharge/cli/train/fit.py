@@ -30,7 +30,7 @@ from isocharge.simulate import (
     read_dataset,
 )
 from isocharge.simulate.sensor.probe import PROBE_HELP
-from isocharge.train import FitConfig, TrainingData, fit, fit_presses, load_config, release
+from isocharge.train import FitConfig, TrainingData, fit, fit_presses, load_config
 from isocharge.train.training.cross_fit import usable_presses
 
 DEFAULT_PROBE = "circle:1.0"
@@ -151,7 +151,7 @@ def _release_presses_model(
     sensor_name = options.model_folder.resolve().name  # the sensor has no other name than that of the model
 
     train = partial(fit_presses, presses, sensor_name, fit_config, probes=notations)
-    train_and_release(train, version_folder, options, release)
+    train_and_release(train, version_folder, options)
 
 
 def _release_data_model(
@@ -166,7 +166,7 @@ def _release_data_model(
         dataset: Dataset folder of the training data; None if there is none.
     """
     version_folder = options.check_version_folder(data.sensor.electrode_names)
-    train_and_release(partial(fit, data, fit_config), version_folder, options, release, dataset)
+    train_and_release(partial(fit, data, fit_config), version_folder, options, dataset)
 
 
 def _read_or_simulate_data(dataset: Path | None, sensor: str | None, notations: list[str], radius: str) -> TrainingData:

@@ -3,25 +3,19 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Protocol, TypeVar
+from typing import Annotated
 
 import typer
 
 from isocharge.cli.shared.forward_maps import write_deflection
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
-from isocharge.common.deflection_field import DEFLECTION_FILE, read_deflection_field
 from isocharge.common.files import write_whole
 from isocharge.serve import ModelMetadata
 from isocharge.serve.model.model_folder import check_target
+from isocharge.serve.viewer.deflection_field import DEFLECTION_FILE, read_deflection_field
 from isocharge.simulate import parse_probe
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
-from isocharge.train import Release
-
-Trained = TypeVar("Trained")
-"""Result of a training, from which a model is released."""
-
-TrainedToRelease = TypeVar("TrainedToRelease", contravariant=True)
-"""Result of a training from which a `WriteRelease` can write a release."""
+from isocharge.train import Fitted, Release, release
 
 ModelFolderOption = Annotated[
     Path,
@@ -37,20 +31,6 @@ VersionOption = Annotated[
     int,
     typer.Option("--version", min=1, help="Version of the model, which is the name of the folder in models/NAME."),
 ]
-
-
-class WriteRelease(Protocol[TrainedToRelease]):
-    """Function that writes the result of a training as a version folder, such as `isocharge.train.release`."""
-
-    def __call__(self, trained: TrainedToRelease, folder: Path, /, *, version: int, command: str) -> Release:
-        """Write the version folder.
-
-        Args:
-            trained: The result of the training.
-            folder: Folder of the model, `models/NAME`.
-            version: Number of the version folder.
-            command: Command that makes this model again, for the model card.
-        """
 
 
 @dataclass(frozen=True)
@@ -81,10 +61,9 @@ class ReleaseOptions:
 
 
 def train_and_release(
-    train: Callable[[], Trained],
+    train: Callable[[], Fitted],
     version_folder: Path,
     options: ReleaseOptions,
-    write_release: WriteRelease[Trained],
     dataset: Path | None = None,
 ) -> None:
     """Train a network, release it as a version folder, and print its errors.
@@ -93,12 +72,11 @@ def train_and_release(
         train: Function that trains the network.
         version_folder: Folder to write, as `ReleaseOptions.check_version_folder` returned it.
         options: Options of the command.
-        write_release: Function that writes the version folder.
         dataset: Dataset folder of the training, whose file with the deflection of the film is copied if there is one.
             If it is None, the deflection is computed.
     """
     with shown_progress():
-        released = write_release(train(), version_folder.parent, version=options.version, command=this_command())
+        released = release(train(), version_folder.parent, version=options.version, command=this_command())
     _add_deflection(released, dataset)
     if options.json:
         show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})

@@ -1,4 +1,4 @@
-// Charges of a press, from the Chebyshev series of the stress that isocharge/common/stress_series.py describes.
+// Charges of a press, from the Chebyshev series of the stress that isocharge/serve/viewer/stress_series.py describes.
 
 const NEAR_MM = 2.0, NEAR_POINTS = 8, FAR_POINTS = 4;
 

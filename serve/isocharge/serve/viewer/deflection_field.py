@@ -10,7 +10,7 @@ where z = x + i y is a point, p is the distance of the probe from the centre and
 film radii. The deflection varies smoothly over these rings. A few hundred numbers are therefore sufficient to describe
 the deflection of one press. The deflection of a membrane is proportional to the cube root of the force. The deflection
 is therefore divided by the cube root of the force, and the quotient is interpolated over the logarithm of the force.
-The package `simulate` writes the file, and the live page of `serve` shows the deflection.
+The package `simulate` computes the deflection, and the live page shows it.
 """
 
 import base64
@@ -25,7 +25,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct
 
-from isocharge.common.arrays import Array, Complexes
+from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
 from isocharge.common.structs import Finite, Positive, WrongKey, read_json
 
@@ -112,37 +112,6 @@ def is_same_film(film: Any, properties: Mapping[str, float]) -> bool:
 def _is_close(given: object, value: float) -> bool:
     """Return whether `given` is a number that is equal to `value`, except for rounding errors."""
     return isinstance(given, int | float) and math.isclose(given, value, rel_tol=1e-6, abs_tol=1e-12)
-
-
-def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, rings: Array, angles: int) -> Complexes:
-    """For a probe on the x axis, compute the points at which a deflection field contains the deflection.
-
-    The points lie on rings. Rings around the origin are mapped to rings around the probe by the disk automorphism
-
-        z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
-
-    where p is the distance of the probe from the centre and r is the radius of the probe, both in film radii. This
-    value of the shift c maps a circle around the origin to the edge of the probe.
-
-    Args:
-        radius_mm: Radius of the film, mm.
-        probe_radius_mm: Radius of the probe, mm.
-        distance_mm: Distance of the probe from the centre, mm.
-        rings: Radii of the rings around the origin, before the automorphism, shape (rings,), in film radii.
-        angles: Number of angles, which range from 0 to pi.
-
-    Returns:
-        Points x + i y, shape (rings, angles), mm.
-    """
-    # Positions of the two edges of the probe on the x axis, in film radii
-    probe_outer_edge = (distance_mm + probe_radius_mm) / radius_mm
-    probe_inner_edge = (distance_mm - probe_radius_mm) / radius_mm
-    shift = math.tanh(0.5 * (math.atanh(probe_outer_edge) + math.atanh(probe_inner_edge)))
-
-    directions = np.exp(1j * np.linspace(0.0, math.pi, angles))
-    points_around_origin = rings[:, None] * directions  # shape (rings, angles), in film radii
-    points_around_probe = (points_around_origin + shift) / (1.0 + shift * points_around_origin)
-    return np.asarray(radius_mm * points_around_probe)
 
 
 def read_deflection_field(path: Path) -> DeflectionField:

@@ -3,7 +3,7 @@
 The playground computes charges from these series. The module is also a command, which writes the series of the built-in
 film with a thickness of 25 um to a file:
 
-    python -m isocharge.simulate.forward.stress_series FILE.json
+    python -m isocharge.cli.demo.playground_film FILE.json
 """
 
 import json
@@ -15,7 +15,7 @@ from numpy.polynomial import chebyshev
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.files import write_whole
-from isocharge.common.stress_series import StressSeries
+from isocharge.serve.viewer.stress_series import StressSeries
 from isocharge.simulate.forward.forward_map import EVEN_FIELD, ForwardMap
 from isocharge.simulate.forward.readout import ReadoutPoints
 from isocharge.simulate.sensor.probe import Circle

@@ -1,9 +1,9 @@
 """Stress of a round film under a round probe as a Chebyshev series, and the file that stores the series.
 
 The film is round and elastically isotropic, so every press is a rotated press on the x axis. A disk automorphism maps
-rings around the origin to rings around the probe (see `isocharge.common.deflection_field`). Let z be a point of the
-film before the automorphism, in film radii. Let s0 be the radius of the ring that the automorphism maps to the edge of
-the probe:
+rings around the origin to rings around the probe (see `isocharge.serve.viewer.deflection_field`). Let z be a point of
+the film before the automorphism, in film radii. Let s0 be the radius of the ring that the automorphism maps to the edge
+of the probe:
 
     s0 = tanh((atanh(p + r) - atanh(p - r)) / 2),
 
@@ -31,9 +31,9 @@ import numpy as np
 from msgspec import Struct
 
 from isocharge.common.arrays import Array
-from isocharge.common.deflection_field import is_same_film
 from isocharge.common.errors import InputError
 from isocharge.common.structs import Finite, Positive, WrongKey, read_json
+from isocharge.serve.viewer.deflection_field import is_same_film
 
 VERSION = 1
 """Version of the file format."""
@@ -47,7 +47,7 @@ class StressSeries:
     """Coefficients of two Chebyshev series that describe the stress of one film under one probe.
 
     Attributes:
-        film: Properties of the film, with the keys `isocharge.common.deflection_field.FILM_KEYS`.
+        film: Properties of the film, with the keys `isocharge.serve.viewer.deflection_field.FILM_KEYS`.
         probe_radius_mm: Radius of the round probe, mm.
         max_distance_mm: Largest distance of the probe from the centre, mm.
         force_range_N: Smallest and largest force, N.
