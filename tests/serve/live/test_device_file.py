@@ -153,7 +153,7 @@ WRONG = [
     ("[gain]\nV_per_unit = 1.0\nfeedback_pF = 0\n", r"gain\.feedback_pF: expected a positive number or a table, got 0"),
     ("[gain]\nV_per_unit = 1.0\npC_per_unit = 1.0\n", r"gain\.V_per_unit: expected either pC_per_unit, or"),
     ("[gain]\nfeedback_pF = 1.0\npC_per_unit = 1.0\n", r"gain\.feedback_pF: expected no capacitance beside"),
-    ("[gane]\n", r"unknown key 'gane'; did you mean 'gain'\? Known are name, frames, channels, gain"),
+    ("[gane]\n", r"unknown key 'gane'; did you mean 'gain'\? Known are name, front_end, frames, channels, gain"),
     ("[tare]\nframe = 50\n", r"unknown key 'tare.frame'; did you mean 'frames'\? Known are on, frames, noise_limit_pC"),
     ("[tare]\nframes = 50.5\n", r"tare\.frames: expected a whole number from 0 to 1000000000, got 50\.5"),
     ("[tare]\nframes = 3000\n", r"tare\.patience: expected at least the 3000 frames of a tare, or 0 .*, got 2000"),

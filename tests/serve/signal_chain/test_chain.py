@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from isocharge.common.errors import TareError
 from isocharge.serve import Frame
@@ -81,8 +82,8 @@ def test_second_tare_never_gives_up():
     assert has_tare.index(True) == 220
 
 
-THRESHOLD_PC = 10.0 + 6.0 * np.sqrt(3.0)
-"""Touch threshold for noise of 1 pC on three electrodes, pC."""
+THRESHOLD_PC = np.sqrt(3.0) + 6.0 / np.sqrt(2.0) + 10.0 / np.sqrt(3.0)
+"""Touch threshold of a charge on one of three electrodes with a noise of 1 pC, pC."""
 
 
 def touch_stage():
@@ -90,10 +91,10 @@ def touch_stage():
     return Touch(Setup(("A", "B", "C"), {TouchRule: TouchRule()}))
 
 
-def detect(touch, total_pC, noise_pC, base_relax_s=math.inf):
-    """Return whether a stage detects a touch in a frame of 1 s with a total charge and a noise, pC."""
+def detect(touch, charge_pC, noise_pC, base_relax_s=math.inf):
+    """Return whether a stage detects a touch in a frame of 1 s with a charge on an electrode and a noise, pC."""
     frame = Frame(None, None, (), dt_s=1.0, base_relax_s=base_relax_s)
-    frame.charge_pC = np.array([total_pC, 0.0, 0.0])
+    frame.charge_pC = np.array([charge_pC, 0.0, 0.0])
     frame.noise_pC = noise_pC
     touch.step(frame)
     return frame.is_contact
@@ -103,11 +104,11 @@ def detect(touch, total_pC, noise_pC, base_relax_s=math.inf):
     ("totals", "noise", "expected"),
     [
         ([THRESHOLD_PC - 0.1, THRESHOLD_PC + 0.1], ONE_PC, [0, 1]),
-        ([9.9, 10.1], 0.0 * ONE_PC, [0, 1]),
-        ([15.0, 25.0, 15.0, 11.0, 9.0, 15.0], ONE_PC, [0, 1, 1, 1, 0, 0]),
+        ([5.7, 5.8], 0.0 * ONE_PC, [0, 1]),
+        ([11.0, 25.0, 15.0, 6.5, 5.0, 11.0], ONE_PC, [0, 1, 1, 1, 0, 0]),
         ([1000.0, 4000.0, 4000.0, 201.0, 199.0], ONE_PC, [1, 1, 1, 1, 0]),
         # The charge at rest has drifted to 60 pC, so that an absolute threshold would never release the press.
-        ([2060.0, 2060.0, 60.0, 62.0, 58.0, 60.0, 75.0, 79.0], ONE_PC, [1, 1, 0, 0, 0, 0, 0, 1]),
+        ([2060.0, 2060.0, 60.0, 62.0, 58.0, 60.0, 69.0, 71.0], ONE_PC, [1, 1, 0, 0, 0, 0, 0, 1]),
         # One frame with an absurd charge does not release a press and does not prevent its detection.
         *(([*before, 3e38, *[850.0] * 4], ONE_PC, [1] * (len(before) + 5)) for before in ([], [850.0], [850.0] * 5)),
     ],
@@ -116,6 +117,61 @@ def detect(touch, total_pC, noise_pC, base_relax_s=math.inf):
 def test_touches_begin_and_end(totals, noise, expected):
     touch = touch_stage()
     assert [detect(touch, total_pC, noise) for total_pC in totals] == expected
+
+
+def false_touch_probability(n_electrode):
+    """Return the probability that noise alone exceeds the touch threshold in a frame, without a floor."""
+    threshold = TouchRule(floor_pC=0.0).threshold_pC(np.ones(n_electrode))[0]
+    return chi2.sf(threshold**2, n_electrode)
+
+
+@pytest.mark.parametrize("n_electrode", [1, 3, 4, 8, 32])
+def test_noise_exceeds_the_touch_threshold_rarely_with_any_number_of_electrodes(n_electrode):
+    assert 1e-9 < false_touch_probability(n_electrode) < 3e-7
+
+
+@pytest.mark.parametrize("ratios", [(1.0, -1.0, 0.0), (-1.0, 0.8, -0.3), (-1.0, -1.0, -1.0)])
+def test_touch_is_detected_from_charges_of_any_sign(ratios):
+    """The charges of a sensor without a film may have any sign, and their sum may be zero or negative."""
+    touch = Touch(Setup(("A", "B", "C"), {TouchRule: TouchRule()}, has_any_sign=True))
+    contacts = []
+    for force in (0.0, 0.0, 100.0, 100.0, 0.0, 0.0, 0.0, -100.0, 0.0):
+        frame = Frame(None, None, (), dt_s=0.1)
+        frame.charge_pC = force * np.array(ratios)
+        frame.noise_pC = ONE_PC
+        touch.step(frame)
+        contacts.append(frame.is_contact)
+    assert contacts == [0, 0, 1, 1, 0, 0, 0, 1, 0]
+
+
+def test_charges_with_the_sum_zero_are_a_touch():
+    touch = touch_stage()
+    frame = Frame(None, None, (), dt_s=0.1)
+    frame.charge_pC = np.array([100.0, -50.0, -50.0])
+    frame.noise_pC = ONE_PC
+    touch.step(frame)
+    assert frame.is_contact
+    assert frame.flags == []
+
+
+@pytest.mark.parametrize("has_any_sign", [False, True])
+def test_end_of_a_long_press_with_a_leak_is_no_touch(has_any_sign):
+    """A press of 5 s loses 39 % of its charge (tau = 10 s), and the release leaves the lost charge with a minus."""
+    touch = Touch(Setup(("A", "B", "C"), {TouchRule: TouchRule()}, has_any_sign=has_any_sign))
+    dt_s = 1.0 / RATE_HZ
+    output_pC = np.zeros(3)
+    contacts, flags = [], []
+    for number in range(4000):
+        charge = np.array([900.0, 300.0, 100.0]) if 200 <= number < 1200 else np.zeros(3)
+        previous = np.array([900.0, 300.0, 100.0]) if 200 < number <= 1200 else np.zeros(3)
+        output_pC = output_pC * np.exp(-dt_s / 10.0) + charge - previous
+        frame = Frame(None, None, (), dt_s=dt_s, base_relax_s=2.0, is_base_held=True)
+        frame.charge_pC, frame.noise_pC = output_pC, ONE_PC
+        touch.step(frame)
+        contacts.append(frame.is_contact)
+        flags.append(frame.flags)
+    assert contacts == [200 <= number < 1200 for number in range(4000)]
+    assert flags[1300] == ["negative"]
 
 
 def contacts_of(readings):

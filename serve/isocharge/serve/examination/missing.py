@@ -1,9 +1,11 @@
 """Messages to the user about settings and properties that a board needs before it can provide contacts."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import structs
 
 from isocharge.common.errors import ChargeError, shown
 from isocharge.common.printable_text import printable
@@ -108,6 +110,8 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
             "--pc-per-unit NUMBER"
         )
     tare_rule = findings.device.rule(TareRule) or TareRule()  # the defaults if the device file has no tare
+    if findings.device.front_end == "current":  # a current of any size at rest is an offset
+        tare_rule = structs.replace(tare_rule, offset_limit_pC=math.inf)
     for channel in findings.channels:
         if channel.unusable:
             yield (
@@ -210,8 +214,9 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
 def _drift_sentences(findings: BoardFindings, tare_rule: TareRule) -> Iterator[str]:
     """Yield a sentence if the charges of an untouched film drift faster than the tare can follow.
 
-    The tare follows a drift with its time constant. The total charge then differs from 0 by the total drift times the
-    time constant. If this difference exceeds the touch threshold, a contact begins without a touch.
+    The tare follows a drift with its time constant. The charges then differ from 0 by the drift times this time. If the
+    size of this difference exceeds the touch threshold, a contact begins without a touch. This does not apply to
+    a negative total drift, because a touch makes most charges positive.
 
     Args:
         findings: Results of the port check.
@@ -219,11 +224,14 @@ def _drift_sentences(findings: BoardFindings, tare_rule: TareRule) -> Iterator[s
     """
     device = findings.device
     touch_rule = device.rule(TouchRule)
-    if touch_rule is None or device.rule(LeakSection) is not None or device.rule(MemoryRule) is not None:
+    follows_drift = device.rule(LeakSection) or device.rule(MemoryRule) or device.front_end == "current"
+    if touch_rule is None or follows_drift or not findings.channels:
         return
-    total_pC_per_s = sum(channel.drift_pC_per_s or 0.0 for channel in findings.channels)
+    drift_pC_per_s = np.array([channel.drift_pC_per_s or 0.0 for channel in findings.channels])
+    total_pC_per_s = float(drift_pC_per_s.sum())
     noise_pC = np.array([channel.noise_pC or 0.0 for channel in findings.channels])
-    if total_pC_per_s * tare_rule.relax_s > touch_rule.threshold_pC(noise_pC):
+    threshold_pC = touch_rule.resolved(has_currents=False).threshold_pC(noise_pC)
+    if total_pC_per_s > 0.0 and np.linalg.norm(drift_pC_per_s * tare_rule.relax_s / threshold_pC) > 1.0:
         yield (
             f"the charges drift by {total_pC_per_s:.2g} pC/s in total, which the tare cannot follow: an untouched film "
             f"seems to be touched, and the records have the flag {DRIFT}; let the amplifier warm up, or put [leak] "
@@ -259,6 +267,11 @@ def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
         for section_name, settings in held_press.sections.items():
             if section_name not in device.table:  # the device file has no such section yet
                 yield f"put {section_text(section_name, settings)} into a device file"
+    elif device.front_end == "current":
+        yield (
+            "listen for 20 s with --seconds 20, press once after the third second, and release the press: the charge "
+            "that remains then shows whether the integral of the currents needs a leak ([leak] tau_s)"
+        )
     elif device.rule(LeakSection) is None:
         yield (
             "state the time constants of the amplifiers in a device file ([leak] tau_s): without them the force of a "

@@ -15,6 +15,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import IsochargeError
 from isocharge.common.printable_text import printable
 from isocharge.serve.examination.channel_health import ChannelHealth, measure_channel_health
+from isocharge.serve.examination.current_press import find_current_press
 from isocharge.serve.examination.held_press import HeldPress, find_held_press
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
 from isocharge.serve.examination.missing import CLEAN_SHARE, BoardFindings, held_press_sentences, missing_sentences
@@ -216,7 +217,8 @@ def examine_received(
     unused_channels = tuple(
         name for position, name in enumerate(capture.names) if position not in electrode_at_position
     )
-    held_press = find_held_press(*capture.values()) if capture.frames else None
+    find_press = find_current_press if device.front_end == "current" else find_held_press
+    held_press = find_press(*capture.values()) if capture.frames else None
     rest_end_s = math.inf if held_press is None else held_press.begin_s  # the film is at rest until a held press begins
     channels = tuple(_measure_channels(capture, device, electrode_at_position, rest_end_s))
     touch_sentence = _touch_sentence(capture, device, electrode_at_position, held_press, unit)

@@ -1,6 +1,7 @@
 """Device file, which contains the settings of a board and its amplifiers in TOML.
 
     name = "bench board 3"         # optional
+    front_end = "charge"           # optional; "current" if each value is the charge of one sampling interval
 
     [frames]                       # optional; without this section the format is recognised
     format = "described"           # or "auto", "binary", "text"; the keys of "described" are those of
@@ -30,7 +31,7 @@ the file has no such section. An unknown key causes an error.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from msgspec import defstruct, field, structs
 
@@ -45,8 +46,8 @@ from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain
 from isocharge.serve.signal_chain.hum import Hum
-from isocharge.serve.signal_chain.leak import Leak
-from isocharge.serve.signal_chain.memory import Memory
+from isocharge.serve.signal_chain.leak import Integrator, Leak
+from isocharge.serve.signal_chain.memory import Memory, MemoryRule
 from isocharge.serve.signal_chain.rule import Rule
 from isocharge.serve.signal_chain.saturation import Saturation
 from isocharge.serve.signal_chain.stage import R, Setup, Stage
@@ -60,6 +61,7 @@ STAGES: tuple[type[Stage], ...] = (
     Gain,
     Hum,
     Tare,
+    Integrator,
     Leak,
     Memory,
     Touch,
@@ -73,10 +75,14 @@ STAGES: tuple[type[Stage], ...] = (
 )
 """All stages in the order in which they process a frame. The device file and the export to C follow from the stages."""
 
+FrontEnd = Literal["charge", "current"]
+"""What the values of a board are: charges, or currents. A current is the charge of one sampling interval."""
+
 DeviceSections = defstruct(
     "DeviceSections",
     [
         ("name", str, "unnamed board"),
+        ("front_end", FrontEnd, "charge"),
         ("frames", Frames, AutoFrames()),
         ("channels", dict[str, str], field(default_factory=dict)),
         *[
@@ -96,6 +102,7 @@ class Device(Settings, frozen=True):
 
     Attributes:
         name: Name of the board.
+        front_end: Whether the values of the board are charges or currents.
         frames: Format of the frames.
         channels: Name or number of the channel of each electrode; empty without the section `[channels]`.
         rules: Settings of each stage that is switched on, by their class.
@@ -104,6 +111,7 @@ class Device(Settings, frozen=True):
     """
 
     name: str = "unnamed board"
+    front_end: FrontEnd = "charge"
     frames: Frames = AutoFrames()
     channels: dict[str, str] = field(default_factory=dict)
     rules: Mapping[type[Rule], Rule] = field(default_factory=dict)
@@ -131,7 +139,17 @@ class Device(Settings, frozen=True):
             reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
             predictor: Model of the stream; None for a stream that computes only touch charges.
         """
-        return Setup(electrodes, self.rules, self.channels, predictor, reader, self.where)
+        has_currents = self.front_end == "current"
+        return Setup(
+            electrodes,
+            self.rules,
+            self.channels,
+            predictor,
+            reader,
+            self.where,
+            has_currents=has_currents,
+            has_any_sign=has_currents,
+        )
 
     def rule(self, rule_class: type[R]) -> R | None:
         """Return the settings of a class, or None if their stage is switched off."""
@@ -222,7 +240,12 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     for section in structs.asdict(sections).values():
         if isinstance(section, Rule) and section.on:
             rules[type(section)] = section
-    return Device(sections.name, sections.frames, sections.channels, rules, table, where)
+    if sections.front_end == "current" and MemoryRule in rules:
+        raise DeviceError(
+            f'{where}: memory: expected no section [memory] beside front_end = "current", because the integral of the '
+            "currents forgets slow changes; remove the section"
+        )
+    return Device(sections.name, sections.front_end, sections.frames, sections.channels, rules, table, where)
 
 
 def with_settings(device: Device, section: str, **settings: Any) -> Device:

@@ -129,6 +129,8 @@ class ReadingStream:
         """
         self._device = device
         self._setup = device.setup(electrodes, reader, predictor)
+        if predictor is not None and "film" not in predictor.metadata.sensor:  # a model of presses alone
+            self._setup.has_any_sign = True
         self.counts = StreamCounts()
         self._before_restart = StreamTotals()  # counts of the time before the latest `restart`
         self._unrecognised = b""  # the bytes before the first frame

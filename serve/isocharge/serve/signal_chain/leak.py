@@ -1,4 +1,4 @@
-"""Compensation of the leak of a charge amplifier.
+"""Compensation of the leak of a charge amplifier, and integration of the currents of a board without such an amplifier.
 
 A charge amplifier is a leaky integrator with the time constant tau = R C. The touch charge q follows from its output v
 frame by frame,
@@ -7,6 +7,9 @@ frame by frame,
 
 where i is the innovation and b is the inflow (pC/s). The inflow is estimated from the innovation, because an estimate
 from the output v would diverge; see `isocharge.serve.signal_chain.inflow`.
+
+A board that sends currents sends the innovation itself, i[n] = v[n]. Its charge is the sum of the currents. If the
+device file states a leak, the sum forgets with the time constant tau, q[n] = a q[n-1] + i[n] - b dt.
 
 While nothing touches the film, any charge is an error or comes from a slow warming of the film. The computed touch
 charge therefore decays exponentially to zero.
@@ -17,8 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.common.arrays import Array
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.inflow import Inflow, LeakSection
+from isocharge.serve.signal_chain.inflow import Inflow, LeakRule, LeakSection
 from isocharge.serve.signal_chain.memory import MemoryRule
 from isocharge.serve.signal_chain.stage import OffsetStage, Setup, WarmingChange
 
@@ -34,15 +38,15 @@ class Leak(OffsetStage):
         """Store the settings. The state begins at the first frame after the tare."""
         super().__init__(setup)
         rule = setup.rule(LeakSection)
-        assert rule is not None
-        self._rule = rule
-        self._tau_s = setup.for_each_electrode("leak.tau_s", rule.tau_s)
+        self._rule: LeakRule = rule or LeakRule()
+        tau_s = math.inf if rule is None else rule.tau_s
+        self._tau_s = setup.for_each_electrode("leak.tau_s", tau_s)
         self.reset()
 
     @classmethod
     def is_used(cls, setup: Setup) -> bool:
-        """Return whether the amplifiers leak. If the film has a memory, a later stage corrects both together."""
-        return super().is_used(setup) and setup.rule(MemoryRule) is None
+        """Return whether charge amplifiers leak. If the film has a memory, a later stage corrects both together."""
+        return super().is_used(setup) and setup.rule(MemoryRule) is None and not setup.has_currents
 
     def reset(self) -> None:
         """Discard the state. A new state begins at the first frame after the next tare."""
@@ -68,7 +72,7 @@ class Leak(OffsetStage):
             return
         if self._previous is not None:
             dt_s = frame.dt_s
-            innovation_pC = output_pC - np.exp(-dt_s / self._tau_s) * self._output_pC
+            innovation_pC = self._innovation_pC(output_pC, np.exp(-dt_s / self._tau_s))
             surplus_pC = innovation_pC - self._inflow.pC_per_s * dt_s  # new touch charge and noise
             self._charge_pC = self._charge_pC + surplus_pC
             if self._previous.is_contact:
@@ -84,6 +88,15 @@ class Leak(OffsetStage):
         frame.charge_pC = self._charge_pC
         frame.base_relax_s = self._rule.relax_s
 
+    def _innovation_pC(self, output_pC: Array, kept: Array) -> Array:
+        """Return the change of the output that the leak does not explain, shape (n_electrode,), pC.
+
+        Args:
+            output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
+            kept: Share of a charge that the leak leaves until this frame, shape (n_electrode,), dimensionless.
+        """
+        return output_pC - kept * self._output_pC
+
     def add_warming(self, change: WarmingChange) -> None:
         """Subtract the warming from the touch charge that the stage integrates."""
         self._charge_pC = self._charge_pC - change.charge_pC
@@ -95,3 +108,33 @@ class Leak(OffsetStage):
         if settings:
             settings["tau_s"] = setup.for_each_electrode("leak.tau_s", settings["tau_s"])
         return settings
+
+
+class Integrator(Leak):
+    """Integrates the currents of a board to charges, and estimates the offset of the currents.
+
+    The leak of the integral limits the charge that errors of the offset accumulate during a touch. Without a section
+    `[leak]`, the integral has no leak.
+    """
+
+    section = ""
+    c_prefix = ""
+
+    @classmethod
+    def is_used(cls, setup: Setup) -> bool:
+        """Return whether the board sends currents."""
+        return setup.has_currents
+
+    def step(self, frame: Frame) -> None:
+        """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
+
+        At rest, the charges decay with the time constant `relax_s`. The sum of independent currents then has the
+        variance of a current times relax_s / (2 dt).
+        """
+        super().step(frame)
+        if frame.charge_pC is not None and frame.dt_s > 0.0:
+            frame.noise_pC = frame.noise_pC * math.sqrt(max(1.0, 0.5 * self._rule.relax_s / frame.dt_s))
+
+    def _innovation_pC(self, output_pC: Array, kept: Array) -> Array:
+        """Return the current, plus the change of the charge because of the leak, shape (n_electrode,), pC."""
+        return output_pC - (1.0 - kept) * self._charge_pC

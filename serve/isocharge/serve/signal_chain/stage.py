@@ -42,6 +42,8 @@ class Setup:
         reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
         where: Name of the device file, for messages.
         offset_stage: Last stage that stores the charge at rest; None until a stage is created.
+        has_currents: Whether each value of the board is a current, which is the charge of one sampling interval.
+        has_any_sign: Whether the charges of a touch may have any sign. Otherwise, most of them are positive.
     """
 
     electrodes: tuple[str, ...]
@@ -51,6 +53,8 @@ class Setup:
     reader: str = "the sensor"
     where: str = "device"
     offset_stage: "OffsetStage | None" = None
+    has_currents: bool = False
+    has_any_sign: bool = False
 
     def rule(self, rule_class: type[R]) -> R | None:
         """Return the settings of a class, or None if their stage is switched off."""

@@ -8,6 +8,7 @@ import math
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DeviceError, TareError
@@ -29,7 +30,7 @@ class TareRule(Rule, frozen=True, kw_only=True):
         noise_limit_pC: Largest standard deviation of an electrode at rest, pC. The reference noise is 1 pC.
         offset_limit_pC: Largest magnitude of the mean charge of an electrode at rest, pC. Under a press of 0.05 N or
             more on a film of 25 um, the mean charge of three electrodes is larger. The tare therefore fails even if the
-            press is held still.
+            press is held still. If the board sends currents, there is no limit, because a held press causes no current.
         patience: Number of frames after which the search for quiet frames ends with an error; 0 for no limit.
         relax_s: Time constant with which the tare follows a slow drift while nothing touches the film, s. The tare
             changes by at most `noise_limit_pC / relax_s`, so that a touch does not change it noticeably.
@@ -70,6 +71,8 @@ class Tare(OffsetStage):
         """Begin without a tare."""
         super().__init__(setup)
         self._rule = setup.rule(TareRule)
+        if self._rule is not None and setup.has_currents:  # at rest, a current of any size is an offset
+            self._rule = structs.replace(self._rule, offset_limit_pC=math.inf)
         self._setup = setup
         self._tare_pC: Array | None = None  # charge at rest
         self._noise_pC = np.zeros(len(setup.electrodes))  # standard deviation of the charge at rest

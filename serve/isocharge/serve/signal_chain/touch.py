@@ -1,9 +1,11 @@
-"""Detection of a touch by the total charge, which is the sum of the charges of all electrodes.
+"""Detection of a touch from the charges of all electrodes, which are a vector in units of the noise.
 
-The detection has a hysteresis. A touch begins when the total charge exceeds a threshold that is derived from the noise.
-A touch ends when the total charge falls below a given share of the largest total charge of this touch. If the threshold
-for the end did not depend on the touch, a touch would never end after the charge at rest has drifted above this
-threshold.
+Each charge is divided by the touch threshold of its electrode. The length of the vector of these ratios is the size of
+the charges. The size does not depend on the signs of the charges.
+
+The detection has a hysteresis. A touch begins when the size of the difference from the base exceeds 1. A touch ends
+when the size of the charges falls below a given share of the largest size of this touch. If the threshold for the end
+did not depend on the touch, a touch would never end after the charge at rest has drifted above this threshold.
 """
 
 import math
@@ -21,55 +23,90 @@ from isocharge.serve.signal_chain.stage import Setup, Stage
 class TouchRule(Rule, frozen=True, kw_only=True):
     """Thresholds for the detection of a touch, from the section `[touch]` of a device file.
 
-    With the reference noise, the touch threshold is 20 pC. A press of 0.05 N on a film with a thickness of 25 um gives
-    a total charge of 340 pC. If the force of a press falls from 2 N to 0.05 N, the total charge falls to 8 % of its
-    peak, so the touch does not end.
+    With the reference noise, a press that is equal on three electrodes needs a total charge of 20 pC. A press of 0.05 N
+    on a film with a thickness of 25 um gives a total charge of 340 pC. If the force of a press falls from 2 N to 0.05
+    N, the charges fall to 8 % of their peak, so the touch does not end.
 
     Attributes:
-        sigmas: First part of the touch threshold, in standard deviations of the total charge at rest.
-        floor_pC: Second part of the touch threshold, pC. The touch threshold is the sum of both parts.
+        sigmas: First part of the touch threshold, in standard deviations of the size of the noise.
+        floor_pC: Second part of the touch threshold, pC: the total charge of a press that is equal on all electrodes.
+            The touch threshold is the sum of both parts. None stands for 10 pC, or for 0 if the board sends currents.
         release_share: Release threshold, relative to the peak of the press. The release threshold is at least half of
-            the touch threshold.
+            the touch threshold. None stands for 0.05, or for 0.2 if the board sends currents, because their integral
+            does not return to zero exactly.
     """
 
     sigmas: Setting = 6.0
-    floor_pC: Setting = 10.0
-    release_share: Setting = 0.05
+    floor_pC: Setting | None = None
+    release_share: Setting | None = None
 
-    def threshold_pC(self, noise_pC: Array) -> float:
-        """Return the touch threshold, pC.
+    def resolved(self, *, has_currents: bool) -> "TouchRule":
+        """Return the settings with the default values for a board that sends charges, or currents."""
+        floor_pC, release_share = (0.0, 0.2) if has_currents else (10.0, 0.05)
+        return TouchRule(
+            sigmas=self.sigmas,
+            floor_pC=floor_pC if self.floor_pC is None else self.floor_pC,
+            release_share=release_share if self.release_share is None else self.release_share,
+        )
+
+    def threshold_pC(self, noise_pC: Array) -> Array:
+        """Return the touch threshold of each electrode, shape (n_electrode,), pC. The settings must be resolved.
+
+        The size of the noise of n electrodes, in standard deviations, has a mean of about sqrt(n) and a standard
+        deviation of about sqrt(1/2).
 
         Args:
             noise_pC: Standard deviation of the charge of each electrode at rest, shape (n_electrode,), pC.
         """
-        return self.floor_pC + self.sigmas * math.sqrt(float(np.dot(noise_pC, noise_pC)))
+        root_count = math.sqrt(len(noise_pC))
+        noise_sizes = root_count + self.sigmas * math.sqrt(0.5)
+        threshold_pC = noise_sizes * noise_pC + (self.floor_pC or 0.0) / root_count
+        return np.maximum(threshold_pC, SMALLEST_THRESHOLD_PC)
 
+
+SMALLEST_THRESHOLD_PC = 1e-12
+"""Lower limit of the touch threshold, pC. It avoids a division by zero for a board without noise."""
 
 SCALE_STD_FACTOR = 2.0
 """Number of common standard deviations of the charges by which the release threshold is raised."""
 
 RISE_S = 0.1
-"""Time constant of the mean total charge that shows whether the total charge rises slowly, s.
+"""Time constant of the mean charges that show whether the charges rise slowly, s.
 
-The total charge of a press of a film of 25 um rises slowly if its force grows by less than about 0.005 N/s.
+The charges of a press of a film of 25 um rise slowly if its force grows by less than about 0.005 N/s.
 """
+
+OPPOSING_COSINE = -0.25
+"""Cosine of the angle to the latest touch below which a change of the charges is the opposite of a touch.
+
+The charges of a touch may have any sign, so the angle of another touch is about 90 degrees or less.
+"""
+
+REST_S = 0.1
+"""Time for which the charges must be small before the direction of the latest touch no longer matters, s."""
 
 
 class Touch(Stage):
     """Determines whether something touches the film.
 
-    A touch begins when the total charge exceeds the base by the touch threshold. The base is the smallest total charge
-    since the last release, so a slow drift does not begin a touch. The base decays exponentially with time.
+    A touch begins when the charges differ from the base by more than the touch threshold. The base consists of the
+    charges that remained after the last release. It follows charges that fall further, and it decays exponentially.
 
-    A touch ends when the total charge falls below the release threshold. The release threshold is a given share of the
-    peak, plus the uncertainty of the total charge. It is at least half of the touch threshold. The peak is the largest
-    total charge that two consecutive frames of the touch have reached. The spike of a single frame is not a peak.
+    After a long press, an amplifier with a leak shows charges of the opposite sign. A change in the direction opposite
+    to the latest touch is therefore no touch, and the base follows such a change. If all charges of a film are known to
+    be positive, the same rule applies to charges that become negative before the first touch.
 
-    If the mean total charge of the last `RISE_S` has already exceeded half of the touch threshold when a touch begins,
-    the charge has risen slowly, and a drift of the charge at rest may have caused the touch. All frames of the touch
-    then have the flag `drift`.
+    A touch ends when the size of the charges falls below the release threshold, or when the charges change their sign
+    from one frame to the next, or become negative if the charges of the film are positive. The release threshold is a
+    given share of the peak, plus the uncertainty of the charges. It is at least half of the touch threshold. The peak
+    is the largest size that two consecutive frames of the touch have reached. The spike of a single frame is not a
+    peak.
 
-    If the total charge lies below zero by more than the touch threshold, the frame has the flag `negative`.
+    If the mean charges of the last `RISE_S` have already exceeded half of the touch threshold when a touch begins, the
+    charges have risen slowly, and a drift of the charge at rest may have caused the touch. All frames of the touch then
+    have the flag `drift`.
+
+    If charges exceed the touch threshold in the direction opposite to a touch, the frame has the flag `negative`.
     """
 
     section = "touch"
@@ -80,18 +117,23 @@ class Touch(Stage):
 
     def __init__(self, setup: Setup) -> None:
         """Begin without a touch."""
-        self._rule = setup.rule(TouchRule)
-        self._offset_stage = setup.offset_stage
+        self._setup = setup
+        rule = setup.rule(TouchRule)
+        self._rule = None if rule is None else rule.resolved(has_currents=setup.has_currents)
         self.reset()
 
     def reset(self) -> None:
         """Discard the touch."""
+        n_electrode = len(self._setup.electrodes)
+        self._rest_direction = np.full(n_electrode, 0.0 if self._setup.has_any_sign else 1.0)
+        self._direction = self._rest_direction  # sum of the directions of the frames of the latest touch
+        self._base = np.zeros(n_electrode)  # charges that are no touch
+        self._last = np.zeros(n_electrode)  # charges of the latest frame
+        self._mean = np.zeros(n_electrode)  # exponential mean of the charges out of contact
+        self._has_drifted = False  # whether the charges rose too slowly at the beginning of this touch
         self._is_contact = False
-        self._peak_pC = 0.0  # largest total charge in this touch
-        self._last_pC = 0.0  # total charge of the latest frame
-        self._base_pC = 0.0  # smallest total charge since the last release
-        self._mean_pC = 0.0  # exponential mean of the total charge out of contact
-        self._has_drifted = False  # whether the total charge rose too slowly at the beginning of this touch
+        self._peak = 0.0  # largest size in this touch
+        self._rest_s = 0.0  # time for which the charges have been small
 
     def step(self, frame: Frame) -> None:
         """Determine whether something touches the film in this frame.
@@ -105,43 +147,78 @@ class Touch(Stage):
         if self._rule is None:
             self._is_contact = True
         else:
-            self._detect(self._rule, frame, float(frame.charge_pC.sum()))
+            self._detect(self._rule, frame, frame.charge_pC / self._rule.threshold_pC(frame.noise_pC))
         frame.is_contact = self._is_contact
         if self._is_contact and self._has_drifted:
             frame.flags.append(DRIFT)
-        if self._is_contact and not was_contact and self._offset_stage is not None:
-            self._offset_stage.begin_touch(frame)
+        offset_stage = self._setup.offset_stage
+        if self._is_contact and not was_contact and offset_stage is not None:
+            offset_stage.begin_touch(frame)
 
-    def _detect(self, rule: TouchRule, frame: Frame, total_pC: float) -> None:
-        """Update the state with the total charge of a frame, pC. A press makes the total charge positive."""
-        touch_threshold_pC = rule.threshold_pC(frame.noise_pC)
-        two_frame_peak_pC = min(total_pC, self._last_pC)  # a spike of a single frame is not a peak
-        self._last_pC = total_pC
+    def _detect(self, rule: TouchRule, frame: Frame, charge: Array) -> None:
+        """Update the state with the charges of a frame.
+
+        Args:
+            rule: Thresholds.
+            frame: The frame.
+            charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
+        """
+        size = _norm(charge)
+        last_size = _norm(self._last)
+        two_frame_peak = min(size, last_size)  # a spike of a single frame is not a peak
+        reference = self._last if self._setup.has_any_sign else self._rest_direction
+        is_reversed = float(charge @ reference) < 0.0
+        self._last = charge
         if self._is_contact:
-            self._peak_pC = max(self._peak_pC, two_frame_peak_pC)
-            uncertainty_pC = SCALE_STD_FACTOR * frame.charge_scale_std * total_pC
-            release_threshold_pC = rule.release_share * self._peak_pC + uncertainty_pC
-            if total_pC < max(release_threshold_pC, 0.5 * touch_threshold_pC):
+            self._peak = max(self._peak, two_frame_peak)
+            uncertainty = SCALE_STD_FACTOR * frame.charge_scale_std * size
+            release_size = max((rule.release_share or 0.0) * self._peak + uncertainty, 0.5)
+            if size < release_size or is_reversed:
                 self._is_contact = False
-                self._base_pC = total_pC
-                self._mean_pC = total_pC
+                self._base = charge
+                self._mean = charge
+                self._rest_s = 0.0
+            else:
+                self._direction = self._direction + charge / size
             return
 
-        # While a finger leaves the film, a positive base must not decay, because this charge still belongs to the
+        # While a finger leaves the film, a remaining base must not decay, because this charge still belongs to the
         # finger.
-        if not (frame.is_base_held and self._base_pC > 0.0):
-            self._base_pC *= math.exp(-frame.dt_s / frame.base_relax_s)
-        if total_pC > self._base_pC + touch_threshold_pC:
+        direction = self._direction
+        is_remainder = float(self._base @ direction) > 0.0
+        if not (frame.is_base_held and is_remainder):
+            self._base = self._base * math.exp(-frame.dt_s / frame.base_relax_s)
+        change = charge - self._base
+        change_size = _norm(change)
+        if float(change @ direction) < OPPOSING_COSINE * change_size * _norm(direction):
+            self._base = charge
+        elif change_size > 1.0:
             self._is_contact = True
-            self._peak_pC = two_frame_peak_pC
-            self._has_drifted = self._mean_pC > self._base_pC + 0.5 * touch_threshold_pC
+            self._peak = two_frame_peak
+            self._direction = charge / max(size, 1.0)
+            self._has_drifted = _norm(self._mean - self._base) > 0.5
             return
-        self._mean_pC = total_pC + math.exp(-frame.dt_s / RISE_S) * (self._mean_pC - total_pC)
-        self._base_pC = min(self._base_pC, total_pC)
-        if total_pC < -touch_threshold_pC:
+        elif is_remainder and size < _norm(self._base):
+            self._base = charge
+
+        self._mean = charge + math.exp(-frame.dt_s / RISE_S) * (self._mean - charge)
+        if size > 1.0 and float(charge @ direction) < 0.0:
             frame.flags.append(NEGATIVE)
+        self._rest_s = 0.0 if size > 1.0 else self._rest_s + frame.dt_s
+        if self._rest_s >= REST_S:
+            self._direction = self._rest_direction
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
-        """Return the settings, and the time constant of the mean total charge."""
-        return super().c_settings(setup) | {"rise_s": RISE_S}
+        """Return the settings, whether the charges of a touch may have any sign, and the time constant of the mean."""
+        rule = setup.rule(TouchRule)
+        settings = super().c_settings(setup)
+        if rule is not None:
+            resolved = rule.resolved(has_currents=setup.has_currents)
+            settings |= {"floor_pC": resolved.floor_pC, "release_share": resolved.release_share}
+        return settings | {"any_sign": setup.has_any_sign, "rise_s": RISE_S}
+
+
+def _norm(vector: Array) -> float:
+    """Return the length of a vector."""
+    return math.sqrt(float(vector @ vector))

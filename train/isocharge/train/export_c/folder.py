@@ -22,7 +22,7 @@ from isocharge.train.model_release.onnx_graph import read_graph
 log = logging.getLogger(__name__)
 
 
-def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
+def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: bool = False) -> str:
     """Return the text of `isocharge_device.h`.
 
     Each stage of the signal chain states its settings for C. The macro `ISOCHARGE_<STAGE>_ON` is 1 if the stage is
@@ -31,12 +31,16 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     Args:
         device: The board.
         electrodes: Names of the electrodes in the order of the model.
+        has_any_sign: Whether the charges of a touch may have any sign.
 
     Raises:
         DeviceError: If the device file is for other electrodes, if its tare is too long for C, or if it uses a stage
             that does not exist in C.
     """
     setup = device.setup(electrodes)
+    if setup.has_currents:
+        raise DeviceError(f"{device.where}: front_end: {NOT_IN_C}")
+    setup.has_any_sign = has_any_sign
     lines = []
     sections_of_host = []
     for stage in STAGES:
@@ -140,7 +144,7 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
     files = {
         "isocharge_model.h": model_header(metadata, network),
         "isocharge_model.c": model_source(metadata, network),
-        "isocharge_device.h": device_header(device, metadata.electrodes),
+        "isocharge_device.h": device_header(device, metadata.electrodes, has_any_sign="film" not in metadata.sensor),
         **{name: source_text(name) for name in (*BOARD_SOURCES, "host_example.c")},
         "self_test.c": self_test(loaded.golden, metadata),
         "README.md": source_text(

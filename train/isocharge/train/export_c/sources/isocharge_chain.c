@@ -46,7 +46,14 @@ static void forget_tare(isocharge_chain *chain)
     chain->leak_running = 0;
 #endif
     chain->contact = chain->below = chain->saturated = chain->slow = 0;
-    chain->peak_pC = chain->last_pC = chain->base_pC = chain->mean_pC = 0;
+#if ISOCHARGE_TOUCH_ON
+    chain->peak = chain->rest_s = 0;
+    EACH(k)
+    {
+        chain->last[k] = chain->base[k] = chain->mean[k] = 0;
+        chain->direction[k] = ISOCHARGE_TOUCH_ANY_SIGN ? 0 : 1;
+    }
+#endif
 #if ISOCHARGE_THERMAL_ON
     chain->drift_pC = chain->drift_pC2 = chain->waited_s = 0;
     chain->blind = 0;
@@ -233,39 +240,89 @@ static void start_leak(isocharge_chain *chain, const real output_pC[N])
 }
 #endif
 
-/* Contact with hysteresis, from the total charge. */
-static void update_contact(isocharge_chain *chain, real total_pC, real decay, real dt_s)
+#if ISOCHARGE_TOUCH_ON
+static real dot(const real a[N], const real b[N])
+{
+    real sum = 0;
+
+    EACH(k) sum += a[k] * b[k];
+    return sum;
+}
+
+static real size_of(const real vector[N])
+{
+    return SQRT(dot(vector, vector));
+}
+
+static void copy(real to[N], const real from[N])
+{
+    EACH(k) to[k] = from[k];
+}
+#endif
+
+/* Contact with hysteresis, from the charges in units of their thresholds.
+
+   follows  whether the tare follows the drift, so that a remainder of the latest touch does not decay */
+static void update_contact(isocharge_chain *chain, const real charge_pC[N], real decay, int follows, real dt_s)
 {
 #if ISOCHARGE_TOUCH_ON
-    real squares = 0, threshold;
+    const real root = SQRT((real)N), half_root = SQRT((real)0.5);
+    const real sizes = root + (real)ISOCHARGE_TOUCH_SIGMAS * half_root;
+    real charge[N], change[N], size, change_size, two_frame_peak, rising;
+    int reversed, remainder;
 
-    EACH(k) squares += chain->noise_pC[k] * chain->noise_pC[k];
-    threshold = (real)ISOCHARGE_TOUCH_FLOOR_PC + (real)ISOCHARGE_TOUCH_SIGMAS * SQRT(squares);
+    EACH(k) charge[k] = charge_pC[k] / larger(sizes * chain->noise_pC[k] + (real)ISOCHARGE_TOUCH_FLOOR_PC / root, (real)1e-12);
+    size = size_of(charge);
+    two_frame_peak = smaller(size, size_of(chain->last));
+    EACH(k) change[k] = ISOCHARGE_TOUCH_ANY_SIGN ? chain->last[k] : 1;
+    reversed = dot(charge, change) < 0;
+    copy(chain->last, charge);
     chain->below = 0;
     if (chain->contact) {
-        chain->peak_pC = larger(chain->peak_pC, smaller(total_pC, chain->last_pC));
-        if (total_pC < larger((real)ISOCHARGE_TOUCH_RELEASE_SHARE * chain->peak_pC, threshold / 2)) {
+        chain->peak = larger(chain->peak, two_frame_peak);
+        if (size < larger((real)ISOCHARGE_TOUCH_RELEASE_SHARE * chain->peak, (real)0.5) || reversed) {
             chain->contact = chain->slow = 0;
-            chain->peak_pC = 0;
-            chain->base_pC = chain->mean_pC = total_pC;
-        }
-    } else {
-        chain->base_pC *= decay;
-        if (total_pC > chain->base_pC + threshold) {
-            chain->contact = 1;
-            chain->slow = chain->mean_pC > chain->base_pC + threshold / 2;
-            chain->peak_pC = smaller(total_pC, chain->last_pC);
-            chain->base_pC = 0;
+            chain->rest_s = 0;
+            copy(chain->base, charge);
+            copy(chain->mean, charge);
         } else {
-            chain->mean_pC = total_pC + EXP(-dt_s / (real)ISOCHARGE_TOUCH_RISE_S) * (chain->mean_pC - total_pC);
-            chain->base_pC = smaller(chain->base_pC, total_pC);
-            chain->below = total_pC < -threshold;
+            EACH(k) chain->direction[k] += charge[k] / size;
         }
+        return;
     }
-    chain->last_pC = total_pC;
+    remainder = dot(chain->base, chain->direction) > 0;
+    EACH(k)
+    {
+        if (!(follows && remainder))
+            chain->base[k] *= decay;
+        change[k] = charge[k] - chain->base[k];
+    }
+    change_size = size_of(change);
+    if (dot(change, chain->direction) < (real)-0.25 * change_size * size_of(chain->direction)) {
+        copy(chain->base, charge); /* the opposite of a touch, such as the end of a long press */
+    } else if (change_size > 1) {
+        chain->contact = 1;
+        chain->peak = two_frame_peak;
+        EACH(k)
+        {
+            chain->direction[k] = charge[k] / larger(size, 1);
+            change[k] = chain->mean[k] - chain->base[k];
+        }
+        chain->slow = size_of(change) > (real)0.5;
+        return;
+    } else if (remainder && size < size_of(chain->base)) {
+        copy(chain->base, charge);
+    }
+    rising = EXP(-dt_s / (real)ISOCHARGE_TOUCH_RISE_S);
+    EACH(k) chain->mean[k] = charge[k] + rising * (chain->mean[k] - charge[k]);
+    chain->below = size > 1 && dot(charge, chain->direction) < 0;
+    chain->rest_s = size > 1 ? 0 : chain->rest_s + dt_s;
+    if (chain->rest_s >= (real)0.1)
+        EACH(k) chain->direction[k] = ISOCHARGE_TOUCH_ANY_SIGN ? 0 : 1;
 #else
-    (void)total_pC;
+    (void)charge_pC;
     (void)decay;
+    (void)follows;
     (void)dt_s;
     chain->contact = 1;
 #endif
@@ -313,12 +370,11 @@ static real track_thermal_drift(isocharge_chain *chain, const real charge_pC[N],
 static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real dt_s, int limited,
                           isocharge_reading *reading)
 {
-    real output_pC[N], *charge_pC = reading->charge_pC, total_pC = 0, decay = 1;
+    real output_pC[N], *charge_pC = reading->charge_pC, decay = 1;
 
 #if TARE_FOLLOWS
     const real kept = EXP(-dt_s / (real)ISOCHARGE_TARE_RELAX_S);
-    if (chain->base_pC < 0)
-        decay = kept;
+    decay = kept;
 #endif
     EACH(k)
     {
@@ -335,8 +391,7 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
 #else
     EACH(k) charge_pC[k] = output_pC[k];
 #endif
-    EACH(k) total_pC += charge_pC[k];
-    update_contact(chain, total_pC, decay, dt_s);
+    update_contact(chain, charge_pC, decay, TARE_FOLLOWS, dt_s);
     chain->saturated = limited || (chain->saturated && chain->contact);
 #if ISOCHARGE_THERMAL_ON
     if (!chain->contact) {

@@ -59,7 +59,11 @@ typedef struct {
     isocharge_real candidate_age_s, learned_s, hold_s;
 #endif
     int contact, below, saturated, slow;
-    isocharge_real peak_pC, last_pC, base_pC, mean_pC;
+#if ISOCHARGE_TOUCH_ON
+    isocharge_real peak, rest_s; /* charges of the touch are in units of their thresholds */
+    isocharge_real last[ISOCHARGE_ELECTRODES], base[ISOCHARGE_ELECTRODES], mean[ISOCHARGE_ELECTRODES];
+    isocharge_real direction[ISOCHARGE_ELECTRODES];
+#endif
 #if ISOCHARGE_THERMAL_ON
     isocharge_real drift_pC, drift_pC2, waited_s;
     int blind;

@@ -1,0 +1,112 @@
+"""Boards that send currents: integral, leak, detection of touches, and the estimate of the leak by the doctor.
+
+The charges are stated first, and the currents are their differences. The integral must return the charges.
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from isocharge.common.errors import DeviceError
+from isocharge.serve import Chunk, Frame, device_from_table, encode_frame
+from isocharge.serve.examination.current_press import find_current_press
+from isocharge.serve.examination.listening import ReceivedData
+from isocharge.serve.examination.port_check import examine_received
+from isocharge.serve.signal_chain.inflow import LeakSection
+from isocharge.train.export_c.folder import device_header
+from stage_runner import StageRunner
+
+RATE_HZ = 1000.0
+T_S = np.arange(0.0, 20.0, 1.0 / RATE_HZ)
+RATIOS = np.array([1.0, -0.6, -0.5])
+"""Charges of a press relative to its force. Their sum is negative."""
+
+FORCE = np.interp(T_S, [0.0, 3.0, 3.4, 6.0, 8.0, 8.2, 11.0, 11.1, 14.0, 14.2], [0, 0, 1, 1, 0.6, 0, 0, 0.4, 0.4, 0])
+"""Force of two presses, shape (n,), relative to the largest force."""
+
+
+def currents(charge_pC, tau_s=math.inf, noise_pC=0.2):
+    """Return the currents of charges, pC in a sampling interval, with an offset, noise and the leak of the film."""
+    leak_pC = charge_pC / (tau_s * RATE_HZ)
+    noise = noise_pC * np.random.default_rng(5).standard_normal(charge_pC.shape)
+    return np.diff(charge_pC, axis=0, prepend=0.0) + leak_pC + noise + np.array([180.0, -300.0, 20.0])
+
+
+def run(values, **sections):
+    """Return the frames of a board that sends currents."""
+    chain = StageRunner(device=device_from_table({"front_end": "current", **sections}, "b"))
+    return [chain.advance(row, t_s, 1.0 / RATE_HZ) for row, t_s in zip(values, T_S, strict=False)]
+
+
+@pytest.mark.parametrize("tau_s", [math.inf, 5.0])
+def test_integral_of_currents_is_the_charge_and_detects_touches(tau_s):
+    charge_pC = 1000.0 * FORCE[:, None] * RATIOS
+    sections = {} if math.isinf(tau_s) else {"leak": {"tau_s": tau_s}}
+    frames = run(currents(charge_pC, tau_s), **sections)
+    is_contact = np.array([frame.is_contact for frame in frames])
+    is_pressed = FORCE > 0.0
+    assert is_contact[is_pressed].mean() > 0.98
+    assert not is_contact[T_S < 3.0].any()
+    assert not is_contact[~is_pressed & (np.abs(T_S - 9.5) < 1.0)].any()
+    integral_pC = np.array([frame.charge_pC for frame in frames if frame.charge_pC is not None])
+    expected_pC = charge_pC[-len(integral_pC) :]
+    is_held = FORCE[-len(integral_pC) :] > 0.3
+    np.testing.assert_allclose(integral_pC[is_held], expected_pC[is_held], atol=60.0)
+    correlation = np.corrcoef(np.abs(integral_pC).sum(axis=1), FORCE[-len(integral_pC) :])[0, 1]
+    assert correlation > 0.99
+
+
+def test_gain_of_currents_does_not_change_the_detection():
+    """The touch threshold is in units of the noise, so the unit of the board does not matter."""
+    values = currents(1000.0 * FORCE[:, None] * RATIOS)
+    contacts = [[frame.is_contact for frame in run(scale * values)] for scale in (1.0, 1e-3)]
+    assert np.mean(np.array(contacts[0]) != np.array(contacts[1])) < 0.002
+
+
+def test_noise_of_currents_gives_no_touch():
+    values = currents(np.zeros((len(T_S), 3)))
+    assert not any(frame.is_contact for frame in run(values))
+
+
+@pytest.mark.parametrize("tau_s", [3.0, 10.0, 30.0])
+def test_doctor_estimates_the_leak_from_a_press_and_its_release(tau_s):
+    is_first_press = T_S < 10.5
+    charge_pC = 1000.0 * FORCE[is_first_press, None] * RATIOS
+    press = find_current_press(currents(charge_pC, tau_s, noise_pC=0.05), T_S[is_first_press])
+    assert press.begin_s == pytest.approx(3.0, abs=0.11)
+    assert press.sections["leak"]["tau_s"] == pytest.approx(tau_s, rel=0.1)
+
+
+def test_doctor_proposes_no_leak_without_a_leak_or_without_a_press():
+    charge_pC = 1000.0 * FORCE[:, None] * RATIOS
+    is_first_press = T_S < 10.5
+    press = find_current_press(currents(charge_pC, noise_pC=0.0)[is_first_press], T_S[is_first_press])
+    assert press.sections == {}
+    assert find_current_press(currents(0.0 * charge_pC), T_S) is None
+    held = T_S < 7.0  # not released
+    assert find_current_press(currents(charge_pC)[held], T_S[held]) is None
+
+
+def test_doctor_writes_the_leak_of_a_current_board():
+    charge_pC = 1000.0 * FORCE[T_S < 10.5, None] * RATIOS
+    rows = currents(charge_pC, 4.0, noise_pC=0.05)
+    data = [encode_frame(Frame(n, round(1e3 * n), tuple(row))) for n, row in enumerate(rows.tolist())]
+    chunks = [Chunk(piece, n / RATE_HZ, round(1e9 * n / RATE_HZ)) for n, piece in enumerate(data)]
+    device = device_from_table({"front_end": "current", "frames": {"format": "binary"}}, "b")
+    received = ReceivedData("tcp://board:1", 115200, chunks=chunks, seconds=len(rows) / RATE_HZ)
+    examination = examine_received(received, device=device)
+    assert examination.works
+    assert examination.touch == ""
+    completed = device_from_table(examination.device, "b")
+    assert completed.front_end == "current"
+    assert completed.rule(LeakSection).tau_s == pytest.approx(4.0, rel=0.1)
+
+
+def test_currents_are_refused_in_c_and_beside_a_memory():
+    with pytest.raises(DeviceError, match="b: front_end: this stage does not exist in the signal chain in C"):
+        device_header(device_from_table({"front_end": "current"}, "b"), ("A", "B", "C"))
+    with pytest.raises(DeviceError, match=r"b: memory: expected no section \[memory\] beside front_end"):
+        device_from_table({"front_end": "current", "memory": {}}, "b")
+    with pytest.raises(DeviceError, match=r"front_end: expected one of .*, got 'voltage'"):
+        device_from_table({"front_end": "voltage"}, "b")
