@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from isocharge.serve.live.device import Device, device_from_table, load_device
     from isocharge.serve.live.steady_press import PressWatch
     from isocharge.serve.live.stream import Policy, ReadingStream, TouchStream, stream
+    from isocharge.serve.model.contact import Contact, Contacts, Validity
     from isocharge.serve.model.metadata import ModelMetadata
     from isocharge.serve.model.model_folder import (
         Model,
@@ -33,10 +34,9 @@ if TYPE_CHECKING:
         verify_model,
         write_model,
     )
+    from isocharge.serve.model.predictor import Predictor
     from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
     from isocharge.serve.port.source import Chunk, Port, open_source
-    from isocharge.serve.prediction.contact import Contact, Contacts, Validity
-    from isocharge.serve.prediction.predictor import Predictor
     from isocharge.serve.prediction.press_check import PressCheck, check_presses
     from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
     from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses, write_presses

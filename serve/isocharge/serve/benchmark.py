@@ -18,8 +18,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.progress import track
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
-from isocharge.serve.prediction.predictor import Predictor
 
 Clock = Callable[[], int]
 """Function that returns the time, ns."""

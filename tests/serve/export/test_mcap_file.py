@@ -37,9 +37,9 @@ from isocharge.serve.export.record_messages import (
     WRENCH,
     WRENCH_DEFINITION,
 )
+from isocharge.serve.model.contact import NO_CORRELATION
 from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.targets import Outputs
-from isocharge.serve.prediction.contact import NO_CORRELATION
 from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking, field_names
 from isocharge.serve.record.schema import record_schema
 

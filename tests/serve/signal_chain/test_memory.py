@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Contact, Frame, TouchStream, device_from_table, encode_frame
-from isocharge.serve.prediction.contact import Sensitivity
+from isocharge.serve.model.contact import Sensitivity
 from isocharge.serve.signal_chain.memory import CREEP_LAW_DEVIATION, LEARN_S, WARMTH_CHANGE_PC
 from isocharge.serve.signal_chain.memory_state import DECADES_S
 from isocharge.serve.signal_chain.thermal import warming_ratios

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from isocharge.serve.prediction.contact import Contact
+from isocharge.serve.model.contact import Contact
 from isocharge.serve.tracking.touch_peak import MAX_AVERAGED_FRAMES, TouchPeak
 
 

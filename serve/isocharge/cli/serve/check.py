@@ -11,7 +11,7 @@ import typer
 from isocharge.cli.shared.options import JsonOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.terminal import show, show_json
-from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses
 from isocharge.serve.prediction.press_errors import ErrorSummary
 

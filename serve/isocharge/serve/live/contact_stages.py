@@ -8,8 +8,8 @@ from msgspec import structs
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import FILM
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.prediction.contact import Contact, Sensitivity
-from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.model.contact import Contact, Sensitivity
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.signal_chain.memory import MemoryRule
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.signal_chain.stage import Setup, Stage

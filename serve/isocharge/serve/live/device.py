@@ -41,8 +41,8 @@ from isocharge.serve.frames.formats import AutoFrames, Frames
 from isocharge.serve.frames.frame import Parser
 from isocharge.serve.frames.frame_layout import FrameLayout
 from isocharge.serve.live.contact_stages import ChargeScale, FollowFilm, Prediction, TouchOffset
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.serial_line import Request
-from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain
 from isocharge.serve.signal_chain.hum import Hum

@@ -14,9 +14,9 @@ from functools import partial
 
 from isocharge.common.errors import IsochargeError
 from isocharge.serve.live.stream import TouchStream
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.recording import Event, FilmReset, Marker, NewModel, RecordedClock, Recorder, Recording
 from isocharge.serve.port.source import Chunk
-from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import PredictionRecord
 
 Load = Callable[[], Predictor]

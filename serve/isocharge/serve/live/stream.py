@@ -19,9 +19,9 @@ from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, SequenceGaps
 from isocharge.serve.live.contact_stages import FollowFilm
 from isocharge.serve.live.device import ANY_BOARD, Device, create_stages
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.serial_line import TELNET_ADVICE, without_telnet
 from isocharge.serve.port.source import Chunk
-from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord
 from isocharge.serve.signal_chain.stage import Stage
 from isocharge.serve.tracking.film_follower import FollowRule

@@ -1,4 +1,4 @@
-"""Folders of models: their metadata, ONNX sessions, golden vectors and companion files, and the search for a model.
+"""Folders of models: their metadata, ONNX sessions, golden vectors and charge maps, and the prediction of contacts.
 
-May import: nothing else of isocharge.serve.
+May import: flags. The package `isocharge.train` also uses this package.
 """

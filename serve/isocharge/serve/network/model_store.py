@@ -18,6 +18,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from isocharge.common.errors import ModelError, ModelNotFound
+from isocharge.serve.model.contact import Validity
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import (
     Model,
@@ -28,7 +29,6 @@ from isocharge.serve.model.model_folder import (
 )
 from isocharge.serve.model.session import BoundPress, output_widths
 from isocharge.serve.network.traffic import Statistics
-from isocharge.serve.prediction.contact import Validity
 
 log = logging.getLogger(__name__)
 

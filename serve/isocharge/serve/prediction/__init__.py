@@ -1,4 +1,4 @@
-"""Prediction of contacts from charges, without a server, for single presses, tables of charges and measured presses.
+"""Prediction of contacts from tables of charges and from measured presses.
 
-May import: model, flags.
+May import: model, presses, record, flags.
 """

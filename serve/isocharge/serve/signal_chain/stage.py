@@ -17,7 +17,7 @@ from msgspec import structs
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DeviceError
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.signal_chain.rule import Rule
 
 R = TypeVar("R", bound=Rule)

@@ -10,7 +10,7 @@ that change from frame to frame. The variance of the constant errors is added to
 import math
 
 from isocharge.serve.flags import BEYOND, MISFIT, SATURATED
-from isocharge.serve.prediction.contact import Contact
+from isocharge.serve.model.contact import Contact
 from isocharge.serve.record.record import TrackedContact
 from isocharge.serve.tracking.two_mode_filter import FORCE_MOTION, POSITION_MOTION, Estimate, Metric, TwoModeFilter
 

@@ -28,7 +28,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.serve.model.charge_series import ChargeSeries, read_charges
 from isocharge.serve.model.metadata import ModelNoise
-from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.tracking.contact_filter import MAX_GAP_s
 from isocharge.serve.tracking.mixture_components import (
     CONTACT,

@@ -23,8 +23,8 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError
 from isocharge.serve.model.charge_series import FILE, read_charges
-from isocharge.serve.prediction.contact import Contact, is_close
-from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.model.contact import Contact, is_close
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.tracking.film_state import FilmModel, Touch

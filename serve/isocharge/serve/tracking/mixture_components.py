@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.serve.prediction.contact import Contact
+from isocharge.serve.model.contact import Contact
 from isocharge.serve.tracking.two_mode_filter import MIN_ACCELERATION_SHARE, POSITION_MOTION
 
 X = 0

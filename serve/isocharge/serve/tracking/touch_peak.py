@@ -12,7 +12,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import BEYOND, GAP, MISFIT, OUTSIDE, REPEAT, STRESS
-from isocharge.serve.prediction.contact import Contact, is_close
+from isocharge.serve.model.contact import Contact, is_close
 
 MAX_AVERAGED_FRAMES = 64
 """Largest number of frames that are averaged.

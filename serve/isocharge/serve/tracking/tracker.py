@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from isocharge.serve.flags import SATURATED
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.prediction.contact import Contact
+from isocharge.serve.model.contact import Contact
 from isocharge.serve.record.record import NO_TRACKING, OtherContact, TrackedContact, Tracking
 from isocharge.serve.signal_chain.rule import Rule, Share
 from isocharge.serve.signal_chain.stage import Setup, Stage

@@ -15,7 +15,8 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, ModelError
 from isocharge.common.files import sha256_of
-from isocharge.serve import ModelMetadata, Predictor
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.predictor import Predictor
 from isocharge.simulate import Dataset, Domain, Probe, Sensor, parse_probe
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train.model_release.evaluate import HELD_PRESSES

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from isocharge.serve import Predictor
+from isocharge.serve.model.predictor import Predictor
 from isocharge.simulate import ChargeSpline, Dataset, limits_at
 from isocharge.train.data.contact_errors import rms
 from isocharge.train.data.presses import LabelledPresses, held_out, is_measured, presses_of

@@ -12,7 +12,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, TrainingError
-from isocharge.serve import Predictor
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.simulate import ChargeMap, Domain, NoiseModel, Triangulation
 from isocharge.train.data.presses import LabelledPresses

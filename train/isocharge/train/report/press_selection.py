@@ -9,7 +9,7 @@ import numpy as np
 
 from isocharge.common.arrays import Booleans
 from isocharge.common.errors import ModelError
-from isocharge.serve import ModelMetadata
+from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.simulate import Dataset, Samples
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.presses import LabelledPresses, check_enough, domain_of

@@ -16,10 +16,10 @@ import orjson
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import RequestError, TooLarge
 from isocharge.common.structs import parse_json
+from isocharge.serve.model.contact import Contacts
 from isocharge.serve.model.session import CORRELATION, INPUT, as_float32, check_output_shapes, run, run_error
 from isocharge.serve.network.model_store import LoadedVersion
 from isocharge.serve.network.protocol.bodies import InferBody, InputTensor, Parameters
-from isocharge.serve.prediction.contact import Contacts
 
 DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
 """NumPy type of the charges by the name of the number type. The protocol prescribes little-endian numbers."""

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError, ModelError
+from isocharge.serve.model.contact import Contact, Contacts, Validity
 from isocharge.serve.model.model_folder import Model, find_model, load_model
 from isocharge.serve.model.session import (
     N_WITHOUT_CORRELATION,
@@ -30,7 +31,6 @@ from isocharge.serve.model.session import (
     run,
     write_finite,
 )
-from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 
 log = logging.getLogger(__name__)
 
