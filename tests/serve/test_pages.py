@@ -24,7 +24,7 @@ from layout_encoder import encode_layout
 SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
 
-SLOW = {"mcap.md", "recordings.md", "virtual_sensor.md", "live_page.md", "live_samples.md", "secure_service.md"}
+SLOW = {"mcap.md", "recordings.md", "virtual_sensor.md", "live_page.md", "secure_service.md"}
 """Pages whose commands simulate a film or start several servers. The tutorial, which simulates a film, runs always."""
 
 
@@ -57,10 +57,10 @@ def test_frame_of_the_documentation_is_read():
 
 
 def test_described_frames_of_the_documentation_are_read():
-    table = tomllib.loads(re.search(r"```toml\n(.*?)```", PAGES["own_frames.md"], re.DOTALL)[1])
+    table = tomllib.loads(re.search(r"```toml\n(.*?)```", PAGES["device_file.md"], re.DOTALL)[1])
     layout = device_from_table(table, "board.toml").frames
     parser = device_from_table(table, "board.toml").parser()
-    frame = Frame(7, None, (100.0, -200.0, 300.0), names=("A", "B", "C"))
+    frame = Frame(7, 5000, (1.0, 100.0, -200.0, 300.0), names=("status", "adc0", "adc1", "adc2"))
     assert parser.feed(encode_layout(layout, frame)) == [frame]
 
 
