@@ -32,6 +32,7 @@ COMMANDS_OF_EXTRAS = {
 }
 """A command that imports the packages of each extra. It runs in an install with this extra only."""
 
+
 def predicted(bin_folder, folder):
     """The contact that the installed command computes."""
     table = "A,B,C\n942.9,910.4,690.8\n"
@@ -41,6 +42,7 @@ def predicted(bin_folder, folder):
     record = json.loads(done.stdout)
     return [record["x_mm"], record["y_mm"], record["force_N"]]
 
+
 @pytest.fixture(scope="module")
 def distributions(tmp_path_factory):
     """The source distribution and the wheel that is built from it."""
@@ -48,11 +50,13 @@ def distributions(tmp_path_factory):
     subprocess.run([sys.executable, "-m", "build", "-o", folder, ROOT], check=True, timeout=280, capture_output=True)
     return sorted(folder.iterdir())
 
+
 @pytest.fixture(scope="module")
 def wheel(distributions):
     """The wheel."""
     (path,) = (path for path in distributions if path.suffix == ".whl")
     return path
+
 
 def install(requirement, folder, timeout, constraints=""):
     """Install a requirement into an empty environment, and return the bin folder of the environment."""
@@ -65,6 +69,7 @@ def install(requirement, folder, timeout, constraints=""):
     subprocess.run([*pip, "install", *options, requirement], check=True, timeout=timeout)
     return python.parent
 
+
 def lower_bounds():
     """Constraints with which pip installs the smallest allowed version of each package.
 
@@ -75,15 +80,18 @@ def lower_bounds():
     bounds = (re.match(r"([\w-]+)>=([\d.]+)", line) for line in requirements)
     return "".join(f"{bound[1]}=={bound[2]}\n" for bound in bounds if bound and bound[1] != "torch")
 
+
 @pytest.fixture(scope="module")
 def base(tmp_path_factory, wheel):
     """The bin folder of an empty environment into which the wheel was installed, with nothing else in it."""
     return install(str(wheel), tmp_path_factory.mktemp("fresh"), timeout=280)
 
+
 def run(base, *words, cwd, timeout=60):
     return subprocess.run(
         [base / words[0], *words[1:]], cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False
     )
+
 
 def test_twine_accepts_both_distributions(distributions):
     names = [path.name for path in distributions]
@@ -92,16 +100,19 @@ def test_twine_accepts_both_distributions(distributions):
     done = subprocess.run(twine, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 
+
 def test_the_version_is_that_of_the_changelog_and_of_the_citation(base, tmp_path):
     assert run(base, "isocharge", "--version", cwd=tmp_path).stdout == f"isocharge {VERSION}\n"
     assert re.search(r"^## (\S+?),? ", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)[1] == VERSION
     assert f"\nversion: {VERSION}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
+
 
 def test_nothing_heavy_came_along(base, tmp_path):
     code = "from importlib.metadata import distributions as all; print(*(one.name.lower() for one in all()))"
     names = {*run(base, "python", "-c", code, cwd=tmp_path).stdout.split()}
     assert {"isocharge", "numpy", "onnxruntime"} <= names
     assert not names & {"torch", "scipy", "scikit-learn", "onnx", "matplotlib"}
+
 
 def test_the_size_of_the_base_install_is_as_stated(base):
     """The size does not include compiled Python modules, which are a tenth of the stated size."""
@@ -110,8 +121,10 @@ def test_the_size_of_the_base_install_is_as_stated(base):
     size_MB = sum(path.stat().st_size for path in base.parent.rglob("*") if path.is_file()) / 2**20
     assert 0.7 * stated_MB < size_MB < 1.05 * stated_MB
 
+
 def test_predict_works_from_any_folder(base, tmp_path):
     assert predicted(base, tmp_path) == pytest.approx([3.0, -2.0, 1.0], abs=0.06)
+
 
 @pytest.mark.parametrize(("page", "number"), [("README.md", 0), ("serve/README.md", 0), ("serve/docs/tutorial.md", 1)])
 def test_examples_of_the_base_install_work_from_any_folder(base, tmp_path, page, number):
@@ -120,11 +133,13 @@ def test_examples_of_the_base_install_work_from_any_folder(base, tmp_path, page,
     done = run(base, "python", "-c", example, cwd=tmp_path)
     assert done.stdout.splitlines() == re.findall(r"^print\(.*\)  # (.+)$", example, re.MULTILINE), done.stderr
 
+
 @pytest.mark.parametrize("stage", ["simulate", "train"])
 def test_a_missing_extra_says_so_in_python_too(base, tmp_path, stage):
     done = run(base, "python", "-c", f"import isocharge.{stage}", cwd=tmp_path)
     assert "isocharge.common.errors.MissingExtra" in done.stderr
     assert f"pip install 'isocharge[{stage}]'" in done.stderr
+
 
 @pytest.mark.first_cases(2)
 @pytest.mark.parametrize(
@@ -144,6 +159,7 @@ def test_a_missing_extra_says_how_to_get_it(base, tmp_path, words, extra):
     assert f"pip install 'isocharge[{extra}]'" in done.stderr
     assert "Traceback" not in done.stderr
 
+
 def check_help_and_missing_argument(bin_folder, folder):
     """Check what typer and click print."""
     for command in ("", "serve stream", "serve predict"):
@@ -152,14 +168,17 @@ def check_help_and_missing_argument(bin_folder, folder):
     done = run(bin_folder, "isocharge", "serve", "predict", cwd=folder)
     assert (done.returncode, "Missing argument 'MODEL'" in done.stderr) == (2, True), done.stderr
 
+
 def test_help_and_a_missing_argument_are_no_crash(base, tmp_path):
     check_help_and_missing_argument(base, tmp_path)
+
 
 @pytest.mark.slow
 def test_the_base_install_works_with_the_lower_bounds_of_its_packages(wheel, tmp_path):
     bin_folder = install(str(wheel), tmp_path, timeout=280, constraints=lower_bounds())
     assert predicted(bin_folder, tmp_path) == pytest.approx([3.0, -2.0, 1.0], abs=0.06)
     check_help_and_missing_argument(bin_folder, tmp_path)
+
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
@@ -174,6 +193,7 @@ def test_the_wheel_with_an_extra_runs_the_readme_and_a_command_of_the_extra(whee
     write_table(table({"A": [942.9], "B": [910.4], "C": [690.8]}), tmp_path / "charges.parquet")
     done = run(bin_folder, "isocharge", *COMMANDS_OF_EXTRAS[extra].split(), cwd=tmp_path, timeout=600)
     assert done.returncode == 0, done.stderr
+
 
 def test_every_extra_has_a_command():
     assert {*COMMANDS_OF_EXTRAS, "dev"} == {*PROJECT["optional-dependencies"]}
