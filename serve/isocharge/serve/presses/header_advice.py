@@ -86,11 +86,11 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
         )
     advice_to_rename = f"rename {shown(column)} to {shown(name)}"
     if meaning.noun == "electrode":
-        meaning = replace(meaning, words=_words(name))  # an electrode is recognised by the words of its name
+        meaning = replace(meaning, words=words_of(name))  # an electrode is recognised by the words of its name
 
     # Check whether the name consists only of words that mean the missing column, such as "force", and of general words,
     # such as "position", which do not change the meaning.
-    words = _words(column)
+    words = words_of(column)
     unknown_words = words - meaning.words - GENERAL_WORDS
     if _is_named(words, meaning) and not unknown_words:
         return advice_to_rename
@@ -101,7 +101,7 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
         return ""
     label, bracketed_unit, last_word = match.groups()
     unit = bracketed_unit or last_word  # only one of them is not None
-    is_label_known = _is_named(_words(label), meaning)
+    is_label_known = _is_named(words_of(label), meaning)
     is_recognised_by_unit = meaning.is_known_by_unit and bracketed_unit is not None
     if unit == meaning.unit and (is_label_known or is_recognised_by_unit):
         return advice_to_rename
@@ -126,6 +126,6 @@ def _is_named(words: frozenset[str], meaning: ColumnMeaning) -> bool:
     return bool(meaning.words & words)
 
 
-def _words(text: str) -> frozenset[str]:
+def words_of(text: str) -> frozenset[str]:
     """Return the words of a text in lower case. All characters except letters and digits separate words."""
     return frozenset(word for word in re.split(r"[\W_]+", text.casefold()) if word)

@@ -9,7 +9,7 @@ import numpy as np
 
 from isocharge.common.errors import ChargeError, cut, shown
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.presses.header_advice import OTHER_UNITS, header_advice
+from isocharge.serve.presses.header_advice import OTHER_UNITS, header_advice, words_of
 from isocharge.serve.presses.number_table import CHARGE_RULE
 from isocharge.serve.signal_chain.gain import GainRule
 from isocharge.serve.signal_chain.stage import Setup, Stage
@@ -19,8 +19,11 @@ MAX_CHANNEL_DIGITS = 4
 
 _UNITS = "|".join(["pC", *OTHER_UNITS["pC"]])
 
-_UNIT = re.compile(rf"(?:_({_UNITS})|\s*[\[(]\s*({_UNITS})\s*[\])])$")
+_UNIT = re.compile(rf"(?:[_\s]({_UNITS})|\s*[\[(]\s*({_UNITS})\s*[\])])$")
 """Unit at the end of the name of a channel, such as `_nC` or `[nC]`."""
+
+_NUMBERED = re.compile(rf"(\D*)(\d{{1,{MAX_CHANNEL_DIGITS}}})(\D*)", re.ASCII)
+"""Name of a channel that contains one number, such as `ch2` or `adc0_raw`."""
 
 
 class Channels(Stage):
@@ -28,10 +31,10 @@ class Channels(Stage):
 
     The section `[channels]` of the device file states the name or the number of the channel of each electrode. If the
     device file has no section `[channels]`, a channel belongs to the electrode with the same name. The name of a
-    channel may have a prefix or a suffix, as in `A_pC` or `charge.A`, and may differ by case. If no channel has the
-    name of an electrode, or nearly so, the channels are assigned by their order, or by their numbers if all names are
-    numbers such as `ch2`: the first channel belongs to the first electrode, and so on. An assignment by order requires
-    as many channels as electrodes.
+    channel may have a unit, as in `A_pC`, may contain further words, as in `charge.A` or `A_raw`, and may differ by
+    case. If no channel has the name of an electrode, or nearly so, the channels are assigned by their order, or by
+    their numbers if the names differ only by a number, as `ch0` and `ch1` do: the first channel belongs to the first
+    electrode, and so on. An assignment by order requires as many channels as electrodes.
     """
 
     is_required = True
@@ -87,9 +90,7 @@ class Channels(Stage):
             return indices
         if len(frame.values) != len(self._electrodes):
             raise self._assignment_error(frame)
-        numbers = [number for name in channel_names(frame) if (number := channel_number(name)) is not None]
-        order = range(len(frame.values))
-        return tuple(sorted(order, key=numbers.__getitem__) if len(numbers) == len(order) else order)
+        return _order_of_channels(channel_names(frame))
 
     def named_indices(self, frame: Frame) -> tuple[int, ...] | None:
         """Return, for each electrode, the index of the channel with its name in `frame.values`.
@@ -187,7 +188,10 @@ def channel_number(name: str) -> int | None:
 
 
 def _channels_of_electrode(electrode: str, names: tuple[str, ...]) -> list[int]:
-    """Return the indices of the channels with the name of an electrode. Case matters only if both cases occur.
+    """Return the indices of the channels with the name of an electrode.
+
+    Case matters only if both cases occur. Further words in the names of the channels are ignored only if no channel has
+    the name of the electrode without them.
 
     Args:
         electrode: Name of the electrode.
@@ -195,7 +199,27 @@ def _channels_of_electrode(electrode: str, names: tuple[str, ...]) -> list[int]:
     """
     electrodes = [electrode_of(name) for name in names]
     equal = [index for index, name in enumerate(electrodes) if name == electrode]
-    return equal or [index for index, name in enumerate(electrodes) if name.casefold() == electrode.casefold()]
+    equal = equal or [index for index, name in enumerate(electrodes) if name.casefold() == electrode.casefold()]
+    required_words = words_of(electrode)
+    if equal or not required_words:
+        return equal
+    return [index for index, name in enumerate(names) if required_words <= words_of(name)]
+
+
+def _order_of_channels(names: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the indices of channels by the numbers in their names, or in their order if there are no such numbers.
+
+    The numbers are used only if the names differ by nothing else.
+
+    Args:
+        names: Names of the channels.
+    """
+    indices = range(len(names))
+    matches = [match for name in names if (match := _NUMBERED.fullmatch(name)) is not None]
+    texts_around_number = {(match[1], match[3]) for match in matches}
+    if len(matches) < len(names) or len(texts_around_number) != 1:
+        return tuple(indices)
+    return tuple(sorted(indices, key=lambda index: int(matches[index][2])))
 
 
 def electrode_of(name: str) -> str:
