@@ -305,6 +305,7 @@ BAD = [
     ),
     (("simulate", "point", SENSOR, "--force", "1e6"), 2, "beyond small strains"),
     (("simulate", "point", SENSOR, "--force", "1e308"), 2, "beyond small strains"),
+    (("simulate", "point", SENSOR, "--force", "1e-300"), 2, "expected at least 1e-12 N"),
     (
         ("simulate", "sweep", SENSOR, "--samples", "1000000000000", "-o", "OUT"),
         2,

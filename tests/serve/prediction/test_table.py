@@ -123,6 +123,7 @@ def test_table_with_only_a_header_has_no_presses():
         ("A;B;C\nA;B;C\n1;2;3\n", "line 2, column 'A': expected a charge in pC, got 'A'"),
         ("A;B;C\n1;2;3\npC;pC;pC\n", "line 3, column 'A': expected a charge in pC, got 'pC'"),
         ("A,B,C\n1,2,3\n\n4,,6\n", "presses.csv, line 4, column 'B': expected a charge in pC, got an empty cell"),
+        ("A,B,C\n1,2 pC,3\n", "expected a charge in pC, got '2 pC'; write the number without 'pC'"),
         ("A,B,C\n1,2,x\n", "line 2, column 'C': expected a charge in pC, got 'x'"),
         ("C,B,A\n1,nan,3\n", "line 2, column 'B': .* got 'nan'"),
         ("A,B,C\n1,2,-inf\n", "line 2, column 'C': .* got '-inf'"),

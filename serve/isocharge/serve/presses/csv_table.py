@@ -250,6 +250,9 @@ class CsvTable(NumberTable):
         if self._marked_number and without_marks != cell and _number(without_marks) is not None:
             mark = "comma" if self._mark_changes else "point"
             advice = f"; write a decimal {mark}, as in {self._marked_number}, and no separators of thousands"
+        words = cell.split()
+        if len(words) == 2 and _number(words[0]) is not None and _number(words[1]) is None:
+            advice = f"; write the number without {shown(words[1])}"
         raise self.error_class(
             f"{self.where}, line {line_number}, column {shown(name)}: expected {rule.description}, got "
             f"{shown(cell)}{advice}"

@@ -39,6 +39,9 @@ MAX_AMPLITUDE2 = 0.1
 The strains are of the order A^2.
 """
 
+MIN_FORCE_N = 1e-12
+"""Smallest force of a press, N. The dimensionless groups of a press with a far smaller force are not finite numbers."""
+
 LINEAR_WEIGHT = 4.0
 """Factor in the estimate of the relative error of a charge that is computed with a linear theory.
 
@@ -197,15 +200,18 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
 
 
 def check_strains(film: Film, force: float) -> None:
-    """Raise an error if the strains under a force are too large for Saint-Venant-Kirchhoff elasticity.
+    """Raise an error if a force is too small to be computed, or too large for Saint-Venant-Kirchhoff elasticity.
 
     Args:
         film: The film.
         force: Force of the press, N.
 
     Raises:
-        SceneError: If the squared amplitude exceeds `MAX_AMPLITUDE2` or is not finite.
+        SceneError: If the force is smaller than `MIN_FORCE_N`, or if the squared amplitude exceeds `MAX_AMPLITUDE2` or
+            is not finite.
     """
+    if force < MIN_FORCE_N:
+        raise SceneError(f"force: expected at least {MIN_FORCE_N:g} N, got {force:.4g} N")
     with np.errstate(over="ignore"):  # the amplitude of a huge force is infinite, and is refused
         squared_amplitude = amplitude_squared(film, force)
     if not squared_amplitude <= MAX_AMPLITUDE2:
