@@ -219,7 +219,11 @@ def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_e
     forward_map = kept(ForwardMap.build, sensor, probe, **QUICK)
     contact, rotation = draw(forward_map, 10, seed=12)
     assert errors(forward_map, contact, 0.0 if probe.is_axisymmetric else rotation).max() < 1e-3
-    turned = replace(sensor.film, oval_axis=sensor.film.oval_axis + 1.0, axis=sensor.film.axis + 1.0)
+    film = sensor.film
+    deviator = complex(*film.deviator) * np.exp(2j)  # its components are those of twice the angle
+    turned = replace(
+        film, oval_axis=film.oval_axis + 1.0, axis=film.axis + 1.0, deviator=(deviator.real, deviator.imag)
+    )
     other = replace(forward_map, sensor=replace(sensor, film=turned))
     assert errors(other, contact).max() > 2e-3, "the direction of the film does not matter"
 
