@@ -20,7 +20,7 @@ from isocharge.simulate import (
     load_sensor,
 )
 from isocharge.simulate.dataset.sweep import write_sweep
-from isocharge.simulate.forward.side_force import SideForceMap
+from isocharge.simulate.forward.derivative_maps import SideForceMap
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.placed_mesh import Geometry, place
 from isocharge.simulate.mesh.placement import Placement

@@ -28,10 +28,9 @@ if TYPE_CHECKING:
     from isocharge.simulate.execution.workers import dask_workers, local_workers
     from isocharge.simulate.forward.charge_map import ChargeMap, FunctionMap
     from isocharge.simulate.forward.charge_spline import ChargeSpline
-    from isocharge.simulate.forward.film_slopes import FilmSlopes
+    from isocharge.simulate.forward.derivative_maps import FilmSlopes, SideForceMap
     from isocharge.simulate.forward.forward_map import ForwardMap
     from isocharge.simulate.forward.readout import touch_charge
-    from isocharge.simulate.forward.side_force import SideForceMap
     from isocharge.simulate.identifiability.cramer_rao import limits_at
     from isocharge.simulate.identifiability.identification import identify
     from isocharge.simulate.identifiability.working_area import working_area

@@ -8,7 +8,7 @@ import pytest
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Polygon, SolveSettings, Theory, deflection, load_sensor, press
 from isocharge.simulate import touch_charge as charge_of
-from isocharge.simulate.forward.side_force import SideForceMap
+from isocharge.simulate.forward.derivative_maps import SideForceMap
 from isocharge.simulate.solver.equilibrium import Equilibrium
 from isocharge.simulate.solver.friction import friction_force, holding_force
 

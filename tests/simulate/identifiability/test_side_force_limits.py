@@ -17,7 +17,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.forward.side_force import SideForceMap
+from isocharge.simulate.forward.derivative_maps import SideForceMap
 from isocharge.simulate.identifiability.identification import Identification
 from isocharge.simulate.identifiability.side_force_limits import ANGLE_COUNT, SideForceLimits, side_force_limits
 

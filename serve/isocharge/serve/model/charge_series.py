@@ -10,8 +10,9 @@ where T_i are Chebyshev polynomials, r is the radius of the domain, and l is the
 of the typical size S of the charges is a polynomial in l.
 
 Without pretension, the charge is nearly F^(2/3) g(x, y), with the force F and a smooth function g of the position. The
-value v is therefore smooth, and few terms suffice. Outside the domain, v and ln S are continued linearly from the
-nearest contact in the domain. In the force, the continuation of Q is a power law.
+value v is therefore smooth, and few terms suffice. For a contact outside the domain, v and ln S are extrapolated
+linearly in x, y and l from the nearest contact in the domain. If all charges are positive, Q is then a power of F for
+forces outside the domain, because ln Q is linear in ln F.
 
 A calibrated film may change. The map then also depends on the state of the film, a vector (t, z_1, ..., z_K):
 

@@ -16,14 +16,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy  # scipy.interpolate is imported when it is used
 
-from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.arrays import Array, Booleans
 from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.charge_map import ChargeMap, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
-from isocharge.simulate.numerics.disk import lattice, onto_disk, sunflower
+from isocharge.simulate.numerics.disk import onto_disk, sunflower
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
-from isocharge.simulate.numerics.spline_fit import fit_spline, spline_knots
+from isocharge.simulate.numerics.spline_fit import disk_positions, fit_spline, rectangle_positions, spline_knots
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.sensor import Calibration
 
@@ -48,19 +48,6 @@ MIN_CELLS = 8
 
 MAX_CELLS = 400
 """Largest number of cells of a spline along x or y."""
-
-PRESSES_PER_CELL = 1.6
-"""Number of presses per cell to which a spline is fitted."""
-
-PRESSES_PER_EDGE_CELL = 2.0
-"""Number of additional presses on the edge of the disk to which a spline is fitted, per cell along the edge."""
-
-EDGE_RADIUS = 1.0 - 1e-12
-"""Distance of the presses on the edge of the disk from the centre, in radii of the disk, dimensionless.
-
-This distance is less than 1 by more than the rounding error. The presses therefore lie in the domain of the forward
-map.
-"""
 
 EXTRA_FORCE_NODES = 2
 """Number of additional force nodes if the piezoelectric coefficient d33 is not zero.
@@ -342,31 +329,6 @@ def _force_nodes(forward_map: ForwardMap) -> Array:
     return np.asarray(np.exp(log_force))
 
 
-def _fit_positions(cells: int) -> Array:
-    """Return positions on the unit disk for the presses to which a spline is fitted.
-
-    The positions are the points of a lattice in the disk, and points on the edge of the disk.
-
-    Args:
-        cells: Number of cells of the spline along the diameter of the disk.
-
-    Returns:
-        Positions (x, y), shape (n, 2), in radii of the disk.
-    """
-    # In units of the side of a cell, the diameter of the disk is `cells`. The constants 16 and 8 ensure that there are
-    # enough presses if there are only a few cells.
-    cells_in_disk = np.pi * (0.5 * cells) ** 2
-    cells_along_edge = np.pi * cells
-    inner_count = int(PRESSES_PER_CELL * cells_in_disk) + 16
-    edge_count = int(PRESSES_PER_EDGE_CELL * cells_along_edge) + 8
-
-    # Positions are complex numbers x + iy. EDGE_RADIUS moves the points on the edge slightly into the disk.
-    inner_positions = lattice(inner_count)
-    edge_positions = np.exp(2j * np.pi * np.arange(edge_count) / edge_count) * EDGE_RADIUS
-    complex_positions = np.concatenate([inner_positions, edge_positions])
-    return np.stack([complex_positions.real, complex_positions.imag], axis=1)
-
-
 @dataclass(frozen=True)
 class _ScaledCharges:
     """Computation of the scaled charges to which splines are fitted. The scaled charges do not include crosstalk.
@@ -427,7 +389,7 @@ def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.
     """
     cells = int(np.clip(np.ceil(2.0 * radius / spacing), MIN_CELLS, MAX_CELLS))
     knots = spline_knots(-radius, radius, cells)
-    position = radius * _fit_positions(cells)
+    position = radius * disk_positions(cells)
     all_electrodes = np.ones(len(samples.forward_map.electrodes), dtype=bool)
     charge = samples.charges_at(position, all_electrodes)
     # No coefficients are fixed at zero, because the charges do not vanish at the edge of the disk.
@@ -466,9 +428,7 @@ def _fit_patch(
     y_knots = spline_knots(lower_left[1], upper_right[1], y_cells)
 
     # Choose the presses of the fit in the part of the rectangle that lies in the disk.
-    cells_along_edge = 2.0 * np.pi * radius / spacing  # along the whole edge of the disk
-    edge_count = int(PRESSES_PER_EDGE_CELL * cells_along_edge)
-    position = _patch_positions(lower_left, upper_right, cells, radius, edge_count)
+    position = rectangle_positions(lower_left, upper_right, cells, radius, spacing)
     if not len(position):
         return None
 
@@ -478,37 +438,6 @@ def _fit_patch(
     residual = (samples.charges_at(position, is_needed) - coarse(position))[:, :, electrode]
     fine_spline = fit_spline(position, residual, (x_knots, y_knots), fixed=2)
     return Patch(electrode, lower_left, upper_right, fine_spline)
-
-
-def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, radius: float, edge_count: int) -> Array:
-    """Return positions in a rectangle for the presses to which the correction of a spline is fitted.
-
-    Some of the positions are the points of a grid that lie in the disk. The other positions are points on the edge of
-    the disk that lie in the rectangle.
-
-    Args:
-        lower_left: Lower left corner (x, y) of the rectangle, shape (2,), mm.
-        upper_right: Upper right corner (x, y) of the rectangle, shape (2,), mm.
-        cells: Numbers of cells of the spline along x and y, shape (2,).
-        radius: Radius of the disk, mm.
-        edge_count: Number of points on the whole edge of the disk.
-
-    Returns:
-        Positions (x, y), shape (n, 2), mm.
-    """
-    # A grid with PRESSES_PER_CELL points per cell has the square root of this number along each side of a cell.
-    x_count, y_count = np.ceil(np.sqrt(PRESSES_PER_CELL) * cells).astype(int)
-    x_line = np.linspace(lower_left[0], upper_right[0], x_count)
-    y_line = np.linspace(lower_left[1], upper_right[1], y_count)
-    x_grid, y_grid = np.meshgrid(x_line, y_line)
-    grid = np.stack([x_grid.ravel(), y_grid.ravel()], axis=1)
-    is_in_disk = np.hypot(grid[:, 0], grid[:, 1]) < radius
-
-    # Use only the points on the edge of the disk that lie in the rectangle.
-    edge_angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
-    edge = radius * EDGE_RADIUS * np.stack([np.cos(edge_angle), np.sin(edge_angle)], axis=1)
-    is_in_rectangle = ((edge > lower_left) & (edge < upper_right)).all(axis=1)
-    return np.concatenate([grid[is_in_disk], edge[is_in_rectangle]])
 
 
 def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:

@@ -4,9 +4,8 @@ The solved presses are the nodes of the family. For every other press, the stres
 """
 
 import math
-from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,23 +13,25 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import SceneError
-from isocharge.common.progress import track
-from isocharge.simulate.execution.workers import in_order
+from isocharge.simulate.forward.readout import touch_charge
 from isocharge.simulate.mechanics.stress import rotate_stress
+from isocharge.simulate.mechanics.theory import Theory, theory_for
+from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
-from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.mesh.placement import widest_smooth_layer
+from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.numerics.interpolation import (
     barycentric_weights,
     chebyshev_nodes,
     lagrange_values,
     periodic_weights,
 )
-from isocharge.simulate.sensor.film import Film, Surface
+from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
-from isocharge.simulate.solver.load_case import SolveSettings, check_press
-from isocharge.simulate.solver.press import press
+from isocharge.simulate.solver.load_case import SolveSettings, check_press, layer_for
+from isocharge.simulate.solver.press import needed_resolution, press
+from isocharge.simulate.solver.press_chain import Chain, Reading, probe_frame_stress, solve_chains
 
 ROTATIONS = 7
 """Smallest number of orientations of a probe that is not axisymmetric.
@@ -48,6 +49,10 @@ DIRECTIONS = 7
 The stress contains even harmonics of the direction, whose amplitudes decrease like powers of the relative differences
 of the moduli and of the pretensions.
 """
+
+
+CHARGE_FLOOR = 0.1
+"""Smallest charge by which an error is divided, in units of the largest charge of the press, dimensionless."""
 
 
 class NodeCount(NamedTuple):
@@ -227,7 +232,7 @@ class Family:
         probe: Probe,
         settings: SolveSettings,
         executor: Executor | None,
-        read: "Reading | None" = None,
+        read: Reading | None = None,
     ) -> Array:
         """Compute the stress under the presses of the family, for the rotations within one period of the probe.
 
@@ -320,6 +325,11 @@ class CheckPress(NamedTuple):
         """Position (x, y) of the press, mm."""
         return self.distance * math.cos(self.angle), self.distance * math.sin(self.angle)
 
+    @property
+    def contact(self) -> Array:
+        """The press as an array of one contact (x, y, F), shape (1, 3), mm and N."""
+        return np.array([[*self.position, self.force]])
+
 
 def spread_check_presses(domain: Domain, count: int) -> list[CheckPress]:
     """Return presses, distributed over the distances and forces of a domain, at which an interpolation is checked.
@@ -392,81 +402,79 @@ def nearest_to_clamp(film: Film, distance: float) -> tuple[float, float]:
     return distance * math.cos(angle), distance * math.sin(angle)
 
 
-Reading = Callable[[Equilibrium, Surface], Array]
-"""Type of a function that computes values from a solved press, such as the stresses at a surface of the film.
-
-The returned array has any shape.
-"""
-
-
-def probe_frame_stress(solved: Equilibrium, surface: Surface) -> Array:
-    """Compute the scaled touch stress at the nodes of the mesh in a frame that rotates with the probe.
-
-    Args:
-        solved: Equilibrium of the film under the press.
-        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
-
-    Returns:
-        Stress components (S11, S22, S12), shape (n_element, n_local, 3), in units of Young's modulus times the squared
-        amplitude, dimensionless.
-    """
-    return rotate_stress(nodal_stress(solved, surface), -solved.probe.angle)
-
-
 @dataclass(frozen=True)
-class Chain:
-    """Presses with different forces at one position of one film. The presses are solved one after the other.
-
-    Each solve starts from the equilibrium under the previous force.
+class FamilySettings:
+    """Settings that are the same for all solves of a forward map.
 
     Attributes:
-        film: Film on which the probe presses.
-        probe: Probe in its rotated orientation.
-        distance: Distance of the centroid of the footprint from the centre of the film, mm.
-        forces: Forces in the order in which they are solved, shape (n_force,), N.
-        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
-        settings: Theory, mesh and width of the thin rings at the rim.
-        read: Function that computes the returned values from each solved press.
+        theory: Terms of the film theory.
+        resolution: Fineness of the mesh.
+        layer: Width of the thin rings of the mesh at the rim, in film radii.
     """
 
-    film: Film
-    probe: Probe
-    distance: float
-    forces: Array
-    surface: Surface
-    settings: SolveSettings
-    read: Reading = probe_frame_stress
+    theory: Theory
+    resolution: Resolution
+    layer: float
+
+    @property
+    def to_solve(self) -> SolveSettings:
+        """The settings in the form that the solver expects."""
+        return SolveSettings(theory=self.theory, resolution=self.resolution, layer=self.layer)
 
 
-def solve_chains(chains: Sequence[Chain], executor: Executor | None) -> Array:
-    """Solve the presses of several chains, and show the progress.
+def family_settings(sensor: Sensor, probe: Probe, domain: Domain, settings: SolveSettings) -> FamilySettings:
+    """Choose the settings that are the same for all presses of a domain.
 
     Args:
-        chains: Chains with the same mesh and the same number of forces.
-        executor: Executor that solves the chains in parallel; None for this process.
-
-    Returns:
-        Values that `Chain.read` computes for each press, shape (n_chain, n_force, n_value).
+        sensor: Sensor with the film.
+        probe: Probe that presses the film.
+        domain: Presses of the forward map.
+        settings: Required accuracy, and settings that are not chosen here; see `ForwardMap.build`.
     """
-    values_of_chains = in_order(executor, _solve_chain, chains)
-    return np.stack(list(track(values_of_chains, "solving the film", len(chains))))
+    film = sensor.film
+    min_force, max_force = domain.force_range
+    middle_force = float(np.sqrt(min_force * max_force))
+    theory = settings.theory
+    if theory == "auto":
+        theory = theory_for(sensor, probe, domain.force_range, settings.accuracy)
+    layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
+    settings = replace(settings, theory=theory, layer=layer)
+    outermost = nearest_to_clamp(film, domain.radius)
+    resolution = needed_resolution(film, probe, outermost, middle_force, settings)
+    template = template_for(probe, resolution, whole=not film.is_axisymmetric)
+    layer = min(layer, widest_smooth_layer(template, probe, domain.radius, film.radius))
+    return FamilySettings(theory, resolution, layer)
 
 
-def _solve_chain(chain: Chain) -> Array:
-    """Solve the presses of one chain.
+def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check: CheckPress) -> Array:
+    """Compute the charges of one press by a direct solve, without interpolation.
 
     Args:
-        chain: The chain, whose presses have the same position and different forces.
+        sensor: Sensor whose charges are computed.
+        probe: Probe in its own orientation, to which the rotation of the press is added.
+        settings: Theory and mesh of the solve.
+        check: Position, force and rotation of the press.
 
     Returns:
-        Values that `Chain.read` computes for each force, shape (n_force, n_value).
+        Charges, shape (n_electrode,), pC.
     """
-    position = (chain.distance, 0.0)
-    values_of_forces = []
-    equilibrium: Equilibrium | None = None
-    for force in chain.forces.tolist():
-        # The equilibrium under the previous force is a good start for the iterations of the solver.
-        equilibrium = press(chain.film, chain.probe, position, force, chain.settings, start=equilibrium)
-        values = chain.read(equilibrium, chain.surface)
-        values_of_forces.append(values.ravel())
-    return np.stack(values_of_forces)
+    rotated_probe = probe.rotated(check.rotation)
+    equilibrium = press(sensor.film, rotated_probe, check.position, check.force, settings)
+    return touch_charge(sensor, equilibrium)
+
+
+def relative_error(charge: Array, direct_charge: Array) -> float:
+    """Compute the largest relative difference between the interpolated and the directly solved charges of a press.
+
+    The difference at each electrode is divided by the directly solved charge of the electrode. The divisor is at least
+    `CHARGE_FLOOR` times the largest charge of the press.
+
+    Args:
+        charge: Interpolated charges, shape (n_electrode,), pC.
+        direct_charge: Directly solved charges, shape (n_electrode,), pC.
+
+    Returns:
+        The largest relative difference of an electrode, dimensionless.
+    """
+    divisor = np.maximum(np.abs(direct_charge), CHARGE_FLOOR * np.abs(direct_charge).max())
+    return float((np.abs(charge - direct_charge) / divisor).max())

@@ -24,36 +24,34 @@ from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.forward.family import (
-    CheckPress,
     Family,
+    FamilySettings,
     NodeCount,
     check_family,
-    nearest_to_clamp,
+    direct_charges,
+    family_settings,
     node_counts,
+    relative_error,
     spread_check_presses,
 )
 from isocharge.simulate.forward.press_chunk import PressChunk
-from isocharge.simulate.forward.readout import ReadoutPoints, contact_charge, touch_charge
+from isocharge.simulate.forward.readout import ReadoutPoints, contact_charge
 from isocharge.simulate.forward.readout_rules import ReadoutRules
 from isocharge.simulate.mechanics.scaling import amplitude_squared
-from isocharge.simulate.mechanics.theory import Theory, theory_for
+from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placed_mesh import distance_on_circular_film, film_oval
-from isocharge.simulate.mesh.placement import Placement, widest_smooth_layer
-from isocharge.simulate.mesh.template import Template, template_for
+from isocharge.simulate.mesh.placement import Placement
+from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.solver.load_case import SolveSettings, layer_for
-from isocharge.simulate.solver.press import needed_resolution, press
+from isocharge.simulate.solver.load_case import SolveSettings
 
 CHUNK_SIZE = 256
 """Number of presses that are evaluated at once, which limits the size of the working arrays to about 100 MB."""
 
 INTERPOLATION_ERROR = 5e-4
 """Largest relative error of a charge, with respect to direct solves, that a forward map may have, dimensionless."""
-
-CHARGE_FLOOR = 0.1
-"""Smallest charge by which an error is divided, in units of the largest charge of the press, dimensionless."""
 
 EVEN_FIELD = np.zeros(1, dtype=bool)
 """Value of the argument `is_odd` for a single even field.
@@ -70,52 +68,6 @@ With such a large error, the next entry would not suffice either.
 
 CHECK_COUNT = 10
 """Number of presses at which a forward map is compared with direct solves."""
-
-
-@dataclass(frozen=True)
-class FamilySettings:
-    """Settings that are the same for all solves of a forward map.
-
-    Attributes:
-        theory: Terms of the film theory.
-        resolution: Fineness of the mesh.
-        layer: Width of the thin rings of the mesh at the rim, in film radii.
-        template: Template of the mesh.
-    """
-
-    theory: Theory
-    resolution: Resolution
-    layer: float
-    template: Template
-
-    @property
-    def to_solve(self) -> SolveSettings:
-        """The settings in the form that the solver expects."""
-        return SolveSettings(theory=self.theory, resolution=self.resolution, layer=self.layer)
-
-
-def _family_settings(sensor: Sensor, probe: Probe, domain: Domain, settings: SolveSettings) -> FamilySettings:
-    """Choose the settings that are the same for all presses of a domain.
-
-    Args:
-        sensor: Sensor with the film.
-        probe: Probe that presses the film.
-        domain: Presses of the forward map.
-        settings: Required accuracy, and settings that are not chosen here; see `ForwardMap.build`.
-    """
-    film = sensor.film
-    min_force, max_force = domain.force_range
-    middle_force = float(np.sqrt(min_force * max_force))
-    theory = settings.theory
-    if theory == "auto":
-        theory = theory_for(sensor, probe, domain.force_range, settings.accuracy)
-    layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
-    settings = replace(settings, theory=theory, layer=layer)
-    outermost = nearest_to_clamp(film, domain.radius)
-    resolution = needed_resolution(film, probe, outermost, middle_force, settings)
-    template = template_for(probe, resolution, whole=not film.is_axisymmetric)
-    layer = min(layer, widest_smooth_layer(template, probe, domain.radius, film.radius))
-    return FamilySettings(theory, resolution, layer, template)
 
 
 @dataclass(frozen=True)
@@ -174,7 +126,7 @@ class ForwardMap:
         film = sensor.film
         domain = Domain(radius, force_range)
         check_family(film, probe, domain)
-        family_settings = _family_settings(sensor, probe, domain, settings)
+        map_settings = family_settings(sensor, probe, domain, settings)
 
         # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared at
         # the check presses, which are solved directly in the first pass of the loop. If the error is very large, the
@@ -185,11 +137,12 @@ class ForwardMap:
         remaining_counts = list(node_counts(film))
         while remaining_counts:
             count = remaining_counts.pop(0)
-            forward_map = cls._solve(sensor, probe, domain, family_settings, count, executor)
+            forward_map = cls._solve(sensor, probe, domain, map_settings, count, executor)
             if not check_charges:
                 solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
                 check_charges = list(in_order(executor, solve_directly, checks))
-            error = max(map(forward_map.relative_error, checks, check_charges))
+            charges = (forward_map.charges(check.contact, check.rotation)[0] for check in checks)
+            error = max(map(relative_error, charges, check_charges))
             if error <= INTERPOLATION_ERROR:
                 return replace(forward_map, error=error)
             if error > SKIP_RATIO * INTERPOLATION_ERROR and len(remaining_counts) > 1:
@@ -206,6 +159,7 @@ class ForwardMap:
         probe: Probe,
         domain: Domain,
         count: NodeCount,
+        settings: SolveSettings = SolveSettings(),
         *,
         executor: Executor | None = None,
     ) -> "ForwardMap":
@@ -216,6 +170,7 @@ class ForwardMap:
             probe: Probe that presses the film.
             domain: Presses for which the map will be used.
             count: Numbers of distances, forces, orientations and directions at which presses are solved.
+            settings: Accuracy, theory and mesh; see `build`.
             executor: Executor that runs the solves; None for this process.
 
         Raises:
@@ -223,8 +178,8 @@ class ForwardMap:
             SolveError: If a press has no equilibrium.
         """
         check_family(sensor.film, probe, domain)
-        family_settings = _family_settings(sensor, probe, domain, SolveSettings())
-        return cls._solve(sensor, probe, domain, family_settings, count, executor)
+        map_settings = family_settings(sensor, probe, domain, settings)
+        return cls._solve(sensor, probe, domain, map_settings, count, executor)
 
     @classmethod
     def _solve(
@@ -232,13 +187,14 @@ class ForwardMap:
         sensor: Sensor,
         probe: Probe,
         domain: Domain,
-        settings: "FamilySettings",
+        settings: FamilySettings,
         count: NodeCount,
         executor: Executor | None,
     ) -> "ForwardMap":
         """Solve a family of presses with given settings. The error of the map is infinite, because it is not known."""
         family = Family.spread(domain, sensor.film, probe, count)
-        table = family.unfold(family.solve(sensor, probe, settings.to_solve, executor), settings.template)
+        template = template_for(probe, settings.resolution, whole=not sensor.film.is_axisymmetric)
+        table = family.unfold(family.solve(sensor, probe, settings.to_solve, executor), template)
         return cls(sensor, probe, family, settings.theory, settings.resolution, settings.layer, table, np.inf)
 
     @property
@@ -310,26 +266,8 @@ class ForwardMap:
             SceneError: If a press lies outside the domain.
         """
         contact = self.domain.check(contact, "forward map")
-        return differences(self._unrotated_charges, contact)
-
-    def relative_error(self, check: CheckPress, direct_charge: Array) -> float:
-        """Compute the largest relative difference between the interpolated and the directly solved charges of a press.
-
-        The difference at each electrode is divided by the directly solved charge of the electrode. The divisor is at
-        least `CHARGE_FLOOR` times the largest charge of the press.
-
-        Args:
-            check: Press at which the charges are compared.
-            direct_charge: Directly solved charges of this press, shape (n_electrode,), pC.
-
-        Returns:
-            The largest relative difference of an electrode, dimensionless.
-        """
-        x, y = check.position
-        contact = np.array([[x, y, check.force]])  # a single press
-        (interpolated_charge,) = self.charges(contact, check.rotation)
-        divisor = np.maximum(np.abs(direct_charge), CHARGE_FLOOR * np.abs(direct_charge).max())
-        return float((np.abs(interpolated_charge - direct_charge) / divisor).max())
+        n_stepped = len(contact) * 2 * contact.shape[1]  # two steps of each variable
+        return differences(partial(self._unchecked_charges, orientation=np.zeros(n_stepped)), contact)
 
     def field_charges(self, contact: Array, is_odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
         """Compute the charges of each stress field in the table, for a circular probe.
@@ -430,17 +368,6 @@ class ForwardMap:
         family = replace(self.family, force=self.family.force[:1])
         return replace(self, family=family, table=table.astype(np.float32))
 
-    def _unrotated_charges(self, contact: Array) -> Array:
-        """Compute the charges of presses in or slightly outside the domain, with the probe in its own orientation.
-
-        Args:
-            contact: Presses (x, y, F), shape (n, 3), mm and N.
-
-        Returns:
-            Charges, shape (n, n_electrode), pC.
-        """
-        return self._unchecked_charges(contact, np.zeros(len(contact)))
-
     def _unchecked_charges(self, contact: Array, orientation: Array) -> Array:
         """Compute the charges of presses that lie in the domain or slightly outside the domain.
 
@@ -531,17 +458,7 @@ class ForwardMap:
         """
         film = self.sensor.film
         presses = self._interpolated_presses(position, force, orientation)
-        _, pairs_of_first_rule = rules[0]
-        pairs_shape = pairs_of_first_rule.shape  # (n, n_electrode), the same for all rules
-        scaled_charge = np.zeros((*pairs_shape, is_odd.size))
-        for rule, uses_rule in rules:
-            # Electrodes with the same number of points are integrated together, because their arrays have equal shapes.
-            for n_point in np.unique(rule.count):
-                press_index, electrode = np.nonzero(uses_rule & (rule.count == n_point))
-                points_mm = rule.points[electrode, :n_point] @ np.array([1.0, 1j])  # (x, y) becomes x + iy
-                points = points_mm / film.radius
-                weights = rule.weights[electrode, :n_point]
-                scaled_charge[press_index, electrode] = presses.scaled_charges(press_index, points, weights, is_odd)
+        scaled_charge = presses.charges_by_rules(rules, film.radius, is_odd)
 
         # Multiply by the unit of the scaled stress in the table.
         stress_unit = film.young * amplitude_squared(film, force)
@@ -579,20 +496,3 @@ class ForwardMap:
     def _readout_rules(self) -> ReadoutRules:
         """Integration rules from which one is selected for each pair of a press and an electrode."""
         return ReadoutRules(self.sensor, self.probe, self.resolution)
-
-
-def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check: CheckPress) -> Array:
-    """Compute the charges of one press by a direct solve, without interpolation.
-
-    Args:
-        sensor: Sensor whose charges are computed.
-        probe: Probe in its own orientation, to which the rotation of the press is added.
-        settings: Theory and mesh of the solve.
-        check: Position, force and rotation of the press.
-
-    Returns:
-        Charges, shape (n_electrode,), pC.
-    """
-    rotated_probe = probe.rotated(check.rotation)
-    equilibrium = press(sensor.film, rotated_probe, check.position, check.force, settings)
-    return touch_charge(sensor, equilibrium)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
+from isocharge.simulate.forward.readout import ReadoutPoints
 from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mesh.placed_mesh import from_oval
 from isocharge.simulate.mesh.placement import Placement
@@ -34,6 +35,33 @@ class PressChunk:
     direction: Array
     frame_angle: Array
     oval: Complexes
+
+    def charges_by_rules(
+        self, rules: tuple[tuple[ReadoutPoints, Booleans], ...], film_radius: float, is_odd: Booleans
+    ) -> Array:
+        """Compute the charges of all electrodes under all presses, each with its integration rule.
+
+        Args:
+            rules: Pairs of an integration rule and an array, shape (n, n_electrode), that is True where a press and an
+                electrode use this rule.
+            film_radius: Radius of the film, mm.
+            is_odd: Whether each field is odd, shape (n_field,); see `scaled_charges`.
+
+        Returns:
+            Charges divided by the unit of the scaled stress, shape (n, n_electrode, n_field), pC/MPa.
+        """
+        _, pairs_of_first_rule = rules[0]
+        pairs_shape = pairs_of_first_rule.shape  # (n, n_electrode), the same for all rules
+        scaled_charge = np.zeros((*pairs_shape, is_odd.size))
+        for rule, uses_rule in rules:
+            # Electrodes with the same number of points are integrated together, because their arrays have equal shapes.
+            for n_point in np.unique(rule.count):
+                press_index, electrode = np.nonzero(uses_rule & (rule.count == n_point))
+                points_mm = rule.points[electrode, :n_point] @ np.array([1.0, 1j])  # (x, y) becomes x + iy
+                points = points_mm / film_radius
+                weights = rule.weights[electrode, :n_point]
+                scaled_charge[press_index, electrode] = self.scaled_charges(press_index, points, weights, is_odd)
+        return scaled_charge
 
     def scaled_charges(self, press_index: Integers, points: Complexes, weights: Array, is_odd: Booleans) -> Array:
         """Compute the charge of each pair of a press and an electrode, by integration of the stress fields.

@@ -6,20 +6,17 @@ up to the clamp would take minutes to build.
 """
 
 from concurrent.futures import Executor
-
-import numpy as np
+from dataclasses import replace
 
 from isocharge.common.contact_domain import Domain
-from isocharge.simulate.forward.family import Family, NodeCount, check_family
+from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.placement import widest_smooth_layer
-from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.solver.load_case import SolveSettings, layer_for
+from isocharge.simulate.solver.load_case import SolveSettings
 
 COARSE_ERROR = 0.05
 """Largest relative error of a charge of the coarse map, dimensionless.
@@ -65,21 +62,8 @@ def whole_film_map(
         SceneError: If some presses cannot exist.
         SolveError: If a press has no equilibrium.
     """
-    film = sensor.film
-    domain = Domain(outermost_distance(film, probe), force_range)
-    check_family(film, probe, domain)
-
-    # All presses are solved with the same theory and the same coarse mesh. The width of the thin rings at the rim is
-    # that of the geometric mean of the smallest and the largest force, unless the mesh of the outermost press needs
-    # narrower rings.
-    theory = Theory(stretching=True, bending=True, pretensioned=film.pretension != 0.0)
-    min_force, max_force = force_range
-    middle_force = float(np.sqrt(min_force * max_force))
-    template = template_for(probe, COARSE_RESOLUTION, whole=not film.is_axisymmetric)
-    layer = min(layer_for(film, middle_force), widest_smooth_layer(template, probe, domain.radius, film.radius))
-    settings = SolveSettings(theory=theory, resolution=COARSE_RESOLUTION, layer=layer)
-
-    family = Family.spread(domain, film, probe, NODE_COUNT)
-    solved_stress = family.solve(sensor, probe, settings, executor)
-    table = family.unfold(solved_stress, template)
-    return ForwardMap(sensor, probe, family, theory, COARSE_RESOLUTION, layer, table, COARSE_ERROR)
+    theory = Theory(stretching=True, bending=True, pretensioned=sensor.film.pretension != 0.0)
+    settings = SolveSettings(theory=theory, resolution=COARSE_RESOLUTION)
+    domain = Domain(outermost_distance(sensor.film, probe), force_range)
+    forward_map = ForwardMap.build_unchecked(sensor, probe, domain, NODE_COUNT, settings, executor=executor)
+    return replace(forward_map, error=COARSE_ERROR)

@@ -13,8 +13,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
+from isocharge.simulate.forward.derivative_maps import SideForceMap
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.forward.side_force import SideForceMap
 from isocharge.simulate.identifiability.cramer_rao import cramer_rao
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings

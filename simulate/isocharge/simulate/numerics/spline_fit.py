@@ -5,12 +5,25 @@ import scipy  # scipy.interpolate is imported when it is used
 from scipy.sparse import csr_array, dia_array, diags_array, eye_array, kron, sparray, vstack
 from scipy.sparse.linalg import splu
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Integers
+from isocharge.simulate.numerics.disk import lattice
 
 SMOOTHING = 5e-3
 """Weight of the third differences of the spline coefficients in the fit, dimensionless.
 
 The third differences determine the coefficients in regions without points.
+"""
+
+POSITIONS_PER_CELL = 1.6
+"""Number of positions per cell to which a spline is fitted."""
+
+POSITIONS_PER_EDGE_CELL = 2.0
+"""Number of additional positions on the edge of the disk to which a spline is fitted, per cell along the edge."""
+
+EDGE_RADIUS = 1.0 - 1e-12
+"""Distance of the positions on the edge of the disk from the centre, in radii of the disk, dimensionless.
+
+This distance is less than 1 by more than the rounding error. The positions therefore lie in the disk.
 """
 
 
@@ -102,3 +115,61 @@ def _penalty_matrix(x_count: int, y_count: int) -> sparray:
 def _third_differences(count: int) -> dia_array:
     """Return the matrix that computes the third differences of neighbouring coefficients, shape (count - 3, count)."""
     return diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
+
+
+def disk_positions(cells: int) -> Array:
+    """Return positions on the unit disk to which a spline is fitted.
+
+    The positions are the points of a lattice in the disk, and points on the edge of the disk.
+
+    Args:
+        cells: Number of cells of the spline along the diameter of the disk.
+
+    Returns:
+        Positions (x, y), shape (n, 2), in radii of the disk.
+    """
+    # In units of the side of a cell, the diameter of the disk is `cells`. The constants 16 and 8 ensure that there are
+    # enough positions if there are only a few cells.
+    cells_in_disk = np.pi * (0.5 * cells) ** 2
+    cells_along_edge = np.pi * cells
+    inner_count = int(POSITIONS_PER_CELL * cells_in_disk) + 16
+    edge_count = int(POSITIONS_PER_EDGE_CELL * cells_along_edge) + 8
+
+    # Positions are complex numbers x + iy. EDGE_RADIUS moves the points on the edge slightly into the disk.
+    inner_positions = lattice(inner_count)
+    edge_positions = np.exp(2j * np.pi * np.arange(edge_count) / edge_count) * EDGE_RADIUS
+    complex_positions = np.concatenate([inner_positions, edge_positions])
+    return np.stack([complex_positions.real, complex_positions.imag], axis=1)
+
+
+def rectangle_positions(lower_left: Array, upper_right: Array, cells: Integers, radius: float, spacing: float) -> Array:
+    """Return positions in a rectangle to which a spline that is zero outside the rectangle is fitted.
+
+    Some of the positions are the points of a grid that lie in the disk. The other positions are points on the edge of
+    the disk that lie in the rectangle.
+
+    Args:
+        lower_left: Lower left corner (x, y) of the rectangle, shape (2,), mm.
+        upper_right: Upper right corner (x, y) of the rectangle, shape (2,), mm.
+        cells: Numbers of cells of the spline along x and y, shape (2,).
+        radius: Radius of the disk, mm.
+        spacing: Largest distance between the knots, mm.
+
+    Returns:
+        Positions (x, y), shape (n, 2), mm.
+    """
+    # A grid with POSITIONS_PER_CELL points per cell has the square root of this number along each side of a cell.
+    x_count, y_count = np.ceil(np.sqrt(POSITIONS_PER_CELL) * cells).astype(int)
+    x_line = np.linspace(lower_left[0], upper_right[0], x_count)
+    y_line = np.linspace(lower_left[1], upper_right[1], y_count)
+    x_grid, y_grid = np.meshgrid(x_line, y_line)
+    grid = np.stack([x_grid.ravel(), y_grid.ravel()], axis=1)
+    is_in_disk = np.hypot(grid[:, 0], grid[:, 1]) < radius
+
+    # Use only the points on the edge of the disk that lie in the rectangle.
+    cells_along_edge = 2.0 * np.pi * radius / spacing  # along the whole edge of the disk
+    edge_count = int(POSITIONS_PER_EDGE_CELL * cells_along_edge)
+    edge_angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
+    edge = radius * EDGE_RADIUS * np.stack([np.cos(edge_angle), np.sin(edge_angle)], axis=1)
+    is_in_rectangle = ((edge > lower_left) & (edge < upper_right)).all(axis=1)
+    return np.concatenate([grid[is_in_disk], edge[is_in_rectangle]])

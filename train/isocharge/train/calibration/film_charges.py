@@ -14,7 +14,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Piezo, Probe, Sensor, SideForceMap
-from isocharge.simulate.forward.derivative_fields import NODE_COUNT
+from isocharge.simulate.forward.derivative_maps import NODE_COUNT
 from isocharge.simulate.sensor.film_properties import PRETENSION, FilmProperty
 
 SOLVED_STEP = 1.0 / 3.0

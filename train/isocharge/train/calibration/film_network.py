@@ -19,7 +19,7 @@ from isocharge.common.arrays import Array
 from isocharge.serve.model.charge_series import ChargeSeries, series_size
 from isocharge.serve.model.chebyshev_series import Series
 from isocharge.simulate import Domain, ForwardMap, NoiseModel
-from isocharge.simulate.forward.derivative_fields import NODE_COUNT
+from isocharge.simulate.forward.derivative_maps import NODE_COUNT
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.simulate.solver.friction import MAX_FRICTION

@@ -1,18 +1,25 @@
-"""Effect of a side force and of the friction of the probe on the charges.
+"""Derivatives of the charges with respect to properties of the film and to a side force of the probe.
 
-A side force (Fx, Fy) of the probe on the film changes the charges to first order by
+A change of a property of the film, such as its pretension or an oval clamp, changes the stress. So does a side force
+(Fx, Fy) of the probe, which changes the charges to first order by
 
     dQ = jacobian @ (Fx, Fy).
 
-A side force has two stress fields. The first field is the change of the stress by a side force along the direction of
-the press. The second field is the change of the stress by a side force across this direction. The stress fields are
-computed from the tangent of the equilibrium (see `solver.sensitivity`) at a few distances and forces. Between the
-solved presses, the stress fields are interpolated as in a forward map. If the side force is at most 0.2 times the force
-of the press, the terms of second order are smaller than 1 % of dQ.
+The changes of the stress are computed from the factorised tangent of the equilibrium (see `solver.sensitivity`), at a
+few distances and forces. Between the solved presses, they are interpolated as in a forward map. They need fewer solved
+presses than the stress itself, because they are used for small corrections. If the side force is at most 0.2 times the
+force of the press, the terms of second order are smaller than 1 % of dQ.
+
+Each property with two axes, like an ellipse, has two components. Let alpha be the angle from the x axis to axis 1 of
+the property. The components are the size of the property times cos(2 alpha) and sin(2 alpha). A side force has two
+stress fields: the changes of the stress by a side force along and across the direction of the press.
 
 Example:
 
     forward_map = ForwardMap.build(sensor, Circle(1.0))
+    slopes = FilmSlopes.build(forward_map)
+    slopes.jacobian(contact)["oval_x"]  # pC, shape (n, n_electrode)
+    slopes.temperature_jacobian(contact)  # pC/K, shape (n, n_electrode)
     side_force_map = SideForceMap.build(forward_map)
     side_force_map.jacobian(contact)  # pC/N, shape (n, n_electrode, 2)
     side_force_map.friction_charges(contact, 0.2)  # pC, shape (n, n_electrode)
@@ -26,14 +33,158 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError
-from isocharge.simulate.forward.derivative_fields import solve_derivatives
+from isocharge.simulate.forward.family import Family, NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import FINE, ReadoutPoints
+from isocharge.simulate.mechanics.film_temperature import tension_change
 from isocharge.simulate.mechanics.scaling import amplitude_squared, side_force_unit
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.solver.equilibrium import Equilibrium
 from isocharge.simulate.solver.friction import check_friction, holding_force, limit_to_friction
-from isocharge.simulate.solver.sensitivity import SIDE_FORCE_IS_ODD, side_force_stress
+from isocharge.simulate.solver.load_case import SolveSettings
+from isocharge.simulate.solver.press_chain import Reading
+from isocharge.simulate.solver.sensitivity import FILM_IS_ODD, SIDE_FORCE_IS_ODD, film_stress, side_force_stress
+
+NODE_COUNT = NodeCount(distances=6, forces=6)
+"""Numbers of distances, forces and directions at which the derivatives are solved."""
+
+TENSION = ("pretension", "tension_difference", "tension_shear")
+"""Mean pretension, half of T11 - T22, and T12, MPa."""
+
+STIFFNESS = ("stiffness_x", "stiffness_xy")
+"""Components of ln(E1 / E2), dimensionless."""
+
+OVAL = ("oval_x", "oval_xy")
+"""Components of the parameter e of an oval clamp, dimensionless."""
+
+
+def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor | None) -> ForwardMap:
+    """Compute derivatives of the stress for a few presses, and return a map that interpolates the derivatives.
+
+    The presses are distributed over the domain of a forward map, and are solved with the mesh of the forward map. The
+    solves take about ten seconds.
+
+    Args:
+        forward_map: Forward map of the film under a circular probe. It provides the domain, the mesh and the readout.
+        read: Function that computes the derivatives of the stress at the nodes of the mesh from a solved press.
+        executor: Executor that runs the solves; None for this process.
+
+    Returns:
+        Copy of the forward map. In place of the stress, its table contains the derivatives that `read` computes, shape
+        (n_distance * n_force * n_direction, n_value).
+
+    Raises:
+        SolveError: If a press has no equilibrium.
+    """
+    sensor = forward_map.sensor
+    film = sensor.film
+    # Choose the distances and forces of the presses. A circular probe has no orientation.
+    family = Family.spread(forward_map.domain, film, forward_map.probe, NODE_COUNT)
+    theory = replace(forward_map.theory, stretching=True)  # `read` needs a theory that includes stretching
+    settings = SolveSettings(theory=theory, resolution=forward_map.resolution, layer=forward_map.layer)
+
+    derivatives = family.solve(sensor, forward_map.probe, settings, executor, read)
+    table = derivatives.reshape(-1, derivatives.shape[-1])
+    return replace(forward_map, family=family, theory=theory, table=table)
+
+
+@dataclass(frozen=True)
+class FilmSlopes:
+    """Derivatives of the charges with respect to properties of one film, at any position and force.
+
+    Attributes:
+        film: Forward map of the film.
+        fields: Forward map whose table contains the stress fields `sensitivity.FILM_FIELDS`.
+    """
+
+    film: ForwardMap
+    fields: ForwardMap
+
+    @classmethod
+    def build(cls, forward_map: ForwardMap, *, executor: Executor | None = None) -> "FilmSlopes":
+        """Solve a few presses in the domain of a forward map, and compute the stress fields of its properties.
+
+        Args:
+            forward_map: Forward map of the film under a circular probe. It provides the domain, the mesh and the
+                readout.
+            executor: Executor that runs the solves; None for this process.
+
+        Raises:
+            SceneError: If the probe is not axisymmetric.
+            SolveError: If a press has no equilibrium.
+        """
+        if not forward_map.probe.is_axisymmetric:
+            raise SceneError(f"properties of a film: expected a circular probe, got {forward_map.probe.notation}")
+        return cls(forward_map, solve_derivatives(forward_map, film_stress, executor))
+
+    def jacobian(self, contact: Array) -> dict[str, Array]:
+        """Compute the derivatives of the charges with respect to the properties in `TENSION`, `STIFFNESS` and `OVAL`.
+
+        Args:
+            contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
+
+        Returns:
+            Derivatives by the name of the property, each of shape (n, n_electrode), pC per unit of the property.
+
+        Raises:
+            SceneError: If a press lies outside the domain.
+        """
+        contact = self.film.domain.check(contact, "properties of a film")
+        film = self.film.sensor.film
+        field_charge = self.film.sensor.calibration.read(
+            self.fields.field_charges(contact, FILM_IS_ODD).swapaxes(1, 2)  # shape (n, n_field, n_electrode)
+        )
+        mean_tension, even_tension, odd_tension, *other_fields = np.moveaxis(field_charge, 1, 0)
+        tension_unit = (film.young * amplitude_squared(film, contact[:, 2]) + film.pretension)[:, None]
+
+        derivatives = {TENSION[0]: mean_tension / tension_unit}
+        even_and_odd = {
+            TENSION[1:]: (even_tension / tension_unit, odd_tension / tension_unit),
+            STIFFNESS: tuple(other_fields[:2]),
+            OVAL: tuple(other_fields[2:]),
+        }
+        # The axes of an even field are along and across the direction of the press, at the angle t from the x axis.
+        # The axes of an odd field are rotated by 45 degrees from them. Rotate both to the axes x and y.
+        twice_angle = 2.0 * np.arctan2(contact[:, 1], contact[:, 0])[:, None]
+        cosine = np.cos(twice_angle)
+        sine = np.sin(twice_angle)
+        for (x_name, xy_name), (even, odd) in even_and_odd.items():
+            derivatives[x_name] = cosine * even - sine * odd
+            derivatives[xy_name] = sine * even + cosine * odd
+        return derivatives
+
+    def tension_jacobian(self, contact: Array) -> Array:
+        """Compute the derivatives of the charges with respect to the pretension (T11, T22, T12) in the axes x and y.
+
+        Args:
+            contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
+
+        Returns:
+            Derivatives, shape (n, n_electrode, 3), pC/MPa.
+
+        Raises:
+            SceneError: If a press lies outside the domain.
+        """
+        mean, difference, shear = (self.jacobian(contact)[name] for name in TENSION)
+        # T11 and T22 contribute to the mean pretension and to half of their difference.
+        return np.stack([0.5 * (mean + difference), 0.5 * (mean - difference), shear], axis=2)
+
+    def temperature_jacobian(self, contact: Array) -> Array:
+        """Compute the derivatives of the touch charges with respect to the temperature of the film.
+
+        The temperature of the ring remains constant. The pyroelectric charge is not included.
+
+        Args:
+            contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
+
+        Returns:
+            Derivatives, shape (n, n_electrode), pC/K. They are zero if the film has no expansion coefficients.
+
+        Raises:
+            SceneError: If a press lies outside the domain.
+        """
+        tension_per_kelvin = tension_change(self.film.sensor.film, 1.0, 0.0)  # (T11, T22, T12), MPa/K
+        return np.asarray(self.tension_jacobian(contact) @ tension_per_kelvin)
 
 
 @dataclass(frozen=True)
