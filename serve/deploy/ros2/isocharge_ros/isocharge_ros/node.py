@@ -1,9 +1,13 @@
 """A ROS 2 node that publishes the contacts of a film. The node has the parameters listed in `DEFAULT_PARAMETERS`."""
 
+from collections import Counter
+
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from std_msgs.msg import String
 
 from isocharge.serve import Port, Predictor, load_device, stream
 from isocharge.serve.export.record_messages import (
@@ -12,11 +16,15 @@ from isocharge.serve.export.record_messages import (
     ros_time_ns,
     with_tracked_contact,
 )
+from isocharge.serve.flags import INVALID, MEANINGS
 
 DEFAULT_PARAMETERS = {"model": "three-25um-biaxial", "port": "/dev/ttyACM0", "device": "", "wait_s": 60.0}
 """Parameters of the node with their default values."""
 
 NANOSECONDS_PER_SECOND = 10**9
+
+DIAGNOSTIC_INTERVAL_s = 1.0
+"""Smallest time between two messages of `/diagnostics`, s."""
 
 X_WITH_Y = 1
 Y_WITH_X = 6
@@ -25,18 +33,33 @@ DIAGONAL = slice(0, 36, 7)
 
 
 class TouchNode(Node):
-    """Node that publishes the wrench and the pose of each contact."""
+    """Node that publishes the wrench and the pose of each contact, the flags, and diagnostics."""
 
     def __init__(self):
-        """Create one publisher for wrenches and one publisher for poses."""
+        """Create one publisher for each topic."""
         super().__init__("isocharge")
         self.wrench_publisher = self.create_publisher(WrenchStamped, "/isocharge/wrench", qos_profile_sensor_data)
         self.pose_publisher = self.create_publisher(
             PoseWithCovarianceStamped, "/isocharge/pose", qos_profile_sensor_data
         )
+        self.flags_publisher = self.create_publisher(String, "/isocharge/flags", qos_profile_sensor_data)
+        self.diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.flag_counts = Counter()
+        self.n_records = 0
+        self.next_diagnostic_s = 0.0  # time of a record from which the next diagnostic is published, s
 
     def publish(self, record):
-        """Publish the wrench of a prediction record and, if something touches the film, the pose of the contact."""
+        """Publish the flags and the wrench of a prediction record and, if something touches the film, the pose."""
+        flags = String()
+        flags.data = ",".join(record.flags)
+        self.flags_publisher.publish(flags)
+        self.flag_counts.update(record.flags)
+        self.n_records += 1
+        if record.timestamp >= self.next_diagnostic_s:
+            self.publish_diagnostic(record)
+            self.next_diagnostic_s = record.timestamp + DIAGNOSTIC_INTERVAL_s
+            self.flag_counts.clear()
+            self.n_records = 0
         if record.force_N is None:  # the force is unknown, for example because the board has sent a value that is NaN
             return
         record_values = with_tracked_contact(record.json_values)  # a tracked contact replaces the contact of the frame
@@ -86,6 +109,33 @@ class TouchNode(Node):
         message.pose.covariance[X_WITH_Y] = xy_covariance
         message.pose.covariance[Y_WITH_X] = xy_covariance
         self.pose_publisher.publish(message)
+
+    def publish_diagnostic(self, record):
+        """Publish the meanings of the flags since the last diagnostic, and how many records had each flag.
+
+        The level is OK without flags, ERROR if a record had the flag `invalid`, and WARN with other flags.
+
+        Args:
+            record: The latest record.
+        """
+        status = DiagnosticStatus()
+        status.name = "isocharge: film"
+        status.hardware_id = record.frame_id
+        status.level = DiagnosticStatus.WARN if self.flag_counts else DiagnosticStatus.OK
+        if INVALID in self.flag_counts:
+            status.level = DiagnosticStatus.ERROR
+        status.message = "; ".join(MEANINGS[flag] for flag in self.flag_counts) or "no flags"
+
+        values = {"model": record.model, "records": self.n_records, "misfit": record.misfit}
+        values["latency_us"] = record.latency_us
+        for name, value in {**values, **self.flag_counts}.items():
+            pair = KeyValue()
+            pair.key = name
+            pair.value = str(value)
+            status.values.append(pair)
+        message = self.with_header(DiagnosticArray(), record)
+        message.status.append(status)
+        self.diagnostics_publisher.publish(message)
 
     def with_header(self, message, record):
         """Copy the coordinate frame and the time of a record into the header of a message, and return the message."""
