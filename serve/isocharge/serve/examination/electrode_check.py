@@ -50,69 +50,20 @@ class ElectrodeCheck:
     inverted: tuple[str, ...]
 
     @property
-    def is_as_expected(self) -> bool:
-        """Whether the presses have confirmed the assumed channel of every electrode."""
-        return dict(self.expected) == dict(self.found)
-
-    @property
     def sentences(self) -> Iterator[str]:
         """Sentences for the user about the channel of each electrode, the order of the channels, and wrong signs."""
         for electrode, channel in self.found.items():
             yield f"press near {electrode}: channel {printable(channel)} answers most strongly"
-        yield _order_sentence(self.expected, self.found)
+        wrong = [electrode for electrode, channel in self.found.items() if channel != self.expected[electrode]]
+        if wrong:
+            yield f"the channels of {', '.join(wrong)} are in another order than assumed"
+        else:
+            yield "every channel belongs to its electrode"
         # If all channels are inverted, only the sign convention of the board differs, which is no mistake.
         is_part_inverted = 0 < len(self.inverted) < len(self.found)
         if is_part_inverted:
             names = printable(", ".join(self.inverted))
             yield f"channel {names} falls under a press and the others rise: check the signs of the gain"
-
-
-def _order_sentence(expected_channels: Mapping[str, str], found_channels: Mapping[str, str]) -> str:
-    """Return a sentence about the order of the channels, which may be swapped, turned or otherwise different.
-
-    Args:
-        expected_channels: Assumed channel of each electrode, by the name of the electrode.
-        found_channels: Channel of each electrode that the presses show, by the name of the electrode.
-    """
-    electrodes = list(expected_channels)
-    wrong_electrodes = [name for name in electrodes if found_channels[name] != expected_channels[name]]
-    if not wrong_electrodes:
-        return "every channel belongs to its electrode"
-
-    # For each electrode that was pressed, find the electrode to which the found channel was assumed to belong.
-    expected_electrode = {channel: electrode for electrode, channel in expected_channels.items()}
-    assumed_electrodes = []
-    for electrode in electrodes:
-        found_channel = found_channels[electrode]
-        assumed_electrodes.append(expected_electrode[found_channel])
-
-    # With two electrodes, turned channels are also swapped. "Swapped" is then the simpler description.
-    turned_places = _turned_places(electrodes, assumed_electrodes)
-    if turned_places is not None and len(electrodes) > 2:
-        return f"the channels are turned by {turned_places} of {len(electrodes)} places"
-    if len(wrong_electrodes) == 2:
-        return f"the channels of {wrong_electrodes[0]} and {wrong_electrodes[1]} are swapped"
-    return f"the channels of {', '.join(wrong_electrodes)} are in another order"
-
-
-def _turned_places(electrodes: list[str], assumed_electrodes: list[str]) -> int | None:
-    """Return the number of electrodes by which all channels are shifted around the film.
-
-    For example, the channels of A, B and C are turned by one place if the presses near A, B and C change the channels
-    that were assumed to belong to B, C and A.
-
-    Args:
-        electrodes: Names of the electrodes in the order of the presses.
-        assumed_electrodes: For each press, the electrode to which the channel that changed was assumed to belong.
-
-    Returns:
-        The number of electrodes, at least 1; None if the channels are not shifted by the same number of electrodes.
-    """
-    for places in range(1, len(electrodes)):
-        turned_electrodes = electrodes[places:] + electrodes[:places]
-        if assumed_electrodes == turned_electrodes:
-            return places
-    return None
 
 
 class UnclearPressError(PressCheckError):
@@ -155,21 +106,27 @@ def check_electrodes(
     """
     electrodes = list(channels)
     channel_names = list(channels.values())
-    blocks = _BlockReader(port, device, channel_names)  # reads the port, and computes medians over short blocks of time
-    presses = _PressReader(blocks, ask, timeout_s)
-    changes = np.array([presses.press_near(electrode) for electrode in electrodes])  # shape (electrodes, channels)
-    attempts = 1
-    while True:
+    presses = _PressReader(port, device, channel_names, ask, timeout_s)
+    changes = np.zeros((len(electrodes), len(channel_names)))  # of each channel under the press near each electrode
+    awaited = list(range(len(electrodes)))  # rows of the presses that are missing or unclear
+    columns: list[int] = []  # column of the channel that belongs to each electrode
+    errors: dict[int, list[PressCheckError]] = {row: [] for row in awaited}
+    while not columns:
         try:
-            columns = assign_channels(changes, electrodes)  # column of the channel that belongs to each electrode
-            break
-        except UnclearPressError as error:
-            if attempts == PRESS_ATTEMPTS:
-                raise
+            while awaited:
+                changes[awaited[0]] = presses.press_near(electrodes[awaited[0]])
+                awaited.pop(0)
+            columns = assign_channels(changes, electrodes)
+        except PressCheckError as error:
+            if isinstance(error, UnclearPressError):
+                awaited += error.rows
+            errors_of_press = errors[awaited[0]]
+            errors_of_press.append(error)
+            if len(errors_of_press) == PRESS_ATTEMPTS:
+                raise errors_of_press[0] from None
+            if len(errors_of_press) == PRESS_ATTEMPTS - 1:
+                presses.detector.forget_rest()  # a press may have been taken for the rest
             ask(str(error))
-            for row in error.rows:
-                changes[row] = presses.press_near(electrodes[row])
-        attempts += 1
 
     # A channel is inverted if its value falls under the press near its own electrode.
     found_channels = {}
@@ -265,25 +222,73 @@ def _reassigned_settings(section: Any, source_electrode: Mapping[str, str]) -> A
     return reassigned_section
 
 
-class _BlockReader:
-    """Reader of a port that computes the medians of the given channels over blocks of time of the length `BLOCK_S`."""
+class _PressReader:
+    """Reader of presses, each of which the user is asked for.
 
-    def __init__(self, port: Port, device: Device, channels: list[str]) -> None:
-        """Store the port and the channels. The first data are read by `next_block`.
+    Attributes:
+        detector: Detector of the presses.
+    """
+
+    def __init__(
+        self, port: Port, device: Device, channels: list[str], ask: Callable[[str], None], timeout_s: float
+    ) -> None:
+        """Store the arguments. The rest level is unknown.
 
         Args:
             port: The open port.
             device: Format of the frames.
             channels: Names of the channels.
+            ask: Function that is called with a sentence that asks the user to wait or to press.
+            timeout_s: Longest time to wait for the rest or for a press, s.
         """
+        self.detector = PressDetector()
         self._port = port
         self._parser = device.parser()
         self._channels = channels
+        self._ask = ask
+        self._timeout_s = timeout_s
 
-    def next_block(self, deadline_s: float) -> tuple[Array, Array] | None:
+    def press_near(self, electrode: str) -> Array:
+        """Ask for a press, wait until it has begun and ended, and return the change of the channels at its peak.
+
+        Args:
+            electrode: Electrode near which the press is expected.
+
+        Returns:
+            Change of each channel in the block with the largest total change, shape (channels,), in the unit of the
+            board.
+
+        Raises:
+            PressCheckError: If the rest, or the begin or the end of the press, does not come in time.
+        """
+        detector = self.detector
+        has_block = False
+        if detector.rest is None:
+            self._ask("wait, and do not touch the film, until the rest level is known")
+            deadline_s = time.monotonic() + self._timeout_s
+            while detector.rest is None and (block := self._next_block(deadline_s)) is not None:
+                has_block = True
+                detector.feed(*block)
+        if detector.rest is not None:
+            self._ask(f"press near electrode {electrode}, as close to it as you can, and let go")
+            deadline_s = time.monotonic() + self._timeout_s
+            while (block := self._next_block(deadline_s)) is not None:
+                if detector.feed(*block):
+                    return detector.change
+            has_block = detector.is_pressed
+            detector.is_pressed = False
+        if has_block:
+            raise PressCheckError(
+                f"electrode {electrode}: the charges did not come to rest within {self._timeout_s:g} s; take the "
+                "finger away after each press, and try again"
+            )
+        raise PressCheckError(f"electrode {electrode}: no press came within {self._timeout_s:g} s; try again")
+
+    def _next_block(self, deadline_s: float) -> tuple[Array, Array] | None:
         """Collect the frames of one block of time, and return the median and the noise of each channel.
 
-        A block lasts for `BLOCK_S`, or longer if no frame has arrived during this time.
+        A block lasts for `BLOCK_S`, or longer if no frame has arrived during this time. Frames without a finite number
+        for every channel are ignored.
 
         Args:
             deadline_s: Time on the monotonic clock until which the function waits for frames, s.
@@ -299,107 +304,11 @@ class _BlockReader:
             if remaining_s <= 0.0:
                 return None
             chunk = self._port.read(min(BLOCK_S, remaining_s))
-            if chunk is not None:  # otherwise no bytes have arrived in time
-                rows += self._rows(chunk.data)
-        values = np.array(rows)  # shape (frames, channels)
-        noise = np.array([channel_noise(column) for column in values.T])
-        return np.median(values, axis=0), noise
-
-    def _rows(self, data: bytes) -> Iterator[list[float]]:
-        """Yield the values of the channels in each frame that has a finite number for every channel.
-
-        Args:
-            data: Bytes from the port. They may end within a frame, which the next bytes complete.
-        """
-        for frame in self._parser.feed(data):
-            positions = [channel_index(channel, frame) for channel in self._channels]  # None for a missing channel
-            values = [frame.values[position] for position in positions if position is not None]
-            has_all_channels = len(values) == len(positions)
-            if has_all_channels and all(map(math.isfinite, values)):
-                yield values
-
-
-class _PressReader:
-    """Reader of presses, each of which the user is asked for."""
-
-    def __init__(self, blocks: _BlockReader, ask: Callable[[str], None], timeout_s: float) -> None:
-        """Store the arguments. The rest level is unknown.
-
-        Args:
-            blocks: Source of the blocks.
-            ask: Function that is called with a sentence that asks the user to wait or to press.
-            timeout_s: Longest time to wait for the rest or for a press, s.
-        """
-        self._blocks = blocks
-        self._ask = ask
-        self._timeout_s = timeout_s
-        self._detector = PressDetector()
-
-    def press_near(self, electrode: str) -> Array:
-        """Ask for a press, wait until it has begun and ended, and return the change of the channels at its peak.
-
-        Args:
-            electrode: Electrode near which the press is expected.
-
-        Returns:
-            Change of each channel in the block with the largest total change, shape (channels,), in the unit of the
-            board.
-
-        Raises:
-            PressCheckError: If no press begins and ends in time, in `PRESS_ATTEMPTS` attempts.
-        """
-        errors: list[PressCheckError] = []
-        for attempt in range(PRESS_ATTEMPTS):
-            if errors:
-                self._ask(str(errors[-1]))
-            if attempt == PRESS_ATTEMPTS - 1:
-                self._detector.forget_rest()  # a press may have been taken for the rest
-            try:
-                return self._wait_for_press(electrode)
-            except PressCheckError as error:
-                errors.append(error)
-        raise errors[0]
-
-    def _wait_for_press(self, electrode: str) -> Array:
-        """Wait for the rest if it is not known, and for a press that begins and ends. Return the change at its peak.
-
-        Args:
-            electrode: Electrode near which the press is expected.
-
-        Raises:
-            PressCheckError: If the rest, or the begin or the end of the press, does not come in time.
-        """
-        detector = self._detector
-        if detector.rest is None:
-            self._ask("wait, and do not touch the film, until the rest level is known")
-            self._wait_until(lambda: detector.rest is not None, electrode, is_rest_awaited=True)
-        self._ask(f"press near electrode {electrode}, as close to it as you can, and let go")
-        self._wait_until(lambda: self._has_ended, electrode, is_rest_awaited=False)
-        return detector.change
-
-    def _wait_until(self, is_done: Callable[[], bool], electrode: str, *, is_rest_awaited: bool) -> None:
-        """Feed blocks to the detector until a condition is true.
-
-        Args:
-            is_done: The condition.
-            electrode: Electrode near which the press is expected.
-            is_rest_awaited: Whether the rest level is awaited, and not a press.
-
-        Raises:
-            PressCheckError: If the condition does not become true in time.
-        """
-        deadline_s = time.monotonic() + self._timeout_s
-        has_block = False
-        while (block := self._blocks.next_block(deadline_s)) is not None:
-            has_block = True
-            self._has_ended = self._detector.feed(*block)
-            if is_done():
-                return
-        is_restless = has_block if is_rest_awaited else self._detector.is_pressed
-        self._detector.is_pressed = False
-        if is_restless:
-            raise PressCheckError(
-                f"electrode {electrode}: the charges did not come to rest within {self._timeout_s:g} s; take the "
-                "finger away after each press, and try again"
-            )
-        raise PressCheckError(f"electrode {electrode}: no press came within {self._timeout_s:g} s; try again")
+            for frame in [] if chunk is None else self._parser.feed(chunk.data):
+                positions = [channel_index(channel, frame) for channel in self._channels]  # None for a missing channel
+                values = [math.nan if position is None else frame.values[position] for position in positions]
+                if all(map(math.isfinite, values)):
+                    rows.append(values)
+        values_of_block = np.array(rows)  # shape (frames, channels)
+        noise = np.array([channel_noise(column) for column in values_of_block.T])
+        return np.median(values_of_block, axis=0), noise

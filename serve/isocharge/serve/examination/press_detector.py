@@ -2,7 +2,9 @@
 
 The values are replaced by their medians over blocks of 0.1 s, because hum averages out in a block. A single damaged
 value does not change the median of a block. The channels are quiet if they change little within half a second. Warming,
-creep and the slow noise of amplifiers cause slower changes than a touch.
+creep and the slow noise of amplifiers cause slower changes than a touch. One detector, `PressDetector`, finds the
+touches of a film that should be at rest, the press that is held during the port check, and the press near each
+electrode.
 
 A press that is held with a constant force during the whole time does not change the values. It cannot be distinguished
 from an amplifier with another rest level.
@@ -13,7 +15,6 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from isocharge.common.arrays import Array
 
@@ -51,7 +52,7 @@ class TouchFound(NamedTuple):
     Attributes:
         column: Column of the channel in the array of values.
         total_change: Largest minus smallest value of the channel, in the unit of the values.
-        time_s: Time of the steepest change, s from the first frame.
+        time_s: Time of the beginning of the touch, s from the first frame.
     """
 
     column: int
@@ -62,8 +63,8 @@ class TouchFound(NamedTuple):
 def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | None:
     """Search for a touch in the values of a film that should be at rest.
 
-    A channel is touched if it is not quiet in some half second. If the values are in pC, a large slow change is a
-    touch, too.
+    The film is touched if a press begins, or if the channels are never quiet. If the values are in pC, a large slow
+    change is a touch, too.
 
     Args:
         values: Values of the channels, shape (n, channels).
@@ -72,32 +73,31 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
             noise only.
 
     Returns:
-        The touched channel with the largest total change. None if no channel is touched, or if the time is too short.
+        The channel with the largest total change, relative to its noise. None if the film is not touched, or if the
+        time is too short.
     """
     blocks = block_medians(values, times_s)  # shape (blocks, channels)
-    if len(blocks) <= QUIET_BLOCKS:
+    if len(blocks) <= QUIET_BLOCKS + 1:
         return None
-    # Smooth the blocks with the median of three consecutive blocks. The result has the shape (blocks - 2, channels).
-    smoothed = np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0)
-    windows = sliding_window_view(smoothed, min(QUIET_BLOCKS, len(smoothed)), axis=0)
-    window_changes = np.ptp(windows, axis=2)  # largest minus smallest level, shape (windows, channels)
+    # Smooth the blocks with the median of three consecutive blocks. A channel without finite values is not touched.
+    smoothed = np.nan_to_num(np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0), posinf=0.0, neginf=0.0)
+    noise = np.array([channel_noise(column) for column in values.T])
+    if unit_is_pC:
+        noise = np.maximum(noise, MIN_NOISE_PC)
+    detector = PressDetector()
+    for level in smoothed:
+        detector.feed(level, noise)
     total_changes = np.ptp(smoothed, axis=0)
-    touches: list[TouchFound] = []
-    for column, total_change in enumerate(total_changes.tolist()):
-        noise = channel_noise(values[:, column])
-        noise = max(noise, MIN_NOISE_PC) if unit_is_pC else noise
-        min_change = CHANGE_SIGMAS * noise
-        is_fast_touch = window_changes[:, column].max() > min_change  # false for NaN
-        is_slow_touch = unit_is_pC and total_change > max(min_change, MAX_SLOW_CHANGE_PC)
-        if is_fast_touch or is_slow_touch:
-            steepest_window = int(np.argmax(window_changes[:, column]))
-            middle_block = steepest_window + 1 + QUIET_BLOCKS // 2  # smoothing has removed the first block
-            touches.append(TouchFound(column, total_change, BLOCK_S * middle_block))
-    return max(touches, key=lambda touch: touch.total_change, default=None)
+    is_slow_touch = unit_is_pC and bool((total_changes > MAX_SLOW_CHANGE_PC).any())
+    if detector.begin_block is None and detector.rest is not None and not is_slow_touch:
+        return None
+    column = int(np.argmax(total_changes))
+    begin_block = (detector.begin_block or 0) + 1  # smoothing has removed the first block
+    return TouchFound(column, float(total_changes[column]), BLOCK_S * begin_block)
 
 
 class PressDetector:
-    """Detector of presses in the levels of successive blocks.
+    """Detector of the begin and the end of presses. It processes the median values of one block of time after another.
 
     The rest level is the mean of the latest quiet blocks before a press. After a press, the rest level before this
     press is used until the channels are quiet again, so that the next press may follow at once.
