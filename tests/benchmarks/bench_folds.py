@@ -22,8 +22,8 @@ from shared import options, print_results
 
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.frames.frame import Frame
+from isocharge.serve.model.charge_series import read_charges
 from isocharge.serve.signal_chain.stage import Setup
-from isocharge.serve.tracking.contact_mixture import contact_mixture
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
 from isocharge.simulate import Circle, ForwardMap, noise_model
 from isocharge.simulate.forward.charge_map import ChargeMap
@@ -156,11 +156,11 @@ def main() -> None:
     rng = np.random.default_rng(asked.seed)
     noise = noise_model(asked.noise)
     metadata = predictor.metadata
-    mixture = contact_mixture(predictor)
-    if mixture is None:
+    charges = read_charges(predictor.folder, metadata.electrodes)
+    if charges is None or not charges.is_folded:
         raise SystemExit(f"{asked.model}: no charges.npz: its map does not fold; give the model of the lines above")
     tracker = Tracker(Setup(metadata.electrodes, {TrackRule: TrackRule()}, predictor=predictor))
-    radius = mixture.charges.radius_mm
+    radius = charges.domain.radius
     sensor = sensor_from_dict(dict(metadata.sensor))
     forward_map = ForwardMap.build(sensor, Circle(1.0), radius + MAP_MARGIN_mm, metadata.force_range_N)
     film = with_fast_derivatives(forward_map)

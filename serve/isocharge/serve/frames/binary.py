@@ -13,7 +13,6 @@ import struct
 from cobs import cobs
 
 from isocharge.serve.frames.frame import ChecksumError, Frame, StuffedParser
-from isocharge.serve.frames.stuffing import cobs_decode
 
 FORMAT = "binary frames of isocharge"
 """Description of the format, for the user."""
@@ -28,7 +27,7 @@ HEADER = struct.Struct("<BHIBB")
 """Format of the fields before the charges: version, frame counter, clock in us, number of charges, and flags."""
 
 CRC = struct.Struct("<H")
-"""Format of the checksum."""
+"""Format of the checksum CRC-16/CCITT-FALSE, which has the polynomial 0x1021 and the initial value 0xFFFF."""
 
 MAX_CHARGES = 255
 """Largest number of charges in a frame, because one byte contains the number."""
@@ -50,7 +49,7 @@ def encode_frame(frame: Frame) -> bytes:
     header = HEADER.pack(FRAME_VERSION, frame.seq or 0, frame.t_us or 0, charge_count, frame.bits)
     charges = struct.pack(f"<{charge_count}f", *frame.values)
     body = header + charges
-    crc = CRC.pack(crc16(body))
+    crc = CRC.pack(binascii.crc_hqx(body, 0xFFFF))
     stuffed: bytes = cobs.encode(body + crc)
     return stuffed + DELIMITER
 
@@ -65,12 +64,15 @@ def decode_frame(stuffed_frame: bytes) -> Frame:
         ChecksumError: If the CRC is wrong.
         ValueError: If the bytes are not a frame of this version.
     """
-    data = cobs_decode(stuffed_frame)
+    try:
+        data: bytes = cobs.decode(stuffed_frame)
+    except cobs.DecodeError as error:
+        raise ValueError(f"the bytes are not encoded with COBS: {error}") from error
     if len(data) < HEADER.size + CRC.size:
         raise ValueError("the frame is shorter than a frame without charges")
     body = data[: -CRC.size]  # header and charges
     sent_crc = data[-CRC.size :]
-    computed_crc = CRC.pack(crc16(body))
+    computed_crc = CRC.pack(binascii.crc_hqx(body, 0xFFFF))
     if computed_crc != sent_crc:
         raise ChecksumError("the CRC is wrong")
     version, seq, t_us, charge_count, flags = HEADER.unpack_from(body)
@@ -79,11 +81,6 @@ def decode_frame(stuffed_frame: bytes) -> Frame:
         raise ValueError("the frame has another version, or another number of charges than it states")
     charges = struct.unpack_from(f"<{charge_count}f", body, HEADER.size)
     return Frame(seq, t_us, charges, flags)
-
-
-def crc16(data: bytes) -> int:
-    """Compute the checksum CRC-16/CCITT-FALSE, which has the polynomial 0x1021 and the initial value 0xFFFF."""
-    return binascii.crc_hqx(data, 0xFFFF)
 
 
 class BinaryParser(StuffedParser):

@@ -39,15 +39,6 @@ def crc_with_parameters(width: int, polynomial: int, start: int, reflected: bool
     return Checksum(crc.calc, width // 8)
 
 
-def _named_crc(name: str, size: int) -> Checksum:
-    """Return the cyclic redundancy check with a name and a size in bytes.
-
-    The package `anycrc` writes the names in another way, for example CRC16-MODBUS for crc-16/modbus.
-    """
-    anycrc_name = name.upper().replace("-", "", 1).replace("/", "-")
-    return Checksum(anycrc.Model(anycrc_name).calc, size)
-
-
 def _fletcher_16(data: bytes) -> int:
     """Compute Fletcher's checksum (1982), which has two bytes.
 
@@ -86,9 +77,12 @@ CHECKSUMS = {
     "xor-8": Checksum(lambda data: reduce(xor, data, 0), 1),
     "sum-16": Checksum(lambda data: sum(data) & 0xFFFF, 2),
     "fletcher-16": Checksum(_fletcher_16, 2),
-    **{name: _named_crc(name, size) for name, size in CRC_SIZES.items()},
+    **{
+        name: Checksum(anycrc.Model(name.upper().replace("-", "", 1).replace("/", "-")).calc, size)
+        for name, size in CRC_SIZES.items()
+    },
 }
-"""All checksums, by name.
+"""All checksums, by name. The package `anycrc` writes the names in another way, for example CRC16-MODBUS.
 
 The checksum `sum-8/negative` is chosen such that the sum of all bytes, including the checksum, is zero modulo 256. The
 checksum `sum-8/inverted` is the sum of the bytes with every bit inverted.

@@ -128,7 +128,12 @@ class DeviceClock:
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
         step_us = self._unwrap(t_us, modulus)  # time since the previous reading
-        if self._is_far_ahead_of(arrival_s):  # no reading can be taken long after its arrival, so a clock was set
+        predicted_s = self._predict(self._device_us)
+
+        # No reading can be taken long after its arrival, so a clock was set. All chunks of a file have the same arrival
+        # time, which contains no information about the clock.
+        is_new_arrival = self._chunk_arrival_s not in (None, arrival_s)
+        if self._fitted_us is not None and is_new_arrival and predicted_s - arrival_s > MAX_DEVIATION_s:
             self.restarts += 1
             self._fitted_us = None  # discards the fit
             step_us = 0  # the time since the previous reading is unknown
@@ -137,30 +142,15 @@ class DeviceClock:
         # time of the previous reading if that is later.
         if self._fitted_us is None:
             self._fitted_us = self._device_us
-            self._fitted_host_s = max(arrival_s, self._latest_host_s)
+            self._fitted_host_s = predicted_s = max(arrival_s, self._latest_host_s)
             self._is_fit_provisional = True
 
         # The host time must not decrease, even if a correction of the fit has moved the predicted host time back.
-        self._latest_host_s = max(self._latest_host_s, self._predict(self._device_us))
+        self._latest_host_s = max(self._latest_host_s, predicted_s)
         frame.host_s = self._latest_host_s
         frame.device_us = self._device_us
         frame.dt_s = step_us * 1e-6
         frame.clock_s = self._device_us * 1e-6
-
-    def _is_far_ahead_of(self, arrival_s: float) -> bool:
-        """Return whether the fit predicts a host time for the latest reading that is far later than its arrival.
-
-        If the difference exceeds `MAX_DEVIATION_s`, one of the two clocks must have been set. Without a fit, the result
-        is False. All chunks of a file have the same arrival time, which contains no information about the clock. The
-        result is therefore also False for the first chunk, and for a chunk with the arrival time of the previous chunk.
-
-        Args:
-            arrival_s: Arrival of the chunk that contains the latest reading, unix seconds.
-        """
-        is_different_arrival = self._chunk_arrival_s is not None and self._chunk_arrival_s != arrival_s
-        if self._fitted_us is None or not is_different_arrival:
-            return False
-        return self._predict(self._device_us) - arrival_s > MAX_DEVIATION_s
 
     def _end_chunk(self, arrival_s: float) -> None:
         """Fit the clock of the device to the arrival time of a chunk, whose readings have been processed.
@@ -224,7 +214,7 @@ class DeviceClock:
 
         The result is only valid if there is a fit.
         """
-        fitted_us = self._fitted_us or 0  # never None here
+        fitted_us = self._fitted_us or 0  # None without a fit
         return self._fitted_host_s + self.rate * (device_us - fitted_us) * 1e-6
 
     def _unwrap(self, t_us: int, modulus: int) -> int:

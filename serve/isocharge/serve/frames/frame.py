@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from isocharge.common.arrays import Array
-from isocharge.serve.flags import GAP, INVALID, REPEAT, RESTART
+from isocharge.serve.flags import GAP, REPEAT, RESTART
 from isocharge.serve.model.contact import Contact, Validity
 from isocharge.serve.record.record import FollowedFilm, Tracking
 
@@ -181,6 +181,7 @@ class Frame:
         clock_s: Time of the frame on the clock of the device, s. If the device sends no clock, it is a time of the host
             that does not jump if the wall clock is set.
         sent: Values of the electrodes in their order, shape (n_electrode,), in the unit of the device.
+        is_valid: Whether all values of the electrodes can be charges.
         raw_pC: Charges as the device sent them, shape (n_electrode,), pC.
         charge_pC: Charges after the stages so far, and touch charges after all stages, shape (n_electrode,), pC; None
             while there is no tare, and for an invalid frame.
@@ -211,6 +212,7 @@ class Frame:
     dt_s: float = 0.0
     clock_s: float = 0.0
     sent: Array = field(init=False, repr=False, compare=False)
+    is_valid: bool = True
     raw_pC: Array = field(init=False, repr=False, compare=False)
     charge_pC: Array | None = None
     tare_pC: Array | None = None
@@ -225,11 +227,6 @@ class Frame:
     film: FollowedFilm | None = None
     tracking: Tracking | None = None
     flags: list[str] = field(default_factory=list)
-
-    @property
-    def is_valid(self) -> bool:
-        """Whether all values of the electrodes can be charges."""
-        return INVALID not in self.flags
 
     def set_contact(self, contact: Contact, validity: Validity) -> None:
         """Set the contact, and the flags of the contact.
@@ -263,13 +260,6 @@ class FrameCounts:
     bytes_dropped: int = 0
     resyncs: int = 0
     is_out_of_sync: bool = False
-
-    def count_frame(self) -> None:
-        """Count an intact frame, and a resynchronisation if bytes were dropped before the frame."""
-        self.frames += 1
-        if self.is_out_of_sync:
-            self.resyncs += 1
-        self.is_out_of_sync = False
 
     def count_rejected(self, size: int, *, wrong_checksum: bool = False) -> None:
         """Count bytes that the parser expected to be one frame, but has rejected.
@@ -411,7 +401,9 @@ class Parser(ABC):
         except (ValueError, OverflowError) as error:
             self.counts.count_rejected(dropped_size, wrong_checksum=isinstance(error, ChecksumError))
             return []
-        self.counts.count_frame()
+        self.counts.frames += 1
+        self.counts.resyncs += self.counts.is_out_of_sync
+        self.counts.is_out_of_sync = False
         return [frame]
 
 

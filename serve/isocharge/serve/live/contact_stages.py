@@ -9,7 +9,6 @@ from isocharge.common.arrays import Array
 from isocharge.serve.flags import FILM
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.contact import Contact, Sensitivity
-from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.signal_chain.memory import MemoryRule
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.signal_chain.stage import Setup, Stage
@@ -26,23 +25,22 @@ The exponent has this value for a film without pretension, and is smaller for a 
 class Prediction(Stage):
     """Predicts the contact of each frame with the present model."""
 
+    is_required = True
+    needs_model = True
     needs_contact = True
 
     def __init__(self, setup: Setup) -> None:
         """Store the limits within which contacts are valid, which are those of the calibrated film."""
         self._setup = setup
-        self._validity = given_predictor(setup).validity
-
-    @classmethod
-    def is_used(cls, setup: Setup) -> bool:
-        """Return whether the stream has a model."""
-        return setup.predictor is not None
+        self._validity = setup.model.validity
 
     def step(self, frame: Frame) -> None:
         """Predict the contact of a frame, unless nothing touches the film or the frame has no charges."""
         if frame.charge_pC is None or not frame.is_contact:
             return
-        frame.set_contact(given_predictor(self._setup).predict(frame.charge_pC), self._validity)
+        predictor = self._setup.predictor
+        assert predictor is not None
+        frame.set_contact(predictor.predict(frame.charge_pC), self._validity)
         frame.model_charge_pC = frame.charge_pC
 
 
@@ -60,7 +58,7 @@ class FollowFilm(Stage):
             ModelError: If the pretension of this film cannot be estimated with the model.
         """
         self._setup = setup
-        predictor = given_predictor(setup)
+        predictor = setup.model
         self._validity = predictor.validity  # of the calibrated film
         self._follower = FilmFollower(predictor, setup.rule(FollowRule), warming_ratios(setup))
 
@@ -155,7 +153,7 @@ class Widening(Stage):
         std, changed_pC = self._error(frame, frame.model_charge_pC)
         if std <= 0.0:
             return None
-        predictor = given_predictor(self._setup)
+        predictor = self._setup.model
         if predictor is not self._sensitivity_predictor:
             self.reset()
         return self._sensitivity.shift(contact, std, lambda: predictor.predict(changed_pC))
@@ -218,9 +216,3 @@ class TouchOffset(Widening):
 
     def _error(self, frame: Frame, charge_pC: Array) -> tuple[float, Array]:  # noqa: ARG002
         return self._rule.std_pC, charge_pC + self.step_size * self._offset_ratio
-
-
-def given_predictor(setup: Setup) -> Predictor:
-    """Return the present model of a stream that has a model."""
-    assert setup.predictor is not None
-    return setup.predictor

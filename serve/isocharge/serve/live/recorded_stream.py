@@ -46,7 +46,8 @@ class RecordedStream:
         self._stream = stream
         self.recorder = recorder
         self._caller_recorder = recorder  # the caller closes this recorder, and all others are closed here
-        self._current_chunk: tuple[Chunk, list[str]] | None = None  # a chunk and its records that are not recorded yet
+        # A chunk and its records that are not recorded yet
+        self._current_chunk: tuple[Chunk, list[PredictionRecord]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
         # The latest request for a recording: its recorder, or None for a request to record nothing. The deque is empty
         # if there is no request. A deque is used because other threads can safely append to it.
@@ -124,10 +125,10 @@ class RecordedStream:
 
                 # If the caller closes the generator at a `yield`, the chunk must be recorded with the records that were
                 # yielded until then. Chunk and records are therefore stored for `_record_chunk`.
-                record_lines: list[str] = []
-                self._current_chunk = (chunk, record_lines)
+                records: list[PredictionRecord] = []
+                self._current_chunk = (chunk, records)
                 for record in self._stream.feed(chunk):
-                    record_lines.append(record.to_json())
+                    records.append(record)
                     yield record
                 self._record_chunk()
             self._stream.finish()
@@ -141,8 +142,8 @@ class RecordedStream:
         Without a recording, they are discarded.
         """
         if self.recorder is not None and self._current_chunk is not None:
-            chunk, record_lines = self._current_chunk
-            self.recorder.chunk(chunk, record_lines)
+            chunk, records = self._current_chunk
+            self.recorder.chunk(chunk, [record.to_json() for record in records])
         self._current_chunk = None
 
     def _begin_requested_recording(self) -> None:

@@ -89,10 +89,6 @@ class TextFile:
             self._file.write(f"{line}\n".encode())
 
 
-def _json_line(record: PredictionRecord) -> str:
-    return record.to_json()
-
-
 def _csv_line_function(context: OutputContext) -> LineFunction:
     return lambda record: csv_row(record, context.electrodes)
 
@@ -115,7 +111,7 @@ class _NoOutput:
 
 
 def _open_stdout_json(_: str, context: OutputContext) -> Output:
-    return StandardOutput(context.write_stdout, _json_line)
+    return StandardOutput(context.write_stdout, PredictionRecord.to_json)
 
 
 def _open_stdout_csv(_: str, context: OutputContext) -> Output:
@@ -127,7 +123,7 @@ def _open_nothing(_: str, __: OutputContext) -> Output:
 
 
 def _open_json_file(target: str, context: OutputContext) -> Output:
-    return TextFile(Path(target), _json_line, is_live=context.is_live)
+    return TextFile(Path(target), PredictionRecord.to_json, is_live=context.is_live)
 
 
 def _open_csv_file(target: str, context: OutputContext) -> Output:

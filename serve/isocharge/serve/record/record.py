@@ -174,18 +174,13 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
         return None if self.tracking is None else self.tracking.other
 
     @property
-    def field_names(self) -> tuple[str, ...]:
-        """Names of the fields that the record contains, in the order in which they are written."""
-        return _NAMES[self.tracking is not None, self.film is not None]
-
-    @property
     def json_values(self) -> dict[str, Any]:
         """Values of the fields by name, as JSON contains them. Numbers are rounded to six decimals."""
         values = structs.asdict(self)
         if self.tracking is not None:
             values |= structs.asdict(self.tracking)
         json_values: dict[str, Any] = {}
-        for name in self.field_names:
+        for name in _NAMES[self.tracking is not None, self.film is not None]:
             value = values[name]
             value_class = value.__class__  # comparing the class is faster than a call of `isinstance`
             if value_class is float:

@@ -102,6 +102,8 @@ class Channels(Stage):
                 or if they state a unit other than pC and the gain is not known.
         """
         names = frame.names
+        if not names:
+            return None
         advice = [] if self._allows_any_unit else _unit_advice(names)
         indices = [_channels_of_electrode(electrode, names) for electrode in self._electrodes]
         if all(len(indices_of_electrode) == 1 for indices_of_electrode in indices) and not advice:

@@ -148,6 +148,7 @@ class Gain(Stage):
         is_valid = magnitude <= self.largest  # false for NaN
         if not is_valid:
             self._skipped_s += frame.dt_s
+            frame.is_valid = False
             frame.flags.append(INVALID)
             with np.errstate(over="ignore"):  # a value may be so large that its conversion overflows
                 frame.raw_pC = (frame.sent - self.zero) * self.gain_pC

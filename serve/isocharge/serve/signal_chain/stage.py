@@ -56,6 +56,12 @@ class Setup:
     has_currents: bool = False
     has_any_sign: bool = False
 
+    @property
+    def model(self) -> Predictor:
+        """The present model of a stream that has a model."""
+        assert self.predictor is not None
+        return self.predictor
+
     def rule(self, rule_class: type[R]) -> R | None:
         """Return the settings of a class, or None if their stage is switched off."""
         rule = self.rules.get(rule_class)
@@ -90,6 +96,7 @@ class Stage(ABC):
         section: Name of the section of the device file with the settings; empty if the stage has no settings.
         rule_class: Class of the settings.
         is_required: Whether each stream has the stage, even if the device file switches it off.
+        needs_model: Whether a stream has the stage only if it has a model.
         is_default: Whether the stage is switched on, with default settings, if the device file has no such section.
         needs_contact: Whether the stage processes the contact of a record. Such a stage skips frames without a record,
             and is not part of an export to C.
@@ -99,6 +106,7 @@ class Stage(ABC):
     section: ClassVar[str] = ""
     rule_class: ClassVar[type[Rule]] = Rule
     is_required: ClassVar[bool] = False
+    needs_model: ClassVar[bool] = False
     is_default: ClassVar[bool] = False
     needs_contact: ClassVar[bool] = False
     c_prefix: ClassVar[str] = ""
@@ -113,7 +121,9 @@ class Stage(ABC):
     @classmethod
     def is_used(cls, setup: Setup) -> bool:
         """Return whether a stream has this stage."""
-        return cls.is_required or cls.rule_class in setup.rules
+        is_switched_on = cls.is_required or cls.rule_class in setup.rules
+        has_model = setup.predictor is not None or not cls.needs_model
+        return is_switched_on and has_model
 
     @abstractmethod
     def step(self, frame: Frame) -> None:

@@ -77,6 +77,7 @@ class Warming(Stage):
 
     section = "common_mode"
     rule_class = ThermalRule
+    needs_model = True
     c_prefix = "THERMAL"
 
     def __init__(self, setup: Setup) -> None:
@@ -88,11 +89,6 @@ class Warming(Stage):
         # Time constant with which the film follows the temperature of the air; only known with a memory
         self._warmth_s = None if memory is None else memory.warmth_s
         self.reset()
-
-    @classmethod
-    def is_used(cls, setup: Setup) -> bool:
-        """Return whether the device file has the section, and there is a model that computes misfits."""
-        return super().is_used(setup) and setup.predictor is not None
 
     def reset(self) -> None:
         """Discard the warming, because a touch has ended."""
@@ -147,9 +143,8 @@ class Warming(Stage):
         self._waited_s = 0.0
 
         # Fit: squared misfit = constant + slope * c + curvature * c^2, where c is the trial value of the change.
-        assert self._setup.predictor is not None
         trial_charges_pC = charge_pC - TRIED_PC[:, np.newaxis] * self._ratios  # shape (trials, n_electrode)
-        squared_misfits = np.square(self._setup.predictor.predict_batch(trial_charges_pC).misfit, dtype=float)
+        squared_misfits = np.square(self._setup.model.predict_batch(trial_charges_pC).misfit, dtype=float)
         _constant, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
 
         # The variance of the estimate is the inverse of the curvature, because the misfit is in standard deviations.

@@ -26,9 +26,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.serve.model.charge_series import ChargeSeries, read_charges
+from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.metadata import ModelNoise
-from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.tracking.contact_filter import MAX_GAP_s
 from isocharge.serve.tracking.mixture_components import (
     CONTACT,
@@ -546,21 +545,3 @@ def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
     medium_log_force = np.log(charges.domain.force_range).mean()  # of the smallest and the largest force
     log_force = np.full(N_INITIAL_COMPONENTS, medium_log_force)
     return np.column_stack([x_mm, y_mm, log_force])
-
-
-def contact_mixture(predictor: Predictor) -> ContactMixture | None:
-    """Create a mixture that follows contacts on the film for which a model was trained.
-
-    Args:
-        predictor: The model.
-
-    Returns:
-        The mixture; None if the model has no file `charges.npz`, or if the map in the file has no fold.
-
-    Raises:
-        ModelError: If the file `charges.npz` is damaged.
-    """
-    charges = read_charges(predictor.folder, predictor.metadata.electrodes)
-    if charges is None or not charges.is_folded:
-        return None
-    return ContactMixture(charges, predictor.metadata.noise)

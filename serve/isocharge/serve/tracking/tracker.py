@@ -9,12 +9,13 @@ from dataclasses import replace
 
 from isocharge.serve.flags import SATURATED
 from isocharge.serve.frames.frame import Frame
+from isocharge.serve.model.charge_series import read_charges
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.record.record import NO_TRACKING, OtherContact, TrackedContact, Tracking
 from isocharge.serve.signal_chain.rule import Rule, Share
 from isocharge.serve.signal_chain.stage import Setup, Stage
 from isocharge.serve.tracking.contact_filter import ContactFilter
-from isocharge.serve.tracking.contact_mixture import ContactMixture, contact_mixture
+from isocharge.serve.tracking.contact_mixture import ContactMixture
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.mixture_components import ContactHypothesis
 
@@ -158,10 +159,11 @@ class Tracker(Stage):
         self._mixture: ContactMixture | None = None
         predictor = setup.predictor
         if predictor is not None and setup.rule(FollowRule) is None:
-            self._mixture = contact_mixture(predictor)  # None if the model has no file `charges.npz`
-        if predictor is not None and self._mixture is not None:
-            # A contact of the mixture is valid in the whole area for which the file describes the charges.
-            self._mixture_validity = replace(predictor.validity, corners_mm=self._mixture.charges.corners_mm)
+            charges = read_charges(predictor.folder, predictor.metadata.electrodes)  # None without the file
+            if charges is not None and charges.is_folded:
+                self._mixture = ContactMixture(charges, predictor.metadata.noise)
+                # A contact of the mixture is valid in the whole area for which the file describes the charges.
+                self._mixture_validity = replace(predictor.validity, corners_mm=charges.corners_mm)
         self.reset()
 
     def reset(self) -> None:

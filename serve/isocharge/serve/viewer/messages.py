@@ -53,7 +53,6 @@ from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, WrongKey, convert
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.record.fields import Field
 from isocharge.serve.record.record import RECORD_FIELDS, PredictionRecord
 from isocharge.serve.viewer.deflection_field import DEFLECTION_FILE, DeflectionField, read_deflection_field
 
@@ -73,27 +72,17 @@ OTHER_PREFIX = "other_"
 """Prefix of the names of the other contact's numbers in a sample."""
 
 
-def _live_numbers() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the numbers in a sample.
+RECORD_NUMBERS = tuple(
+    field.name
+    for field in RECORD_FIELDS
+    if field.meaning.is_shown_live and field.kind == "number" and field.name != "timestamp"
+)
+"""Names of the numbers of the record in a sample, except the timestamp, whose type is another one."""
 
-    The timestamp is not included, because its type differs from the type of all other numbers.
-
-    Returns:
-        The names of the numbers of the record itself, and the names of the numbers of its field `other`.
-    """
-    (other_field,) = (field for field in RECORD_FIELDS if field.name == "other")
-    record_names = tuple(name for name in _live_names(RECORD_FIELDS) if name != "timestamp")
-    other_names = _live_names(other_field.parts)
-    return record_names, other_names
-
-
-def _live_names(fields: Sequence[Field]) -> tuple[str, ...]:
-    """Return the names of the numeric fields that the live page shows."""
-    return tuple(field.name for field in fields if field.meaning.is_shown_live and field.kind == "number")
-
-
-RECORD_NUMBERS, OTHER_NUMBERS = _live_numbers()
-"""Names of the numbers in a sample: the numbers of the record, and the numbers of the other contact."""
+OTHER_NUMBERS = tuple(
+    part.name for field in RECORD_FIELDS if field.name == "other" for part in field.parts if part.meaning.is_shown_live
+)
+"""Names of the numbers of the other contact in a sample."""
 
 
 class SampleFormat:
