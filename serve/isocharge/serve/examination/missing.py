@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec import structs
@@ -23,6 +23,9 @@ from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.touch import TouchRule
 
+if TYPE_CHECKING:
+    from isocharge.serve.examination.port_check import Examination
+
 CLEAN_SHARE = 0.99
 """Smallest share of bytes in good frames with a good cable and the right baud rate, dimensionless."""
 
@@ -41,50 +44,28 @@ GAIN_REQUESTS = {
 """Request to the user for the gain, by the unit of the channels."""
 
 
-@dataclass(frozen=True)
-class BoardFindings:
-    """Results of the port check from which the missing settings and properties are derived.
-
-    Attributes:
-        capture: The frames.
-        channels: Health of the channels that electrodes use.
-        unused_channels: Names of the other channels.
-        device: Settings of the board.
-        electrodes: Electrodes of the model; empty for any model.
-        unit: Unit of the channels: "pC", "counts", "V", or a unit in their names, such as "nC".
-        held_press: Press that was held during the check; None if no press was held.
-        touch_sentence: Sentence about a touch of the film, which should be at rest; empty if there was no touch.
-        uses_telnet: Whether more bytes are frames without the escapes of the telnet protocol.
-    """
-
-    capture: Capture
-    channels: tuple[ChannelHealth, ...]
-    unused_channels: tuple[str, ...]
-    device: Device
-    electrodes: tuple[str, ...]
-    unit: str
-    held_press: HeldPress | None
-    touch_sentence: str
-    uses_telnet: bool
-
-
-def missing_sentences(findings: BoardFindings) -> Iterator[str]:
+def missing_sentences(
+    examination: "Examination", capture: Capture, device: Device, electrodes: tuple[str, ...], *, uses_telnet: bool
+) -> Iterator[str]:
     """Yield one sentence for each missing setting and for each problem that prevents the computation of contacts.
 
     Without bytes or without frames, there is only one sentence, because nothing else is known. Problems of charges,
     such as a large noise, are reported only if the unit of the channels is pC.
 
     Args:
-        findings: Results of the port check.
+        examination: The other results of the port check.
+        capture: The frames.
+        device: Settings of the board.
+        electrodes: Electrodes of the model; empty for any model.
+        uses_telnet: Whether more bytes are frames without the escapes of the telnet protocol.
     """
-    capture = findings.capture
     if not capture.bytes_seen:
         yield (
             "no bytes were received: check the power and the cable; if the board sends only after a request, state the "
             "request with --request"
         )
         return
-    if findings.uses_telnet:
+    if uses_telnet:
         yield TELNET_ADVICE
         return
     if not capture.frames and capture.parser.unread_line:
@@ -100,19 +81,19 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
             "touched"
         )
         return
-    if findings.touch_sentence:
-        yield findings.touch_sentence
+    if examination.touch:
+        yield examination.touch
     yield from _transmission_sentences(capture)
-    yield from _channel_count_sentences(findings)
-    if findings.unit != "pC":
-        yield GAIN_REQUESTS.get(findings.unit) or (
-            f"the names of the channels state {findings.unit}: state the charge of one {findings.unit} in pC with "
-            "--pc-per-unit NUMBER"
+    yield from _channel_count_sentences(examination, capture, device, electrodes)
+    unit = examination.unit
+    if unit != "pC":
+        yield GAIN_REQUESTS.get(unit) or (
+            f"the names of the channels state {unit}: state the charge of one {unit} in pC with --pc-per-unit NUMBER"
         )
-    tare_rule = findings.device.rule(TareRule) or TareRule()  # the defaults if the device file has no tare
-    if findings.device.front_end == "current":  # a current of any size at rest is an offset
+    tare_rule = device.rule(TareRule) or TareRule()  # the defaults if the device file has no tare
+    if device.front_end == "current":  # a current of any size at rest is an offset
         tare_rule = structs.replace(tare_rule, offset_limit_pC=math.inf)
-    for channel in findings.channels:
+    for channel in examination.channels:
         if channel.unusable:
             yield (
                 f"channel {printable(channel.name)} is {channel.unusable_value} in {channel.unusable} frames, which is "
@@ -120,10 +101,10 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
             )
         if channel.span_pC == 0.0:
             yield f"channel {printable(channel.name)} is dead: every value is {channel.offset_pC:g}"
-        if findings.unit == "pC":  # the limits of noise, offset, drift and hum are in pC
+        if unit == "pC":  # the limits of noise, offset, drift and hum are in pC
             yield from _charge_sentences(channel, tare_rule)
-    if findings.unit == "pC":
-        yield from _drift_sentences(findings, tare_rule)
+    if unit == "pC":
+        yield from _drift_sentences(examination, device, tare_rule)
 
 
 def _transmission_sentences(capture: Capture) -> Iterator[str]:
@@ -144,32 +125,34 @@ def _transmission_sentences(capture: Capture) -> Iterator[str]:
         yield f"{capture.gaps.lost} frames were lost: send fewer frames per second, or use a faster link"
 
 
-def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
+def _channel_count_sentences(
+    examination: "Examination", capture: Capture, device: Device, electrodes: tuple[str, ...]
+) -> Iterator[str]:
     """Yield a sentence if the board has more or fewer channels than the model has electrodes.
 
     No sentence is needed without a model, or if the device file assigns a channel to every electrode. If the names of
     the channels are nearly those of the electrodes, the sentence names the difference.
 
     Args:
-        findings: Results of the port check.
+        examination: The other results of the port check.
+        capture: The frames.
+        device: Settings of the board.
+        electrodes: Electrodes of the model; empty for any model.
     """
-    electrodes = findings.electrodes  # empty without a model
-    if not electrodes:
-        return
-    channel_count = len(findings.channels)
-    has_every_electrode_a_channel = set(electrodes) <= set(findings.device.channels)
+    has_every_electrode_a_channel = set(electrodes) <= set(device.channels)  # also without a model
     if has_every_electrode_a_channel:
         return
+    channel_count = len(examination.channels)
     try:
-        Channels(Setup(electrodes, reader="the model"), any_unit=True).named_indices(findings.capture.frames[-1])
+        Channels(Setup(electrodes, reader="the model"), any_unit=True).named_indices(capture.frames[-1])
     except ChargeError as error:
         yield str(error)
         return
     if channel_count == len(electrodes):
         return
     used_channels = f"{channel_count} channels"
-    if findings.unused_channels:
-        used_channels = f"{channel_count} of {len(findings.capture.names)} channels"
+    if examination.unused:
+        used_channels = f"{channel_count} of {len(capture.names)} channels"
     yield (
         f"the board uses {used_channels}, but the model has the electrodes {electrodes}: choose another model with "
         "--model, or assign the channels in the section [channels] of a device file"
@@ -211,7 +194,7 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
             )
 
 
-def _drift_sentences(findings: BoardFindings, tare_rule: TareRule) -> Iterator[str]:
+def _drift_sentences(examination: "Examination", device: Device, tare_rule: TareRule) -> Iterator[str]:
     """Yield a sentence if the charges of an untouched film drift faster than the tare can follow.
 
     The tare follows a drift with its time constant. The charges then differ from 0 by the drift times this time. If the
@@ -219,17 +202,17 @@ def _drift_sentences(findings: BoardFindings, tare_rule: TareRule) -> Iterator[s
     a negative total drift, because a touch makes most charges positive.
 
     Args:
-        findings: Results of the port check.
+        examination: The other results of the port check.
+        device: Settings of the board.
         tare_rule: Conditions of the tare, with its time constant.
     """
-    device = findings.device
     touch_rule = device.rule(TouchRule)
     follows_drift = device.rule(LeakSection) or device.rule(MemoryRule) or device.front_end == "current"
-    if touch_rule is None or follows_drift or not findings.channels:
+    if touch_rule is None or follows_drift or not examination.channels:
         return
-    drift_pC_per_s = np.array([channel.drift_pC_per_s or 0.0 for channel in findings.channels])
+    drift_pC_per_s = np.array([channel.drift_pC_per_s or 0.0 for channel in examination.channels])
     total_pC_per_s = float(drift_pC_per_s.sum())
-    noise_pC = np.array([channel.noise_pC or 0.0 for channel in findings.channels])
+    noise_pC = np.array([channel.noise_pC or 0.0 for channel in examination.channels])
     threshold_pC = touch_rule.resolved(has_currents=False).threshold_pC(noise_pC)
     if total_pC_per_s > 0.0 and np.linalg.norm(drift_pC_per_s * tare_rule.relax_s / threshold_pC) > 1.0:
         yield (
@@ -239,7 +222,7 @@ def _drift_sentences(findings: BoardFindings, tare_rule: TareRule) -> Iterator[s
         )
 
 
-def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
+def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress | None) -> Iterator[str]:
     """Yield one sentence for each missing setting or property without which the force of a held press seems to change.
 
     The force seems to change because the amplifiers leak. Touches are computed in any case.
@@ -250,13 +233,13 @@ def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
     - If no press was held, the time constants of the amplifiers are requested, unless the device file contains them.
 
     Args:
-        findings: Results of the port check.
+        capture: The frames.
+        device: Settings of the board.
+        held_press: Press that was held during the check; None if no press was held.
     """
-    if not findings.capture.frames:
+    if not capture.frames:
         return
-    device = findings.device
-    held_press = findings.held_press
-    has_device_clock = findings.capture.frames[0].t_us is not None
+    has_device_clock = capture.frames[0].t_us is not None
     if device.rule(LeakSection) is not None and not has_device_clock:
         yield (
             "send the time of a device clock in each frame (t_us, t_ms or t_s): without it the leak is corrected with "

@@ -18,7 +18,7 @@ from isocharge.serve.examination.channel_health import ChannelHealth, measure_ch
 from isocharge.serve.examination.current_press import find_current_press
 from isocharge.serve.examination.held_press import HeldPress, find_held_press
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
-from isocharge.serve.examination.missing import CLEAN_SHARE, BoardFindings, held_press_sentences, missing_sentences
+from isocharge.serve.examination.missing import CLEAN_SHARE, held_press_sentences, missing_sentences
 from isocharge.serve.examination.press_detector import find_touch
 from isocharge.serve.examination.proposal import Proposal, propose, unit_of
 from isocharge.serve.frames.frame import Frame
@@ -226,17 +226,6 @@ def examine_received(
     # Complete the device file, and test whether the film can be tared with its settings. Proposed offsets that were
     # measured on a touched film are wrong.
     table = _completed_table(proposal.table, held_press, without_offsets=is_proposed and bool(touch_sentence))
-    findings = BoardFindings(
-        capture,
-        channels,
-        unused_channels,
-        device,
-        proposal.electrodes,
-        unit,
-        held_press,
-        touch_sentence,
-        uses_telnet=_uses_telnet(received, given_device, capture.intact_share),
-    )
     electrode_names = proposal.electrodes or tuple(electrode_at_position.values())
     is_at_rest = bool(electrode_at_position) and not touch_sentence
     can_be_tared = is_at_rest and _can_be_tared(received, table, electrode_names)
@@ -245,7 +234,7 @@ def examine_received(
     first_frame = capture.frames[0] if capture.frames else Frame(None, None, ())
     is_numbered = first_frame.seq is not None
     counts = capture.parser.counts
-    return Examination(
+    examination = Examination(
         url=received.url,
         baud=received.baud,
         format=capture.parser.format,
@@ -262,11 +251,14 @@ def examine_received(
         unused=unused_channels,
         held="" if held_press is None else held_press.description,
         touch=touch_sentence,
-        missing=tuple(missing_sentences(findings)),
-        missing_for_held_presses=tuple(held_press_sentences(findings)),
+        missing=(),
+        missing_for_held_presses=tuple(held_press_sentences(capture, device, held_press)),
         works=can_be_tared,
         device=table,
     )
+    uses_telnet = _uses_telnet(received, given_device, capture.intact_share)
+    missing = missing_sentences(examination, capture, device, proposal.electrodes, uses_telnet=uses_telnet)
+    return replace(examination, missing=tuple(missing))
 
 
 def _completed_table(

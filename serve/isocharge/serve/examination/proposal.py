@@ -23,15 +23,6 @@ from isocharge.serve.signal_chain.tare import TareRule
 QUIET_SHARE = 0.1
 """Smallest noise of a channel that is connected to an electrode, relative to the median noise of the channels."""
 
-HALF_SCALE_SHARE = 0.05
-"""Largest distance of a rest level from half of the range of a converter, relative to that half, dimensionless.
-
-A rest level within this distance is replaced by half of the range.
-"""
-
-CONVERTER_BITS = range(8, 32)
-"""Possible resolutions of converters, bits."""
-
 REST_SIGMAS = 20.0
 """Largest rest level of a channel without an offset, in standard deviations of the noise."""
 
@@ -260,38 +251,20 @@ def _channels_of_similar_noise(values: Array, candidates: list[int], count: int)
 def _offset_setting(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, Any]:
     """Return the setting `offset` of the section `[gain]`, which contains the values of the channels without charge.
 
-    The rest level of a channel is its measured value at rest. If a channel rests near half of the range of a converter,
-    half of the range is its offset. For any other channel, the offset is the rest level.
-
-    A tare is the measurement of the charges at rest. It fails if a rest level differs too much from the offset. If the
-    gain is known and the tare of any electrode would fail, the rest levels are the offsets of all electrodes.
+    The offset of a channel is its measured value at rest.
 
     Args:
         columns: Values of the channel of each electrode at rest, each of shape (n,), in the unit of the board.
         gain: The other keys of the section; empty if they are not known.
 
     Returns:
-        The key with its value, which is one number if all electrodes have the same offset, and otherwise a table of
-        numbers by electrode; empty if all electrodes rest at 0.
+        The key with a table of numbers by electrode; empty if all electrodes rest at 0.
     """
-    rest_levels = {electrode: measure_rest_level(column) for electrode, column in columns.items()}
-
-    # A rest level whose magnitude is at most the limit of the electrode counts as 0.
     limits = _zero_limits(columns, gain)
-    all_rest_at_zero = all(abs(rest) <= limits[electrode] for electrode, rest in rest_levels.items())
-    if all_rest_at_zero:
+    rest_levels = {electrode: measure_rest_level(column) for electrode, column in columns.items()}
+    if all(abs(rest_level) <= limits[electrode] for electrode, rest_level in rest_levels.items()):
         return {}
-
-    # After the offset is subtracted, the remaining rest level must be small enough for a tare. Without the gain, the
-    # largest allowed rest level is not known, because the limit of a tare is in pC.
-    offsets = {electrode: _proposed_offset(column) for electrode, column in columns.items()}
-    prevents_tare = any(abs(rest - offsets[electrode]) > limits[electrode] for electrode, rest in rest_levels.items())
-    if gain and prevents_tare:
-        offsets = {electrode: _round_rest_level(rest) for electrode, rest in rest_levels.items()}
-    different_offsets = set(offsets.values())
-    if len(different_offsets) == 1:
-        return {"offset": different_offsets.pop()}
-    return {"offset": offsets}
+    return {"offset": {electrode: _round_rest_level(rest_level) for electrode, rest_level in rest_levels.items()}}
 
 
 def _zero_limits(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, float]:
@@ -328,26 +301,6 @@ def _largest_charge_of_unit(gain: Mapping[str, Any]) -> float:
         numbers = setting.values() if isinstance(setting, Mapping) else [setting]
         product_pC *= max(abs(float(number)) for number in numbers)
     return product_pC
-
-
-def _proposed_offset(column: Array) -> float | int:
-    """Return the value that a channel probably has without charge, in the unit of the board.
-
-    A converter usually rests at zero or at half of its range, which is 2^(bits - 1) counts. If the values are whole
-    numbers and the rest level is near half of the range of a usual converter, half of the range is returned. Otherwise
-    the rounded rest level is returned.
-
-    Args:
-        column: Values of the channel at rest, shape (n,).
-    """
-    rest_level = measure_rest_level(column)
-    has_whole_numbers = bool((column == np.round(column)).all())
-    if has_whole_numbers:
-        for bits in CONVERTER_BITS:
-            half_range = 1 << (bits - 1)  # 2^(bits - 1)
-            if abs(rest_level - half_range) <= HALF_SCALE_SHARE * half_range:
-                return half_range
-    return _round_rest_level(rest_level)
 
 
 def _round_rest_level(rest: float) -> float | int:
