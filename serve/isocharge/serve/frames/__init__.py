@@ -1,7 +1,14 @@
-"""Parsers that convert bytes to frames, with one module for each wire format. The parsers do not depend on a port.
+"""Formats in which boards send frames, and parsers that convert the received bytes to frames.
+
+A device file selects the format with the key `format` of its section `[frames]`:
+
+- `binary`: the binary frames of isocharge (module `binary`),
+- `text`: lines of text (modules `text` and `text_lines`),
+- `described`: frames of fixed length whose layout the device file describes (module `frame_layout`),
+- `auto`: `binary` or `text`, depending on the bytes (module `formats`).
+
+Each format has two classes. The section class declares the further keys of the section `[frames]`, and creates the
+parser. The parser class is derived from `frame.Parser`. A parser receives bytes and does not open a port.
 
 May import: prediction, record, port, flags.
-
-Each format has two classes. The parser class is derived from `frame.Parser`, and the section class declares the keys of
-the section `[frames]` in a device file. The key `format` of this section contains the tag of the section class.
 """

@@ -188,10 +188,16 @@ class Connection(HttpToolsProtocol, TimedConnection):
         self.deadline = self.loop.time() + LINGER_SECONDS
 
     def _refuse_and_stop(self, status: int, message: str) -> NoReturn:
-        """Refuse a request, and stop the parser, which would otherwise parse the remaining data of the client.
+        """Refuse a request while its data are parsed, and raise an exception that ends the parsing.
+
+        Without the exception, the parser would take the remaining data of the client for further requests.
+
+        Args:
+            status: HTTP status of the response that refuses the request.
+            message: Reason of the refusal.
 
         Raises:
-            RequestRefused: Always.
+            RequestRefused: Always. The caller of the parser catches this exception.
         """
         self.refuse(status, message)
         raise RequestRefused(message)

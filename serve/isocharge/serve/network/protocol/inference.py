@@ -85,7 +85,9 @@ def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, 
 
 
 def check_request(body: InferBody, binary: bytes, loaded: LoadedVersion, max_presses: int) -> InferRequest:
-    """Check a request for an inference, and return its charges and the requested outputs.
+    """Check whether a request fits the requested model, and return the values that the model needs to answer it.
+
+    The result contains the charges of the presses as an array, and the names of the outputs that the response contains.
 
     Args:
         body: Content of the JSON text.

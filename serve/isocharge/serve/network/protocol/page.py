@@ -19,7 +19,13 @@ START_PAGE = files(__package__).joinpath("index.html").read_bytes()
 
 
 def _hash_of(element: bytes) -> bytes:
-    """Return the source of a content security policy that allows the only style sheet or script of the start page."""
+    """Return the expression `'sha256-...'` that allows an element of the start page in a content security policy.
+
+    A browser uses the element only if the hash of its content is equal to the hash in the expression.
+
+    Args:
+        element: Name of the element, `style` or `script`. The page contains one element with this name.
+    """
     match = re.search(rb"<%s>(.*?)</%s>" % (element, element), START_PAGE, re.DOTALL)
     text = match[1] if match else b""
     return b"'sha256-%s'" % base64.b64encode(hashlib.sha256(text).digest())
