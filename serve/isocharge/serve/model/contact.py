@@ -376,11 +376,16 @@ class Validity:
             The words `outside`, `beyond`, `misfit` and `stress` whose conditions are true; empty if the contact is
             valid.
         """
+        is_outside = self._is_outside(contact)
+        has_misfit = contact.misfit > self.misfit_limit
+        is_above_yield = contact.force_N > self.yield_force_N
+        if not (is_outside or has_misfit or is_above_yield):  # a contact beyond all limits is also outside the domain
+            return ()
         return _flag_words(
-            is_outside=self._is_outside(contact),
+            is_outside=is_outside,
             is_beyond=self.is_beyond(contact),
-            has_misfit=contact.misfit > self.misfit_limit,
-            is_above_yield=contact.force_N > self.yield_force_N,
+            has_misfit=has_misfit,
+            is_above_yield=is_above_yield,
         )
 
     def _is_outside(self, contact: Contact) -> bool:

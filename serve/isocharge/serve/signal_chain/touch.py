@@ -120,6 +120,8 @@ class Touch(Stage):
         self._setup = setup
         rule = setup.rule(TouchRule)
         self._rule = None if rule is None else rule.resolved(has_currents=setup.has_currents)
+        self._noise_pC: Array | None = None  # noise of the latest tare
+        self._threshold_pC = np.zeros(len(setup.electrodes))  # touch thresholds with this noise
         self.reset()
 
     def reset(self) -> None:
@@ -147,7 +149,10 @@ class Touch(Stage):
         if self._rule is None:
             self._is_contact = True
         else:
-            self._detect(self._rule, frame, frame.charge_pC / self._rule.threshold_pC(frame.noise_pC))
+            if frame.noise_pC is not self._noise_pC:  # the film was tared
+                self._noise_pC = frame.noise_pC
+                self._threshold_pC = self._rule.threshold_pC(frame.noise_pC)
+            self._detect(self._rule, frame, frame.charge_pC / self._threshold_pC)
         frame.is_contact = self._is_contact
         if self._is_contact and self._has_drifted:
             frame.flags.append(DRIFT)

@@ -94,9 +94,9 @@ class ContactFilter:
         dt_s = t_s - self._latest_time_s
         self._latest_time_s = t_s
         if previous is not None and 0.0 <= dt_s <= MAX_GAP_s:
-            self._position_filter.predict(dt_s)
+            self._position_filter.predict(dt_s, metric)
             self._force_filter.predict(dt_s)
-            smoothed_position = self._position_filter.update(position, noise_ratio * position_variance, metric)
+            smoothed_position = self._position_filter.update(position, noise_ratio * position_variance)
             if smoothed_position is not None:
                 smoothed_log_force = self._force_filter.update(log_force, noise_ratio * log_force_variance)
             elif self._outlier_count < MAX_OUTLIERS and _is_too_far(position, previous, dt_s):

@@ -191,7 +191,7 @@ class TwoModeFilter:
         moving_covariance: Covariance of `moving_value` and `velocity`.
         moving_probability: Probability of the moving mode.
         noise_age_s: Time since `noise` was last updated, s.
-        metric: Shape of the covariance of the latest measured value.
+        metric: Shape of the covariance of the noise in the predicted frame.
     """
 
     motion: MotionModel
@@ -220,15 +220,17 @@ class TwoModeFilter:
         noise = NoiseEstimate(measured)
         return cls(motion, measured, variance, measured, variance, zero, motion.velocity_variance, noise)
 
-    def predict(self, dt_s: float) -> None:
+    def predict(self, dt_s: float, metric: Metric = EQUAL_ERRORS) -> None:
         """Mix the two modes, and predict the values of both modes at the next frame.
 
         Args:
             dt_s: Time until the next frame, s, not negative.
+            metric: Shape of the covariance of the noise in the next frame.
         """
+        self.metric = metric
         self.noise_age_s += dt_s
         drift, initial_velocity_variance, acceleration_density, dimensions = self.motion
-        mean, skew = self.metric
+        mean, skew = metric
 
         # Probability of each mode at the next frame. `started` is the probability that a contact that moves then is
         # held now. `stopped` is the probability that a contact that is held then moves now.
@@ -271,14 +273,13 @@ class TwoModeFilter:
         self.velocity = velocity
         self.velocity_variance = velocity_variance + velocity_noise
 
-    def update(self, measured: complex, stated_variance: float, metric: Metric = EQUAL_ERRORS) -> Estimate | None:
+    def update(self, measured: complex, stated_variance: float) -> Estimate | None:
         """Update the predicted modes and their probabilities with the measured value of the frame.
 
         Args:
             measured: The measured value.
             stated_variance: Variance of the noise that is independent from frame to frame, as stated by the model. A
                 larger variance gives the frame a smaller weight.
-            metric: Shape of the covariance of this noise.
 
         Returns:
             The estimate of the value; None if the frame does not belong to the same contact as the previous frames.
@@ -290,7 +291,7 @@ class TwoModeFilter:
         moving_innovation = measured - self.moving_value
         held_precision = 1.0 / (self.held_variance + noise_variance)
         moving_precision = 1.0 / (self.moving_variance + noise_variance)
-        mean, skew = self.metric = metric
+        mean, skew = self.metric
         held_square = mean * abs(held_innovation) ** 2 + (skew * held_innovation * held_innovation).real
         held_square *= held_precision
         moving_square = mean * abs(moving_innovation) ** 2 + (skew * moving_innovation * moving_innovation).real
@@ -318,7 +319,7 @@ class TwoModeFilter:
         self.velocity_variance -= velocity_gain * self.moving_covariance
         self.moving_covariance = velocity_gain * noise_variance
         if self.noise_age_s >= NoiseEstimate.MIN_INTERVAL_s:
-            self.noise.update(measured, self.noise_age_s, stated_variance, metric, dimensions)
+            self.noise.update(measured, self.noise_age_s, stated_variance, self.metric, dimensions)
             self.noise_age_s = 0.0
 
         # Mean and variance of the mixture of the two modes

@@ -197,7 +197,7 @@ class Connection(HttpToolsProtocol, TimedConnection):
             message: Reason of the refusal.
 
         Raises:
-            RequestRefused: Always. The caller of the parser catches this exception.
+            RequestRefused: Always.
         """
         self.refuse(status, message)
         raise RequestRefused(message)
