@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from isocharge.serve import Frame, Validity, device_from_table
-from isocharge.serve.flags import in_order
+from isocharge.serve.flags import INVALID, in_order
 from isocharge.serve.frames.frame import SATURATED_BIT
 from isocharge.serve.live.device import create_stages
 from isocharge.serve.signal_chain.stage import Setup
@@ -62,5 +62,6 @@ def new_tracker(mixture=None, **settings):
 def track(tracker, contact, t_s, flags=(), charge_pC=None):
     """Process a frame with a tracker, and return the tracked contact and the event."""
     frame = Frame(None, None, (), clock_s=t_s, flags=list(flags), charge_pC=charge_pC, contact=contact)
+    frame.is_valid = INVALID not in flags
     tracker.step(frame)
     return frame.tracking.tracked, frame.tracking.event

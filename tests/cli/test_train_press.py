@@ -21,7 +21,6 @@ from isocharge.serve.live.steady_press import (
     PORT_LOST,
     Phase,
     SteadyPress,
-    SteadyRule,
     WatchResult,
     unsteadiness,
 )
@@ -159,7 +158,7 @@ def test_a_press_that_is_refused_is_asked_for_again(capsys):
 )
 def test_reason_of_a_drift_holds_for_negative_charges(charge_pC, drift_pC, reason):
     press = SteadyPress(np.array(charge_pC), np.ones(4), np.array(drift_pC), 2.0, 0.5, 100, ())
-    assert unsteadiness(SteadyRule(), press, np.ones(4), NAMES, [(0.5, 500.0), (2.0, 430.0)]).startswith(reason)
+    assert unsteadiness(press, np.ones(4), NAMES, [(0.5, 500.0), (2.0, 430.0)]).startswith(reason)
 
 
 def test_nothing_is_asked_with_yes():
