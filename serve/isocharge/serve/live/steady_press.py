@@ -141,6 +141,21 @@ class Press:
     MIN_HELD_S = 0.1
     """Shortest duration of a press, s. Shorter touches are ignored."""
 
+    MAX_SCATTER_SIGMAS = 3.0
+    """Largest scatter of a charge about a straight line, in standard deviations of its noise."""
+
+    RELATIVE_NOISE = 0.007
+    """Standard deviation of the additional noise of a press, relative to its charge. The force of a hand varies."""
+
+    MAX_RELATIVE_DRIFT = 0.005
+    """Largest drift of a charge over the window, relative to its magnitude or to the mean magnitude of all charges.
+
+    A drift of this size changes the position by about 0.05 mm.
+    """
+
+    DRIFT_SIGMAS = 4.0
+    """Number of standard errors of the drift by which the drift may also exceed this limit."""
+
     def __init__(self, electrodes: tuple[str, ...], begin_s: float, rest_charges_pC: Sequence[Array]) -> None:
         """Begin without a frame.
 
@@ -349,22 +364,6 @@ class PressWatch:
         return WatchResult(Phase.waiting, charge_pC)
 
 
-MAX_SCATTER_SIGMAS = 3.0
-"""Largest scatter of a charge about a straight line, in standard deviations of its noise."""
-
-RELATIVE_NOISE = 0.007
-"""Standard deviation of the additional noise of a press, relative to its charge, because the force of a hand varies."""
-
-MAX_RELATIVE_DRIFT = 0.005
-"""Largest drift of a charge over the window, relative to its magnitude or to the mean magnitude of all charges.
-
-A drift of this size changes the position by about 0.05 mm.
-"""
-
-DRIFT_SIGMAS = 4.0
-"""Number of standard errors of the drift by which the drift may also exceed this limit."""
-
-
 def unsteadiness(
     press: SteadyPress,
     noise_pC: Array,
@@ -389,9 +388,9 @@ def unsteadiness(
     """
     # The charges scatter because of the noise at rest, and because a hand varies its force.
     mean_magnitude_pC = float(np.abs(press.charge_pC).mean())
-    expected_scatter_pC = np.hypot(noise_pC, RELATIVE_NOISE * mean_magnitude_pC)
+    expected_scatter_pC = np.hypot(noise_pC, Press.RELATIVE_NOISE * mean_magnitude_pC)
     relative_scatter = press.scatter_pC / expected_scatter_pC
-    if relative_scatter.max() > MAX_SCATTER_SIGMAS:
+    if relative_scatter.max() > Press.MAX_SCATTER_SIGMAS:
         worst_index = int(relative_scatter.argmax())
         return f"the charge of {electrodes[worst_index]} shakes by {press.scatter_pC[worst_index]:.2g} pC"
 
@@ -399,7 +398,7 @@ def unsteadiness(
     drift_std_pC = press.scatter_pC * np.sqrt(12.0 / press.frames)
     # A charge that is smaller than the mean magnitude may change as much as a charge of the mean magnitude.
     reference_pC = np.maximum(np.abs(press.charge_pC), mean_magnitude_pC)
-    max_drift_pC = MAX_RELATIVE_DRIFT * reference_pC + DRIFT_SIGMAS * drift_std_pC
+    max_drift_pC = Press.MAX_RELATIVE_DRIFT * reference_pC + Press.DRIFT_SIGMAS * drift_std_pC
     is_drift_small = (np.abs(press.drift_pC) <= max_drift_pC).all()
     if is_drift_small:
         return ""
