@@ -30,3 +30,11 @@ def test_a_misspelt_name_is_an_attribute_error(package):
     module = import_module(package)
     with pytest.raises(AttributeError, match="has no attribute 'calibrat'"):
         module.calibrat  # noqa: B018
+
+
+def test_a_sweep_imports_no_part_of_a_stream():
+    """The command needs only the table of presses and the table of the deflection, which the live page draws."""
+    code = """import sys, isocharge.cli.simulate.sweep
+print(sorted({".".join(name.split(".")[:3]) for name in sys.modules if name.startswith("isocharge.serve.")}))"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "['isocharge.serve.presses', 'isocharge.serve.viewer']\n"

@@ -11,8 +11,12 @@ from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
 from isocharge.common.errors import InputError, IsochargeError, SceneError, SolveError
 from isocharge.common.files import write_whole
-from isocharge.serve.viewer.deflection_field import DEFLECTION_FILE, FILM_KEYS, DeflectionField
-from isocharge.serve.viewer.messages import included_deflection_field
+from isocharge.serve.viewer.deflection_field import (
+    DEFLECTION_FILE,
+    FILM_KEYS,
+    DeflectionField,
+    included_deflection_field,
+)
 from isocharge.simulate import Circle, Dataset, Film, Probe, Sensor, Sweep, noise_model, read_dataset, working_area
 from isocharge.simulate.execution.workers import dask_workers, local_workers
 from isocharge.simulate.sensor.sensor_file import film_to_dict

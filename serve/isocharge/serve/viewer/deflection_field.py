@@ -18,6 +18,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import as_file, files
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -133,6 +134,22 @@ def read_deflection_field(path: Path) -> DeflectionField:
         rings=file.rings,
         deflection_mm=ratio * file.scale_mm,
     )
+
+
+def included_deflection_field(film: Any) -> DeflectionField | None:
+    """Return the deflection field of a film that is included in isocharge, or None if there is none for this film.
+
+    The included fields belong to the films of the released models.
+
+    Args:
+        film: The film as a sensor file describes it.
+    """
+    with as_file(files("isocharge.serve.viewer") / "fields") as folder:
+        for field_path in sorted(folder.glob("*.json")):
+            field = read_deflection_field(field_path)
+            if field.fits(film):
+                return field
+    return None
 
 
 Increasing = Annotated[tuple[Finite, ...], Meta(min_length=1)]

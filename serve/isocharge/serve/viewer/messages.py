@@ -40,7 +40,6 @@ this module. The value of `do` is the class name in lower case.
 import math
 import struct
 from collections.abc import Mapping, Sequence
-from importlib.resources import as_file, files
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -54,7 +53,12 @@ from isocharge.common.structs import Finite, WrongKey, convert
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.record.record import RECORD_FIELDS, PredictionRecord
-from isocharge.serve.viewer.deflection_field import DEFLECTION_FILE, DeflectionField, read_deflection_field
+from isocharge.serve.viewer.deflection_field import (
+    DEFLECTION_FILE,
+    DeflectionField,
+    included_deflection_field,
+    read_deflection_field,
+)
 
 FLAG_BITS = {word: 1 << position for position, word in enumerate(MEANINGS)}
 """Bit that represents each flag in a sample."""
@@ -348,22 +352,6 @@ def find_deflection_field(version_folder: Path, metadata: ModelMetadata) -> Defl
     if path.is_file():
         return read_deflection_field(path)
     return included_deflection_field(metadata.sensor.get("film"))
-
-
-def included_deflection_field(film: Any) -> DeflectionField | None:
-    """Return the deflection field of a film that is included in isocharge, or None if there is none for this film.
-
-    The included fields belong to the films of the released models.
-
-    Args:
-        film: The film as a sensor file describes it.
-    """
-    with as_file(files("isocharge.serve.viewer") / "fields") as folder:
-        for field_path in sorted(folder.glob("*.json")):
-            field = read_deflection_field(field_path)
-            if field.fits(film):
-                return field
-    return None
 
 
 def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | None) -> dict[str, Any]:
