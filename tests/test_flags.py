@@ -30,7 +30,7 @@ def column(table_name, model):
     position = header.index(model)
     shares = {}
     for row in rows:
-        numbers = re.findall(r"([\d.]+) %", row[position])
+        numbers = re.findall(r"[\d.]+", row[position])
         if numbers:
             shares[row[1]] = tuple(float(number) for number in numbers)
     return shares

@@ -32,15 +32,15 @@ def table(results: dict[str, dict[str, Shares]]) -> list[str]:
 
 
 def cell(shares: Shares | None) -> str:
-    """Return the two shares of a cell as text; empty if the model has no such fault."""
+    """Return the two shares of a cell as text, in %; empty if the model has no such fault."""
     if shares is None:
         return ""
-    return f"{percent(shares.flagged)}; {percent(shares.unnoticed)}"
+    return f"{percent(shares.flagged)}, {percent(shares.unnoticed)}"
 
 
 def percent(share: float) -> str:
     """Return a share in percent as text, with a decimal where it is below one percent."""
-    return f"{share:.1f} %" if share < 1.0 else f"{share:.0f} %"
+    return f"{share:.1f}" if share < 1.0 else f"{share:.0f}"
 
 
 def main() -> None:

@@ -46,10 +46,10 @@ def row_order(ring: str) -> tuple[int, float]:
 
 
 def cell(shares: RingShares | None) -> str:
-    """Return the three shares of a cell as text; a dash if the working area covers the ring."""
+    """Return the three shares of a cell as text, in %; a dash if the working area covers the ring."""
     if shares is None:
         return "-"
-    return "; ".join(percent(share) for share in (shares.flagged, shares.unnoticed, shares.mirrored))
+    return ", ".join(percent(share) for share in (shares.flagged, shares.unnoticed, shares.mirrored))
 
 
 def main() -> None:
