@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test types tests test-all lower-bounds browser workflows ros2 size attack docs bench soak dist sbom installed release report paper \
+.PHONY: demo test types tests test-all lower-bounds browser workflows ros2 conda-recipe size attack docs bench soak dist sbom installed release report paper \
 	proto clean
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
@@ -50,6 +50,12 @@ workflows: $(VENV)/installed
 # The node of ROS 2 with the virtual sensor; needs pixi, which installs ROS 2.
 ros2:
 	pixi run --manifest-path serve/deploy/ros2/pixi.toml check
+
+# The recipe for conda-forge, rendered by rattler-build.
+conda-recipe:
+	$(PYTHON) -m venv build/rattler
+	build/rattler/bin/python -m pip install --quiet "py-rattler-build>=0.73"
+	build/rattler/bin/python .ci/conda/check.py
 
 # Modules, nodes of the syntax tree and numeric constants of each package; a test compares them with their limits.
 size:

@@ -12,6 +12,7 @@ import venv
 from pathlib import Path
 
 import pytest
+import yaml
 from pyarrow import table
 from pyarrow.parquet import write_table
 
@@ -120,6 +121,14 @@ def test_the_version_is_that_of_the_changelog_and_of_the_citation(base, tmp_path
     assert run(base, "isocharge", "--version", cwd=tmp_path).stdout == f"isocharge {VERSION}\n"
     assert re.search(r"^## (\S+?),? ", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)[1] == VERSION
     assert f"\nversion: {VERSION}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
+
+
+def test_the_conda_recipe_has_the_version_and_the_requirements_of_the_package():
+    recipe = yaml.safe_load((ROOT / ".ci/conda/recipe.yaml").read_text("utf-8"))
+    packages = [line for line in recipe["requirements"]["run"] if not line.startswith(("python ", "__unix"))]
+    assert [line.replace(" ", "") for line in packages] == PROJECT["dependencies"]
+    assert recipe["context"]["version"] == VERSION
+    assert f">={recipe['context']['python_min']}" == PROJECT["requires-python"]
 
 
 def test_nothing_heavy_came_along(base, tmp_path):
