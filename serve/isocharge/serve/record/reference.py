@@ -19,8 +19,8 @@ TYPES = {
 }
 """Description of each kind of value in the table."""
 
-GROUPS = {"tracking": "with `[track]`", "film": "with `[follow]`"}
-"""Condition under which a record has the fields of a group."""
+GROUPS = {"tracking": " Only with `[track]`.", "film": " Only with `[follow]`."}
+"""Sentence about the condition under which a record has the fields of a group."""
 
 
 def record_table() -> str:
@@ -28,11 +28,11 @@ def record_table() -> str:
 
     If a field is an object, the rows of the object's fields follow the row of the field.
     """
-    header = ["| field | type | unit | meaning | present |", "|---|---|---|---|---|"]
+    header = ["| field | type | unit | meaning |", "|---|---|---|---|"]
     return "\n".join([*header, *_rows(RECORD_FIELDS)]) + "\n"
 
 
-def _rows(fields: Iterable[Field], prefix: str = "", group: str = "") -> Iterator[str]:
+def _rows(fields: Iterable[Field], prefix: str = "") -> Iterator[str]:
     """Yield a row of the Markdown table for each field.
 
     If a field is an object, the rows of the object's fields follow the row of the field.
@@ -41,19 +41,16 @@ def _rows(fields: Iterable[Field], prefix: str = "", group: str = "") -> Iterato
         fields: Fields of the record or of an object.
         prefix: Text before the names of the fields, which is the name of the object that contains the fields, and a
             point. Empty for the fields of the record itself.
-        group: Group of the object that contains the fields. A group consists of fields that a record has only under a
-            condition; see `GROUPS`. Empty if there is no such object or group.
     """
     for field in fields:
         full_name = f"{prefix}{field.name}"
-        field_group = field.group or group  # a field without a group is in the group of its object
-        condition = GROUPS.get(field_group, "always")
+        condition = GROUPS.get(field.group, "")
         value_type = TYPES[field.kind]
         if field.may_be_null:
             value_type += " or null"
-        cells = (f"`{full_name}`", value_type, field.meaning.unit, field.meaning.text, condition)
+        cells = (f"`{full_name}`", value_type, field.meaning.unit, f"{field.meaning.text}{condition}")
         yield f"| {' | '.join(cells)} |"
-        yield from _rows(field.parts, f"{full_name}.", field_group)
+        yield from _rows(field.parts, f"{full_name}.")
 
 
 if __name__ == "__main__":
