@@ -6,7 +6,6 @@ import pytest
 
 from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
-from isocharge.train.training import correlation
 from kept import ROOT, kept
 
 FOLDERS = ("simulate", "train", "serve")
@@ -102,11 +101,10 @@ def test_an_example_does_what_it_says(page_example, desk, installed, run_example
 
 @pytest.fixture
 def train_in_this_process(monkeypatch, capsys):
-    """Run a Python example that trains, in this process, where the correlations are fitted to few examples.
+    """Run a Python example that trains, in this process.
 
     It must have one `print`, which prints what the comment on its line says.
     """
-    monkeypatch.setattr(correlation, "N_EXAMPLES", 3_000)
 
     def run(example, folder):
         monkeypatch.chdir(folder)

@@ -5,7 +5,6 @@ import pytest
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Sweep, load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, TrainingData, fit
-from isocharge.train.training import correlation
 from isocharge.train.training import fit as fit_module
 from isocharge.train.training.fit import train_network
 from kept import kept
@@ -14,14 +13,6 @@ QUICK = FitConfig(
     network=NetworkConfig(hidden=(32, 32), misfit_hidden=(24, 24)),
     training=TrainingConfig(steps=400, misfit_steps=600, misfit_charges=4_000, batch=256),
 )
-
-
-@pytest.fixture(scope="session", autouse=True)
-def few_examples_of_correlations():
-    """Fit the correlations of each network to a tenth of the examples, because the tests train many networks."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(correlation, "N_EXAMPLES", 3_000)
-        yield
 
 
 @pytest.fixture(scope="session")
@@ -60,7 +51,7 @@ def trained(dataset):
 def fitted(dataset, trained):
     """The same network after folding, with everything that a release needs."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit_module, "train_network", lambda *_, **__: trained)
+        patch.setattr(fit_module, "train_network", lambda *_: trained)
         return fit(dataset, QUICK)
 
 

@@ -16,11 +16,9 @@ from isocharge.serve import find_model
 from isocharge.simulate import Domain, noise_model
 from isocharge.train.model_release.graph_check import check_graph
 from isocharge.train.model_release.onnx_graph import read_graph, write_graph
-from isocharge.train.training import correlation
-from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.folded_network import LOG_STD, UNIT_LOG_STD_RANGE
-from isocharge.train.training.losses import likelihood_loss
-from isocharge.train.training.network import fold_network, limit_log_std
+from isocharge.train.training.losses import covariance_loss
+from isocharge.train.training.network import Posterior, fold_network, limit_log_std
 
 REFERENCE = noise_model("reference")
 
@@ -60,7 +58,7 @@ def held_out(trained):
 
 @pytest.fixture(scope="module")
 def exact(trained):
-    return fold_with_correlation(trained.network, trained.split.train)
+    return fold_network(trained.network)
 
 
 @pytest.fixture(scope="module")
@@ -71,10 +69,6 @@ def graph(exact):
 @pytest.fixture(scope="module")
 def session(graph):
     return onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
-
-
-def fold_with_correlation(network, presses):
-    return with_correlation(fold_network(network), presses, REFERENCE, 0)
 
 
 def onnxruntime_outputs(network, charge):
@@ -124,12 +118,11 @@ def test_the_graph_answers_as_the_network_does_on_unusual_charges(trained, held_
         assert misfit.min() > 50.0
 
 
-def test_a_network_with_infinite_answers_is_not_released(trained, held_out, monkeypatch):
-    monkeypatch.setattr(correlation, "N_EXAMPLES", 1_000)  # the errors of this network have no correlations
+def test_a_network_with_infinite_answers_is_not_released(trained, held_out):
     network = copy.deepcopy(trained.network)
     with torch.no_grad():
         network.contact.skip.weight *= 15.0
-    diverging = fold_with_correlation(network, trained.split.train)
+    diverging = fold_network(network)
     with pytest.raises(TrainingError, match=r"answers contact = .* expected finite numbers for any charges"):
         check_graph(write_graph(diverging, {}), diverging.outputs, held_out, REFERENCE)
 
@@ -198,7 +191,7 @@ def test_a_standard_deviation_beyond_its_limit_returns_in_the_training():
     domain = Domain(8.0, (0.1, 2.0))
     raw = torch.tensor([[-60.0, 50.0, -60.0]], requires_grad=True)
     log_std = limit_log_std(raw, torch.zeros(1, 3), domain)
-    likelihood_loss(torch.zeros(1, 3), log_std, torch.full((1, 3), 0.1)).backward()
+    covariance_loss(Posterior(torch.zeros(1, 3), log_std, torch.zeros(1, 3)), torch.full((1, 3), 0.1)).backward()
     low_x, high_y, low_force = raw.grad[0]
     assert low_x < 0.0 < high_y
     assert low_force < 0.0

@@ -1,9 +1,8 @@
 """Training data and settings of a student, which is a small network that learns the answers of a model.
 
 A student has the same inputs and outputs as the model. It has only about 5,000 weights and biases, so it fits into the
-flash memory of a microcontroller. The student learns the contacts and standard deviations that the model estimates. The
-student does not learn its misfit from the model. Like the model, it learns the misfit from exact distances between
-charges.
+flash memory of a microcontroller. The student learns the contacts that the model estimates. Like the model, it learns
+its standard deviations from its own errors, and the misfit from exact distances between charges.
 """
 
 from dataclasses import dataclass, replace
@@ -14,7 +13,6 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, ModelError
-from isocharge.common.files import sha256_of
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
 from isocharge.simulate import Dataset, Domain, Probe, Sensor, parse_probe
@@ -88,12 +86,9 @@ def student_data(model: Path, dataset: Dataset) -> TrainingData:
             f"on {dataset.sensor.name!r}; simulate them on the model's own sensor"
         )
 
-    def estimate(charge: Array) -> tuple[Array, Array]:
-        """Return estimated contacts (x, y, F) and their standard deviations, both of shape (n, 3), mm and N."""
+    def estimate(charge: Array) -> Array:
+        """Return estimated contacts (x, y, F), shape (n, 3), mm and N."""
         answers = predictor.predict_batch(charge)
-        contact = np.stack([answers.x_mm, answers.y_mm, answers.force_N], axis=1)
-        std = np.stack([answers.x_std_mm, answers.y_std_mm, answers.force_std_N], axis=1)
-        return contact.astype(float), std.astype(float)
+        return np.stack([answers.x_mm, answers.y_mm, answers.force_N], axis=1).astype(float)
 
-    checksum = sha256_of((model / "model.onnx").read_bytes())
-    return replace(TrainingData.of(dataset), teacher=Teacher(metadata.label, checksum, estimate))
+    return replace(TrainingData.of(dataset), teacher=Teacher(metadata.label, estimate))

@@ -48,7 +48,7 @@ class DefaultSizes(NamedTuple):
 
 
 FEW_ELECTRODE_SIZES = DefaultSizes(
-    width=96, misfit_width=64, layers=3, steps=1_200, misfit_steps=1_500, misfit_charges=40_000, rate_factor=1.0
+    width=96, misfit_width=64, layers=3, steps=1_500, misfit_steps=1_500, misfit_charges=40_000, rate_factor=1.0
 )
 """Default sizes for at most `FEW_ELECTRODES` electrodes."""
 
@@ -141,8 +141,6 @@ class TrainingConfig(Settings, frozen=True):
             `DefaultSizes`.
         batch: Number of presses in a batch.
         learning_rate: Largest learning rate of the optimiser SOAP.
-        patience: Number of steps without a better validation score after which the training stops. The network then
-            gets the weights with the best score.
         hold_out: Fraction of the positions that are used for testing. Half as many positions are used for validation.
             If the presses are measured, the same fifth of them is always used for testing.
         noise: Noise that is drawn again in every step, as a `NoiseModel` or as a name that `noise_model` accepts.
@@ -156,43 +154,16 @@ class TrainingConfig(Settings, frozen=True):
     misfit_charges: Annotated[int, Meta(ge=1_000, le=10_000_000)] | None = None
     batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 512
     learning_rate: Annotated[float, Meta(gt=0.0, lt=1.0, description="a number between 0 and 1")] = 2e-2
-    patience: Count = 3_000
     hold_out: Annotated[float, Meta(gt=0.0, lt=0.6, description="a number between 0 and 0.6")] = 0.1
     noise: Annotated[str | NoiseModel, Meta(description="a text")] = "reference"
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
     threads: Annotated[int, Meta(ge=1, le=64)] = 1
 
-    def contact_step_count(self, n_electrode: int) -> int:
-        """Return the number of optimiser steps of the contact network.
-
-        Args:
-            n_electrode: Number of electrodes, which determines the number of steps if the setting is None.
-        """
-        return self.steps if self.steps is not None else DefaultSizes.for_electrodes(n_electrode).steps
-
-    def misfit_step_count(self, n_electrode: int) -> int:
-        """Return the number of optimiser steps of the misfit network.
-
-        Args:
-            n_electrode: Number of electrodes, which determines the number of steps if the setting is None.
-        """
-        return (
-            self.misfit_steps
-            if self.misfit_steps is not None
-            else DefaultSizes.for_electrodes(n_electrode).misfit_steps
-        )
-
-    def misfit_charge_count(self, n_electrode: int) -> int:
-        """Return the number of sets of charges in the training of the misfit network.
-
-        Args:
-            n_electrode: Number of electrodes, which determines the result if the setting is None.
-        """
-        return (
-            self.misfit_charges
-            if self.misfit_charges is not None
-            else DefaultSizes.for_electrodes(n_electrode).misfit_charges
-        )
+    def sizes(self, n_electrode: int) -> DefaultSizes:
+        """Return the default sizes for a number of electrodes, in which the given settings replace the defaults."""
+        names = ("steps", "misfit_steps", "misfit_charges")
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return DefaultSizes.for_electrodes(n_electrode)._replace(**given)
 
     @property
     def noise_model(self) -> NoiseModel:
@@ -217,11 +188,9 @@ class FitConfig(Settings, frozen=True):
             hidden=self.network.contact_widths(n_electrode),
             misfit_hidden=self.network.misfit_widths(n_electrode),
         )
+        sizes = self.training.sizes(n_electrode)
         training = replace(
-            self.training,
-            steps=self.training.contact_step_count(n_electrode),
-            misfit_steps=self.training.misfit_step_count(n_electrode),
-            misfit_charges=self.training.misfit_charge_count(n_electrode),
+            self.training, steps=sizes.steps, misfit_steps=sizes.misfit_steps, misfit_charges=sizes.misfit_charges
         )
         return FitConfig(network, training)
 

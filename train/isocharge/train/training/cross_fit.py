@@ -13,9 +13,8 @@ training step, random noise with half of the estimated size is added to the char
 """
 
 import logging
-from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -40,13 +39,13 @@ from isocharge.train.data.presses import (
     presses_sha256,
 )
 from isocharge.train.training.config import MANY_ELECTRODE_SIZES, FitConfig, TrainingConfig
-from isocharge.train.training.descent import Descent, TrainingStage
+from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fit import contact_stage, threads_and_seed, train_perceptron
 from isocharge.train.training.fitted import Answers, Fitted, Provenance
-from isocharge.train.training.losses import distillation_loss
+from isocharge.train.training.losses import covariance_loss
 from isocharge.train.training.misfit_training import misfit_stage
-from isocharge.train.training.network import InverseNetwork, TrainablePerceptron, as_tensor, fold_network
+from isocharge.train.training.network import InverseNetwork, Posterior, as_tensor, fold_network
 
 _log = logging.getLogger(__name__)
 
@@ -296,7 +295,7 @@ def _with_defaults_for_measured(config: TrainingConfig, n_electrode: int) -> Tra
         config: Settings in which the numbers may be missing.
         n_electrode: Number of electrodes.
     """
-    default_steps = max(config.contact_step_count(n_electrode), DEFAULT_LARGEST_STEPS)
+    default_steps = max(config.sizes(n_electrode).steps, DEFAULT_LARGEST_STEPS)
     return structs.replace(
         config,
         steps=config.steps or default_steps,
@@ -314,8 +313,8 @@ def _train_fold_networks(
 ) -> int:
     """Train one network for each fold on the presses of all other folds.
 
-    The number of steps is doubled until the validation score of the first network no longer improves. The other
-    networks are then trained with the number of steps that was best for the first network.
+    The number of steps is doubled until the loss of the first network on the presses of its own fold no longer
+    decreases. The other networks are then trained with the number of steps that was best for the first network.
 
     Args:
         fold_networks: Networks to train, one for each fold.
@@ -328,65 +327,35 @@ def _train_fold_networks(
         Number of steps that was best for the first network.
     """
 
-    def train(fold_index: int, steps: int) -> Descent:
-        """Train the network of one fold with a given number of steps, and return the finished training.
-
-        The presses of this fold are used for validation. The presses of all other folds are used for training.
-
-        Args:
-            fold_index: Index of the fold and of its network.
-            steps: Number of steps.
-        """
+    def train(fold_index: int, steps: int) -> float:
+        """Train the network of one fold with a number of steps, and return its loss on the presses of this fold."""
+        network = fold_networks[fold_index]
         is_validation = fold_of_press == fold_index
-        stage = contact_stage(
-            fold_networks[fold_index],
-            presses[~is_validation],
-            presses[is_validation],
-            noise.scaled(TRAINING_NOISE_FACTOR),
-            structs.replace(config, steps=steps),
-        )
-        named_stage = replace(stage, name=f"contact-{fold_index + 1}-{steps}")
-        patience = max(steps // 2, 1)  # the training ends after half of its steps without a better score
-        descent = Descent(named_stage, config.learning_rate, patience, config.seed + fold_index)
-        descent.run()
-        return descent
+        stage_config = structs.replace(config, steps=steps, seed=config.seed + fold_index)
+        train_presses = presses[~is_validation]
+        contact_stage(network, train_presses, noise.scaled(TRAINING_NOISE_FACTOR), stage_config).run()
+        validation = presses[is_validation]
+        with torch.no_grad():
+            posterior = network.posterior(as_tensor(validation.charge))
+            error = as_tensor(network.domain.to_unit(validation.contact)) - posterior.mean
+            return covariance_loss(posterior, error).mean().item()
 
-    first_network = fold_networks[0]
-    largest_steps = config.contact_step_count(first_network.n_electrode)
-    train_first_network = partial(train, 0)  # function of the number of steps
-    steps = _train_with_best_steps(first_network.contact, train_first_network, largest_steps)
+    first_network = fold_networks[0].contact
+    initial_weights = deepcopy(first_network.state_dict())
+    largest_steps = config.sizes(fold_networks[0].n_electrode).steps
+    steps = min(FIRST_STEPS, largest_steps)
+    loss = train(0, steps)
+    while 2 * steps <= largest_steps:
+        shorter_weights = deepcopy(first_network.state_dict())
+        first_network.load_state_dict(initial_weights)
+        longer_loss = train(0, 2 * steps)
+        if longer_loss >= loss:
+            first_network.load_state_dict(shorter_weights)
+            break
+        loss = longer_loss
+        steps *= 2
     for fold_index in range(1, len(fold_networks)):
         train(fold_index, steps)
-    return steps
-
-
-def _train_with_best_steps(network: TrainablePerceptron, train: Callable[[int], Descent], largest_steps: int) -> int:
-    """Train a network repeatedly with more and more steps, and keep the weights of the best training.
-
-    Each training begins with the same initial weights, and has twice as many steps as the previous training. The
-    function stops if the validation score does not improve from one training to the next, or if the number of steps
-    would exceed `largest_steps`.
-
-    Args:
-        network: Network to train. Its present weights are the initial weights.
-        train: Function that trains the network with a number of steps, and returns the finished training.
-        largest_steps: Largest number of steps.
-
-    Returns:
-        Number of steps of the best training.
-    """
-    initial_weights = {name: weight.clone() for name, weight in network.state_dict().items()}
-    steps = min(FIRST_STEPS, largest_steps)
-    best_training = train(steps)
-    while 2 * steps <= largest_steps:
-        network.load_state_dict(initial_weights)
-        longer_training = train(2 * steps)
-        is_better = longer_training.best_score < best_training.best_score
-        if not is_better:
-            network.load_state_dict(best_training.best_weights)  # the longer training has replaced these weights
-            break
-        best_training = longer_training
-        steps = 2 * steps
     return steps
 
 
@@ -424,56 +393,39 @@ def _distillation_stage(
 ) -> TrainingStage:
     """Define the training of a network on the mean outputs of other networks (distillation).
 
-    The inputs are copies of the charges, with noise of several sizes and in random order. The last of these copies are
-    used for validation. Their number is half the number of presses. The training has half as many steps as the settings
-    allow for the contact network.
+    The inputs are copies of the charges, with noise of several sizes. The training has half as many steps as the
+    settings allow for the contact network.
 
     Args:
         network: Network to train.
         fold_networks: Networks whose mean outputs are the targets.
         presses: All presses.
         noise: Noise of the charges.
-        config: Number of steps, batch size and seed.
+        config: Number of steps, batch size, learning rate and seed.
     """
-    # Compute the inputs: copies of the charges with noise, in random order, shape (n_copy * n_press, n_electrode).
     rng = np.random.default_rng(config.seed)
     copies = [noise.scaled(factor).add(presses.charge, rng) for factor in DISTILLATION_NOISE_FACTORS]
-    order = rng.permutation(len(copies) * len(presses))
-    charge = as_tensor(np.concatenate(copies)[order])
-    n_validation = len(presses) // 2
-    n_train = len(charge) - n_validation
-
-    # Compute the targets: the outputs of the fold networks, averaged over these networks. The outputs of one network
-    # have the shape (2, n, 3): unit coordinates, and logarithms of their standard deviations.
+    charge = as_tensor(np.concatenate(copies))
+    # The targets are the means of the outputs over the fold networks.
     with torch.no_grad():
-        outputs = [torch.stack(fold_network.posterior(charge)) for fold_network in fold_networks]
-    target_mean, target_log_std = torch.stack(outputs).mean(dim=0)
-    network.contact.fit_linear_part(network.inputs(charge[:n_train]), target_mean[:n_train])
+        outputs = [fold_network.posterior(charge) for fold_network in fold_networks]
+    targets = Posterior(*(torch.stack(values).mean(dim=0) for values in zip(*outputs, strict=True)))
+    network.contact.fit_linear_part(network.inputs(charge), targets.mean)
 
-    def divergence(rows: Tensor | slice) -> Tensor:
-        """Return the Kullback-Leibler divergence between the outputs of the network and the targets for some inputs."""
-        mean, log_std = network.posterior(charge[rows])
-        return distillation_loss(mean, log_std, target_mean[rows], target_log_std[rows])
+    def loss(_: float, random: torch.Generator) -> Tensor:  # the loss is the same in every step
+        """Return the mean squared differences from the targets for a random batch.
 
-    def loss(_: int, random: torch.Generator) -> Tensor:  # the loss is the same in every step
-        """Return the divergence for a random batch."""
-        batch_rows = torch.randint(n_train, (config.batch,), generator=random)
-        return divergence(batch_rows)
+        The differences of the means are divided by the standard deviations.
+        """
+        rows = torch.randint(len(charge), (config.batch,), generator=random)
+        target = Posterior(*(values[rows] for values in targets))
+        mean, log_std, turn = network.posterior(charge[rows])
+        mean_difference = (mean - target.mean) * torch.exp(-target.log_std)
+        squares = 0.5 * mean_difference**2 + (log_std - target.log_std) ** 2 + (turn - target.turn) ** 2
+        return squares.sum(dim=1).mean()
 
-    def score() -> tuple[float, str]:
-        """Return the divergence for the validation charges, and a text about this divergence."""
-        validation_loss = divergence(slice(n_train, None)).item()
-        return validation_loss, f"{validation_loss:.4f} from the mean of {len(fold_networks)} networks"
-
-    steps = max(config.contact_step_count(network.n_electrode) // 2, 1)
-    return TrainingStage(
-        "contact",
-        network.contact,
-        loss,
-        score,
-        steps,
-        slow_parameters=(network.contact.skip.weight,),
-    )
+    steps = max(config.sizes(network.n_electrode).steps // 2, 1)
+    return TrainingStage("contact", network.contact, loss, steps, config.learning_rate, config.seed)
 
 
 def _misfit_examples(
@@ -502,7 +454,7 @@ def _misfit_examples(
 
     # Draw charges, which are made from the charges of randomly chosen presses.
     n_electrode = presses.charge.shape[1]
-    chosen_rows = rng.integers(len(presses), size=config.misfit_charge_count(n_electrode))
+    chosen_rows = rng.integers(len(presses), size=config.sizes(n_electrode).misfit_charges)
     _, charge = draw_charges(rng, presses.charge[chosen_rows], presses.charge, noise)
     residual = planes.residuals(noise.level(charge))
     return np.stack([charge, residual])

@@ -1,10 +1,9 @@
 """Training of a network on presses.
 
-The contact perceptron learns the mean and the standard deviation of the contact by maximum likelihood, with fresh noise
-on the charges in every step. In the first steps, it learns only the mean by least squares. If a teacher is given, the
-contact perceptron learns the teacher's answers to these charges instead. The misfit perceptron learns residuals, which
-are computed before the training. The residual of a set of charges is its difference from the charges of the nearest
-contact.
+The contact perceptron learns the mean and the covariance of the contact, with fresh noise on the charges in every step.
+If a teacher is given, the mean learns the teacher's answers to these charges. The misfit perceptron learns residuals,
+which are computed before the training. The residual of a set of charges is its difference from the charges of the
+nearest contact.
 """
 
 import logging
@@ -26,52 +25,29 @@ from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.training.config import DefaultSizes, FitConfig, NetworkConfig, TrainingConfig
-from isocharge.train.training.correlation import with_correlation
-from isocharge.train.training.descent import Descent, TrainingStage
+from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
+from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.exact_search import error_cautions
 from isocharge.train.training.fitted import Fitted, Provenance
-from isocharge.train.training.folded_network import FoldedNetwork
-from isocharge.train.training.linear_targets import LinearTargets, TargetBatch
-from isocharge.train.training.losses import (
-    CORRELATION_WEIGHT,
-    distillation_loss,
-    linear_target_loss,
-    robust_correlation_loss,
-    validation_score,
-    warm_up_loss,
-    weighted_likelihood_loss,
-    with_fresh_noise,
-)
-from isocharge.train.training.misfit_training import MisfitExamples, misfit_stage
-from isocharge.train.training.network import (
-    InverseNetwork,
-    TrainablePerceptron,
-    as_tensor,
-    fold_network,
-)
-from isocharge.train.training.output_regression import fit_std
+from isocharge.train.training.linear_targets import LinearTargets
+from isocharge.train.training.losses import contact_loss, fresh_noise
+from isocharge.train.training.misfit_training import misfit_examples, misfit_stage
+from isocharge.train.training.network import InverseNetwork, TrainablePerceptron, as_tensor, fold_network
 from isocharge.train.training.source import Teacher, TrainingData
 from isocharge.train.training.split import Split
 
 _log = logging.getLogger(__name__)
 
-WARM_UP_FRACTION = 0.15
-"""Fraction of the steps that use the warm-up loss, dimensionless."""
-
 LINEAR_TARGET_FRACTION = 0.7
 """Fraction of the steps in which the network of a sensor with more than `FEW_ELECTRODES` electrodes learns from linear
-targets, including the warm-up. With three and four electrodes, these targets do not reduce the errors."""
+targets. With three and four electrodes, these targets do not reduce the errors."""
 
 ROUNDED_FRACTION = 0.25
 """Number of steps after the hidden weights are rounded, relative to the number of steps before, dimensionless."""
 
-N_STD_PRESSES = 30_000
-"""Number of presses with noise to which the standard deviations of a trained network are fitted."""
-
 
 def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitted:
-    """Train a network on presses, fold it into the form of a release, and calibrate its standard deviations.
+    """Train a network on presses, and fold it into the form of a release.
 
     A warning is logged if two contacts of the requested domain have the same charges. Another warning is logged if the
     errors of the network are clearly larger than the errors of an exact search.
@@ -97,7 +73,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
     # The threshold of the misfit needs many good presses. Of few measured presses, those for training are used, too.
     split = trained.split
     good_presses = data.presses.within(split.domain.radius) if data.presses.measured else split.test
-    network = _fold_and_calibrate(trained, settings.training)
+    network = fold_network(trained.network)
     cautions = split.cautions
     noise = settings.training.noise_model
     # A search for the true contacts can only be compared with a network that has learned the true contacts.
@@ -120,27 +96,6 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         outside=trained.outside,
         yield_force_N=data.yield_force_N,
     )
-
-
-def _fold_and_calibrate(trained: "TrainedNetwork", config: TrainingConfig) -> FoldedNetwork:
-    """Fold a trained network, and fit its standard deviations and its correlations to its errors.
-
-    The standard deviations are fitted only if the presses are simulated, because the noise of measured presses is not
-    known.
-
-    Args:
-        trained: The network in PyTorch and its presses.
-        config: Noise, seed and number of threads.
-    """
-    train = trained.split.train
-    noise = config.noise_model
-    with threads_and_seed(config.threads, config.seed):
-        network = fold_network(trained.network)
-        if not train.measured:
-            presses = train.repeated(N_STD_PRESSES)
-            noisy_charge = presses.noisy(noise, config.seed + 1)  # other noise than for the correlations
-            network = fit_std(network, noisy_charge, presses.contact)
-        return with_correlation(network, train, noise, config.seed)
 
 
 def _is_noise_known(data: TrainingData, noise: NoiseModel) -> bool:
@@ -206,20 +161,17 @@ def train_network(data: TrainingData, config: FitConfig) -> TrainedNetwork:
     _check_electrodes(config.network, data.sensor)
     training = config.training
     with threads_and_seed(training.threads, training.seed), second_thread() as executor:
-        # Split the presses, and draw the examples from the working area.
         split = Split.by_position(data, training)
         for caution in split.cautions:
             _log.warning("%s", caution)
         features = split.features(misfit_noise(training.noise_model))
         network = InverseNetwork(split.domain, features, config.network)
-        examples = MisfitExamples(split, features, training)
-        inner_examples = examples.inner()
         outside = None if data.presses.measured else OutsidePresses.of(split.domain, data.presses, data.outside)
 
         def train_misfit() -> None:
             """Train the misfit perceptron on examples from the working area and from the rest of the film."""
-            all_examples = examples.with_outside(inner_examples, outside)
-            train_perceptron(misfit_stage(network, all_examples, training), network.misfit_vector, config)
+            examples = misfit_examples(split, features, outside, training)
+            train_perceptron(misfit_stage(network, examples, training), network.misfit_vector, config)
 
         # Second thread: train the misfit perceptron. This thread: train the contact perceptron
         misfit_training = executor.submit(train_misfit)
@@ -228,13 +180,7 @@ def train_network(data: TrainingData, config: FitConfig) -> TrainedNetwork:
         if has_many_electrodes and data.teacher is None and _is_noise_known(data, training.noise_model):
             linear_targets = LinearTargets.compute(split.train, split.field, training.noise_model)
         stage = contact_stage(
-            network,
-            split.train,
-            split.validation,
-            training.noise_model,
-            training,
-            teacher=data.teacher,
-            linear_targets=linear_targets,
+            network, split.train, training.noise_model, training, teacher=data.teacher, linear_targets=linear_targets
         )
         train_perceptron(stage, network.contact, config)
         misfit_training.result()
@@ -277,39 +223,29 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
 def train_perceptron(stage: TrainingStage, perceptron: TrainablePerceptron, config: FitConfig) -> None:
     """Train a perceptron. If the configuration requires it, also round the hidden weights to 8 bits.
 
-    After the rounding, the other weights are trained further. In the further training, the steps are counted from the
-    beginning of the first training. Its loss is therefore the loss after the warm-up.
+    After the rounding, the other weights are trained further, with the loss of the last step.
 
     Args:
-        stage: Loss, validation score and number of steps.
+        stage: Loss and number of steps.
         perceptron: The perceptron of the stage.
-        config: Form of the weights, learning rate, patience and seed.
+        config: Form of the weights.
     """
-    settings = config.training
-    Descent(stage, settings.learning_rate, settings.patience, settings.seed).run()
+    stage.run()
     if config.network.weights != "int8":
         return
 
     perceptron.round_hidden_matrices()
 
-    def further_loss(step: int, random: torch.Generator) -> Tensor:
-        """Return the loss of a step, whose number is counted from the beginning of the first training."""
-        return stage.loss(stage.steps + step, random)
+    def last_loss(_: float, random: torch.Generator) -> Tensor:
+        """Return the loss at the end of the training."""
+        return stage.loss(1.0, random)
 
-    rounded_stage = replace(
-        stage,
-        name=f"{stage.name}-rounded",
-        loss=further_loss,
-        steps=round(ROUNDED_FRACTION * stage.steps),
-        warm_up_steps=0,
-    )
-    Descent(rounded_stage, settings.learning_rate, settings.patience, settings.seed).run()
+    replace(stage, loss=last_loss, steps=round(ROUNDED_FRACTION * stage.steps)).run()
 
 
 def contact_stage(
     network: InverseNetwork,
     train: LabelledPresses,
-    validation: LabelledPresses,
     noise: Noise,
     config: TrainingConfig,
     *,
@@ -318,102 +254,48 @@ def contact_stage(
 ) -> TrainingStage:
     """Define the training of the contact perceptron on charges with fresh noise.
 
-    Before the training, the linear part of the perceptron is fitted by least squares. The training begins with a
-    warm-up. If there are linear targets, the mean of the network learns from them during the first
-    `LINEAR_TARGET_FRACTION` of the steps, including the warm-up. The remaining steps maximise the likelihood of the
-    contacts, or minimise the distance from the teacher's answers.
+    Before the training, the linear part of the perceptron is fitted by least squares. If there are linear targets, the
+    mean of the network learns from them during the first `LINEAR_TARGET_FRACTION` of the steps. Later, or without
+    linear targets, it learns from the answers of the teacher or, without a teacher, from the true contacts. The
+    covariance always learns from the errors.
 
     Args:
         network: The network, whose contact perceptron is trained.
         train: Presses for training.
-        validation: Presses for early stopping.
         noise: Noise that is added to the charges in every step.
-        config: Number of steps, batch size and seed.
+        config: Number of steps, batch size, learning rate and seed.
         teacher: Model whose answers are learned; None to learn the contacts of the presses.
         linear_targets: Targets of the presses of `train` for the first steps; None to use only the contacts or the
             teacher.
     """
     domain = network.domain
-    steps = config.contact_step_count(network.n_electrode)
-    warm_up_steps = round(WARM_UP_FRACTION * steps)
     charge = as_tensor(train.charge)
     unit_contact = as_tensor(domain.to_unit(train.contact))
-    # Measured charges already contain noise. Noise is only added to simulated charges.
-    noisy_validation_charge = validation.charge if validation.measured else validation.noisy(noise, config.seed)
-    validation_charge = as_tensor(noisy_validation_charge)
-    validation_target = as_tensor(domain.to_unit(validation.contact))
     batch = min(config.batch, len(charge))
-    noisy_charge = with_fresh_noise(charge, noise, torch.Generator().manual_seed(config.seed))
+    noisy_charge = charge + fresh_noise(charge, noise, torch.Generator().manual_seed(config.seed))
     network.contact.fit_linear_part(network.inputs(noisy_charge), unit_contact)
 
-    linear_steps = round(LINEAR_TARGET_FRACTION * steps)
-
-    def loss(step: int, random: torch.Generator) -> Tensor:
+    def loss(progress: float, random: torch.Generator) -> Tensor:
         """Return the loss of a random batch with new noise.
 
-        In the first steps, the network learns from linear targets if there are any. Later, or without linear targets,
-        it learns from the answers of the teacher or, without a teacher, from the true contacts. The warm-up has a
-        simpler loss in each case.
-
         Args:
-            step: Number of the step.
+            progress: Fraction of completed steps.
             random: Random number generator of the batch and of its noise.
         """
         rows = torch.randint(len(charge), (batch,), generator=random)
         contact = unit_contact[rows]
-        is_warm_up = step < warm_up_steps
-        if linear_targets is not None and step < linear_steps:
-            return linear_loss(linear_targets.draw(rows, random), contact, is_warm_up=is_warm_up)
+        if linear_targets is not None and progress < LINEAR_TARGET_FRACTION:
+            noisy_batch, target, noise_factor = linear_targets.draw(rows, random)
+            posterior = network.posterior(noisy_batch)
+            # The errors are proportional to the noise. The division by the factor gives the errors that charges with
+            # their usual noise would cause.
+            return contact_loss(posterior, target, (contact - posterior.mean) / noise_factor)
 
-        noisy_batch = with_fresh_noise(charge[rows], noise, random)
-        mean, log_std, angles = network.posterior_with_angles(noisy_batch)
-        if teacher is None:
-            if is_warm_up:
-                return warm_up_loss(mean, log_std, contact)
-            posterior_loss = weighted_likelihood_loss(mean, log_std, contact)
-        else:
-            teacher_mean, teacher_log_std = teacher.posterior(noisy_batch, domain)
-            if is_warm_up:
-                return warm_up_loss(mean, log_std, teacher_mean)
-            posterior_loss = distillation_loss(mean, log_std, teacher_mean, teacher_log_std)
-        return posterior_loss + weighted_correlation_loss(angles, contact - mean, log_std)
+        noisy_batch = charge[rows] + fresh_noise(charge[rows], noise, random)
+        posterior = network.posterior(noisy_batch)
+        target = contact if teacher is None else teacher.unit_contact(noisy_batch, domain)
+        return contact_loss(posterior, target, contact - posterior.mean)
 
-    def linear_loss(linear_batch: TargetBatch, contact: Tensor, *, is_warm_up: bool) -> Tensor:
-        """Return the loss of a batch with linear targets.
-
-        A linear target is the true contact plus the change that the enlarged noise of the charges causes in a linear
-        estimate.
-
-        Args:
-            linear_batch: Charges with enlarged noise, targets, and factors by which the noise was enlarged.
-            contact: True unit coordinates, shape (n, 3).
-            is_warm_up: Whether the step belongs to the warm-up.
-        """
-        mean, log_std, angles = network.posterior_with_angles(linear_batch.charge)
-        if is_warm_up:
-            return warm_up_loss(mean, log_std, linear_batch.target)
-        # The errors are proportional to the noise. The division by the factor gives the errors that charges with their
-        # usual noise would cause, from which the standard deviations and the correlations learn.
-        error = (contact - mean) / linear_batch.noise_factor
-        mean_and_std_loss = linear_target_loss(mean, log_std, linear_batch.target, error)
-        return mean_and_std_loss + weighted_correlation_loss(angles, error, log_std)
-
-    def weighted_correlation_loss(angles: Tensor, error: Tensor, log_std: Tensor) -> Tensor:
-        """Divide errors by their standard deviations, and return the weighted loss of the correlations between them."""
-        return CORRELATION_WEIGHT * robust_correlation_loss(angles, error * torch.exp(-log_std))
-
-    def score() -> tuple[float, str]:
-        """Return the loss on the validation presses, and a text with the errors."""
-        mean, log_std = network.posterior(validation_charge)
-        return validation_score(mean, log_std, validation_target, domain, "presses")
-
-    return TrainingStage(
-        "contact",
-        network.contact,
-        loss,
-        score,
-        steps,
-        warm_up_steps,
-        slow_parameters=(network.contact.skip.weight,),
-        rate_factor=DefaultSizes.for_electrodes(network.n_electrode).rate_factor,
-    )
+    sizes = config.sizes(network.n_electrode)
+    rate = config.learning_rate * sizes.rate_factor
+    return TrainingStage("contact", network.contact, loss, sizes.steps, rate, config.seed)

@@ -59,7 +59,7 @@ COSINES_TO_CORRELATIONS = np.array(
 """Matrix, shape (8, 3), by which the cosines of the eight angles are multiplied to get the correlations.
 
 The correlations are those of x with y, of x with the force, and of y with the force
-(`isocharge.train.training.correlation`).
+(`isocharge.train.training.folding`).
 """
 
 MISFIT_UNIT = 5.0
@@ -171,42 +171,3 @@ class FoldedNetwork:
         bias_change = np.zeros_like(bias)
         bias_change[LOG_STD] = np.log([position_factor, position_factor, force_factor])
         return replace(self, layers=replace(self.layers, last=Layer(weight, bias + bias_change)))
-
-    def with_angles(self, angle_layer: Layer[Array], angle_skip: Array) -> "FoldedNetwork":
-        """Return a network with eight additional answers: angles, from whose cosines the correlations are computed.
-
-        The new answers are inserted between the answers about the contact and the misfit vector.
-
-        Args:
-            angle_layer: Output layer of the angles: weight, shape (n_hidden, 8), and bias, shape (8,).
-            angle_skip: Weights from the input features to the angles, shape (n_electrode, 8).
-        """
-
-        def insert_columns(values: Array, angle_values: Array) -> Array:
-            """Insert the columns of the angles between the columns of the contact and those of the misfit vector."""
-            contact_values, misfit_values = np.split(values, [N_CONTACT_ANSWERS], axis=-1)
-            return np.concatenate([contact_values, angle_values, misfit_values], axis=-1)
-
-        last = self.layers.last
-        new_last = Layer(
-            insert_columns(last.weight, angle_layer.weight),
-            insert_columns(last.bias, angle_layer.bias),
-        )
-        new_skip = insert_columns(self.layers.skip, angle_skip)
-        return replace(self, layers=replace(self.layers, last=new_last, skip=new_skip))
-
-
-def relative_log_std(answers: Array) -> Array:
-    """Compute the logarithms of the standard deviations of x, y and ln F from the answers of a network.
-
-    The standard deviation of ln F is the standard deviation of F divided by F.
-
-    Args:
-        answers: Answers of the network, shape (n, n_answer).
-
-    Returns:
-        Logarithms of the standard deviations, shape (n, 3).
-    """
-    log_std = answers[:, LOG_STD].copy()
-    log_std[:, 2:] -= answers[:, LOG_FORCE]  # the last column belongs to the force
-    return np.asarray(log_std)

@@ -3,6 +3,20 @@
 In a prediction for a single press, the overhead of each node of the graph takes more time than the arithmetic. The
 whitening of the inputs is therefore included in the first layer, and the scaling of the outputs is included in the last
 layer. Two perceptrons with the same inputs become one perceptron. Its later layers have block-diagonal weights.
+
+Correlations
+------------
+
+The contact perceptron estimates three angles a, b and c that determine the correlations between the errors of x, y and
+ln F. Every matrix of correlations between three errors is the Gram matrix of three unit vectors. The vectors (1, 0, 0),
+(cos a, sin a, 0) and (cos b, sin b cos c, sin b sin c) have unit length for all angles, so they always give a valid
+correlation matrix. The vectors are also the rows of the Cholesky factor of this matrix. Products of sines and cosines
+can be written as sums of cosines. The correlations are therefore linear in eight cosines:
+
+    xy = cos a,  xF = cos b,
+    yF = (cos(a - b) + cos(a + b)) / 2 + (cos(a - b - c) + cos(a - b + c) - cos(a + b - c) - cos(a + b + c)) / 4.
+
+In the exported graph, one node computes the cosines, and another node computes their weighted sums.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,6 +35,25 @@ from isocharge.train.training.folded_network import (
     UNIT_LOG_STD_RANGE,
 )
 from isocharge.train.training.perceptron import Layer, Perceptron
+
+N_CONTACT_OUTPUTS = 9
+"""Number of outputs of the contact perceptron: means, logarithms of the standard deviations, and turns."""
+
+TURN = slice(N_CONTACT_ANSWERS, N_CONTACT_OUTPUTS)
+"""Columns of the outputs of the contact perceptron with the turns, which are the angles minus a right angle."""
+
+ANGLES_TO_COSINE_ARGUMENTS = np.array(
+    [
+        [1, 0, 1, 1, 1, 1, 1, 1],  # coefficients of a
+        [0, 1, -1, 1, -1, -1, 1, 1],  # coefficients of b
+        [0, 0, 0, 0, -1, 1, -1, 1],  # coefficients of c
+    ],
+    dtype=float,
+)
+"""Matrix, shape (3, 8), from the angles (a, b, c) to the arguments of the eight cosines.
+
+The arguments are a, b, a - b, a + b, a - b - c, a - b + c, a + b - c and a + b + c.
+"""
 
 LOG_FORCE_STD = slice(LOG_STD.stop - 1, LOG_STD.stop)
 """Column of the answers with the logarithm of the standard deviation of the force."""
@@ -62,53 +95,35 @@ def fold(
     )
 
 
-def transform_inputs(perceptron: Perceptron[Array], transform: Layer[Array]) -> Perceptron[Array]:
-    """Return a perceptron that first transforms its inputs linearly and then evaluates the given perceptron.
-
-    Args:
-        perceptron: The given perceptron.
-        transform: Linear transform of the inputs, x @ weight + bias: weight, shape (n_input, n_input), and bias, shape
-            (n_input,).
-    """
-    first, *other_hidden = perceptron.hidden
-    new_first = Layer(transform.weight @ first.weight, first.bias + transform.bias @ first.weight)
-    last = perceptron.last
-    return replace(
-        perceptron,
-        hidden=(new_first, *other_hidden),
-        last=Layer(last.weight, last.bias + transform.bias @ perceptron.skip),
-        skip=transform.weight @ perceptron.skip,
-    )
-
-
-def linear_answer_map(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer[Array]:
+def linear_answer_map(domain: Domain, n_electrode: int) -> Layer[Array]:
     """Return the linear map from the outputs of the contact perceptron and the misfit perceptron to the answers.
 
     The contact perceptron estimates unit coordinates, which the map converts to (x, y, ln F). The perceptron also
     computes the logarithm of the relative standard deviation of the force. The corresponding answer is the logarithm of
-    the absolute standard deviation of the force in N. The map therefore adds ln F to the logarithm.
+    the absolute standard deviation of the force in N. The map therefore adds ln F to the logarithm. The map also
+    converts the angles a, b and c to the eight angles whose cosines give the correlations.
 
     Args:
         domain: Domain that defines the centre and the scale of the unit coordinates.
-        rotation: Matrix T, shape (3, 3). If the contact perceptron computes the means u, the unit coordinates are
-            T u + o.
-        offset: Vector o, shape (3,).
         n_electrode: Number of electrodes, which is also the number of entries of the misfit vector.
     """
-    # The identity matrix leaves the logarithms of the standard deviations and the misfit vector unchanged.
-    n_answer = N_CONTACT_ANSWERS + n_electrode
-    weight = np.eye(n_answer)
-    bias = np.zeros(n_answer)
+    # The identity matrices leave the logarithms of the standard deviations and the misfit vector unchanged.
+    weight = np.asarray(block_diag(np.eye(N_CONTACT_ANSWERS), ANGLES_TO_COSINE_ARGUMENTS, np.eye(n_electrode)))
+    bias = np.zeros(weight.shape[1])
 
-    # Means: (T u + o) * scale + centre. Layers multiply row vectors by the weight, so the matrix T is transposed.
-    weight[MEAN, MEAN] = rotation.T * domain.scale
-    bias[MEAN] = offset * domain.scale + domain.centre
+    # Means: u * scale + centre.
+    weight[MEAN, MEAN] *= domain.scale
+    bias[MEAN] = domain.centre
 
     # Logarithms of the standard deviations: add ln(scale). For the force, also add ln F, and therefore copy the weights
     # and the bias with which the map computes ln F from the means.
     bias[LOG_STD] = np.log(domain.scale)
     weight[MEAN, LOG_FORCE_STD] = weight[MEAN, LOG_FORCE]
     bias[LOG_FORCE_STD] += bias[LOG_FORCE]
+
+    # The perceptron computes the angles minus a right angle.
+    n_angle = ANGLES_TO_COSINE_ARGUMENTS.shape[1]
+    bias[N_CONTACT_ANSWERS : N_CONTACT_ANSWERS + n_angle] = 0.5 * np.pi * ANGLES_TO_COSINE_ARGUMENTS.sum(axis=0)
     return Layer(weight, bias)
 
 

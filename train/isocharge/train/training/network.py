@@ -15,6 +15,7 @@ several thousand, so it is compressed by the function asinh.
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,10 +31,9 @@ from isocharge.train.training.folded_network import (
     LOG_STD,
     MEAN,
     MISFIT_UNIT,
-    N_CONTACT_ANSWERS,
     FoldedNetwork,
 )
-from isocharge.train.training.folding import fold, linear_answer_map, log_std_limits
+from isocharge.train.training.folding import N_CONTACT_OUTPUTS, TURN, fold, linear_answer_map, log_std_limits
 from isocharge.train.training.perceptron import Layer, Perceptron
 from isocharge.train.training.torch_evaluation import evaluate, evaluate_features
 
@@ -46,14 +46,8 @@ FIRST_LAYER_SLOPES = (0.5, 3.5)
 The inputs of the layer have unit variance.
 """
 
-N_TRAINING_ANGLES = 3
-"""Number of outputs of the contact perceptron for angles of correlations, which a released model does not contain."""
-
-TRAINING_ANGLES = slice(N_CONTACT_ANSWERS, N_CONTACT_ANSWERS + N_TRAINING_ANGLES)
-"""Columns of the outputs of the contact perceptron that contain the angles of the correlations minus a right angle."""
-
-FORCE_OUTPUTS = [LOG_FORCE.start, LOG_STD.stop - 1]
-"""Outputs of the contact perceptron for ln F and for the logarithm of its standard deviation."""
+FORCE_OUTPUTS = [LOG_FORCE.start, LOG_STD.stop - 1, TURN.start + 1, TURN.start + 2]
+"""Outputs of the contact perceptron for ln F, for the logarithm of its standard deviation and for its correlations."""
 
 INITIAL_NONLINEAR_SIZE = 0.2
 """Factor by which the initial weights of an output are multiplied after its linear part was fitted."""
@@ -63,6 +57,20 @@ MIN_LENGTH = 1e-9
 
 MIN_SCALE = 1e-30
 """Smallest scale by which the rounding divides, so that no division by zero occurs."""
+
+
+class Posterior(NamedTuple):
+    """Normal distributions of the unit coordinates of n contacts, as the contact perceptron estimates them.
+
+    Attributes:
+        mean: Means, shape (n, 3).
+        log_std: Logarithms of the standard deviations, shape (n, 3).
+        turn: Angles of the correlations minus a right angle, shape (n, 3), rad. Three zeros mean no correlations.
+    """
+
+    mean: Tensor
+    log_std: Tensor
+    turn: Tensor
 
 
 class TrainablePerceptron(nn.Module):
@@ -211,14 +219,14 @@ class InverseNetwork(nn.Module):
         self.features = features
         n_electrode = self.n_electrode
         activation = ACTIVATIONS[config.activation]
-        n_output = N_CONTACT_ANSWERS + N_TRAINING_ANGLES
-        self.contact = TrainablePerceptron(n_electrode, config.contact_widths(n_electrode), n_output, activation)
+        widths = config.contact_widths(n_electrode)
+        self.contact = TrainablePerceptron(n_electrode, widths, N_CONTACT_OUTPUTS, activation)
         self.contact.sharpen_first_layer()
         self.misfit_vector = TrainablePerceptron(
             n_electrode, config.misfit_widths(n_electrode), n_electrode, activation
         )
-        self.output_factor = nn.Buffer(torch.ones(n_output))
-        self.output_offset = nn.Buffer(torch.zeros(n_output))
+        self.output_factor = nn.Buffer(torch.ones(N_CONTACT_OUTPUTS))
+        self.output_offset = nn.Buffer(torch.zeros(N_CONTACT_OUTPUTS))
         if force_std is not None:
             self.output_factor[FORCE_OUTPUTS] = 0.0
             self.output_offset[LOG_STD.stop - 1] = np.log(force_std / domain.scale[2])
@@ -244,35 +252,11 @@ class InverseNetwork(nn.Module):
         features = evaluate_features(self.features.charge_features, charge)
         return (features - self.features_mean) @ self.whitening
 
-    def posterior(self, charge: Tensor) -> tuple[Tensor, Tensor]:
-        """Estimate the means of the unit coordinates and the logarithms of their standard deviations.
-
-        Args:
-            charge: Charges, shape (n, n_electrode), pC.
-
-        Returns:
-            Means and logarithms of the standard deviations, each of shape (n, 3).
-        """
-        mean, log_std, _ = self.posterior_with_angles(charge)
-        return mean, log_std
-
-    def posterior_with_angles(self, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Estimate the unit coordinates, their standard deviations, and the angles that determine their correlations.
-
-        The module `isocharge.train.training.correlation` explains the angles. The angles are trained together with the
-        network, so that the hidden layers contain information about the correlations. A released model has other
-        angles, which are fitted to the hidden layers after the training.
-
-        Args:
-            charge: Charges, shape (n, n_electrode), pC.
-
-        Returns:
-            Means of the unit coordinates, logarithms of their standard deviations, and angles minus a right angle, each
-            of shape (n, 3).
-        """
+    def posterior(self, charge: Tensor) -> Posterior:
+        """Estimate the contacts of n presses from their charges, shape (n, n_electrode), pC."""
         outputs = self.contact(self.inputs(charge)) * self.output_factor + self.output_offset
         mean = outputs[:, MEAN]
-        return mean, limit_log_std(outputs[:, LOG_STD], mean, self.domain), outputs[:, TRAINING_ANGLES]
+        return Posterior(mean, limit_log_std(outputs[:, LOG_STD], mean, self.domain), outputs[:, TURN])
 
     def forward(self, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Estimate contacts.
@@ -285,7 +269,7 @@ class InverseNetwork(nn.Module):
             shape (n, 1).
         """
         # Convert the unit coordinates to (x, y, ln F).
-        unit_mean, unit_log_std = self.posterior(charge)
+        unit_mean, unit_log_std, _ = self.posterior(charge)
         log_contact = unit_mean * self.scale + self.centre
         log_contact_std = torch.exp(unit_log_std) * self.scale
 
@@ -349,26 +333,17 @@ def perceptron_to_numpy(perceptron: Perceptron[Tensor]) -> Perceptron[Array]:
 
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
-    """Fold both perceptrons of a trained network into one perceptron."""
+    """Fold both perceptrons of a trained network into one perceptron. A constant force is part of its last layer."""
     charge_features = network.features.charge_features
-    # The contact perceptron estimates the unit coordinates directly, so they are neither rotated nor shifted.
-    answer_map = linear_answer_map(network.domain, np.eye(3), np.zeros(3), charge_features.n_electrode)
-    perceptrons = [_contact_to_numpy(network), network.misfit_vector.to_numpy()]
+    contact = network.contact.to_numpy()
+    factor = _to_numpy(network.output_factor)
+    offset = _to_numpy(network.output_offset)
+    weight, bias = contact.last
+    contact = replace(contact, last=Layer(weight * factor, bias * factor + offset), skip=contact.skip * factor)
+    perceptrons = [contact, network.misfit_vector.to_numpy()]
+    answer_map = linear_answer_map(network.domain, charge_features.n_electrode)
     layers = fold(perceptrons, _to_numpy(network.features_mean), _to_numpy(network.whitening), answer_map)
     return FoldedNetwork(charge_features, layers, log_std_limits(network.domain))
-
-
-def _contact_to_numpy(network: InverseNetwork) -> Perceptron[Array]:
-    """Return the contact perceptron as NumPy arrays, without its outputs for the angles of the correlations.
-
-    A constant force is included in the last layer.
-    """
-    perceptron = network.contact.to_numpy()
-    factor = _to_numpy(network.output_factor)[:N_CONTACT_ANSWERS]
-    offset = _to_numpy(network.output_offset)[:N_CONTACT_ANSWERS]
-    weight, bias = perceptron.last
-    last = Layer(weight[:, :N_CONTACT_ANSWERS] * factor, bias[:N_CONTACT_ANSWERS] * factor + offset)
-    return replace(perceptron, last=last, skip=perceptron.skip[:, :N_CONTACT_ANSWERS] * factor)
 
 
 def _to_numpy(tensor: Tensor) -> Array:

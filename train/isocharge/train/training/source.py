@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 
-import numpy as np
 from torch import Tensor
 
 from isocharge.common.arrays import Array
@@ -21,22 +20,20 @@ class Teacher:
     """A model from which a smaller network learns (knowledge distillation, Hinton et al., 2015).
 
     For given noisy charges, the true contact is only one sample from the posterior distribution of the contact. A good
-    model estimates this distribution without the scatter of single samples. A small network therefore learns faster
-    from the answers of such a model than from the true contacts.
+    model estimates the mean of this distribution without the scatter of single samples. A small network therefore
+    learns faster from the answers of such a model than from the true contacts.
 
     Attributes:
         label: Name and version of the model.
-        sha256: Checksum of the model file.
         answer: Function that estimates contacts from charges, shape (n, n_electrode), pC. It returns the contacts,
-            shape (n, 3), mm and N, and their standard deviations, shape (n, 3).
+            shape (n, 3), mm and N.
     """
 
     label: str
-    sha256: str
-    answer: Callable[[Array], tuple[Array, Array]]
+    answer: Callable[[Array], Array]
 
-    def posterior(self, charge: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
-        """Compute the model's estimates of the unit coordinates and the logarithms of their standard deviations.
+    def unit_contact(self, charge: Tensor, domain: Domain) -> Tensor:
+        """Compute the model's estimates of the unit coordinates.
 
         The unit coordinates are x, y and ln F after a shift and a scaling, so that each of them ranges from -1 to 1 in
         the domain.
@@ -46,12 +43,9 @@ class Teacher:
             domain: Domain that defines the centre and the scale of the unit coordinates.
 
         Returns:
-            Estimated unit coordinates and logarithms of their standard deviations, each of shape (n, 3).
+            Estimated unit coordinates, shape (n, 3).
         """
-        contact, std = self.answer(charge.double().numpy())
-        log_force_std = std[:, 2] / contact[:, 2]  # the standard deviation of ln F, because d ln F = dF / F
-        unit_std = np.column_stack([std[:, :2], log_force_std]) / domain.scale
-        return as_tensor(domain.to_unit(contact)), as_tensor(np.log(unit_std))
+        return as_tensor(domain.to_unit(self.answer(charge.double().numpy())))
 
 
 @dataclass(frozen=True, kw_only=True)
