@@ -1,5 +1,6 @@
 """Headless Chromium for the tests and benchmarks of pages."""
 
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,7 +8,7 @@ from typing import Any
 
 import pytest
 
-EXECUTABLE = "/usr/bin/chromium"
+EXECUTABLE = os.environ.get("CHROMIUM", "/usr/bin/chromium")
 
 ARGUMENTS = (
     *("--no-sandbox", "--no-first-run", "--disable-quic", "--disable-sync", "--disable-background-networking"),
@@ -20,13 +21,15 @@ ARGUMENTS = (
 def start_chromium(*arguments: str) -> Iterator[Any]:
     """Run Chromium while the block runs. A test is skipped if Chromium or Playwright is not installed.
 
+    If the environment variable `CHROMIUM` contains its path, as in `make browser`, the test is not skipped.
+
     Args:
         arguments: Further arguments of the command line.
 
     Yields:
         The browser as an object of Playwright.
     """
-    if shutil.which(EXECUTABLE) is None:
+    if "CHROMIUM" not in os.environ and shutil.which(EXECUTABLE) is None:
         pytest.skip(f"needs {EXECUTABLE} (apt-get install chromium)")
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as started:
