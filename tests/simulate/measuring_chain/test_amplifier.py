@@ -143,7 +143,7 @@ def test_amplifier_file_changes_the_given_values(tmp_path):
         ("white_pC = inf", "white_pC: expected a number from 0, got inf"),
         ("hum_pC = nan", "hum_pC: expected a number from 0, got nan"),
         ("hum_pC = true", "hum_pC: expected a number from 0, got True"),
-        ('like = "kitchen"', "like: expected one of clean, reference, bench, surgery, got 'kitchen'"),
+        ('like = "kitchen"', "like: expected one of clean, reference, measured, bench, surgery, got 'kitchen'"),
         ("tau_s", "not a TOML file"),
     ],
 )
@@ -164,7 +164,7 @@ def test_infinite_tau_and_limit_mean_no_leak_and_no_limit(tmp_path):
 
 def test_unknown_noise_level_raises_input_error():
     with pytest.raises(
-        InputError, match=r"expected one of clean, reference, bench, surgery, or a TOML file, got 'lab'"
+        InputError, match=r"expected one of clean, reference, measured, bench, surgery, or a TOML file, got 'lab'"
     ):
         load_amplifier("lab")
 

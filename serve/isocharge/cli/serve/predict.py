@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.options import ModelArgument, ModelsOption
+from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.terminal import say, until_stopped
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
 from isocharge.common.files import bounded_lines
-from isocharge.serve import Predictor, read_charges, table_records, write_contacts
+from isocharge.serve import Predictor, load_device, read_charges, table_records, write_contacts
+from isocharge.serve.live.contact_stages import NoiseRule
 from isocharge.serve.prediction.table import blocks, read_charge_file
 
 
@@ -29,16 +30,21 @@ def predict_command(
     json: Annotated[
         bool, typer.Option("--json", help="Print one prediction record per line as JSON. (default: CSV)")
     ] = False,
+    device: DeviceOption = None,
     models: ModelsOption = None,
 ) -> None:
     """Compute positions (mm) and forces (N) with their standard deviations from the charges of presses (pC).
 
     The column `flags` states why a contact may be wrong. For example, the contact may be outside the working area or
-    the range of forces, or the charges may fit no single contact.
+    the range of forces, or the charges may fit no single contact. Of the device file, only the section [noise] is used:
+    the standard deviations are those for this noise.
 
     Example: isocharge serve predict three-25um-biaxial presses.csv > contacts.csv
     """
     predictor = Predictor(model, models=models)
+    noise = load_device(device).rule(NoiseRule)
+    if noise is not None:
+        predictor = predictor.with_noise(noise.white_pC, noise.gain)
     charge_pC = _read_charges(file, predictor.metadata.electrodes)
     with until_stopped():
         if json:

@@ -72,7 +72,7 @@ def virtual_command(
         ),
     ] = 0.0,
     noise: Annotated[
-        str, typer.Option("--noise", help="Amplifier: clean, reference, bench, surgery, or a TOML file.")
+        str, typer.Option("--noise", help="Amplifier: clean, reference, measured, bench, surgery, or a TOML file.")
     ] = "reference",
     probe: ProbeOption = "circle:1.0",
     film: Annotated[

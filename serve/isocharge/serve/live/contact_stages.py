@@ -10,7 +10,7 @@ from isocharge.serve.flags import FILM
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.contact import Contact, Sensitivity
 from isocharge.serve.signal_chain.memory import MemoryRule
-from isocharge.serve.signal_chain.rule import Rule, Setting
+from isocharge.serve.signal_chain.rule import Rule, Setting, Share
 from isocharge.serve.signal_chain.stage import Setup, Stage
 from isocharge.serve.signal_chain.thermal import warming_ratios
 from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule
@@ -22,9 +22,25 @@ The exponent has this value for a film without pretension, and is smaller for a 
 """
 
 
-class Prediction(Stage):
-    """Predicts the contact of each frame with the present model."""
+class NoiseRule(Rule, frozen=True, kw_only=True):
+    """Noise of the charges of a bench, from the section `[noise]` of a device file.
 
+    The variance of the noise of a charge q is `white_pC`^2 + (`gain` q)^2.
+
+    Attributes:
+        white_pC: Standard deviation of the part that does not depend on the charge, pC.
+        gain: Standard deviation of the part that is proportional to the charge, relative to the charge.
+    """
+
+    white_pC: Setting = 1.0
+    gain: Share
+
+
+class Prediction(Stage):
+    """Predicts the contact of each frame with the present model, for the noise that the device file states."""
+
+    section = "noise"
+    rule_class = NoiseRule
     is_required = True
     needs_model = True
     needs_contact = True
@@ -32,6 +48,9 @@ class Prediction(Stage):
     def __init__(self, setup: Setup) -> None:
         """Store the limits within which contacts are valid, which are those of the calibrated film."""
         self._setup = setup
+        noise = setup.rule(NoiseRule)
+        if noise is not None:
+            setup.predictor = setup.model.with_noise(noise.white_pC, noise.gain)
         self._validity = setup.model.validity
 
     def step(self, frame: Frame) -> None:

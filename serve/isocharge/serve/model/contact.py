@@ -213,6 +213,24 @@ class Contacts(NamedTuple):
         """
         return np.stack(tuple(self), axis=1).astype(dtype or np.float32, copy=False)
 
+    def with_covariance(self, covariance: Array) -> "Contacts":
+        """Return the contacts with the covariance of an additional independent error.
+
+        Correlations that are NaN remain NaN.
+
+        Args:
+            covariance: Covariance of the additional error of x, y and the force, shape (n, 3, 3), mm and N.
+        """
+        std = np.stack([self.x_std_mm, self.y_std_mm, self.force_std_N], axis=1).astype(float)
+        total_std = np.sqrt(std**2 + np.diagonal(covariance, axis1=1, axis2=2))
+        correlations = {"xy_correlation": (0, 1), "xF_correlation": (0, 2), "yF_correlation": (1, 2)}
+        total_correlations: dict[str, Singles] = {}
+        for name, (i, j) in correlations.items():
+            total = getattr(self, name) * std[:, i] * std[:, j] + covariance[:, i, j]
+            total_correlations[name] = (total / (total_std[:, i] * total_std[:, j])).astype(np.float32)
+        x_std_mm, y_std_mm, force_std_N = total_std.T.astype(np.float32)
+        return self._replace(x_std_mm=x_std_mm, y_std_mm=y_std_mm, force_std_N=force_std_N, **total_correlations)
+
 
 MISFIT_LIMIT = 5.0
 """Smallest limit of the misfit, in standard deviations of the noise.

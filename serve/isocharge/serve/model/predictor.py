@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError, ModelError
 from isocharge.serve.model.contact import Contact, Contacts, Validity
+from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.model_folder import Model, find_model, load_model
 from isocharge.serve.model.session import (
     N_WITHOUT_CORRELATION,
@@ -81,6 +82,7 @@ class Predictor:
         self._max_distance_squared_mm2, self._max_force_N = self.validity.implausible_limits
         self._has_warned = False
         self._constants: Mapping[str, Singles] = {}
+        self._stated_noise: ModelNoise | None = None
         _check_bound_memory(self._press, loaded)
 
     def with_constants(self, constants: Mapping[str, Singles]) -> "Predictor":
@@ -102,9 +104,26 @@ class Predictor:
         new_predictor._press_lock = threading.Lock()
         return new_predictor
 
+    def with_noise(self, white_pC: float, gain: float) -> "Predictor":
+        """Return a predictor of the same model whose standard deviations are those for another noise of the charges.
+
+        The contacts are the same. The covariance of a contact is increased by the covariance that the additional noise
+        of the charges causes, which is computed from predictions with changed charges. If the noise is smaller than the
+        noise of the training, the standard deviations do not change. The misfit is in units of the larger noise.
+        `predict_into` ignores the noise.
+
+        Args:
+            white_pC: Standard deviation of the part of the noise that does not depend on the charge, pC.
+            gain: Standard deviation of the part that is proportional to the charge, relative to the charge.
+        """
+        new_predictor = object.__new__(type(self))
+        new_predictor.__dict__.update(self.__dict__)
+        new_predictor._stated_noise = ModelNoise(name="stated", white_pC=white_pC, gain=gain)
+        return new_predictor
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how `copy` and `pickle` create the predictor again, because the onnxruntime session has no copy."""
-        return _load_again, (type(self), self.folder.resolve(), dict(self._constants))
+        return _load_again, (type(self), self.folder.resolve(), dict(self._constants), self._stated_noise)
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
         """Compute the contact of one press. Call `flags` to find out whether the contact is valid.
@@ -127,6 +146,9 @@ class Predictor:
                 press.write(*as_press(charge_pC, self.metadata.electrodes))
             press.run()
             contact = Contact(*press.read())
+        if self._stated_noise is not None:
+            contacts = self._with_stated_noise(self._stated_noise, as_batch([values], self.metadata.electrodes))
+            contact = Contact(*np.asarray(contacts, float)[0].tolist())
 
         # These lines repeat `Validity.is_beyond`, because a call would slow down the prediction.
         x_from_centre_mm = contact.x_mm - self._centre_x_mm
@@ -190,9 +212,44 @@ class Predictor:
         Raises:
             ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
         """
+        charges = as_batch(charge_pC, self.metadata.electrodes)
+        if self._stated_noise is not None:
+            return self._with_stated_noise(self._stated_noise, charges)
+        return self._predict(charges)
+
+    def _with_stated_noise(self, noise: ModelNoise, charge_pC: Singles) -> Contacts:
+        """Compute the contacts of n presses, with the covariance for another noise of the charges.
+
+        Each charge is raised and lowered by the standard deviation of its additional noise. Half of the difference
+        between the two contacts is the effect of the additional noise of this charge (central difference).
+
+        Args:
+            noise: Noise of the charges.
+            charge_pC: Touch charges, shape (n, electrodes), pC.
+        """
+        contacts = self._predict(charge_pC)
+        model_variance = self.metadata.noise.variance(charge_pC.astype(float))
+        extra_variance = np.maximum(noise.variance(charge_pC.astype(float)) - model_variance, 0.0)
+        effects = []  # changes of x, mm, y, mm, and the force, N, each of shape (n, 3)
+        for column, extra_std in enumerate(np.sqrt(extra_variance).T):
+            step = np.zeros_like(charge_pC)
+            step[:, column] = extra_std
+            raised, lowered = (np.asarray(self._predict(charge_pC + sign * step), float)[:, :3] for sign in (1, -1))
+            effects.append(0.5 * (raised - lowered))
+        covariance = np.einsum("kni,knj->nij", effects, effects)
+        relative_extra = extra_variance / np.maximum(model_variance, np.finfo(float).tiny)  # a model may have no noise
+        noise_ratio = np.sqrt(1.0 + relative_extra.mean(axis=1))
+        misfit = (contacts.misfit / noise_ratio).astype(np.float32)
+        return contacts.with_covariance(covariance)._replace(misfit=misfit)
+
+    def _predict(self, charges: Singles) -> Contacts:
+        """Compute the contacts of n presses, with the standard deviations for the noise of the training.
+
+        Args:
+            charges: Touch charges, shape (n, electrodes), pC.
+        """
         # For each output of the graph, the columns in the table below that this output fills
         columns_by_output = self._press.columns
-        charges = as_batch(charge_pC, self.metadata.electrodes)
         outputs = run(self._session, charges, tuple(columns_by_output))
 
         # Table with one row for each press and one column for each attribute of `Contact`. The columns of the
@@ -236,14 +293,19 @@ class Predictor:
         )
 
 
-def _load_again(predictor_class: type[Predictor], folder: Path, constants: Mapping[str, Singles]) -> Predictor:
-    """Load a predictor from its folder, with the constants of `with_constants` if there are any.
+def _load_again(
+    predictor_class: type[Predictor], folder: Path, constants: Mapping[str, Singles], noise: ModelNoise | None
+) -> Predictor:
+    """Load a predictor from its folder, with the constants of `with_constants` and the noise of `with_noise`.
 
     Raises:
         ModelError: If the model is no longer in the folder, or is damaged.
     """
     predictor = predictor_class(folder)
-    return predictor.with_constants(constants) if constants else predictor
+    if constants:
+        predictor = predictor.with_constants(constants)
+    predictor._stated_noise = noise
+    return predictor
 
 
 def _describe(value: object) -> str:

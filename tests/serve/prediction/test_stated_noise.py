@@ -1,0 +1,84 @@
+"""Standard deviations of released models for a stated noise, against closed formulas and against simulated presses."""
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from isocharge.cli.main import app
+from isocharge.serve import Frame, Predictor, device_from_table
+from isocharge.serve.live.device import create_stages
+from isocharge.simulate import Circle, ForwardMap, NoiseModel, load_sensor
+
+NAME = "four-25um-biaxial"
+
+
+@pytest.fixture(scope="module")
+def released():
+    return Predictor(NAME)
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    """Contacts (x, y, F), shape (n, 3), in the working area, and their charges, pC, from the finite-element solver."""
+    rng = np.random.default_rng(3)
+    radius, angle = 8.0 * np.sqrt(rng.random(1500)), rng.uniform(0.0, 2.0 * np.pi, 1500)
+    force = np.exp(rng.uniform(np.log(0.1), np.log(2.0), 1500))
+    contact = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force])
+    forward_map = ForwardMap.build(load_sensor(NAME), Circle(1.0), force_range=(0.05, 2.0))
+    return contact, forward_map.charges(contact)
+
+
+@pytest.mark.parametrize("gain", [0.002, 0.007, 0.015, 0.03])
+def test_intervals_for_a_stated_noise_hold_as_often_as_they_state(released, pressed, gain):
+    contact, charge_pC = pressed
+    noisy_pC = NoiseModel("bench", 1.0, gain).add(charge_pC, np.random.default_rng(1))
+    contacts = np.asarray(released.with_noise(1.0, gain).predict_batch(noisy_pC), float)
+    error = np.abs(contacts[:, :3] - contact) / contacts[:, 3:6]
+    assert 0.65 < np.mean(error < 1.0) < 0.71
+    assert 0.93 < np.mean(error < 1.96) < 0.97
+    assert np.mean(contacts[:, 6] > 5.0) < 0.01  # few misfits
+
+
+def test_covariance_for_a_stated_noise_is_that_of_the_linearised_problem(released):
+    """The Jacobian J comes from small changes of the charges: the added covariance is J diag(s'^2 - s^2) J^T."""
+    charge_pC = np.array([1200.0, 800.0, 700.0, 900.0])
+    plain = np.asarray(released.predict_batch([charge_pC]), float)[0]
+    stated = np.asarray(released.with_noise(2.0, 0.005).predict_batch([charge_pC]), float)[0]
+    steps = 2.0 * np.eye(4)
+    difference = np.asarray(released.predict_batch(charge_pC + steps), float)[:, :3]
+    difference = difference - np.asarray(released.predict_batch(charge_pC - steps), float)[:, :3]
+    jacobian = difference.T / 4.0
+    extra = 4.0 - 1.0 + (0.005**2 - 0.002**2) * charge_pC**2
+    added = jacobian @ np.diag(extra) @ jacobian.T
+    x, y, force = stated[3:6]
+    np.testing.assert_allclose(stated[3:6] ** 2 - plain[3:6] ** 2, np.diag(added), rtol=0.02)
+    covariance = stated[7:] * [x * y, x * force, y * force] - plain[7:] * plain[[3, 3, 4]] * plain[[4, 5, 5]]
+    np.testing.assert_allclose(covariance, added[[0, 0, 1], [1, 2, 2]], rtol=0.02, atol=1e-7)
+    np.testing.assert_array_equal(stated[:3], plain[:3])
+
+
+def test_smaller_noise_than_in_the_training_changes_nothing(released):
+    charge_pC = [1200.0, 800.0, 700.0, 900.0]
+    assert released.with_noise(0.5, 0.001).predict(charge_pC) == pytest.approx(released.predict(charge_pC), rel=1e-6)
+
+
+def test_device_file_with_noise_widens_the_contacts_of_a_stream_and_of_predict(released, tmp_path):
+    charge_pC = np.array([1200.0, 800.0, 700.0, 900.0])
+    device = device_from_table({"noise": {"gain": 0.015}}, "b")
+    setup = device.setup(released.metadata.electrodes, predictor=released)
+    (prediction,) = create_stages(setup, needs_contact=True)
+    frame = Frame(None, None, (), charge_pC=charge_pC, is_contact=True)
+    prediction.step(frame)
+    expected = released.with_noise(1.0, 0.015).predict(charge_pC)
+    assert frame.contact == expected
+    assert expected.x_std_mm > 4.0 * released.predict(charge_pC).x_std_mm
+    assert pickle.loads(pickle.dumps(setup.predictor)).predict(charge_pC) == expected
+
+    presses, board = tmp_path / "presses.csv", tmp_path / "board.toml"
+    presses.write_text("A,B,C,D\n1200,800,700,900\n")
+    board.write_text("[noise]\ngain = 0.015\n")
+    result = CliRunner().invoke(app, ["serve", "predict", NAME, str(presses), "--json", "--device", str(board)])
+    assert json.loads(result.stdout)["x_std_mm"] == pytest.approx(expected.x_std_mm, rel=1e-5)
