@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from isocharge.simulate import ChargeSpline, Circle, Domain, ForwardMap, Sweep, load_sensor, noise_model, parse_probe
-from isocharge.simulate.identifiability.nearest_contact import nearest_contact
+from isocharge.simulate.identifiability.nearest_contact import explain
 
 sensor = load_sensor("four-25um-uniaxial")
 noise = noise_model("reference")
@@ -24,7 +24,8 @@ contact = Sweep(domain.radius, (force, force), samples=1000).contacts()
 figure, (differences, errors) = plt.subplots(1, 2, figsize=(11.0, 4.4), layout="constrained")
 for notation in ("circle:0.5", "circle:2.0", "triangle:4.0"):
     charge = ForwardMap.build(sensor, parse_probe(notation), domain.radius, domain.force_range).charges(contact)
-    explaining, sigmas = nearest_contact(circle, noise, charge, contact)
+    explaining, residual = explain(circle, charge, noise.sigma(charge), contact)
+    sigmas = np.linalg.norm(residual, axis=1)
     error = np.hypot(*(explaining - contact)[:, :2].T)
     print(
         f"{notation}: {100 * np.mean(sigmas > 3.0):.0f} % of the presses are distinguished; median position error "

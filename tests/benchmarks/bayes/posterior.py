@@ -22,6 +22,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from bayes.force_profile import ForceProfile
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import ChargeError, InputError
@@ -30,7 +31,6 @@ from isocharge.simulate import ChargeSpline, NoiseModel
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import check_radius
 from isocharge.simulate.identifiability.folds import singular_values
-from isocharge.simulate.identifiability.force_profile import ForceProfile
 from isocharge.simulate.numerics.disk import onto_disk
 
 CHUNK = 64

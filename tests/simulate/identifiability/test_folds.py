@@ -27,7 +27,7 @@ from isocharge.simulate.identifiability.folds import (
     has_reversed_orientation,
     scaled_derivatives,
 )
-from isocharge.simulate.identifiability.nearest_contact import nearest_contact
+from isocharge.simulate.identifiability.nearest_contact import explain
 from isocharge.simulate.numerics.disk import Rings
 from kept import kept
 
@@ -222,9 +222,10 @@ def test_nearest_contact_finds_the_true_contact(force, forces):
     charge_map = folded_map(0.3, forces=forces)
     truth = np.array([[1.0, -2.0, force], [-3.0, 1.0, force]])
     start = np.array([[0.0, 0.0, np.sqrt(np.prod(forces))]] * 2)
-    contact, distance = nearest_contact(charge_map, REFERENCE, charge_map.charges(truth), start)
+    charge = charge_map.charges(truth)
+    contact, residual = explain(charge_map, charge, REFERENCE.sigma(charge), start)
     np.testing.assert_allclose(contact, truth, rtol=1e-4)
-    assert distance == pytest.approx(0.0, abs=0.01)
+    np.testing.assert_allclose(residual, 0.0, atol=0.01)
 
 
 def test_fold_line_bounds_the_working_area():

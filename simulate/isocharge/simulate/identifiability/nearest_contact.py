@@ -5,19 +5,13 @@ charge. The distance between Q and Q(c) is the norm |(Q - Q(c)) / sigma|. The di
 a domain.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
-from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import INNER_RADIUS
-from isocharge.simulate.numerics.disk_least_squares import MAX_STEPS, MIN_CHANGE, minimise
-
-STEPS = 8
-"""Largest number of steps of a descent from a starting point near the solution. Most descents need five steps."""
+from isocharge.simulate.numerics.disk_least_squares import MIN_CHANGE, minimise
 
 CANDIDATES = 4096
 """Number of contacts among which the starting points of a search are chosen.
@@ -35,40 +29,13 @@ CHUNK = 2048
 """Number of rows of charges that are compared with all candidates at once, which limits the required memory."""
 
 
-def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, start: Array) -> tuple[Array, Array]:
-    """Find the contacts whose charges are nearest to given charges. The starting points must be near the solution.
-
-    A least-squares descent leads from each starting point to a contact.
-
-    Args:
-        charge_map: Map that computes the charges of contacts.
-        noise: Noise of the readings.
-        charge: Given charges, shape (n, n_electrode), pC.
-        start: Contacts (x, y, F) from which the descents start, shape (n, 3), mm and N.
-
-    Returns:
-        Contacts (x, y, F) within the domain of the map, shape (n, 3), mm and N. Distances of their charges from the
-        given charges, shape (n,), in standard deviations of the noise.
-    """
-
-    def predicted_sigma(_: Integers, predicted: Array) -> Array:
-        """Return the standard deviation of the noise of each predicted charge, shape (k, n_electrode), pC.
-
-        It does not depend on the indices of the rows, which are the first argument.
-        """
-        return noise.sigma(predicted)
-
-    contact, residual = _descend(charge_map, charge, predicted_sigma, start, STEPS)
-    return contact, np.linalg.norm(residual, axis=1)
-
-
 def explain(
     charge_map: ChargeMap, charge: Array, sigma: Array, start: Array, *, min_change: float = MIN_CHANGE
 ) -> tuple[Array, Array]:
     """Find the contacts whose charges are nearest to given charges. The starting points may be anywhere.
 
-    A least-squares descent leads from each starting point to a contact. In contrast to `nearest_contact`, the standard
-    deviations of the charges are given.
+    A least-squares descent leads from each starting point to a local minimum of the distance. The unknowns are x, y and
+    ln F in unit coordinates. In these coordinates, the domain is the unit disk times the interval [-1, 1].
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -82,38 +49,6 @@ def explain(
         minus the charges of the contacts, divided by `sigma`, shape (n, n_electrode), dimensionless.
     """
 
-    def given_sigma(rows: Integers, _: Array) -> Array:
-        """Return the given standard deviations for k selected rows of charges, shape (k, n_electrode), pC."""
-        return np.asarray(sigma[rows])
-
-    return _descend(charge_map, charge, given_sigma, start, MAX_STEPS, min_change)
-
-
-def _descend(
-    charge_map: ChargeMap,
-    charge: Array,
-    compute_sigma: Callable[[Integers, Array], Array],
-    start: Array,
-    max_steps: int,
-    min_change: float = MIN_CHANGE,
-) -> tuple[Array, Array]:
-    """Minimise the distance |(Q - Q(c)) / sigma| between given charges Q and the charges Q(c) of contacts c.
-
-    For each row of charges, a least-squares descent leads from a starting point to a local minimum. The unknowns are
-    x, y and ln F in unit coordinates. In these coordinates, the domain is the unit disk times the interval [-1, 1].
-
-    Args:
-        charge_map: Map that computes the charges of contacts.
-        charge: Given charges, shape (n, n_electrode), pC.
-        compute_sigma: Function that computes standard deviations, shape (k, n_electrode), pC. Its arguments are the
-            indices of k rows of the given charges, and the predicted charges for these rows.
-        start: Contacts (x, y, F) from which the descents start, shape (n, 3), mm and N.
-        max_steps: Largest number of steps of a descent.
-        min_change: A descent ends if the squared distance changes by less than `min_change` times 1 + its value.
-
-    Returns:
-        Contacts (x, y, F), shape (n, 3), mm and N. Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
-    """
     # Compute the centre and the half width of the domain along x, y and ln F. Unit coordinates are relative to them.
     radius = INNER_RADIUS * charge_map.domain.radius
     force_range = charge_map.domain.force_range
@@ -142,14 +77,13 @@ def _descend(
         """
         # The slopes are the derivatives of the charges with respect to x, y and ln F, shape (k, n_electrode, 3).
         predicted, slopes = linearised(charge_map, to_contact(unit_coordinates))
-        sigma = compute_sigma(rows, predicted)
-        derivatives = -slopes * half_width / sigma[..., None]  # the small derivative of sigma is neglected
-        return (charge[rows] - predicted) / sigma, derivatives.swapaxes(1, 2)
+        derivatives = -slopes * half_width / sigma[rows][..., None]
+        return (charge[rows] - predicted) / sigma[rows], derivatives.swapaxes(1, 2)
 
     # Convert the starting points into unit coordinates, minimise, and convert the solution back.
     log_start = np.column_stack([start[:, :2], np.log(start[:, 2])])  # (x, y, ln F)
     unit_start = (log_start - centre) / nonzero_half_width
-    unit_solution, residual = minimise(residuals, unit_start, max_steps, min_change)
+    unit_solution, residual = minimise(residuals, unit_start, min_change=min_change)
     return to_contact(unit_solution), residual
 
 
@@ -164,27 +98,70 @@ def search(
 ) -> tuple[Array, Array]:
     """Find the contacts whose charges are nearest to given charges, without given starting points.
 
-    Candidates are contacts that are distributed over the domain. The function compares the given charges with the
-    charges of the candidates. For each row of charges, least-squares descents start from the candidates with the
-    nearest charges.
+    For each row of charges, least-squares descents start from the contacts of `starting_contacts`. All descents run
+    together, because the charge map is faster for many contacts at once.
 
     Args:
         charge_map: Map that computes the charges of contacts.
         charge: Given charges, shape (n, n_electrode), pC.
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
         starts: Number of descents for each row of charges.
-        candidates: Number of candidates.
+        candidates: Number of candidates for the starting points.
         min_change: A descent ends if the squared distance changes by less than `min_change` times 1 + its value.
 
     Returns:
         Contacts (x, y, F), shape (n, 3), mm and N, and residuals, shape (n, n_electrode), of the best descent for each
         row; see `explain`.
     """
+    start = starting_contacts(charge_map, charge, sigma, starts=starts, candidates=candidates)
+    contact_of_descent, residual_of_descent = explain(
+        charge_map,
+        np.repeat(charge, starts, axis=0),
+        np.repeat(sigma, starts, axis=0),
+        start.reshape(-1, 3),
+        min_change=min_change,
+    )
+
+    # Choose the descent with the smallest residual for each row of charges. The axes are (row, start, component).
+    contact_by_start = contact_of_descent.reshape(len(charge), starts, 3)
+    residual_by_start = residual_of_descent.reshape(len(charge), starts, charge.shape[1])
+    best_start = (residual_by_start**2).sum(axis=2).argmin(axis=1)  # shape (n,)
+    row = np.arange(len(charge))
+    return contact_by_start[row, best_start], residual_by_start[row, best_start]
+
+
+def starting_contacts(
+    charge_map: ChargeMap,
+    charge: Array,
+    sigma: Array,
+    *,
+    starts: int = 2,
+    candidates: int = CANDIDATES,
+    excluded: tuple[Array, Array] | None = None,
+) -> Array:
+    """Find starting points of descents for given charges.
+
+    Candidates are contacts that are distributed over the domain. The function compares the given charges with the
+    charges of the candidates.
+
+    Args:
+        charge_map: Map that computes the charges of contacts.
+        charge: Given charges, shape (n, n_electrode), pC.
+        sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
+        starts: Number of starting points for each row of charges.
+        candidates: Number of candidates.
+        excluded: Disk for each row of charges in which no starting point lies: centres, shape (n, 2), mm, and radii,
+            shape (n,), mm. None to exclude no disk.
+
+    Returns:
+        For each row of charges, the contacts (x, y, F) with the nearest charges, in ascending order of the distance of
+        their charges, shape (n, starts, 3), mm and N. They do not lie close together.
+    """
     # Compute the charges of the candidates, and find the pairs of candidates that lie close together.
     unit_candidates = _unit_candidates(candidates)
-    candidate_contacts = charge_map.domain.to_contact(INNER_RADIUS * unit_candidates)
-    candidate_contacts[:, 2] = np.clip(candidate_contacts[:, 2], *charge_map.domain.force_range)
-    candidate_charges = charge_map.charges(candidate_contacts)
+    contact = charge_map.domain.to_contact(INNER_RADIUS * unit_candidates)
+    contact[:, 2] = np.clip(contact[:, 2], *charge_map.domain.force_range)
+    candidate_charges = charge_map.charges(contact)
     positions = unit_candidates[:, :2]
     is_neighbour = scipy.spatial.distance.cdist(positions, positions) < START_SEPARATION
 
@@ -193,25 +170,14 @@ def search(
     nearest_candidates = []
     for chunk_start in range(0, max(len(charge), 1), CHUNK):
         chunk = slice(chunk_start, chunk_start + CHUNK)
-        nearest_candidates.append(_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, is_neighbour, starts))
-
-    # For each row of charges, one descent starts from the nearest candidate, one from the second nearest, and so on.
-    # All descents run together, because the charge map is faster for many contacts at once.
-    candidates_of_descents = np.concatenate(nearest_candidates).T  # shape (starts, n)
-    contact_of_descent, residual_of_descent = explain(
-        charge_map,
-        np.tile(charge, (starts, 1)),
-        np.tile(sigma, (starts, 1)),
-        candidate_contacts[candidates_of_descents.ravel()],
-        min_change=min_change,
-    )
-
-    # Choose the descent with the smallest residual for each row of charges. The axes are (start, row, component).
-    contact_by_start = contact_of_descent.reshape(starts, len(charge), 3)
-    residual_by_start = residual_of_descent.reshape(starts, *charge.shape)
-    best_start = (residual_by_start**2).sum(axis=2).argmin(axis=0)  # shape (n,)
-    row = np.arange(len(charge))
-    return contact_by_start[best_start, row], residual_by_start[best_start, row]
+        is_excluded = None
+        if excluded is not None:
+            centre, radius = excluded
+            is_excluded = scipy.spatial.distance.cdist(centre[chunk], contact[:, :2]) <= radius[chunk, None]
+        nearest_candidates.append(
+            _nearest_rows(charge[chunk], sigma[chunk], candidate_charges, is_neighbour, starts, is_excluded)
+        )
+    return np.asarray(contact[np.concatenate(nearest_candidates)])
 
 
 def _unit_candidates(count: int) -> Array:
@@ -235,7 +201,12 @@ def _unit_candidates(count: int) -> Array:
 
 
 def _nearest_rows(
-    charge: Array, sigma: Array, candidate_charges: Array, is_neighbour: Booleans, count: int
+    charge: Array,
+    sigma: Array,
+    candidate_charges: Array,
+    is_neighbour: Booleans,
+    count: int,
+    is_excluded: Booleans | None = None,
 ) -> Integers:
     """For each row of charges, find the candidates whose charges are nearest to this row.
 
@@ -248,6 +219,7 @@ def _nearest_rows(
         candidate_charges: Charges of the candidates, shape (n_candidate, n_electrode), pC.
         is_neighbour: Whether each pair of candidates lies close together, shape (n_candidate, n_candidate).
         count: Number of candidates to find for each row of charges.
+        is_excluded: Whether a candidate must not be found for a row, shape (n, n_candidate); None to allow all.
 
     Returns:
         Indices of the candidates in ascending order of the distance of their charges, shape (n, count).
@@ -259,6 +231,8 @@ def _nearest_rows(
     weights = np.hstack([inverse_variance, -2.0 * charge * inverse_variance])
     charge_powers = np.hstack([candidate_charges**2, candidate_charges])
     squared_distance = weights @ charge_powers.T  # shape (n, n_candidate)
+    if is_excluded is not None:
+        squared_distance[is_excluded] = np.inf
     nearest = np.empty((len(charge), count), dtype=np.intp)
     for rank in range(count):
         nearest_candidate = squared_distance.argmin(axis=1)

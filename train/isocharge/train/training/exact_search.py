@@ -9,7 +9,7 @@ too short, or it has too few weights for its sensor.
 import numpy as np
 
 from isocharge.simulate import ChargeMap, NoiseModel
-from isocharge.simulate.identifiability.nearest_contact import nearest_contact
+from isocharge.simulate.identifiability.nearest_contact import explain
 from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.folded_network import FoldedNetwork
@@ -44,7 +44,7 @@ def error_cautions(
     charge = compared_presses.noisy(noise, seed)
     network_contact, _, _ = network.predict(charge)
     # The search starts at the true contacts, so that it does not end at another contact with similar charges.
-    search_contact, _ = nearest_contact(charge_map, noise, charge, compared_presses.contact)
+    search_contact, _ = explain(charge_map, charge, noise.sigma(charge), compared_presses.contact)
     network_errors = ContactErrorStatistics.of(network_contact, compared_presses.contact)
     search_errors = ContactErrorStatistics.of(search_contact, compared_presses.contact)
     position_ratio = network_errors.position_rms_mm / search_errors.position_rms_mm
