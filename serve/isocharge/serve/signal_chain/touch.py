@@ -131,6 +131,7 @@ class Touch(Stage):
         self._direction = self._rest_direction  # sum of the directions of the frames of the latest touch
         self._base = np.zeros(n_electrode)  # charges that are no touch
         self._last = np.zeros(n_electrode)  # charges of the latest frame
+        self._last_size = 0.0
         self._mean = np.zeros(n_electrode)  # exponential mean of the charges out of contact
         self._has_drifted = False  # whether the charges rose too slowly at the beginning of this touch
         self._is_contact = False
@@ -169,8 +170,8 @@ class Touch(Stage):
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
         """
         size = _norm(charge)
-        last_size = _norm(self._last)
-        two_frame_peak = min(size, last_size)  # a spike of a single frame is not a peak
+        two_frame_peak = min(size, self._last_size)  # a spike of a single frame is not a peak
+        self._last_size = size
         reference = self._last if self._setup.has_any_sign else self._rest_direction
         is_reversed = float(charge @ reference) < 0.0
         self._last = charge
