@@ -438,9 +438,11 @@ def write_model(
     session = open_session(onnx_model, where)
     check_interface(session, len(metadata.electrodes), where)
     charges = as_batch(golden_charge_pC, metadata.electrodes)
-    golden_without_companions = make_golden(session, onnx_model, charges, contact_floors(metadata))
-    companion_sha256 = {name: sha256_of(content) for name, content in companion_files.items()}
-    golden = replace(golden_without_companions, companion_sha256=companion_sha256)
+    golden_without_files = make_golden(session, onnx_model, charges, contact_floors(metadata))
+    golden = replace(
+        golden_without_files,
+        companion_sha256={name: sha256_of(content) for name, content in companion_files.items()},
+    )
 
     # Write the version under a temporary name. `new_folder` renames it to `target` after the check has succeeded.
     with new_folder(target) as draft:
