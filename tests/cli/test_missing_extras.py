@@ -11,7 +11,15 @@ import pytest
 from cli.test_help import COMMANDS
 from isocharge.common.extras import PACKAGES
 
-BASE_COMMANDS = {"serve predict", "serve check", "serve stream", "serve replay", "serve doctor", "serve bench"}
+BASE_COMMANDS = {
+    "serve predict",
+    "serve check",
+    "serve stream",
+    "serve replay",
+    "serve doctor",
+    "serve bench",
+    "verify",
+}
 """Commands that the base install runs. Their examples name files and ports that do not exist here."""
 
 EXTRAS = {"serve http": "http", "serve plot": "simulate", "serve virtual": "simulate", "simulate design": "design"}

@@ -1,6 +1,8 @@
 """Following a film through touches, on a film whose charges are a closed formula and whose model searches exactly."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
+from isocharge.common.files import sha256_of
 from isocharge.serve import Contact
 from isocharge.serve.model.charge_series import FILE, ChargeSeries
 from isocharge.serve.tracking.film_follower import FilmFollower
@@ -15,6 +18,9 @@ from isocharge.simulate import noise_model
 
 NOISE = noise_model("reference")
 ELECTRODES = ("A", "B", "C", "D")
+
+GOLDEN = Path(__file__).parents[3] / "models" / "four-25um-biaxial" / "1" / "golden.json"
+"""Golden vectors of a released model, to which the checksum of a charge map is added."""
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +50,10 @@ def series() -> ChargeSeries:
 
 def model_in(folder, series: ChargeSeries) -> SimpleNamespace:
     """Return a model of the calibrated film that searches for the nearest contact, and write its charge map."""
-    (folder / FILE).write_bytes(series.to_bytes())
+    data = series.to_bytes()
+    (folder / FILE).write_bytes(data)
+    golden = json.loads(GOLDEN.read_text("utf-8")) | {"files": {FILE: sha256_of(data)}}
+    (folder / "golden.json").write_text(json.dumps(golden), "utf-8")
     calibrated = series.at_state(series.calibrated_state)
 
     def predict(charge_pC) -> Contact:
