@@ -86,6 +86,8 @@ def _report_lines(check: PressCheck) -> Iterator[str]:
 
     yield ""
     yield check.verdict
+    if check.std_factor is not None:
+        yield check.std_factor.statement
     yield from (f"- {note}" for note in check.notes)
 
 

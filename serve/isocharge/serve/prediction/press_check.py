@@ -34,6 +34,7 @@ from isocharge.serve.prediction.press_errors import (
     misfit_limit,
     press_errors,
 )
+from isocharge.serve.prediction.std_factor import StdFactor
 from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
 
 MIN_PRESSES = 3
@@ -79,6 +80,7 @@ class PressCheck:
         verdict: The result of the comparison in words.
         notes: Further findings, as one sentence for each finding.
         errors: Errors of each press.
+        std_factor: Factor for the standard deviations of the model with a guarantee; None if there are too few presses.
     """
 
     model: str
@@ -91,6 +93,7 @@ class PressCheck:
     verdict: str
     notes: tuple[str, ...]
     errors: PressErrors
+    std_factor: StdFactor | None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary of values that can be written as JSON.
@@ -117,6 +120,7 @@ class PressCheck:
             "force_scale": 1.0 + agreement.force.mean,
             "force_scale_std": agreement.force.std,
             "common_p_value": agreement.common_p_value,
+            "std_factor": None if self.std_factor is None else self.std_factor.factor,
             "each": [self.errors.row(press) for press in range(self.presses)],
         }
         return {name: plain_values(value) for name, value in values.items()}
@@ -170,6 +174,8 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
         verdict=_verdict(fits, selected_count, position, force, misfit_text),
         notes=tuple(notes),
         errors=errors,
+        # A guarantee needs all presses, also the bad ones.
+        std_factor=StdFactor.from_errors(errors.error[errors.is_compared], errors.noise_std[errors.is_compared]),
     )
 
 
