@@ -21,6 +21,11 @@ NEIGHBOURS = 16
 LEAST_CONTACTS = 8
 """Smallest number of different contacts to which a plane is fitted, which is twice the number of its coefficients."""
 
+MIN_REPEATED_PRESSES = 100
+"""Number of presses at repeated contacts from which the noise is estimated from these presses only.
+
+The standard deviation of the noise of a channel is then known to about 10 %."""
+
 SAME_CONTACT_DECIMALS = 3
 """Decimals of the unit coordinates in which two contacts agree if they count as the same contact."""
 
@@ -79,8 +84,10 @@ class ChannelNoise:
     def estimate(cls, charge: Array, unit_contact: Array) -> "ChannelNoise":
         """Estimate the noise of each channel from measured presses.
 
-        A plane through the neighbours of a press estimates the charges of the press without noise. The residuals are
-        the differences between the measured and the estimated charges. The white noise and the noise of the gain are
+        If contacts are repeated, the residuals are the differences between the repeated charges and their means. They
+        contain only noise. Otherwise, a plane through the neighbours of a press estimates the charges of the press
+        without noise. The residuals are then the differences between the measured and the estimated charges, and also
+        contain the curvature of the map from contacts to charges. The white noise and the noise of the gain are
         fitted to these residuals. Both kinds of noise have lower limits.
 
         Args:
@@ -90,10 +97,14 @@ class ChannelNoise:
         Returns:
             Noise model with the white noise and the noise of the gain of each channel.
         """
-        planes = LocalPlanes.fit(unit_contact, charge)
+        size, residual = _repeated_residuals(unit_contact, charge)
+        if len(residual) < MIN_REPEATED_PRESSES:
+            planes = LocalPlanes.fit(unit_contact, charge)
+            size = planes.value
+            residual = planes.residual
         channel_variances = [
-            _fit_variances(channel_charge, channel_residual)
-            for channel_charge, channel_residual in zip(planes.value.T, planes.residual.T, strict=True)
+            _fit_variances(channel_size, channel_residual)
+            for channel_size, channel_residual in zip(size.T, residual.T, strict=True)
         ]
         white_std, gain_std = np.sqrt(np.array(channel_variances)).T  # each of shape (n_electrode,)
         gain = np.maximum(gain_std, LEAST_GAIN)
@@ -275,6 +286,28 @@ class LocalPlanes:
             is_nearer = (residual**2).sum(axis=1) < (smallest_residual**2).sum(axis=1)
             smallest_residual[is_nearer] = residual[is_nearer]
         return smallest_residual
+
+
+def _repeated_residuals(unit_contact: Array, charge: Array) -> tuple[Array, Array]:
+    """Compute the residuals of presses whose contact is repeated: their differences from the mean of the contact.
+
+    Args:
+        unit_contact: Contacts in unit coordinates, shape (n, 3).
+        charge: Measured charges, shape (n, n_electrode), pC.
+
+    Returns:
+        The mean charges of the contact, and the residuals, both of shape (m, n_electrode), pC, for the m presses whose
+        contact is repeated. The residuals have the variance of the noise.
+    """
+    _, contact_of_press, press_count = np.unique(
+        np.round(unit_contact, SAME_CONTACT_DECIMALS), axis=0, return_inverse=True, return_counts=True
+    )
+    sums = np.stack([np.bincount(contact_of_press, column) for column in charge.T], axis=1)
+    mean = (sums / press_count[:, None])[contact_of_press]
+    count = press_count[contact_of_press, None]
+    is_repeated = count[:, 0] > 1
+    residual = (charge - mean)[is_repeated] * np.sqrt(count / np.maximum(count - 1, 1))[is_repeated]
+    return mean[is_repeated], residual
 
 
 def usual_size(charge: Array) -> Array:
