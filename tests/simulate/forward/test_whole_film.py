@@ -8,7 +8,7 @@ import pytest
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Domain, Resolution, SolveSettings, load_sensor, press, touch_charge
 from isocharge.simulate.forward.family import check_family
-from isocharge.simulate.forward.whole_film import COARSE_ERROR, outermost_distance
+from isocharge.simulate.forward.whole_film import COARSE_ERROR, COARSE_RESOLUTION, outermost_distance
 from isocharge.simulate.solver.load_case import check_press
 from whole_films import whole_film_map_solved_once
 
@@ -36,6 +36,17 @@ def test_coarse_map_agrees_with_direct_solves_up_to_the_clamp(pretension):
 
 def test_coarse_map_leaves_a_gap_of_more_than_the_probe_radius_to_the_clamp():
     assert outermost_distance(SENSOR.film, Circle(1.5)) == pytest.approx(45.0 - 1.5 - 1.8)
+
+
+@pytest.mark.parametrize("film_radius", [12.0, 45.0])
+@pytest.mark.parametrize("probe_radius", [0.15, 0.5, 0.9])
+def test_outermost_press_of_a_small_probe_can_be_meshed(probe_radius, film_radius):
+    film = replace(SENSOR.film, radius=film_radius, pretension=1.0)
+    probe = Circle(probe_radius)
+    solved = press(
+        film, probe, (outermost_distance(film, probe), 0.0), 0.1, SolveSettings(resolution=COARSE_RESOLUTION)
+    )
+    assert solved.status == "converged"
 
 
 @pytest.mark.parametrize("changes", [{"oval": 0.05}, {"oval": 0.05, "oval_axis": 1.6}, {"oval": -0.05}])

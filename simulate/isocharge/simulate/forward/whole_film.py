@@ -33,13 +33,23 @@ RIM_GAP = 1.2
 The coarse mesh does not resolve a narrower gap.
 """
 
+SMALL_PROBE_GAP = 0.042
+"""Smallest gap between a very small probe and the clamp, in units of the radius of the film, dimensionless.
+
+An element of the coarse mesh would be folded in a narrower gap. The gap decreases by 0.75 of the reach of the probe.
+"""
+
 NODE_COUNT = NodeCount(distances=10, forces=4)
 """Numbers of distances, forces, orientations and directions at which presses are solved."""
 
 
 def outermost_distance(film: Film, probe: Probe) -> float:
-    """Return the largest distance of a press from the centre (mm) for which the coarse map is valid; see `RIM_GAP`."""
-    return film.inner_radius - (1.0 + RIM_GAP) * probe.reach
+    """Return the largest distance of a press from the centre (mm) for which the coarse map is valid.
+
+    See `RIM_GAP` and `SMALL_PROBE_GAP`.
+    """
+    gap = max(RIM_GAP * probe.reach, SMALL_PROBE_GAP * film.inner_radius - 0.75 * probe.reach)
+    return film.inner_radius - probe.reach - gap
 
 
 def whole_film_map(
