@@ -152,6 +152,17 @@ def test_film_with_charges_of_both_signs_is_calibrated():
 
 
 @pytest.mark.slow
+def test_derivatives_of_a_strongly_uneven_film_include_the_change_from_the_even_film(solved):
+    """From a solved film with E1 / E2 = 1.6, the charges are extrapolated to E1 / E2 = 1.4."""
+    prior = solved.prior
+    values = solved.values.copy()
+    values[prior.index("stiffness_x")] = np.log(1.6)
+    uneven = solved.solved(values.copy(), None)
+    values[prior.index("stiffness_x")] = np.log(1.4)
+    np.testing.assert_allclose(uneven.charges(values, CONTACT), direct(*prior.film(values), CONTACT), rtol=2e-3)
+
+
+@pytest.mark.slow
 def test_negative_coefficients_and_charges_give_the_same_film_as_positive_ones():
     """The charges are proportional to the coefficients, so both signs must change together."""
     sensor = load_sensor("four-25um-biaxial")

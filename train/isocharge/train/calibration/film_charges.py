@@ -48,6 +48,7 @@ class FilmCharges:
     Attributes:
         prior: Declarations of the properties.
         values: Properties of the solved film, shape (n_property,).
+        even_values: Properties of the axisymmetric film, shape (n_property,).
         film: Forward map of the solved film.
         slopes: Derivatives with respect to the mechanical properties, for the axisymmetric film.
         same_probe: Forward map of the axisymmetric film under a circular probe, with the few nodes of the slopes.
@@ -58,6 +59,7 @@ class FilmCharges:
 
     prior: FilmPrior
     values: Array
+    even_values: Array
     film: ForwardMap
     slopes: FilmSlopes
     same_probe: ForwardMap
@@ -106,6 +108,7 @@ class FilmCharges:
         return cls(
             prior=prior,
             values=even_values,
+            even_values=even_values,
             film=same_probe,
             slopes=FilmSlopes.build(same_probe, executor=executor),
             same_probe=same_probe,
@@ -228,7 +231,33 @@ class _Reading:
             derivatives[one.name] if one.name in derivatives else self._read_difference(one, contact)
             for one in self._prior.properties
         ]
-        return np.stack(columns, axis=2)
+        even_jacobian = np.stack(columns, axis=2)
+        return even_jacobian + self._secant_correction(contact, charge, even_jacobian)
+
+    def _secant_correction(self, contact: Array, charge: Array, jacobian: Array) -> Array:
+        """Compute the change of the derivatives from the axisymmetric film to the solved film, along their difference.
+
+        The charges are assumed to be quadratic along the line between both films. The derivative at the solved film
+        then differs from that at the axisymmetric film by twice the deviation of the charges from the first order, and
+        only along this line (Broyden 1965).
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges of the solved film at these contacts, shape (n, n_electrode), pC.
+            jacobian: Derivatives of the axisymmetric film, shape (n, n_electrode, n_property), pC per unit.
+
+        Returns:
+            Change of the derivatives, shape (n, n_electrode, n_property), pC per unit.
+        """
+        charges = self._charges
+        step = np.where(self._prior.changes_stress, charges.values - charges.even_values, 0.0)
+        scaled_step = step / self._prior.std**2
+        length = float(step @ scaled_step)  # squared, in prior standard deviations
+        if length == 0.0 or charges.film.probe.is_axisymmetric != self._prior.probe.is_axisymmetric:
+            return np.zeros_like(jacobian)
+        even_charge = self._read(charges.same_probe).charges(contact)
+        deviation = charge - even_charge - jacobian @ step
+        return np.asarray(2.0 * deviation[:, :, None] * scaled_step / length)
 
     def _mechanical(self, contact: Array, charge: Array) -> dict[str, Array]:
         """Compute the derivatives with respect to the properties that change the stress.
