@@ -26,7 +26,7 @@ from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.model_folder import find_model
+from isocharge.serve.model.model_search import find_model
 from isocharge.serve.record.csv_rows import csv_header
 
 HARMFUL_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}

@@ -27,13 +27,12 @@ if TYPE_CHECKING:
         Model,
         ModelCheck,
         check_golden,
-        find_labelled_model,
-        find_model,
         load_checked_model,
         load_model,
         verify_model,
         write_model,
     )
+    from isocharge.serve.model.model_search import find_labelled_model, find_model
     from isocharge.serve.model.predictor import Predictor
     from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
     from isocharge.serve.port.source import Chunk, Port, open_source

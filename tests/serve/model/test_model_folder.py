@@ -218,7 +218,7 @@ def roots(tmp_path, monkeypatch):
     current.mkdir(parents=True)
     given.mkdir()
     monkeypatch.chdir(current.parent)
-    monkeypatch.setattr("isocharge.serve.model.model_folder._released_models", lambda: tmp_path / "shipped")
+    monkeypatch.setattr("isocharge.serve.model.model_search._released_models", lambda: tmp_path / "shipped")
     return {"given": given, "variable": variable, "current": current, "shipped": tmp_path / "shipped"}
 
 

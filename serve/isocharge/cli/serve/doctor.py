@@ -21,7 +21,7 @@ from isocharge.serve.examination.channel_health import ChannelHealth
 from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.electrode_check import ElectrodeCheck, check_electrodes, corrected_table
 from isocharge.serve.examination.listening import BAUDS
-from isocharge.serve.model.model_folder import model_names, repositories
+from isocharge.serve.model.model_search import model_names, repositories
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.port.source import has_speed
 from isocharge.serve.presses.number_text import parse_number

@@ -6,7 +6,8 @@ import typer
 
 from isocharge.cli.shared.options import JsonOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.terminal import show, show_json
-from isocharge.serve.model.model_folder import find_model, verify_model
+from isocharge.serve.model.model_folder import verify_model
+from isocharge.serve.model.model_search import find_model
 
 
 def verify_command(model: ModelArgument, json: JsonOption = False, models: ModelsOption = None) -> None:

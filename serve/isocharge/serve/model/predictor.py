@@ -22,7 +22,8 @@ from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError, ModelError
 from isocharge.serve.model.contact import Contact, Contacts, Validity
 from isocharge.serve.model.metadata import ModelNoise
-from isocharge.serve.model.model_folder import Model, find_model, load_model
+from isocharge.serve.model.model_folder import Model, load_model
+from isocharge.serve.model.model_search import find_model
 from isocharge.serve.model.session import (
     N_WITHOUT_CORRELATION,
     BoundPress,

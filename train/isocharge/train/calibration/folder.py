@@ -29,7 +29,8 @@ from isocharge.common.errors import ModelError, PressError
 from isocharge.common.files import as_output_errors, locked, remove_empty, write_whole
 from isocharge.serve.model.charge_series import FILE as CHARGES
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.model_folder import check_target, version_folders
+from isocharge.serve.model.model_folder import check_target
+from isocharge.serve.model.model_search import version_folders
 from isocharge.serve.presses.measured_presses import presses_text
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.calibrate import solve_film
