@@ -159,8 +159,8 @@ def _check_version(model: Model) -> str:
     return f"the metadata name the model {model.metadata.label}"
 
 
-def _check_charge_map(model: Model) -> str:
-    """Check that the companion files of a model have the checksums in `golden.json`.
+def _check_companion_files(model: Model) -> str:
+    """Check that the files beside `model.onnx`, such as the charge map, have the checksums in `golden.json`.
 
     Returns:
         Sentence that names the files.
@@ -168,17 +168,17 @@ def _check_charge_map(model: Model) -> str:
     Raises:
         ModelError: If a file is missing, is changed, or belongs to another model.
     """
-    listed_names = model.golden.companion_sha256 or {}
-    names = sorted({*listed_names, *(path.name for path in model.folder.glob("*.npz"))})
+    existing_names = {path.name for path in model.folder.glob("*.npz")}
+    names = sorted(existing_names | model.golden.companion_sha256.keys())
     for name in names:
         read_companion_file(model.folder, name, "make the model again")
     if not names:
         return "the model has no charge map"
-    return f"{', '.join(names)}: as golden.json states"
+    return f"{', '.join(names)}: the checksum is that in golden.json"
 
 
 MODEL_CHECKS: Mapping[str, Callable[[Model], str]] = MappingProxyType(
-    {"version": _check_version, "charge map": _check_charge_map, "golden vectors": check_golden}
+    {"version": _check_version, "charge map": _check_companion_files, "golden vectors": check_golden}
 )
 """Checks of a model that was read, by the name of what is checked.
 

@@ -190,7 +190,7 @@ def channel_number(name: str) -> int | None:
 
 
 def _channels_of_electrode(electrode: str, names: tuple[str, ...]) -> list[int]:
-    """Return the indices of the channels with the name of an electrode.
+    """Return the indices of the channels whose name is that of an electrode.
 
     Case matters only if both cases occur. Further words in the names of the channels are ignored only if no channel has
     the name of the electrode without them.

@@ -9,7 +9,7 @@ where i is the innovation and b is the inflow (pC/s). The inflow is estimated fr
 from the output v would diverge; see `isocharge.serve.signal_chain.inflow`.
 
 A board that sends currents sends the innovation itself, i[n] = v[n]. Its charge is the sum of the currents. If the
-device file states a leak, the sum forgets with the time constant tau, q[n] = a q[n-1] + i[n] - b dt.
+device file states a leak, the sum decays with the time constant tau, q[n] = a q[n-1] + i[n] - b dt.
 
 While nothing touches the film, any charge is an error or comes from a slow warming of the film. The computed touch
 charge therefore decays exponentially to zero.
@@ -88,14 +88,14 @@ class Leak(OffsetStage):
         frame.charge_pC = self._charge_pC
         frame.base_relax_s = self._rule.relax_s
 
-    def _innovation_pC(self, output_pC: Array, kept: Array) -> Array:
+    def _innovation_pC(self, output_pC: Array, decay: Array) -> Array:
         """Return the change of the output that the leak does not explain, shape (n_electrode,), pC.
 
         Args:
             output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
-            kept: Share of a charge that the leak leaves until this frame, shape (n_electrode,), dimensionless.
+            decay: Share of a charge that the leak leaves until this frame, shape (n_electrode,), dimensionless.
         """
-        return output_pC - kept * self._output_pC
+        return output_pC - decay * self._output_pC
 
     def add_warming(self, change: WarmingChange) -> None:
         """Subtract the warming from the touch charge that the stage integrates."""
@@ -135,6 +135,6 @@ class Integrator(Leak):
         if frame.charge_pC is not None and frame.dt_s > 0.0:
             frame.noise_pC = frame.noise_pC * math.sqrt(max(1.0, 0.5 * self._rule.relax_s / frame.dt_s))
 
-    def _innovation_pC(self, output_pC: Array, kept: Array) -> Array:
+    def _innovation_pC(self, output_pC: Array, decay: Array) -> Array:
         """Return the current, plus the change of the charge because of the leak, shape (n_electrode,), pC."""
-        return output_pC - (1.0 - kept) * self._charge_pC
+        return output_pC - (1.0 - decay) * self._charge_pC
