@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from isocharge.serve.live.device import Device, device_from_table, load_device
     from isocharge.serve.live.steady_press import PressWatch
     from isocharge.serve.live.stream import Policy, ReadingStream, TouchStream, stream
-    from isocharge.serve.model.contact import Contact, Contacts, Validity
+    from isocharge.serve.model.contact import Contact, Contacts
     from isocharge.serve.model.metadata import ModelMetadata
     from isocharge.serve.model.model_folder import (
         Model,
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     )
     from isocharge.serve.model.model_search import find_labelled_model, find_model
     from isocharge.serve.model.predictor import Predictor
+    from isocharge.serve.model.validity import Validity
     from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
     from isocharge.serve.port.source import Chunk, Port, open_source
     from isocharge.serve.prediction.press_check import PressCheck, check_presses

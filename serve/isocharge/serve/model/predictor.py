@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError, ModelError
-from isocharge.serve.model.contact import Contact, Contacts, Validity
+from isocharge.serve.model.contact import Contact, Contacts
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.model_folder import Model, load_model
 from isocharge.serve.model.model_search import find_model
@@ -33,6 +33,7 @@ from isocharge.serve.model.session import (
     run,
     write_finite,
 )
+from isocharge.serve.model.validity import Validity
 
 log = logging.getLogger(__name__)
 

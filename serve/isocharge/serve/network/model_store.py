@@ -18,11 +18,11 @@ from pathlib import Path
 from types import MappingProxyType
 
 from isocharge.common.errors import ModelError, ModelNotFound
-from isocharge.serve.model.contact import Validity
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import Model, load_checked_model
 from isocharge.serve.model.model_search import model_names, repositories, version_folders
 from isocharge.serve.model.session import BoundPress, output_widths
+from isocharge.serve.model.validity import Validity
 from isocharge.serve.network.traffic import Statistics
 
 log = logging.getLogger(__name__)

@@ -15,9 +15,10 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Singles
 from isocharge.common.errors import ChargeError
-from isocharge.serve.model.contact import Contact, Contacts, Validity
+from isocharge.serve.model.contact import Contact, Contacts
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
+from isocharge.serve.model.validity import Validity
 from isocharge.serve.presses.csv_table import CsvTable
 from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, ignored_columns_message
 from isocharge.serve.presses.table_file import open_table

@@ -15,9 +15,9 @@ from typing import Any
 
 from isocharge.common.errors import ModelError
 from isocharge.serve.flags import BEYOND, MEANINGS, MISFIT, OUTSIDE, STRESS
-from isocharge.serve.model.contact import Validity
 from isocharge.serve.model.model_folder import load_model
 from isocharge.serve.model.model_search import find_model
+from isocharge.serve.model.validity import Validity
 from isocharge.serve.viewer.messages import describe_film
 from isocharge.serve.viewer.stress_series import StressSeries, read_stress_series
 

@@ -9,7 +9,7 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError
-from isocharge.serve.model.contact import inside_polygon
+from isocharge.serve.model.validity import inside_polygon
 from isocharge.simulate import Domain
 from isocharge.simulate.numerics.polygon import area_of, to_complex, to_corners
 

@@ -21,10 +21,11 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
-from isocharge.serve.model.contact import Contact, Contacts, Validity
+from isocharge.serve.model.contact import Contact, Contacts
 from isocharge.serve.model.golden import Golden
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import CORRELATION, N_WITHOUT_CORRELATION
+from isocharge.serve.model.validity import Validity
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
 from isocharge.train.export_c.layer_source import LayerSource, find_blocks
 from isocharge.train.training.charge_features import ChargeFeatures

@@ -8,8 +8,9 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.flags import STRESS
-from isocharge.serve.model.contact import Contacts, Validity
+from isocharge.serve.model.contact import Contacts
 from isocharge.serve.model.metadata import ModelMetadata, UnnoticedPresses, percent_text
+from isocharge.serve.model.validity import Validity
 from isocharge.train.training.fitted import Fitted
 
 WRONG_STDS = 4.0

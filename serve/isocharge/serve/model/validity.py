@@ -1,0 +1,288 @@
+"""The domain in which a model is valid.
+
+The class `Validity` compares contacts with the domain for which a model was trained. The result of the comparison is a
+subset of the flags `outside`, `beyond`, `misfit` and `stress`.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Booleans, Reals
+from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
+from isocharge.serve.model.contact import Contact, Contacts
+from isocharge.serve.model.metadata import ModelMetadata
+
+MISFIT_LIMIT = 5.0
+"""Smallest limit of the misfit, in standard deviations of the noise.
+
+The metadata of a model may contain a larger limit, which 0.1 % of good presses exceed.
+"""
+
+TOUCH_LIMIT = 5.0
+"""Charge, in standard deviations of the white noise, above which an electrode indicates a touch."""
+
+IMPLAUSIBLE_FACTOR = 3.0
+"""Factor that gives the limits beyond which an output of the model cannot be a measurement, dimensionless.
+
+The limit of the force is the largest force times this factor. The limit of the distance from the centre of the working
+area is the radius of the circle around the working area times this factor.
+"""
+
+MAX_CENTRE_OFFSET = 0.05
+"""Largest distance between the origin and the centre of a working area that is called centred, dimensionless.
+
+The distance is relative to the radius of the area.
+"""
+
+
+@dataclass(frozen=True)
+class Validity:
+    """The domain in which a model is valid: the working area, the range of forces and the limit of the misfit.
+
+    Attributes:
+        corners_mm: Corners of the polygon that is the working area, shape (n, 2), mm.
+        force_range_N: Smallest and largest force, N.
+        misfit_limit: Misfit above which the charges are not attributed to a single contact, in standard deviations.
+        yield_force_N: Force above which the film yields, N.
+        white_pC: Standard deviation of the white noise, pC: one number for all electrodes, or one number for each
+            electrode.
+    """
+
+    corners_mm: Array
+    force_range_N: tuple[float, float]
+    misfit_limit: float = MISFIT_LIMIT
+    yield_force_N: float = math.inf
+    white_pC: float | tuple[float, ...] = 0.0
+
+    @classmethod
+    def of(cls, metadata: ModelMetadata) -> "Validity":
+        """Return the domain that the metadata of a model describe.
+
+        Args:
+            metadata: Metadata of the model.
+        """
+        measured_limit = metadata.errors.get("misfit_p999", MISFIT_LIMIT)  # 0.1 % of good presses exceed it
+        return cls(
+            corners_mm=np.array(metadata.working_area_mm),
+            force_range_N=metadata.force_range_N,
+            misfit_limit=max(MISFIT_LIMIT, measured_limit),
+            yield_force_N=math.inf if metadata.yield_force_N is None else metadata.yield_force_N,
+            white_pC=metadata.noise.white_pC,
+        )
+
+    @cached_property
+    def radius_mm(self) -> float:
+        """Largest distance of a corner of the working area from the origin, mm."""
+        return float(np.linalg.norm(self.corners_mm, axis=1).max())
+
+    @cached_property
+    def centre_mm(self) -> tuple[float, float]:
+        """Centre (x, y) of the bounding box of the working area, mm."""
+        lowest = self.corners_mm.min(axis=0)
+        highest = self.corners_mm.max(axis=0)
+        x_mm, y_mm = (0.5 * (lowest + highest)).tolist()
+        return x_mm, y_mm
+
+    @cached_property
+    def implausible_limits(self) -> tuple[float, float]:
+        """Limits beyond which an output of the model cannot be a measurement.
+
+        The first limit is a squared distance from `centre_mm`, mm^2. The second limit is a force, N.
+        """
+        circumscribed_radius_mm = np.linalg.norm(self.corners_mm - self.centre_mm, axis=1).max()
+        _min_force_N, max_force_N = self.force_range_N
+        return float(IMPLAUSIBLE_FACTOR * circumscribed_radius_mm) ** 2, IMPLAUSIBLE_FACTOR * max_force_N
+
+    def is_touch(self, charge_pC: Array) -> Booleans:
+        """Compute for each press whether the charge of at least one electrode exceeds the noise.
+
+        A charge exceeds the noise if its magnitude is larger than `TOUCH_LIMIT` standard deviations of the white noise.
+
+        Args:
+            charge_pC: Charges of n presses, shape (n, electrodes), pC.
+
+        Returns:
+            Whether each press is a touch, shape (n,).
+        """
+        limit_pC = TOUCH_LIMIT * np.asarray(self.white_pC)
+        return np.asarray((np.abs(charge_pC) > limit_pC).any(axis=1))
+
+    @property
+    def is_centred(self) -> bool:
+        """Whether the centre of the working area is close to the origin."""
+        return math.hypot(*self.centre_mm) < MAX_CENTRE_OFFSET * self.radius_mm
+
+    @cached_property
+    def area_text(self) -> str:
+        """Description of the working area for messages.
+
+        The text states the radius of the area if its centre is close to the origin, and its bounding box otherwise.
+        """
+        if self.is_centred:
+            return f"up to {self.radius_mm:.3g} mm"
+        # The limits are the corners of the bounding box of the working area.
+        left_mm, bottom_mm = self.corners_mm.min(axis=0)
+        right_mm, top_mm = self.corners_mm.max(axis=0)
+        return f"from ({left_mm:.3g}, {bottom_mm:.3g}) to ({right_mm:.3g}, {top_mm:.3g}) mm"
+
+    def is_beyond(self, contact: Contact) -> bool:
+        """Return whether a contact is so far outside the domain that it cannot be a measurement.
+
+        Args:
+            contact: Contact that the model computed.
+        """
+        centre_x_mm, centre_y_mm = self.centre_mm
+        max_distance_squared_mm2, max_force_N = self.implausible_limits
+        x_from_centre_mm = contact.x_mm - centre_x_mm
+        y_from_centre_mm = contact.y_mm - centre_y_mm
+        distance_squared_mm2 = x_from_centre_mm * x_from_centre_mm + y_from_centre_mm * y_from_centre_mm
+        return distance_squared_mm2 > max_distance_squared_mm2 or contact.force_N > max_force_N
+
+    @cached_property
+    def inscribed_radius_squared_mm2(self) -> float:
+        """Squared radius of the largest circle around the origin that lies inside the working area, mm^2.
+
+        The squared radius is the squared distance from the origin to the nearest edge of the working area. If the
+        origin is outside the working area, the squared radius is 0.
+        """
+        origin_coordinate_mm = np.zeros(1)  # x and also y; `inside_polygon` takes arrays of points, here of one point
+        is_origin_inside = inside_polygon(origin_coordinate_mm, origin_coordinate_mm, self.corners_mm)[0]
+        if not is_origin_inside:
+            return 0.0
+
+        # The nearest point of each edge is the projection of the origin onto the edge, limited to the ends of the edge.
+        start = self.corners_mm  # start of each edge, shape (edges, 2)
+        edge = np.roll(start, -1, axis=0) - start  # the last edge ends at the first corner
+        # If the last corner repeats the first corner, one edge has the length 0. The limit avoids a division by 0.
+        edge_length_squared = np.maximum((edge * edge).sum(axis=1), 1e-30)
+        projection = -(start * edge).sum(axis=1) / edge_length_squared  # as a fraction of the edge, shape (edges,)
+        limited_projection = np.clip(projection, 0.0, 1.0)
+        nearest_point = start + limited_projection[:, np.newaxis] * edge
+        distance_squared_mm2 = (nearest_point**2).sum(axis=1)
+        return float(distance_squared_mm2.min())
+
+    def flags(self, contact: Contact) -> tuple[str, ...]:
+        """Return the flags of one contact, which are the reasons why the contact may be wrong.
+
+        For most contacts, the method takes about a microsecond. A contact near the edge of the working area must be
+        compared with the polygon of the area, which takes about 30 us.
+
+        Args:
+            contact: Contact that the model computed.
+
+        Returns:
+            The words `outside`, `beyond`, `misfit` and `stress` whose conditions are true; empty if the contact is
+            valid.
+        """
+        is_outside = self._is_outside(contact)
+        has_misfit = contact.misfit > self.misfit_limit
+        is_above_yield = contact.force_N > self.yield_force_N
+        if not (is_outside or has_misfit or is_above_yield):  # a contact beyond all limits is also outside the domain
+            return ()
+        return _flag_words(
+            is_outside=is_outside,
+            is_beyond=self.is_beyond(contact),
+            has_misfit=has_misfit,
+            is_above_yield=is_above_yield,
+        )
+
+    def _is_outside(self, contact: Contact) -> bool:
+        """Return whether a contact is outside the working area or the range of forces.
+
+        The contact is first compared with two circles around the origin. One circle lies inside the working area, and
+        the other circle encloses it. The slow comparison with the polygon of the area is only needed for a contact
+        between the two circles.
+
+        Args:
+            contact: Contact that the model computed.
+        """
+        min_force_N, max_force_N = self.force_range_N
+        if contact.force_N < min_force_N or contact.force_N > max_force_N:
+            return True
+        distance_squared_mm2 = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm
+        if distance_squared_mm2 < self.inscribed_radius_squared_mm2:
+            return False
+        if distance_squared_mm2 > self.radius_mm * self.radius_mm:
+            return True
+        return not inside_polygon(np.array([contact.x_mm]), np.array([contact.y_mm]), self.corners_mm)[0]
+
+    def batch_flags(self, contacts: Contacts) -> list[tuple[str, ...]]:
+        """Return the flags of n contacts.
+
+        Args:
+            contacts: Contacts of n presses.
+
+        Returns:
+            A list of length n with the flags of each press, as the method `flags` returns them for a single contact.
+        """
+        min_force_N, max_force_N = self.force_range_N
+        is_outside_area = ~inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm)
+        is_outside_forces = (contacts.force_N < min_force_N) | (contacts.force_N > max_force_N)
+        is_outside = is_outside_area | is_outside_forces
+        has_misfit = contacts.misfit > self.misfit_limit
+        is_above_yield = contacts.force_N > self.yield_force_N
+        # A contact beyond the implausible limits is also outside. The flag `beyond` therefore adds no flagged contact.
+        has_flag = is_outside | has_misfit | is_above_yield
+        if not has_flag.any():
+            return [()] * len(has_flag)
+
+        centre_x_mm, centre_y_mm = self.centre_mm
+        max_distance_squared_mm2, implausible_force_N = self.implausible_limits
+        with np.errstate(over="ignore"):  # a distance that overflows is infinite and exceeds the limit
+            distance_squared_mm2 = (contacts.x_mm - centre_x_mm) ** 2 + (contacts.y_mm - centre_y_mm) ** 2
+        is_beyond = (distance_squared_mm2 > max_distance_squared_mm2) | (contacts.force_N > implausible_force_N)
+
+        # Convert the four conditions of each contact to the words of the flags.
+        columns = (is_outside.tolist(), is_beyond.tolist(), has_misfit.tolist(), is_above_yield.tolist())
+        return [_flag_words(*conditions) for conditions in zip(*columns, strict=True)]
+
+
+def _flag_words(is_outside: bool, is_beyond: bool, has_misfit: bool, is_above_yield: bool) -> tuple[str, ...]:
+    """Return the flags whose conditions are true, in a fixed order.
+
+    Args:
+        is_outside: Whether the contact is outside the working area or the range of forces.
+        is_beyond: Whether the contact is so far outside that it cannot be a measurement.
+        has_misfit: Whether the misfit is above the limit of the model.
+        is_above_yield: Whether the force is above the force at which the film yields.
+    """
+    flags = []
+    if is_outside:
+        flags.append(OUTSIDE)
+    if is_beyond:
+        flags.append(BEYOND)
+    if has_misfit:
+        flags.append(MISFIT)
+    if is_above_yield:
+        flags.append(STRESS)
+    return tuple(flags)
+
+
+def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
+    """Compute whether points lie inside a polygon.
+
+    A point is inside the polygon if a horizontal ray from the point to the right crosses an odd number of edges. The
+    ray crosses an edge under two conditions. Exactly one end of the edge is above the ray, and the edge intersects the
+    horizontal line to the right of the point.
+
+    Args:
+        x: First coordinates of the points, shape (n,), in the unit of the corners.
+        y: Second coordinates of the points, shape (n,).
+        corners: Corners in their order along the polygon, shape (m, 2). The last corner may repeat the first corner.
+
+    Returns:
+        Whether each point is inside, shape (n,). The result for points on an edge is undefined.
+    """
+    edge_ends = np.roll(corners, -1, axis=0)
+    # Coordinates of shape (m, 1), so that the arrays below have the shape (m edges, n points).
+    x_start, y_start = corners.T[..., np.newaxis]
+    x_end, y_end = edge_ends.T[..., np.newaxis]
+    crosses_height = (y_start > y) != (y_end > y)  # the edge crosses the horizontal line through the point
+    with np.errstate(divide="ignore", invalid="ignore"):  # the division by 0 of a horizontal edge has no effect
+        crossing_x = x_start + (y - y_start) * (x_end - x_start) / (y_end - y_start)
+    is_to_the_right = x < crossing_x
+    crossing_count = np.count_nonzero(crosses_height & is_to_the_right, axis=0)
+    return np.asarray(crossing_count % 2 == 1)
