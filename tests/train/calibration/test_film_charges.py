@@ -134,21 +134,23 @@ def test_own_layout_with_five_electrodes_and_a_rectangle_is_calibrated(tmp_path)
 
 @pytest.mark.slow
 def test_film_with_charges_of_both_signs_is_calibrated():
-    """Light presses on a taut uniaxial film give negative charges."""
-    problem = CalibrationProblem(load_sensor("four-25um-uniaxial"), Circle(1.0), radius=3.0, force_range=(0.1, 0.5))
+    """The electrodes on the x axis have positive charges, and those on the y axis negative charges."""
+    sensor = load_sensor("four-25um-biaxial")
+    sensor = replace(sensor, piezo=replace(sensor.piezo, d31=12.0, d32=-8.0))
+    problem = CalibrationProblem(sensor, Circle(1.0), radius=5.0, force_range=(0.1, 1.0))
     prior = problem.prior.layout.prior
     values = prior.mean.copy()
-    values[prior.index("pretension")] = 2.6
-    film = ForwardMap.build(*prior.film(values), 3.2, (0.08, 0.6))
+    values[prior.index("pretension")] = 1.2
+    film = ForwardMap.build(*prior.film(values), 5.2, (0.08, 1.2))
     rng = np.random.default_rng(2)
     contact = draw_contacts(rng, problem.domain, 15)
     charge = film.charges(contact)
-    assert 0.05 < (charge < 0.0).mean() < 0.6
+    assert 0.3 < (charge < 0.0).mean() < 0.7
     presses = measured_presses(problem, with_rig_errors(contact, rng), problem.noise.add(charge, rng))
     result = calibrate(presses, problem)
-    assert abs(result.film.value("pretension") - 2.6) < 4.0 * result.film.std("pretension") < 1.2
+    assert abs(result.film.value("pretension") - 1.2) < 4.0 * result.film.std("pretension") < 1.2
     residual = result.charges.charges(result.film.film_values, contact) - charge
-    assert np.sqrt(np.mean((residual / problem.noise.sigma(charge)) ** 2)) < 10.0
+    assert np.sqrt(np.mean((residual / problem.noise.sigma(charge)) ** 2)) < 3.0
 
 
 @pytest.mark.slow
