@@ -34,7 +34,7 @@ class Split:
     Attributes:
         domain: Contacts for which the network is trained.
         train: Presses for training.
-        validation: Presses for early stopping.
+        validation: Presses that choose the degrees of the charge field.
         test: Presses for measuring errors.
         field: Map from contacts to charges. It is fitted to the presses of the domain, or to all presses if this fit is
             more accurate.
