@@ -9,8 +9,8 @@ from dataclasses import asdict
 
 import pytest
 
-from isocharge.cli.serve.doctor import report_lines
-from isocharge.cli.shared.terminal import say, show, show_json, warnings_to_stderr
+from isocharge.cli.serve.doctor import brief_report
+from isocharge.cli.shared.terminal import say, show, show_json, show_result, warnings_to_stderr
 from isocharge.common.errors import IsochargeError
 from isocharge.serve import (
     Chunk,
@@ -128,7 +128,7 @@ def test_names_of_a_board_through_the_doctor(notation, attack):
         chunks = [Chunk(data, 1.7e9 + 0.005 * number, 0) for number, data in enumerate(NOTATIONS[notation](names))]
         with checked_terminal():
             examination = examine_received(ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=1.0))
-            show("\n".join(report_lines(examination)))
+            show_result(brief_report(examination), json=False)
             show_json(asdict(examination))
             comments = [line for line in device_text(examination).splitlines() if line.startswith("#")]
             check_terminal_text("\n".join(comments))

@@ -52,7 +52,7 @@ def test_a_point(command):
     assert ["MPa" in warning for warning in answer["warnings"]] == [True]
     code, out, err = command("simulate", "point", SENSOR, "--at", "3,-2", "--force", "0.5")
     assert (code, err) == (0, "")
-    assert re.search(r"charge A +[0-9.]+ pC", out)
+    assert re.search(r"charge_pC +A [0-9.]+\n", out)
 
 
 def test_simulate_point_reports_the_side_force_and_the_friction_of_a_vertical_stage(command):

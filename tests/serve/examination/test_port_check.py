@@ -9,7 +9,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from isocharge.cli.serve.doctor import report_lines
+from isocharge.cli.serve.doctor import brief_report
+from isocharge.cli.shared.terminal import show_result
 from isocharge.common.errors import DeviceError, NoFramesError
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text
 from isocharge.serve.examination.channel_health import measure_channel_health
@@ -75,8 +76,7 @@ def test_check_uses_no_stage_that_is_switched_off():
     report = examine_received(received(charges()), device=device_from_table(off, "test"))
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]
     assert "in a device file ([leak] tau_s)" in missing_for_held_presses(report)
-    lines = list(report_lines(report))
-    assert lines[-3:-1] == ["missing to get a touch: nothing", "missing for held presses:"]
+    assert report.missing == ()
 
 
 def test_check_of_a_channel_without_a_number():
@@ -86,16 +86,16 @@ def test_check_of_a_channel_without_a_number():
     assert report.channels[0].unusable == report.good == 400
     assert "channel A is nan in 400 frames" in missing(report)
     assert "channel B is dead: every value is 1.5" in missing(report)
-    assert {("A", "?"), ("B", "1.50")} <= {tuple(line.split()[:2]) for line in report_lines(report)}
     json.dumps(asdict(report), allow_nan=False)
 
 
-def test_table_of_a_board_that_sends_microcoulombs():
+def test_table_of_a_board_that_sends_microcoulombs(capsys):
     report = examine_received(
         received(lambda k: b"A_uC:%.7f,B_uC:%.7f\n" % (4e-4 + 1e-7 * (k % 2), -3e-4 - 3e-7 * (k % 2)))
     )
-    rows = [line.split()[:3] for line in report_lines(report) if line.startswith(("A", "B"))]
-    assert rows == [["A_uC", "0.00040005", "5e-08"], ["B_uC", "-0.00030015", "1.5e-07"]]
+    show_result(brief_report(report), json=False)
+    rows = [line.split()[:3] for line in capsys.readouterr().out.splitlines() if line.lstrip().startswith(("A", "B"))]
+    assert rows == [["A_uC", "0.00040005", "4.9998e-08"], ["B_uC", "-0.00030015", "1.4999e-07"]]
 
 
 @pytest.mark.parametrize(
@@ -134,9 +134,9 @@ def test_unused_inputs_are_ignored():
     assert (report.unused, report.unit) == (("2", "5"), "counts")
     assert "dead" not in missing(report)
     assert "--pc-per-unit" in missing(report)
-    text = "\n".join(report_lines(report))
-    assert "the channels are counts, not pC" in text
-    assert "pC" not in text.partition("channel ")[2].splitlines()[0]
+    (first, *_) = brief_report(report)["channels"]
+    assert {"offset_counts", "drift_counts_per_s"} <= set(first)
+    assert not any("pC" in name for name in first)
 
 
 def test_too_few_used_channels_for_the_model():

@@ -1,7 +1,5 @@
 """`isocharge serve check`: comparison of a model with measured presses."""
 
-import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,13 +8,15 @@ import typer
 
 from isocharge.cli.shared.options import JsonOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
-from isocharge.cli.shared.terminal import show, show_json
+from isocharge.cli.shared.terminal import say, show_result
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses
-from isocharge.serve.prediction.press_errors import ErrorSummary
 
 MAX_ROWS = 40
 """Largest number of presses in the table. If there are more, the presses with the largest errors are listed."""
+
+SHOWN = ("line", "x_mm", "y_mm", "force_N", "position_error_mm", "force_error_percent", "flags", "left_out")
+"""Values of a press in the table."""
 
 
 def check_command(
@@ -43,93 +43,23 @@ def check_command(
     """
     predictor = Predictor(model, models=models)
     check = check_presses(predictor, read_press_file(file, predictor.metadata.electrodes, position_std_mm, force_std))
-    if json:
-        show_json(check.to_dict())
-    else:
-        show("\n".join(_report_lines(check)))
+    result = check.to_dict()
+    if not json:
+        del result["each"]
+        summaries = {name: result.pop(name) for name in ("position_mm", "force_percent")}
+        errors = {name: summary for name, summary in summaries.items() if summary is not None}
+        presses = [{name: row[name] for name in SHOWN} for row in _worst_presses(check)]
+        result = {"each": presses, "errors": errors} | result
+        result["std_factor"] = check.std_factor and check.std_factor.statement
+    show_result(result, json=json)
     raise typer.Exit(0 if check.fits else 1)
 
 
-def _report_lines(check: PressCheck) -> Iterator[str]:
-    """Yield the lines of the report: presses, summary of the errors, statistical tests, verdict and notes.
-
-    The summary contains the errors, and the parts of the errors that are explained by the noise of the charges and by
-    the uncertainty of the rig. The column `beyond` is the part of the errors that neither the noise nor the rig
-    explains.
-
-    Args:
-        check: Result of the comparison.
-    """
-    yield from _press_lines(check)
-    yield ""
-    yield f"{check.model}, {check.compared} of {check.presses} presses"
-    yield f"{'error':14}{'rms':>9}{'median':>9}{'max':>9}{'noise':>9}{'rig':>9}{'beyond':>9}"
-    yield from _summary_line("position, mm", check.position_mm)
-    yield from _summary_line("force, %", check.force_percent)
-
-    # Statistical tests of whether the noise and the rig explain the errors. Without measured positions or forces, there
-    # are no errors.
-    agreement = check.agreement
-    if agreement.degrees > 0:
-        reduced_chi_squared = agreement.chi_squared / agreement.degrees
-        yield (
-            f"chi-squared per degree of freedom {reduced_chi_squared:.3g} ({agreement.degrees}), "
-            f"p value {agreement.p_value:.2g}"
-        )
-    if check.position_mm is not None:
-        shift_x = agreement.shift_x
-        shift_y = agreement.shift_y
-        yield f"shift ({shift_x.mean:.3f} +- {shift_x.std:.3f}, {shift_y.mean:.3f} +- {shift_y.std:.3f}) mm"
-    if check.force_percent is not None:
-        relative_error = agreement.force  # common to all forces
-        yield f"scale of the force {1.0 + relative_error.mean:.4f} +- {relative_error.std:.4f}"
-
-    yield ""
-    yield check.verdict
-    if check.std_factor is not None:
-        yield check.std_factor.statement
-    yield from (f"- {note}" for note in check.notes)
-
-
-def _press_lines(check: PressCheck) -> Iterator[str]:
-    """Yield the lines of a table of the `MAX_ROWS` presses with the largest errors, in the order of the file."""
+def _worst_presses(check: PressCheck) -> list[dict[str, Any]]:
+    """Return the `MAX_ROWS` presses with the largest errors, in the order of the file."""
     squared_ratio = check.errors.squared_ratio  # squared errors of x, y and F over their variances, shape (n, 3)
     chi_squared = np.nansum(squared_ratio, axis=1)  # shape (n,); an unknown error is NaN and does not count
     worst_indices = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
     if check.presses > MAX_ROWS:
-        yield f"the {MAX_ROWS} worst of {check.presses} presses; --json has all"
-    yield f"{check.errors.row_noun:>6}{'x, mm':>9}{'y, mm':>9}{'force, N':>10}{'off, mm':>9}{'off, %':>9}  flags"
-    for press_index in sorted(worst_indices.tolist()):  # in the order of the file
-        yield _press_line(check.errors.row(press_index))
-
-
-def _press_line(row: dict[str, Any]) -> str:
-    """Format the values of `PressErrors.row` as the line of one press.
-
-    The line contains the place of the press in the file, the estimated x, y and force, their errors, the flags and, if
-    the press is left out of the comparison, the reason.
-    """
-    numbers = [
-        _number_cell(row["x_mm"], width=9, decimals=2),
-        _number_cell(row["y_mm"], width=9, decimals=2),
-        _number_cell(row["force_N"], width=10, decimals=3),
-        _number_cell(row["position_error_mm"], width=9, decimals=3),
-        _number_cell(row["force_error_percent"], width=9, decimals=2),
-    ]
-    notes = list(row["flags"])
-    if row["left_out"]:  # the reason why the press is left out
-        notes.append(row["left_out"])
-    return f"{row['line']:>6}{''.join(numbers)}  {', '.join(notes)}".rstrip()
-
-
-def _number_cell(value: float, width: int, decimals: int) -> str:
-    """Format a number, aligned to the right in a cell of the given width. NaN is formatted as a dash."""
-    text = "-" if math.isnan(value) else f"{value:.{decimals}f}"
-    return text.rjust(width)
-
-
-def _summary_line(name: str, errors: ErrorSummary | None) -> Iterator[str]:
-    """Yield the line of the summary for one kind of error, or nothing if there are no errors of this kind."""
-    if errors is not None:
-        values = (errors.rms, errors.median, errors.max, errors.noise, errors.rig, errors.beyond)
-        yield f"{name:14}" + "".join(f"{value:9.3g}" for value in values)
+        say(f"the table has the {MAX_ROWS} worst of {check.presses} presses; --json has all")
+    return [check.errors.row(press_index) for press_index in sorted(worst_indices.tolist())]

@@ -12,19 +12,19 @@ from serial.tools import list_ports
 
 from isocharge.cli.serve.records import WaitOption
 from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption
-from isocharge.cli.shared.terminal import say, show, show_json
+from isocharge.cli.shared.terminal import say, show, show_json, show_result
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.files import refuse_existing, write_whole
-from isocharge.common.printable_text import printable
 from isocharge.serve import Examination, Port, Predictor, device_from_table, examine, load_device
-from isocharge.serve.examination.channel_health import ChannelHealth
 from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.electrode_check import ElectrodeCheck, check_electrodes, corrected_table
 from isocharge.serve.examination.listening import BAUDS
 from isocharge.serve.model.model_search import model_names, repositories
 from isocharge.serve.port.serial_line import Request
-from isocharge.serve.port.source import has_speed
 from isocharge.serve.presses.number_text import parse_number
+
+SHOWN = ("name", "offset_pC", "noise_pC", "drift_pC_per_s", "hum_pC")
+"""Values of a channel in the table."""
 
 GAIN_METAVAR = "NUMBER|A=..,B=.."
 
@@ -135,7 +135,7 @@ def doctor_command(
         wait=wait,
     )
     if not json:
-        show("\n".join(report_lines(examination)))
+        show_result(brief_report(examination), json=False)
     if metadata and unnoticed and examination.good and not json:
         show(f"{metadata.label}: {unnoticed.summary}")
     is_unit_missing = write is not None and device is None and examination.unit != "pC"
@@ -307,82 +307,15 @@ def _write_device_file(path: Path, examination: Examination, model: str) -> None
     say(f"{path} written; use it with: {command}")
 
 
-def report_lines(examination: Examination) -> Iterator[str]:
-    """Yield the lines of the report on a port: the frames, a table of the channels, and the missing settings.
+def brief_report(examination: Examination) -> dict[str, Any]:
+    """Return the report on a port without the device file, and with the unit of the channels in the names of values.
 
     Args:
         examination: Result of the port check.
     """
-    # The frames
-    speed = f" at {examination.baud} baud" if has_speed(examination.url) else ""
-    yield f"{examination.url}{speed}: {examination.format}"
-    yield f"{examination.bytes_seen} bytes in {examination.seconds:.1f} s, {examination.rate_Hz:.1f} frames/s"
-    yield f"{examination.good} good frames, {examination.bad} bad pieces"
-    yield _numbering_line(examination)
-    if examination.unused:
-        yield f"channels that no electrode uses: {printable(', '.join(examination.unused))}"
-
-    # The channels: a line if their unit is not pC, and a table with one row for each channel
-    if examination.unit == "V":
-        yield "the channels are volts, it seems, not pC"
-    elif examination.unit != "pC":
-        yield f"the channels are {examination.unit}, not pC"
-    if examination.channels:
-        unit = UNIT_SYMBOLS.get(examination.unit, examination.unit)
-        yield f"channel    offset {unit}   noise {unit}  drift {unit}/s  50 Hz {unit}  60 Hz {unit}"
-    for channel in examination.channels:
-        yield _channel_line(channel, examination.unit)
-    if examination.held:
-        yield examination.held  # a sentence about a press that was held during the check
-
-    # The missing settings
-    yield "missing to get a touch:" if examination.missing else "missing to get a touch: nothing"
-    for sentence in examination.missing:
-        yield f"- {sentence}"
-    if examination.missing_for_held_presses:
-        yield "missing for held presses:"
-    for sentence in examination.missing_for_held_presses:
-        yield f"- {sentence}"
-
-
-UNIT_SYMBOLS = {"pC": "pC", "counts": "ct", "V": " V"}
-"""Symbols of the units in the head of the table. Each symbol has two characters."""
-
-COLUMN_WIDTHS = (12, 11, 12, 10, 10)
-"""Widths of the columns of numbers, characters."""
-
-FORMATS = {
-    "pC": (".2f", ".3f", ".2f", ".2f", ".2f"),
-    "counts": (".2f", ".3f", ".2f", ".2f", ".2f"),
-    "V": (".5f", ".6f", ".5f", ".5f", ".5f"),
-}
-"""Formats of the columns of numbers, by the unit. Other units get `OTHER_FORMATS`."""
-
-OTHER_FORMATS = (".5g", ".3g", ".3g", ".3g", ".3g")
-"""Formats of the columns in units whose size is not known, such as the uC of a channel `A_uC`: significant digits."""
-
-
-def _numbering_line(examination: Examination) -> str:
-    """Return a line about lost and repeated frames, and about the clock of the device."""
-    clock = "a device clock" if examination.device_clock else "no device clock"
-    if examination.lost is None:
-        return f"frames have no numbers; {clock}"
-    return f"{examination.lost} lost, {examination.repeated} repeated; {clock}"
-
-
-def _channel_line(channel: ChannelHealth, unit: str) -> str:
-    """Return the row of a channel in the table of the report.
-
-    Args:
-        channel: Health of the channel.
-        unit: Unit of the channel: "pC", "counts", "V", or a unit in its name, such as "nC".
-    """
-    # The attributes are named after pC, but their values have the unit of the channel. The hum has two amplitudes, at
-    # 50 Hz and at 60 Hz. A value that was not measured is None.
-    results = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
-    formats = FORMATS.get(unit, OTHER_FORMATS)
-    cells = [f"{printable(channel.name):8.8s}"]
-    for result, width, form in zip(results, COLUMN_WIDTHS, formats, strict=True):
-        text = "?" if result is None else f"{result:{form}}"
-        cells.append(f"{text:>{width}s}")
-    return "".join(cells)
+    report = asdict(examination)
+    del report["device"]
+    report["channels"] = [
+        {name.replace("_pC", f"_{examination.unit}"): channel[name] for name in SHOWN} for channel in report["channels"]
+    ]
+    return {name: value for name, value in report.items() if value != ""}

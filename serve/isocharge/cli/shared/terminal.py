@@ -15,8 +15,9 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from shutil import get_terminal_size
 from typing import Any, Self
 
 import typer
@@ -97,6 +98,73 @@ def show_json(value: Any) -> None:
     from isocharge.common.json_values import plain_values  # imports numpy, which help does not need
 
     print(printable(json.dumps(plain_values(value), allow_nan=False)), flush=True)
+
+
+def show_result(result: Mapping[str, Any], *, json: bool) -> None:
+    """Print a result on stdout, either as one line of JSON, or as text with the same names and values.
+
+    In the text, each value, each item of a dictionary and each of several sentences has a line. A list or a dictionary
+    of dictionaries is a table. Numbers are rounded to five significant digits. A number that is unknown or not finite
+    is printed as a dash.
+
+    Args:
+        result: Values by their names, which contain the units. The dictionaries of a table have the same keys.
+        json: Whether to print JSON.
+    """
+    from isocharge.common.json_values import plain_values  # imports numpy, which help does not need
+
+    values: Any = plain_values(result)
+    if json:
+        show_json(values)
+        return
+    width = max(map(len, values))
+    next_line = "\n" + " " * (width + 2)
+    for name, value in values.items():
+        rows = value
+        if isinstance(value, dict) and value and all(isinstance(item, dict) for item in value.values()):
+            rows = [{"": key} | item for key, item in value.items()]
+        if isinstance(rows, list) and rows and isinstance(rows[0], dict):
+            show("\n".join([f"{name}:", *_table_lines(rows)]))
+        else:
+            show(f"{name:<{width}}  {_value_text(value, separator=next_line)}")
+
+
+def _table_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """Return the lines of a table, with one column for each key of the rows.
+
+    A table that is wider than the terminal has one column for each row instead.
+    """
+    table = [list(rows[0]), *([_value_text(value) for value in row.values()] for row in rows)]
+    lines = _aligned_lines(table)
+    max_characters, _lines = get_terminal_size((100, 24))  # 100 without a terminal
+    if len(lines[0]) <= max_characters:
+        return lines
+    return _aligned_lines([list(column) for column in zip(*table, strict=True)])
+
+
+def _aligned_lines(table: list[list[str]]) -> list[str]:
+    """Return the rows of a table as lines in which the cells of each column are aligned at the right."""
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    return ["  ".join(map(str.rjust, row, widths)).rstrip() for row in table]
+
+
+def _value_text(value: Any, separator: str = ", ") -> str:
+    """Return a value as text.
+
+    Args:
+        value: Number, text, None, or a list or dictionary of such values.
+        separator: Text between the items of a dictionary or of a list of texts.
+    """
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.5g}"
+    if isinstance(value, dict):
+        return separator.join(f"{key} {_value_text(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        is_text = bool(value) and isinstance(value[0], str)
+        return (separator if is_text else ", ").join(map(_value_text, value)) or "none"
+    return printable(str(value))
 
 
 def announce(line: str) -> None:

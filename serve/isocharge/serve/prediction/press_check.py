@@ -103,10 +103,8 @@ class PressCheck:
         agreement = self.agreement
         degrees = agreement.degrees
         values = {
+            "each": [self.errors.row(press) for press in range(self.presses)],
             "model": self.model,
-            "fits": self.fits,
-            "verdict": self.verdict,
-            "notes": self.notes,
             "presses": self.presses,
             "counted": self.compared,
             "position_mm": None if self.position_mm is None else asdict(self.position_mm),
@@ -121,7 +119,9 @@ class PressCheck:
             "force_scale_std": agreement.force.std,
             "common_p_value": agreement.common_p_value,
             "std_factor": None if self.std_factor is None else self.std_factor.factor,
-            "each": [self.errors.row(press) for press in range(self.presses)],
+            "fits": self.fits,
+            "notes": self.notes,
+            "verdict": self.verdict,
         }
         return {name: plain_values(value) for name, value in values.items()}
 

@@ -3,14 +3,14 @@
 import json as json_module
 from math import inf
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from isocharge.cli.shared.forward_maps import executor_for
 from isocharge.cli.shared.options import ForceRangeOption, JsonOption, NoiseOption, SensorArgument, WorkersOption
 from isocharge.cli.shared.probe_option import ProbeOption
-from isocharge.cli.shared.terminal import say, show, show_json, shown_progress
+from isocharge.cli.shared.terminal import say, show_result, shown_progress
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import InputError
 from isocharge.common.files import new_folder, refuse_existing
@@ -84,33 +84,8 @@ def identify_command(
             (folder / RESULTS).write_bytes(json_module.dumps(results, indent=1).encode())
 
     # Print the results and a summary in sentences.
-    if json:
-        show_json(results)
-    else:
-        show(_table(results))
+    brief = ("working_area", "limits_in_working_area")
+    show_result(results if json else {name: results[name] for name in brief}, json=json)
     say(identification.summary)
     if identification.mirror is not None:
         say(identification.mirror.summary)
-
-
-def _table(results: dict[str, Any]) -> str:
-    """Return the table that the command prints, with the error statistics within the working area for each force.
-
-    Args:
-        results: Result of `Identification.to_dict`.
-    """
-    radius_mm = results["working_area"]["radius_mm"]
-    lines = [f"within {radius_mm:g} mm    position, mm: median    rms  worst    force, %: median    rms  worst"]
-    for errors in results["limits_in_working_area"]:
-        force = f"{errors['force_N']:8g} N"
-
-        # The widths of the columns align the numbers with the words "median", "rms" and "worst" of the first line.
-        position_median = f"{errors['position_median_mm']:25.3f}"
-        position_rms = f"{errors['position_rms_mm']:6.3f}"
-        position_worst = f"{errors['position_worst_mm']:6.3f}"
-        force_median = f"{errors['force_median_percent']:18.2f}"
-        force_rms = f"{errors['force_rms_percent']:6.2f}"
-        force_worst = f"{errors['force_worst_percent']:6.2f}"
-        columns = [force, position_median, position_rms, position_worst, force_median, force_rms, force_worst]
-        lines.append(" ".join(columns))
-    return "\n".join(lines)

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from math import isfinite
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -14,7 +14,7 @@ from isocharge.cli.shared.options import (
     parse_side_force,
 )
 from isocharge.cli.shared.probe_option import ProbeOption
-from isocharge.cli.shared.terminal import say, show, show_json
+from isocharge.cli.shared.terminal import say, show_result
 from isocharge.common.errors import InputError
 from isocharge.simulate import (
     Equilibrium,
@@ -115,11 +115,9 @@ def point_command(
     report = {"charge_pC": charge_pC, **summary(equilibrium)}
     if any(applied_side_force):
         report["side_force_N"] = list(applied_side_force)
-    if json:
-        show_json(report)
-    else:
-        show(_table(report))
-    for warning in [*_cautions(equilibrium, accuracy), *report["warnings"]]:
+    warnings = report["warnings"] if json else report.pop("warnings")
+    show_result(report, json=json)
+    for warning in [*_cautions(equilibrium, accuracy), *warnings]:
         say(f"caution: {warning}")
 
 
@@ -139,27 +137,3 @@ def _cautions(equilibrium: Equilibrium, accuracy: float) -> list[str]:
     if error > accuracy:
         return [f"expected an error of the charges of at most {accuracy:.2g} (--accuracy), got {error:.2g}"]
     return []
-
-
-def _table(report: dict[str, Any]) -> str:
-    """Return the text that the command prints: charges, side force, deflection, theory and solver.
-
-    Args:
-        report: Results by the names of the JSON output. The side force is contained only if it is not zero.
-    """
-    lines = [f"charge {name:<10} {charge:10.2f} pC" for name, charge in report["charge_pC"].items()]
-    if "side_force_N" in report:
-        side_x, side_y = report["side_force_N"]
-        lines.append(f"side force        ({side_x:.4g}, {side_y:.4g}) N")
-    lines.append(f"deflection        {report['deflection_mm']:10.4f} mm")
-    lines.append(f"theory            {report['theory']}, estimated error {_percent(report['estimated_error'])}")
-    lines.append(
-        f"solver            {report['status']} in {report['iterations']} steps, residual {report['residual']:.1e}, "
-        f"{report['seconds']:.3f} s CPU"
-    )
-    return "\n".join(lines)
-
-
-def _percent(error: float | None) -> str:
-    """Return a relative error as text in percent, or "unknown" if the error is None."""
-    return "unknown" if error is None else f"{error:.2%}"
