@@ -25,7 +25,7 @@ from isocharge.serve import (
     read_charges,
 )
 from isocharge.serve.live.device import create_stages
-from isocharge.serve.model.charge_series import charges_from_bytes
+from isocharge.serve.model.charge_file import charge_map_from_bytes
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.virtual_sensor.script import load_script
@@ -325,7 +325,7 @@ def test_charge_maps_with_faults(attack):
         return file.getvalue()
 
     def read(data):
-        charges = charges_from_bytes(data, ELECTRODES)
+        charges = charge_map_from_bytes(data, ELECTRODES)
         assert np.isfinite(charges.linearised(np.array([[0.0, 0.0, 0.5], [3.0, -2.0, 0.1]]))[0]).all()
 
     read(packed(good))

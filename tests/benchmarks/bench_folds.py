@@ -22,7 +22,7 @@ from shared import options, print_results
 
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.model.charge_series import read_charges
+from isocharge.serve.model.charge_file import read_charge_map
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
 from isocharge.simulate import Circle, ForwardMap, noise_model
@@ -156,7 +156,7 @@ def main() -> None:
     rng = np.random.default_rng(asked.seed)
     noise = noise_model(asked.noise)
     metadata = predictor.metadata
-    charges = read_charges(predictor.folder, metadata.electrodes)
+    charges = read_charge_map(predictor.folder, metadata.electrodes)
     if charges is None or not charges.is_folded:
         raise SystemExit(f"{asked.model}: no charges.npz: its map does not fold; give the model of the lines above")
     tracker = Tracker(Setup(metadata.electrodes, {TrackRule: TrackRule()}, predictor=predictor))

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from attacks.companions import ELECTRODES, charge_arrays
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
-from isocharge.serve.model.charge_series import ChargeSeries, charges_from_bytes, interpolation_weights, read_charges
+from isocharge.serve.model.charge_file import charge_map_bytes, charge_map_from_bytes, read_charge_map
+from isocharge.serve.model.charge_series import ChargeSeries, interpolation_weights
 
 DOMAIN = Domain(8.0, (0.05, 2.0))
 NODES = np.array([-0.5, 0.0, 0.25])
@@ -140,7 +141,7 @@ def test_interpolation_weights_reproduce_a_cubic_and_continue_linearly():
 @pytest.mark.parametrize("is_signed", [False, True])
 def test_file_is_read_as_it_was_written(is_signed):
     written = replace(random_series(is_signed=is_signed), offset_pC=3.5)
-    read = charges_from_bytes(written.to_bytes(), ELECTRODES)
+    read = charge_map_from_bytes(charge_map_bytes(written), ELECTRODES)
     contact = random_contacts()
     state = np.array([0.1, 1.0, -1.0])
     np.testing.assert_array_equal(read.changes(contact, state).charge_pC, written.changes(contact, state).charge_pC)
@@ -153,7 +154,7 @@ def test_map_with_a_single_force_is_read_and_does_not_depend_on_the_force():
     coefficients[0, 0, 0, 0] = 5.0
     coefficients[0, 1, 0, 0] = coefficients[0, 0, 1, 0] = 0.1
     series = ChargeSeries(domain=Domain(8.0, (0.5, 0.5)), electrodes=ELECTRODES, coefficients=coefficients)
-    read = charges_from_bytes(series.to_bytes(), ELECTRODES)
+    read = charge_map_from_bytes(charge_map_bytes(series), ELECTRODES)
     charge, slopes = read.linearised(np.array([[4.0, 0.0, 0.5], [4.0, 0.0, 0.9]]))
     np.testing.assert_allclose(charge, np.exp(5.05), rtol=1e-6)
     np.testing.assert_array_equal(slopes[:, :, 2], 0.0)
@@ -207,11 +208,11 @@ SERIES = GOOD["series"]
 )
 def test_file_that_describes_no_charges_is_refused(change, reason):
     with pytest.raises(ModelError, match=rf"charges\.npz: .*{reason}.*train again"):
-        charges_from_bytes(packed(GOOD | change), ELECTRODES)
+        charge_map_from_bytes(packed(GOOD | change), ELECTRODES)
 
 
 def test_model_without_the_file_has_no_map(tmp_path):
-    assert read_charges(tmp_path, ELECTRODES) is None
+    assert read_charge_map(tmp_path, ELECTRODES) is None
 
 
 numbers = st.floats(width=32, allow_nan=True, allow_infinity=True) | st.sampled_from([0.0, 1.0, -1.0, 1e300])
@@ -222,7 +223,7 @@ def test_file_with_any_number_is_refused_or_gives_finite_charges(name, entry, nu
     changed = np.array(GOOD[name], float)
     changed.flat[entry % changed.size] = number
     try:
-        series = charges_from_bytes(packed(GOOD | {name: changed}), ELECTRODES)
+        series = charge_map_from_bytes(packed(GOOD | {name: changed}), ELECTRODES)
     except ModelError:
         return
     contact = series.domain.to_contact(np.array([[0.0, 0.0, 0.0], [0.5, -0.5, 1.0], [3.0, 0.0, -2.0]]))

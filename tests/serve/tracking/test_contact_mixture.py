@@ -15,7 +15,8 @@ from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import Chunk, Frame, Predictor, TouchStream, encode_frame
 from isocharge.serve.live.device import device_from_table
-from isocharge.serve.model.charge_series import ChargeSeries, read_charges
+from isocharge.serve.model.charge_file import charge_map_bytes, read_charge_map
+from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.tracking.contact_mixture import GAIN_STD, ContactMixture
 from stage_runner import new_tracker
@@ -197,7 +198,7 @@ def test_contact_is_found_again_at_once_if_the_clock_is_set_back(set_back_s: flo
 def model(models, tmp_path):
     """A model with the file `charges.npz` of its film."""
     folder = shutil.copytree(models / "linear", tmp_path / "linear") / "1"
-    put_charges(folder, folded_series().to_bytes())
+    put_charges(folder, charge_map_bytes(folded_series()))
     return folder
 
 
@@ -267,14 +268,14 @@ def test_stream_keeps_its_model_if_the_charges_npz_of_the_next_model_is_damaged(
         (lambda data: data[::-1], "zip"),
         (lambda data: re.sub(rb"(PK\x01\x02.{4})\0", rb"\g<1>" b"\x01", data, flags=re.DOTALL), "encrypted"),
         (
-            lambda _: folded_series(coefficients=np.zeros((1, 3, 3, 2, 4))).to_bytes(),
+            lambda _: charge_map_bytes(folded_series(coefficients=np.zeros((1, 3, 3, 2, 4)))),
             r"shape \(1, n, n, n, 3\), got \(1, 3, 3, 2, 4\)",
         ),
-        (lambda _: folded_series(coefficients=np.full((1, 3, 3, 2, 3), np.nan)).to_bytes(), "finite"),
-        (lambda _: folded_series(domain=Domain(6.0, (2.0, 1.0))).to_bytes(), "got 2 and 1 N"),
+        (lambda _: charge_map_bytes(folded_series(coefficients=np.full((1, 3, 3, 2, 3), np.nan))), "finite"),
+        (lambda _: charge_map_bytes(folded_series(domain=Domain(6.0, (2.0, 1.0)))), "got 2 and 1 N"),
     ],
 )
 def test_damaged_charges_npz_raises_a_model_error(model, spoil, message):
-    put_charges(model, spoil(folded_series().to_bytes()))
+    put_charges(model, spoil(charge_map_bytes(folded_series())))
     with pytest.raises(ModelError, match=rf"charges\.npz: .*({message}).*train again"):
-        read_charges(model, ELECTRODES)
+        read_charge_map(model, ELECTRODES)

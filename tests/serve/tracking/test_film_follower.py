@@ -12,7 +12,8 @@ from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import Contact
-from isocharge.serve.model.charge_series import FILE, ChargeSeries
+from isocharge.serve.model.charge_file import FILE, charge_map_bytes
+from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.simulate import noise_model
 
@@ -50,7 +51,7 @@ def series() -> ChargeSeries:
 
 def model_in(folder, series: ChargeSeries) -> SimpleNamespace:
     """Return a model of the calibrated film that searches for the nearest contact, and write its charge map."""
-    data = series.to_bytes()
+    data = charge_map_bytes(series)
     (folder / FILE).write_bytes(data)
     golden = json.loads(GOLDEN.read_text("utf-8")) | {"files": {FILE: sha256_of(data)}}
     (folder / "golden.json").write_text(json.dumps(golden), "utf-8")

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from isocharge.common.errors import DatasetError, TrainingError
-from isocharge.serve.model.charge_series import charges_from_bytes
+from isocharge.serve.model.charge_file import charge_map_from_bytes
 from isocharge.simulate import Domain, Electrode, Sweep, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.forward.charge_map import differences
@@ -183,7 +183,7 @@ def test_charge_series_of_the_whole_domain_is_released_if_the_domain_is_reduced(
     presses = LabelledPresses(contact, 1000.0 * charges_folded_at(5.0)(*contact.T))
     data = TrainingData(sensor=sensor, probes=("circle:1.0",), domain=DOMAIN, presses=presses, sha256="0" * 64)
     fitted = fit(data, TINY)
-    series = charges_from_bytes(fitted.provenance.files["charges.npz"], ("A", "B", "C"))
+    series = charge_map_from_bytes(fitted.provenance.files["charges.npz"], ("A", "B", "C"))
     assert np.allclose(series.charges(contact), presses.charge, rtol=2e-3)
     assert fitted.domain.radius < 5.2 < series.domain.radius
     assert "'serve stream --track' follows contacts to 8 mm" in fitted.cautions[0]

@@ -22,7 +22,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError
-from isocharge.serve.model.charge_series import FILE, read_charges
+from isocharge.serve.model.charge_file import FILE, read_charge_map
 from isocharge.serve.model.contact import Contact, is_close
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.record.record import FollowedFilm
@@ -125,7 +125,7 @@ class FilmFollower:
                 "fit some contact exactly on any film, so touches do not show its changes; update such a film with "
                 "`isocharge train calibrate --from`"
             )
-        series = read_charges(predictor.folder, electrodes)
+        series = read_charge_map(predictor.folder, electrodes)
         if series is None or series.node_MPa.size < 2:
             raise ModelError(
                 f"{predictor.folder}: expected the file {FILE} with the charges of the film at several pretensions; a "

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from isocharge.serve.flags import SATURATED
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.model.charge_series import read_charges
+from isocharge.serve.model.charge_file import read_charge_map
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.record.record import NO_TRACKING, OtherContact, TrackedContact, Tracking
 from isocharge.serve.signal_chain.rule import Rule, Share
@@ -159,7 +159,7 @@ class Tracker(Stage):
         self._mixture: ContactMixture | None = None
         predictor = setup.predictor
         if predictor is not None and setup.rule(FollowRule) is None:
-            charges = read_charges(predictor.folder, predictor.metadata.electrodes)  # None without the file
+            charges = read_charge_map(predictor.folder, predictor.metadata.electrodes)  # None without the file
             if charges is not None and charges.is_folded:
                 self._mixture = ContactMixture(charges, predictor.metadata.noise)
                 # A contact of the mixture is valid in the whole area for which the file describes the charges.

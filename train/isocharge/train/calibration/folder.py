@@ -27,7 +27,8 @@ import numpy as np
 
 from isocharge.common.errors import ModelError, PressError
 from isocharge.common.files import as_output_errors, locked, remove_empty, write_whole
-from isocharge.serve.model.charge_series import FILE as CHARGES
+from isocharge.serve.model.charge_file import FILE as CHARGES
+from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target
 from isocharge.serve.model.model_search import version_folders
@@ -189,7 +190,7 @@ def write_calibration(
     sensor, _ = result.sensor_and_probe
     is_folded = CHARGES in fitted.provenance.files
     files = {
-        CHARGES: replace(series, is_folded=is_folded).to_bytes(),
+        CHARGES: charge_map_bytes(replace(series, is_folded=is_folded)),
         RESULT: json_text(result_table(result)).encode(),
         SENSOR: sensor_to_toml(sensor).encode(),
         PICTURE: picture_bytes(calibration_picture(result)),

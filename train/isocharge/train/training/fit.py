@@ -18,7 +18,8 @@ from torch import Tensor
 from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.errors import ConfigError
 from isocharge.common.progress import second_thread
-from isocharge.serve.model.charge_series import FILE as CHARGES_FILE
+from isocharge.serve.model.charge_file import FILE as CHARGES_FILE
+from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import Dataset, NoiseModel, Sensor
 from isocharge.train.data.channel_noise import Noise
@@ -131,7 +132,7 @@ def _provenance(
     made_with.update(data.provenance.made_with)
     files = dict(data.provenance.files)
     if folded_charges is not None:
-        files[CHARGES_FILE] = folded_charges.to_bytes()
+        files[CHARGES_FILE] = charge_map_bytes(folded_charges)
     return replace(data.provenance, made_with=made_with, files=files)
 
 
