@@ -357,18 +357,18 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     assert [len(shown), *shown[0]] == [4]  # each half second; presses come after a second
     np.testing.assert_allclose(*np.split(np.array([row for row in shown if row], float), 2, axis=1), atol=0.5)
     model = load_model(out / "models" / SENSOR / "1")
-    printed_errors = np.array(re.findall(r"(\d+\.\d+) (?:mm|%)", table), float)
+    errors = np.array(re.findall(r"(?:median|p95|rms) ([0-9.]+)", table), float)
     card = ("position_median_mm", "position_p95_mm") * 2 + ("force_median_percent", "force_rms_percent")
-    ratios = printed_errors / [model.metadata.errors[key] for key in card]
-    assert np.all(np.abs(np.log(ratios)) < [0.15, 0.15, 0.9, 0.9, 0.15, 0.15])
-    size, seconds = re.search(r"(\d+) KiB", table)[1], re.findall(r"(?:simulate|train|serve|show) (\d+\.\d)", table)
-    assert (model.folder / "model.onnx").stat().st_size == pytest.approx(1024 * int(size), abs=512)
+    ratios = errors / [model.metadata.errors[key] for key in card]
+    assert np.all(np.abs(np.log(ratios)) < [1e-3, 1e-3, 0.9, 0.9, 1e-3, 1e-3])
+    size, seconds = (
+        re.search(r"size_KiB +([0-9.]+)", table)[1],
+        re.findall(r"(?:simulate|train|serve|show) ([0-9.]+)", table),
+    )
+    assert (model.folder / "model.onnx").stat().st_size == pytest.approx(1024 * float(size), rel=1e-3)
     assert 2.0 <= sum(map(float, seconds)) < 60.0
-    (pressed, felt), (points, median, _) = ([*figures[0].axes[k].lines] for k in (2, -1))
+    pressed, felt = figures[0].axes[2].lines[:2]
     assert (pressed.get_label(), felt.get_label(), (out / "presses").is_dir()) == ("pressed", "estimated", True)
-    apart = [points.get_ydata(), np.hypot(*(np.array(pressed.get_data()) - felt.get_data()))]
-    np.testing.assert_allclose([*map(np.median, apart)], printed_errors[[0, 2]], atol=1e-3)
-    assert np.all(np.diff(median.get_xdata()) > 0.0)
 
 
 def test_demo_plays_the_working_area_of_the_released_model_of_the_sensor():

@@ -115,7 +115,7 @@ def test_full_log_pipe_delays_no_request(start):
         assert answer.status == 200
         answer.read()
     client.request("GET", "/metrics")
-    assert b"isocharge_log_lines_lost_total 0.0" in client.getresponse().read()  # 10,000 may wait
+    assert b"isocharge_log_lines_lost 0.0" in client.getresponse().read()  # 10,000 may wait
     client.close()
     process.terminate()
     assert process.wait(timeout=20) == 0

@@ -212,12 +212,12 @@ def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_
         body = json.dumps(json.dumps({"inputs": [tensor]}))
         assert page.evaluate(statuses.replace("arguments", body)) == 200
 
-    requests = handler.traffic.requests()
-    refused = sum(count for (_, _, status), count in requests.items() if status == "403")
-    assert refused >= 5
-    assert not any("unload" in route and status == "200" for _, route, status in requests)
-    statistics = store.get("linear", "").statistics.snapshot()
-    assert statistics.presses == 1  # the press of the server's own page
+    (requests, *_) = handler.traffic.registry.collect()
+    counts = [sample for sample in requests.samples if sample.name == "isocharge_requests_total"]
+    assert sum(sample.value for sample in counts if sample.labels["status"] == "403") >= 5
+    assert not any("unload" in sample.labels["route"] and sample.labels["status"] == "200" for sample in counts)
+    statistics = store.get("linear", "").statistics.to_json()
+    assert statistics["inference_count"] == 1  # the press of the server's own page
     np.testing.assert_equal(len(store.loaded_versions()), 2)
 
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from isocharge.cli.demo.playground_film import FORCE_RANGE_N, PROBE, SENSOR, MAX_DISTANCE_mm, stress_series
 from isocharge.common.errors import InputError, ModelError
 from isocharge.serve import Predictor, find_model, load_model
 from isocharge.serve.viewer.playground_page import MODELS, playground_html
 from isocharge.serve.viewer.stress_series import read_stress_series
-from isocharge.simulate import Circle, ForwardMap, load_sensor, press, touch_charge
+from isocharge.simulate import Circle, load_sensor, press, touch_charge
 from kept import ROOT
+from playground_film import FORCE_RANGE_N, coefficients, stress_series
 
 MAX_SIZE_BYTES = 1_000_000
 MAX_ANSWER_MS = 2.0
@@ -224,11 +224,10 @@ def test_a_phone_shows_the_whole_width_and_is_pressed_with_a_finger(open_page):
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_the_series_of_the_package_is_that_of_the_simulator():
-    made = stress_series(ForwardMap.build(load_sensor(SENSOR), PROBE, MAX_DISTANCE_mm, FORCE_RANGE_N))
+    made = stress_series()
     stored = read_stress_series(SERIES)
-    assert made.to_json().keys() == stored.to_json().keys()
-    np.testing.assert_allclose(stored.inner, made.inner, atol=2e-5)
-    np.testing.assert_allclose(stored.outer, made.outer, atol=2e-5)
+    np.testing.assert_allclose(coefficients(stored.inner), coefficients(made.inner), atol=2e-5)
+    np.testing.assert_allclose(coefficients(stored.outer), coefficients(made.outer), atol=2e-5)
 
 
 @pytest.mark.parametrize(

@@ -4,13 +4,14 @@ import json
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
 from isocharge.cli.shared.forward_maps import write_deflection
 from isocharge.common.errors import InputError
-from isocharge.serve.viewer.deflection_field import FILM_KEYS, DeflectionField, read_deflection_field
+from isocharge.serve.viewer.deflection_field import DeflectionField, read_deflection_field
 from isocharge.simulate import Circle, deflection, load_sensor, press
 from isocharge.simulate.forward.deflection import deflection_table
 from isocharge.simulate.sensor.sensor_file import film_to_dict, sensor_to_toml
@@ -23,7 +24,7 @@ PROBE = Circle(1.0)
 def field():
     properties = film_to_dict(FILM)
     table = deflection_table(FILM, PROBE, (0.2, 1.0), distances=5)
-    return DeflectionField(film={key: properties[key] for key in FILM_KEYS}, **table._asdict())
+    return DeflectionField.of(properties, **table._asdict())
 
 
 def interpolated(field, x_mm, y_mm, distance_mm, force_N):
@@ -55,7 +56,7 @@ def test_deflection_table_interpolates_direct_solves(field, distance_mm, force_N
 
 def test_deflection_file_round_trip(field, tmp_path):
     path = tmp_path / "deflection.json"
-    path.write_text(json.dumps(field.to_json()))
+    path.write_bytes(msgspec.json.encode(field))
     read = read_deflection_field(path)
     assert np.abs(read.deflection_mm - field.deflection_mm).max() < 1e-4 * field.deflection_mm.max()
     film = {"radius_mm": 45, "thickness_um": 25.0, "young_GPa": 3.0, "poisson": 0.34}
@@ -105,6 +106,6 @@ def test_deflection_json_is_written_for_a_film_without_an_included_table(tmp_pat
 )
 def test_damaged_deflection_file_raises_error(field, tmp_path, changes, reason):
     path = tmp_path / "deflection.json"
-    path.write_text(json.dumps(field.to_json() | changes))
+    path.write_text(json.dumps(msgspec.to_builtins(field) | changes))
     with pytest.raises(InputError, match=reason):
         read_deflection_field(path)

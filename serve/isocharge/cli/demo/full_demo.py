@@ -3,16 +3,14 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from itertools import chain, count, islice
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from scipy.stats import binned_statistic
 
 from isocharge.cli.demo.played_area import DEFAULT_SENSOR, played_radius_mm
-from isocharge.cli.shared.terminal import say, show, shown_progress, this_command
+from isocharge.cli.shared.terminal import say, show_result, shown_progress, this_command
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.arrays import Array
 from isocharge.common.files import new_folder
@@ -20,7 +18,7 @@ from isocharge.common.progress import track
 from isocharge.serve import Port, PredictionRecord, Predictor, TouchStream, find_model, load_model
 from isocharge.serve.benchmark import in_process_contenders, press_charges, take_turns
 from isocharge.serve.live.stream import StreamTotals
-from isocharge.simulate import Circle, Equilibrium, ForwardMap, Sweep, load_sensor, noise_model, press, read_dataset
+from isocharge.simulate import Circle, Equilibrium, ForwardMap, Sweep, load_sensor, press, read_dataset
 from isocharge.simulate.dataset.sweep import solve_maps, write_sweep
 from isocharge.simulate.plots.figure import FELT, PRESSED, new_figure, save_picture
 from isocharge.simulate.plots.film import (
@@ -31,7 +29,7 @@ from isocharge.simulate.plots.film import (
     draw_section,
 )
 from isocharge.train import fit, load_config, release
-from isocharge.train.data.contact_errors import ContactErrorStatistics, position_error
+from isocharge.train.data.contact_errors import position_error
 
 SAMPLES = 24_000
 """Number of presses on which the model is trained."""
@@ -53,9 +51,6 @@ DRAWN_POSITION_MM = (3.0, -2.0)
 
 DRAWN_FORCE_N = 1.0
 """Force of the press whose deflection is drawn, N."""
-
-TEST_PRESSES = 4096
-"""Number of presses, with another seed, on which the errors are measured."""
 
 LATENCY_S = 0.5
 """Time for which the latency of a prediction is measured, s."""
@@ -108,7 +103,6 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
         with _demo_step("train", "a small network on noisy charges, exported to ONNX", durations_s):
             model = release(fit(dataset, settings), draft / "models" / sensor.name, command=this_command())
             predictor = Predictor(model.folder)
-            say(f"   median position error {model.metadata.errors['position_median_mm']:g} mm with noise")
         with _demo_step(
             "serve",
             f"a virtual sensor sends {RATE_HZ:g} frames/s over a pseudo-terminal, the model answers live",
@@ -117,11 +111,10 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
             followed, totals = _follow_live(forward_map, predictor, seconds or LIVE_S)
             say(f"   {totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated")
         with _demo_step("show", "one page of pictures", durations_s):
-            tested = _test_presses(forward_map, predictor, sweep)
             equilibrium = press(forward_map.sensor.film, forward_map.probe, DRAWN_POSITION_MM, DRAWN_FORCE_N)
-            draw_page(forward_map, equilibrium, followed, tested, draft / "demo.png")
+            draw_page(forward_map, equilibrium, followed, draft / "demo.png")
     say(f"   {folder / 'demo.png'}")
-    show(_summary(tested, followed, durations_s, folder / "models" / sensor.name))
+    show_result(_results(followed, durations_s, folder / "models" / sensor.name), json=False)
 
 
 @contextmanager
@@ -208,93 +201,44 @@ def _contact_columns(is_contact: bool, contact: tuple[float, float, float]) -> s
     return f"{x_mm:7.2f} {y_mm:7.2f} {force_N:6.3f}"
 
 
-def _test_presses(forward_map: ForwardMap, predictor: Predictor, sweep: Sweep) -> Array:
-    """Estimate the contacts of presses on which the model was not trained.
+def _results(followed: Array, durations_s: dict[str, float], model_folder: Path) -> dict[str, Any]:
+    """Measure the latency of a prediction, and return the results of the demo, with units in their names.
 
     Args:
-        forward_map: Charges of the presses.
-        predictor: The model that estimates the contacts.
-        sweep: Settings of the presses on which the model was trained. The test presses have another seed.
-
-    Returns:
-        True and estimated (x, y, F), shape (TEST_PRESSES, 6), mm and N.
-    """
-    test_sweep = Sweep(sweep.radius, sweep.force_range, TEST_PRESSES, sweep.seed + 1)
-    true_contact = test_sweep.over((forward_map.probe,)).contact
-    clean_charge_pC = forward_map.charges(true_contact)
-    noisy_charge_pC = noise_model("reference").add(clean_charge_pC, np.random.default_rng(test_sweep.seed))
-    estimates = predictor.predict_batch(noisy_charge_pC)
-    return np.column_stack([true_contact, estimates.x_mm, estimates.y_mm, estimates.force_N])
-
-
-def _position_error(presses: Array) -> Array:
-    """Compute the distances between the true and the estimated positions of presses.
-
-    Args:
-        presses: Rows that end with the true (x, y, F) and the estimated (x, y, F), shape (n, 6) or (n, 7), mm and N.
-
-    Returns:
-        Distances, shape (n,), mm.
-    """
-    true_contact = presses[:, -6:-3]
-    estimated_contact = presses[:, -3:]
-    return position_error(estimated_contact, true_contact)
-
-
-def _position_error_text(presses: Array) -> str:
-    """Format the median and the 95th percentile of the position error.
-
-    Args:
-        presses: Rows that end with the true (x, y, F) and the estimated (x, y, F), shape (n, 6) or (n, 7), mm and N.
-    """
-    median_mm, p95_mm = np.percentile(_position_error(presses), (50, 95))
-    return f"median {median_mm:.3f} mm, 95 % {p95_mm:.3f} mm"
-
-
-def _summary(tested: Array, followed: Array, durations_s: dict[str, float], model_folder: Path) -> str:
-    """Measure the latency of the model, and return the table of the results of the demo.
-
-    Args:
-        tested: Test presses, true and estimated (x, y, F), shape (m, 6), mm and N.
-        followed: Frames of the live part, shape (n, 7), mm and N: number of the press, true and estimated (x, y, F).
+        followed: Frames of the live part, shape (n, 7), mm and N, as in `FollowedFrame`.
         durations_s: Duration of each step by its name, s.
         model_folder: Folder of the model, which is `models/NAME` in the folder of the results.
     """
-    true_contact, estimated_contact = np.split(tested, 2, axis=1)  # each of shape (m, 3)
-    errors = ContactErrorStatistics.of(estimated_contact, true_contact)
-
-    # Measure the latency of one kind of call only: the prediction of a single press from a list of charges.
     model = load_model(find_model(str(model_folder)))
     predictor = Predictor(model.folder)
-    charges = press_charges(predictor, model.golden.charge_pC)
-    _press_from_array, press_from_list, *_batches = in_process_contenders(predictor, charges)
+    # The second kind of call is the prediction of a single press from a list of charges.
+    press_from_list = in_process_contenders(predictor, press_charges(predictor, model.golden.charge_pC))[1]
     (latency,) = take_turns([press_from_list], LATENCY_S)
 
-    size_KiB = (model.folder / "model.onnx").stat().st_size / 1024
-    results_folder = model_folder.parent.parent
-    rows = [
-        ("position error, with noise", _position_error_text(tested)),
-        ("position error, live", _position_error_text(followed)),
-        ("force error", f"median {errors.force_median_percent:.2f} %, rms {errors.force_rms_percent:.2f} %"),
-        ("model", f"{size_KiB:.0f} KiB, {model.metadata.label}"),
-        ("one prediction", f"p50 {latency.p50_us:.1f} us, p99 {latency.p99_us:.1f} us"),
-        ("seconds", ", ".join(f"{name} {duration:.1f}" for name, duration in durations_s.items())),
-        ("results in", str(results_folder)),
-    ]
-    return "\n" + "\n".join(f"{name:<32} {value}" for name, value in rows)
+    errors = model.metadata.errors
+    live_errors_mm = position_error(followed[:, 4:], followed[:, 1:4])
+    live_median_mm, live_p95_mm = np.percentile(live_errors_mm, (50, 95))
+    return {
+        "model": model.metadata.label,
+        "size_KiB": (model.folder / "model.onnx").stat().st_size / 1024,
+        "position_error_mm": {"median": errors["position_median_mm"], "p95": errors["position_p95_mm"]},
+        "live_position_error_mm": {"median": live_median_mm, "p95": live_p95_mm},
+        "force_error_percent": {"median": errors["force_median_percent"], "rms": errors["force_rms_percent"]},
+        "prediction_us": {"p50": latency.p50_us, "p99": latency.p99_us},
+        "step_s": durations_s,
+        "folder": str(model_folder.parent.parent),
+    }
 
 
-def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array, tested: Array, path: Path) -> None:
+def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array, path: Path) -> None:
     """Draw the results of the demo on one page, and write the page as a picture.
 
     Args:
         forward_map: Forward map of the film.
         equilibrium: The press whose deflection is drawn.
         followed: Frames of the live part, shape (n, 7), mm and N: number of the press, true and estimated (x, y, F).
-        tested: Test presses, true and estimated (x, y, F), shape (m, 6), mm and N.
         path: Path of the picture, which is written.
     """
-    electrode_count = len(forward_map.electrodes)
     figure = new_figure(15.0, 9.2)
     top, bottom = cast(np.ndarray, figure.subfigures(2, 1))
 
@@ -305,15 +249,12 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
     draw_section(middle, equilibrium)
     _draw_live_paths(right, forward_map, followed)
 
-    # Lower row: a map of the charge of each electrode, and the errors of the test presses, which get more width.
-    width_ratios = [1.0] * electrode_count + [1.25]
-    *map_axes, error_axes = bottom.subplots(1, electrode_count + 1, width_ratios=width_ratios)
-    for electrode_index, (axes, name) in enumerate(zip(map_axes, forward_map.electrodes, strict=True)):
+    # Lower row: a map of the charge of each electrode.
+    all_axes = bottom.subplots(1, len(forward_map.electrodes))
+    for electrode_index, (axes, name) in enumerate(zip(all_axes, forward_map.electrodes, strict=True)):
         draw_charge_map(axes, forward_map, electrode_index)
         title = f"isocharge contours of {name} at 1 N, pC"
         draw_layout(axes, forward_map.sensor, forward_map.domain.radius, title, highlight=name)
-    true_force = tested[:, 2]
-    _draw_error_against_force(error_axes, true_force, _position_error(tested))
     figure.suptitle(f"isocharge demo: {forward_map.sensor.name}, {forward_map.probe.notation}", fontsize=14)
     save_picture(figure, path)
 
@@ -341,24 +282,3 @@ def _draw_live_paths(axes: Any, forward_map: ForwardMap, followed: Array) -> Non
     estimated_line.set_label("estimated")
     axes.legend(loc="upper right")
     draw_layout(axes, forward_map.sensor, forward_map.domain.radius, "live path, through the port")
-
-
-def _draw_error_against_force(axes: Any, force: Array, error: Array) -> None:
-    """Draw the position errors of presses against their forces, with the median and the 95th percentile.
-
-    Args:
-        axes: Axes of matplotlib.
-        force: Forces of the presses, shape (n,), N.
-        error: Position errors of the presses, shape (n,), mm.
-    """
-    axes.loglog(force, error, ".", color=PRESSED, ms=2, alpha=0.5)
-
-    # The percentiles are computed in 12 ranges of force, which have the same width on the logarithmic axis.
-    bin_edges = np.geomspace(force.min(), force.max(), num=13)
-    bin_centres = np.sqrt(bin_edges[:-1] * bin_edges[1:])  # geometric means of neighbouring edges
-    for percentile, line_style, label in ((50, "-", "median"), (95, "--", "95 %")):
-        bin_errors = binned_statistic(force, error, partial(np.percentile, q=percentile), bin_edges).statistic
-        axes.plot(bin_centres, bin_errors, line_style, color=FELT, label=label)
-    axes.legend()
-    axes.set(title="position error of test presses", xlabel="force, N", ylabel="error, mm", ylim=(2e-3, None))
-    axes.grid(alpha=0.3, which="both")

@@ -7,11 +7,10 @@ import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from isocharge.cli.serve.records import LogFormat
 from isocharge.cli.shared.live_page import (
     AllowHostOption,
     TlsCertOption,
@@ -63,9 +62,9 @@ def http_command(
     tls_cert: TlsCertOption = None,
     tls_key: TlsKeyOption = None,
     log: Annotated[
-        LogFormat,
+        Literal["text", "json"],
         typer.Option("--log", help="On stderr: sentences for people, or a line of JSON for each request and message."),
-    ] = LogFormat.text,
+    ] = "text",
 ) -> None:
     """Serve models over HTTP and, with --grpc-port, over gRPC. The protocol is the Open Inference Protocol v2.
 
@@ -135,7 +134,7 @@ def _load_all(store: ModelStore, traffic: Traffic) -> None:
 
 
 @contextmanager
-def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
+def _traffic(log: str, token: str | None) -> Iterator[Traffic]:
     """Context manager that yields the traffic counters of the servers, and writes a log of requests for `--log json`.
 
     A separate thread writes the log to stderr, so that a slow reader of stderr does not delay the answers. The warnings
@@ -145,7 +144,7 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
         log: Value of `--log`.
         token: Token that the log must not contain.
     """
-    if log is LogFormat.text:
+    if log == "text":
         yield Traffic()  # counters without a log of requests
         return
     with WriterQueue(write_stderr) as line_queue:
@@ -153,7 +152,7 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
         logging.basicConfig(level=logging.WARNING, handlers=[request_log], force=True)
         logging.captureWarnings(True)
         traffic = Traffic(request_log)
-        traffic.lost_lines = lambda: line_queue.lost  # number of lines that the queue discarded, for the metrics
+        traffic.lost_lines.set_function(lambda: line_queue.lost)
         yield traffic
 
 

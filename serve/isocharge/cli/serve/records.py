@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from enum import StrEnum
 from typing import Annotated
 
 import numpy as np
@@ -23,13 +22,6 @@ WaitOption = Annotated[
         help="Time to wait until the port can be opened, and until the first byte if this is more than 10 s, s.",
     ),
 ]
-
-
-class LogFormat(StrEnum):
-    """Format of the messages of a server on stderr."""
-
-    text = "text"
-    json = "json"
 
 
 OutputOption = Annotated[

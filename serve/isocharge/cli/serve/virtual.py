@@ -3,10 +3,9 @@
 import threading
 import time
 from dataclasses import replace
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -33,16 +32,6 @@ from isocharge.simulate import (
     parse_probe,
     virtual_film,
 )
-
-
-class FrameFormat(StrEnum):
-    """Format of the frames."""
-
-    binary = "binary"
-    csv = "csv"
-    pairs = "pairs"
-    teleplot = "teleplot"
-    json = "json"
 
 
 def virtual_command(
@@ -99,7 +88,9 @@ def virtual_command(
             "(default: random presses, no faults)",
         ),
     ] = None,
-    frames: Annotated[FrameFormat, typer.Option("--frames", help="Format of the frames.")] = FrameFormat.binary,
+    frames: Annotated[
+        Literal["binary", "csv", "pairs", "teleplot", "json"], typer.Option("--frames", help="Format of the frames.")
+    ] = "binary",
 ) -> None:
     """Play a sensor: simulate presses that wander over the film, and send their charges as frames on a pseudo-terminal.
 
@@ -121,9 +112,9 @@ def virtual_command(
     player = VirtualSensor(
         lambda _: np.zeros((0, electrode_count)),
         _untouched_frame(rate),
-        noise=measure_function(amplifier, rate),
+        noise=measure_function(amplifier, electrode_count, rate, seed),
         seed=seed,
-        encode=encode_frame if frames is FrameFormat.binary else partial(encode_text, notation=frames.value),
+        encode=encode_frame if frames == "binary" else partial(encode_text, notation=frames),
         faults=settings.faults,
         link=link,
     )

@@ -6,6 +6,8 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from msgspec import json
+
 from isocharge.cli.shared.options import parse_radius_mm, worker_count
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
@@ -13,7 +15,6 @@ from isocharge.common.errors import InputError, IsochargeError, SceneError, Solv
 from isocharge.common.files import write_whole
 from isocharge.serve.viewer.deflection_field import (
     DEFLECTION_FILE,
-    FILM_KEYS,
     DeflectionField,
     included_deflection_field,
 )
@@ -113,8 +114,8 @@ def write_deflection(folder: Path, film: Film, probes: Iterable[Probe]) -> None:
     except (SceneError, SolveError) as error:
         say(f"caution: the live page cannot draw this film in relief: {error}")
         return
-    field = DeflectionField(film={key: properties[key] for key in FILM_KEYS}, **table._asdict())
-    write_whole(folder / DEFLECTION_FILE, field.to_bytes())
+    field = DeflectionField.of(properties, **table._asdict())
+    write_whole(folder / DEFLECTION_FILE, json.encode(field))
 
 
 N_SIMULATED_PRESSES = 24_000

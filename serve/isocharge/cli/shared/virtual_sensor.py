@@ -4,6 +4,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE
 from isocharge.serve import Script, VirtualSensor, wander
@@ -25,7 +27,7 @@ def virtual_sensor(forward_map: ForwardMap, noise: str, seed: int, rate_Hz: floa
     """
     _min_force_N, max_force_N = DEFAULT_PLAYED_FORCE_RANGE
     script = random_script(forward_map, seed, rate_Hz, max_force_N)
-    measure = measure_function(load_amplifier(noise), rate_Hz)
+    measure = measure_function(load_amplifier(noise), len(forward_map.electrodes), rate_Hz, seed)
     return VirtualSensor(film_charges(forward_map), script, noise=measure, seed=seed)
 
 
@@ -98,33 +100,19 @@ def _charges(map_charges: Callable[[Array], Array], min_force_N: float, contact:
     return map_charges(contact_in_domain) * charge_factor[:, None]
 
 
-def measure_function(amplifier: Amplifier, rate_Hz: float) -> Callable[..., Any]:
+def measure_function(amplifier: Amplifier, electrode_count: int, rate_Hz: float, seed: int) -> Callable[..., Any]:
     """Return the amplifier as the function that the virtual sensor calls to measure charges.
 
     Args:
         amplifier: The amplifier.
+        electrode_count: Number of electrodes.
         rate_Hz: Frames per second, Hz.
+        seed: Seed of the drift and the noise, which continue from call to call.
 
     Returns:
         Function that converts the charges of the next n frames, shape (n, electrodes), pC, to measured charges of the
-        same shape. Its further arguments are a source of random numbers and, optionally, the change of the charges per
-        kelvin of the film. The first call creates the state of the amplifier, with its drift and its noise, which the
-        following calls continue.
+        same shape. Its second argument is not used. The optional third argument is the change of the charges per kelvin
+        of the film.
     """
-    return _RunningAmplifier(amplifier, rate_Hz).measure
-
-
-class _RunningAmplifier:
-    """An amplifier that continues its drift and its noise from call to call."""
-
-    def __init__(self, amplifier: Amplifier, rate_Hz: float) -> None:
-        """Store the amplifier. The first call of `measure` creates the state of the amplifier."""
-        self._amplifier = amplifier
-        self._rate_Hz = rate_Hz
-        self._measurement: Callable[..., Any] | None = None
-
-    def measure(self, charge_pC: Any, rng: Any, charge_pC_per_K: Any = None) -> Any:
-        """Return the measured charges of the next frames; see `measure_function` for the arguments."""
-        if self._measurement is None:
-            self._measurement = self._amplifier.start(charge_pC.shape[1], self._rate_Hz, rng)
-        return self._measurement(charge_pC, charge_pC_per_K)
+    measurement = amplifier.start(electrode_count, rate_Hz, np.random.default_rng(seed))
+    return lambda charge_pC, _rng, charge_pC_per_K=None: measurement(charge_pC, charge_pC_per_K)

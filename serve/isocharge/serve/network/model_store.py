@@ -23,7 +23,7 @@ from isocharge.serve.model.model_folder import Model, load_checked_model
 from isocharge.serve.model.model_search import model_names, repositories, version_folders
 from isocharge.serve.model.session import BoundPress, output_widths
 from isocharge.serve.model.validity import Validity
-from isocharge.serve.network.traffic import Statistics
+from isocharge.serve.network.metrics import ModelMetrics, Statistics
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class LoadedVersion:
     model: Model
     metadata: ModelMetadata
     version: str
-    statistics: Statistics = field(default_factory=Statistics)
+    statistics: Statistics
     _thread_local: threading.local = field(default_factory=threading.local, repr=False)
 
     @cached_property
@@ -74,6 +74,9 @@ class ModelStore:
     """Loaded models by name and version.
 
     Any thread may call any method. A lock ensures that only one thread at a time loads or unloads models.
+
+    Attributes:
+        metrics: Metrics of the requests to each version. They also contain versions that are no longer loaded.
     """
 
     def __init__(self, folders: Callable[[], Mapping[str, Path]]) -> None:
@@ -88,6 +91,7 @@ class ModelStore:
         """
         self._folders = folders
         self._change_lock = threading.Lock()
+        self.metrics = ModelMetrics()
         self._statistics: dict[tuple[str, int], Statistics] = {}
         # Loaded versions by name and version. The empty version in a key stands for the highest loaded version.
         self._loaded: dict[tuple[str, str], LoadedVersion] = {}
@@ -208,14 +212,6 @@ class ModelStore:
                 rows.append({"name": name, "version": "", "state": "UNAVAILABLE", "reason": ""})
         return rows
 
-    def counters(self) -> dict[tuple[str, str], Statistics]:
-        """Return a copy of the counters of every version, by model name and version number.
-
-        The result also contains versions that are no longer loaded.
-        """
-        counters = sorted(dict(self._statistics).items())  # a copy, because another thread may add a version
-        return {(name, str(version)): statistics.snapshot() for (name, version), statistics in counters}
-
     def load(self, name: str) -> None:
         """Read the files of a model again, and replace its loaded versions.
 
@@ -270,7 +266,9 @@ class ModelStore:
         refused: dict[tuple[str, int], str] = {}
         for version, version_folder in version_folders(folder).items():
             # The counters continue when files are loaded again, because a Prometheus counter must never decrease.
-            statistics = self._statistics.setdefault((name, version), Statistics())
+            if (name, version) not in self._statistics:
+                self._statistics[name, version] = Statistics(self.metrics, name, version)
+            statistics = self._statistics[name, version]
             try:
                 new_versions[version] = _load_version(name, version, version_folder, statistics)
             except Exception as error:  # any error in one folder must not affect the other models
@@ -314,6 +312,8 @@ class ModelStore:
         }
         self._refused = other_refused | refused
         self._loaded = loaded
+        for (known_name, version), statistics in self._statistics.items():
+            statistics.ready.set((known_name, str(version)) in loaded)
 
 
 def open_model_store(models: Path | None = None) -> ModelStore:
@@ -381,4 +381,5 @@ def _load_version(name: str, version: int, folder: Path, statistics: Statistics)
             f"{folder}: expected the model {name}/{version}, as the folders say, got {model.metadata.label}; "
             "move it into folders of that name and version"
         )
+    statistics.info.info({"sensor": model.metadata.frame_id, "sha256": model.golden.sha256})
     return LoadedVersion(model, model.metadata, str(version), statistics)

@@ -1,9 +1,7 @@
 """Counters and log of the HTTP server and of the gRPC server.
 
-The class `Traffic` counts requests by route and status. The class `Statistics` counts the requests to one version of a
-model, their duration, and the presses with a large misfit. Clients can read the counts of both classes in the
-statistics of Triton's protocol and under the path `/metrics`. The class `RequestLog` writes one line of JSON for each
-request.
+The class `Traffic` counts requests by route and status, for the path `/metrics`. The class `RequestLog` writes one line
+of JSON for each request.
 
 The log line of a request contains no text that a client has sent. The names of routes, models, statuses and errors are
 defined by this server, and the address of the client comes from the operating system. A client therefore cannot forge a
@@ -11,16 +9,13 @@ log line, fill the disk with long lines, write a secret into the log, or create 
 """
 
 import logging
-import threading
-import time
 import traceback
-from bisect import bisect_left
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import orjson
+from prometheus_client import CollectorRegistry, Counter, Gauge
 
 MAX_TEXT_CHARACTERS = 4000
 """Largest number of characters of a message or a traceback in a line. The middle of a longer text is left out."""
@@ -123,17 +118,30 @@ class Traffic:
 
     Attributes:
         log: Log to which each request is written, or None if there is no log.
-        open: For each transport ("http" or "grpc"), a function that returns the number of its open connections or
-            calls.
-        lost_lines: Function that returns the number of log lines that could not be written, or None if there is no log.
+        registry: Registry of the metrics.
+        open: Number of open connections or calls, with the label "http" or "grpc".
+        lost_lines: Number of log lines that could not be written.
     """
 
     def __init__(self, log: RequestLog | None = None) -> None:
+        """Create the metrics of a server that has not received any request."""
         self.log = log
-        self.open: dict[str, Callable[[], int]] = {}
-        self.lost_lines: Callable[[], int] | None = None
-        self._requests: dict[tuple[str, str, int | str], int] = {}
-        self._lock = threading.Lock()
+        self.registry = CollectorRegistry(auto_describe=False)
+        self._requests = Counter(
+            "isocharge_requests",
+            "Requests that were answered or refused.",
+            ("transport", "route", "status"),
+            registry=self.registry,
+        )
+        self.open = Gauge(
+            "isocharge_open",
+            "Open connections of HTTP and open calls of gRPC.",
+            ("transport",),
+            registry=self.registry,
+        )
+        self.lost_lines = Gauge(
+            "isocharge_log_lines_lost", "Lines of the log that could not be written.", registry=self.registry
+        )
 
     def count(self, transport: str, route: str, status: int | str) -> None:
         """Count a request that was answered, possibly with an error.
@@ -143,123 +151,10 @@ class Traffic:
             route: Name of the route.
             status: HTTP status, or name of the gRPC status.
         """
-        key = transport, route, status
-        with self._lock:
-            self._requests[key] = self._requests.get(key, 0) + 1
+        self._requests.labels(transport, route, status).inc()
 
     def count_and_log(self, exchange: Exchange) -> None:
         """Count a request that was answered, and log the request if there is a log."""
         self.count(exchange.transport, exchange.route, exchange.status)
         if self.log is not None:
             self.log.write_exchange(exchange)
-
-    def requests(self) -> dict[tuple[str, str, str], int]:
-        """Return the number of requests by transport, route and status."""
-        with self._lock:
-            counts = dict(self._requests)
-        return {(transport, route, str(status)): count for (transport, route, status), count in counts.items()}
-
-
-STAGES = ("compute_input", "compute_infer", "compute_output")
-"""Triton's names of the three stages of an inference.
-
-In these stages, the server reads the request, runs the model, and writes the response.
-"""
-
-LATENCY_BOUNDS_NS = (
-    10_000,
-    20_000,
-    30_000,
-    50_000,
-    100_000,
-    200_000,
-    500_000,
-    1_000_000,
-    2_000_000,
-    5_000_000,
-    20_000_000,
-)
-"""Upper bounds of the buckets of the latency histogram, ns.
-
-They range from half the latency of a single press to three times the latency of the largest batch.
-"""
-
-
-@dataclass
-class Statistics:
-    """Counters of one version of a model since the start of the server. Any thread may call any method.
-
-    Attributes:
-        presses: Number of presses for which contacts were returned.
-        alarms: Number of these presses whose misfit is above the limit of the model.
-        answered: Number of requests that were answered.
-        refused: Number of requests that were refused.
-        latency: Number of answered requests in each bucket of the latency histogram. The last bucket has no upper
-            bound.
-        stages_ns: Total time of the answered requests in each of `STAGES`, ns.
-        refused_ns: Total time of the refused requests, ns.
-        last_ms: Unix time of the last response, ms.
-    """
-
-    presses: int = 0
-    alarms: int = 0
-    answered: int = 0
-    refused: int = 0
-    latency: list[int] = field(default_factory=lambda: [0] * (len(LATENCY_BOUNDS_NS) + 1))
-    stages_ns: list[int] = field(default_factory=lambda: [0] * len(STAGES))
-    refused_ns: int = 0
-    last_ms: int = 0
-    _lock: threading.Lock = field(default_factory=threading.Lock, compare=False)
-
-    def count_answered(self, presses: int, stages_ns: tuple[int, int, int], alarms: int = 0) -> None:
-        """Count a request that was answered.
-
-        Args:
-            presses: Number of presses in the request.
-            stages_ns: Time that the request has spent in each of `STAGES`, ns.
-            alarms: Number of presses whose misfit is above the limit.
-        """
-        read_ns, run_ns, write_ns = stages_ns
-        # The request belongs to the first bucket whose upper bound is at least as large as the total time.
-        bucket = bisect_left(LATENCY_BOUNDS_NS, read_ns + run_ns + write_ns)
-        with self._lock:
-            self.presses += presses
-            self.alarms += alarms
-            self.answered += 1
-            self.latency[bucket] += 1
-            # A loop over the three stages would take half a microsecond more.
-            self.stages_ns[0] += read_ns
-            self.stages_ns[1] += run_ns
-            self.stages_ns[2] += write_ns
-            self.last_ms = time.time_ns() // 1_000_000
-
-    def count_refused(self, ns: int) -> None:
-        """Count a request that was refused.
-
-        Args:
-            ns: Time from the complete request to the refusal, ns.
-        """
-        with self._lock:
-            self.refused += 1
-            self.refused_ns += ns
-
-    def snapshot(self) -> "Statistics":
-        """Return a copy of all counters. No other thread can change a counter while the counters are copied."""
-        with self._lock:
-            return replace(self, latency=[*self.latency], stages_ns=[*self.stages_ns], _lock=threading.Lock())
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the counters as a JSON object with the names that Triton uses in its statistics."""
-        counters = self.snapshot()
-        durations_ns = dict(zip(STAGES, counters.stages_ns, strict=True))
-        durations_ns["queue"] = 0  # no request waits in a queue
-        durations_ns["success"] = sum(counters.stages_ns)
-        inference_stats = {name: {"count": counters.answered, "ns": ns} for name, ns in durations_ns.items()}
-        inference_stats["fail"] = {"count": counters.refused, "ns": counters.refused_ns}
-        return {
-            "last_inference": counters.last_ms,
-            "inference_count": counters.presses,
-            "execution_count": counters.answered,
-            "inference_stats": inference_stats,
-            "batch_stats": [],
-        }

@@ -13,11 +13,8 @@ is therefore divided by the cube root of the force, and the quotient is interpol
 The package `simulate` computes the deflection, and the live page shows it.
 """
 
-import base64
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib.resources import as_file, files
 from itertools import pairwise
 from pathlib import Path
@@ -46,126 +43,51 @@ MAX_NUMBERS = 1 << 18
 """Largest number of deflections in a table."""
 
 
-@dataclass(frozen=True)
-class DeflectionField:
-    """Table of the deflection of one film under one probe.
+Increasing = Annotated[tuple[Finite, ...], Meta(min_length=1)]
+"""Increasing numbers; `DeflectionField` checks their order."""
+
+
+class FilmField(Struct, kw_only=True):
+    """Base class of the files that describe a property of one pressed film.
 
     Attributes:
         film: Properties of the film, with the keys `FILM_KEYS`.
         probe_radius_mm: Radius of the round probe, mm.
+    """
+
+    film: dict[str, Finite]
+    probe_radius_mm: Positive
+
+    def __post_init__(self) -> None:
+        if set(self.film) != set(FILM_KEYS):  # sets, because the order of the keys does not matter
+            raise WrongKey("film", f"the keys {', '.join(FILM_KEYS)}", list(self.film))
+
+    def fits(self, film: Any) -> bool:
+        """Return whether the properties of a film are equal to those of this film, except for rounding errors.
+
+        Args:
+            film: The film as a sensor file describes it. If it is not a table, or has further properties such as an
+                oval clamp or a closed back, the result is False.
+        """
+        if not isinstance(film, Mapping) or not film.keys() <= set(FILM_KEYS):
+            return False
+        film_properties = {"pretension_MPa": 0.0, **film}  # the pretension is 0 if the file omits it
+        return all(_is_close(film_properties.get(key), self.film[key]) for key in FILM_KEYS)
+
+
+class DeflectionField(FilmField, kw_only=True):
+    """Table of the deflection of one film under one probe. The attributes are the keys of the file.
+
+    Attributes:
         force_N: Forces in increasing order, N.
         distance_mm: Distances of the probe from the centre in increasing order from 0, mm.
         rings: Radii of the rings around the origin, before the automorphism, from 0 to 1, in film radii.
-        deflection_mm: Deflections, shape (forces, distances, rings, angles), mm, positive in the direction of the push.
-            The angles range from 0 (outwards) to pi. The other half of the film is the mirror image.
+        angles: Number of angles, from 0 (outwards) to pi. The other half of the film is the mirror image.
+        scale_mm: Largest deflection, mm.
+        deflection: Deflections in units of `scale_mm` / `N_STEPS`, as 16-bit integers.
     """
 
-    film: Mapping[str, float]
-    probe_radius_mm: float
-    force_N: tuple[float, ...]
-    distance_mm: tuple[float, ...]
-    rings: tuple[float, ...]
-    deflection_mm: Array
-
-    def fits(self, film: Any) -> bool:
-        """Return whether a film has the same properties as the film of this deflection field.
-
-        Args:
-            film: The film as a sensor file describes it. If it is not a table, the result is False.
-        """
-        return is_same_film(film, self.film)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the content of the file in which the deflection field is stored."""
-        scale_mm = float(np.max(self.deflection_mm)) or 1.0  # if all deflections are 0, any positive scale is correct
-        steps = np.round(np.clip(self.deflection_mm / scale_mm, 0.0, 1.0) * N_STEPS).astype("<u2")
-        return {
-            "isocharge_deflection": VERSION,
-            "film": dict(self.film),
-            "probe_radius_mm": self.probe_radius_mm,
-            "force_N": list(self.force_N),
-            "distance_mm": list(self.distance_mm),
-            "rings": [round(ring, 6) for ring in self.rings],
-            "angles": int(self.deflection_mm.shape[3]),
-            "scale_mm": scale_mm,
-            "deflection": base64.b64encode(steps.tobytes()).decode(),
-        }
-
-    def to_bytes(self) -> bytes:
-        """Return the file in which the deflection field is stored."""
-        return json.dumps(self.to_json()).encode()
-
-
-def is_same_film(film: Any, properties: Mapping[str, float]) -> bool:
-    """Return whether the properties of a film are equal to expected properties, except for rounding errors.
-
-    Args:
-        film: The film as a sensor file describes it. If it is not a table, or has further properties such as an oval
-            clamp or a closed back, the result is False.
-        properties: Expected properties, with the keys `FILM_KEYS`.
-    """
-    if not isinstance(film, Mapping) or not film.keys() <= set(FILM_KEYS):
-        return False
-    film_properties = {"pretension_MPa": 0.0, **film}  # the pretension is 0 if the file omits it
-    return all(_is_close(film_properties.get(key), properties[key]) for key in FILM_KEYS)
-
-
-def _is_close(given: object, value: float) -> bool:
-    """Return whether `given` is a number that is equal to `value`, except for rounding errors."""
-    return isinstance(given, int | float) and math.isclose(given, value, rel_tol=1e-6, abs_tol=1e-12)
-
-
-def read_deflection_field(path: Path) -> DeflectionField:
-    """Read a deflection field from its file.
-
-    Args:
-        path: The file.
-
-    Raises:
-        InputError: If the file cannot be read, is damaged, or has an unsupported version.
-    """
-    file = read_json(path, "a deflection field", InputError, _File)
-    ratio = np.frombuffer(file.deflection, "<u2").reshape(file.shape) / N_STEPS  # to the largest deflection
-    return DeflectionField(
-        film=file.film,
-        probe_radius_mm=file.probe_radius_mm,
-        force_N=file.force_N,
-        distance_mm=file.distance_mm,
-        rings=file.rings,
-        deflection_mm=ratio * file.scale_mm,
-    )
-
-
-def included_deflection_field(film: Any) -> DeflectionField | None:
-    """Return the deflection field of a film that is included in isocharge, or None if there is none for this film.
-
-    The included fields belong to the films of the released models.
-
-    Args:
-        film: The film as a sensor file describes it.
-    """
-    with as_file(files("isocharge.serve.viewer") / "fields") as folder:
-        for field_path in sorted(folder.glob("*.json")):
-            field = read_deflection_field(field_path)
-            if field.fits(film):
-                return field
-    return None
-
-
-Increasing = Annotated[tuple[Finite, ...], Meta(min_length=1)]
-"""Increasing numbers; `_File` checks their order."""
-
-
-class _File(Struct):
-    """Content of the file of a deflection field.
-
-    The key `deflection` contains 16-bit integers in base64. An integer n stands for the deflection `scale_mm` * n /
-    `N_STEPS`.
-    """
-
-    isocharge_deflection: Annotated[int, Meta(ge=VERSION, le=VERSION, description=f"the version {VERSION}")]
-    film: dict[str, Finite]
-    probe_radius_mm: Positive
+    isocharge_deflection: Annotated[int, Meta(ge=VERSION, le=VERSION, description=f"the version {VERSION}")] = VERSION
     force_N: Increasing
     distance_mm: Increasing
     rings: Increasing
@@ -173,17 +95,36 @@ class _File(Struct):
     scale_mm: Positive
     deflection: bytes
 
+    @classmethod
+    def of(cls, film: Mapping[str, Any], deflection_mm: Array, **axes: Any) -> "DeflectionField":
+        """Create the field of a film.
+
+        Args:
+            film: The film as a sensor file describes it.
+            deflection_mm: Deflections, shape (forces, distances, rings, angles), mm, positive in the direction of the
+                push.
+            axes: The attributes `probe_radius_mm`, `force_N`, `distance_mm` and `rings`.
+        """
+        scale_mm = float(np.max(deflection_mm)) or 1.0  # if all deflections are 0, any positive scale is correct
+        steps = np.round(np.clip(deflection_mm / scale_mm, 0.0, 1.0) * N_STEPS).astype("<u2")
+        return cls(
+            film={key: film[key] for key in FILM_KEYS},
+            angles=deflection_mm.shape[3],
+            scale_mm=scale_mm,
+            deflection=steps.tobytes(),
+            **axes,
+        )
+
     def __post_init__(self) -> None:
         """Check that the values of the keys are consistent with each other.
 
-        The film must have exactly the keys `FILM_KEYS`. The forces, the distances and the rings must be in ascending
+        The forces, the distances and the rings must be in ascending
         order, without duplicates. There must be one deflection for each combination of force, distance, ring and angle.
 
         Raises:
             WrongKey: If the value of a key is wrong. The error names the first such key.
         """
-        if set(self.film) != set(FILM_KEYS):  # sets, because the order of the keys does not matter
-            raise WrongKey("film", f"the keys {', '.join(FILM_KEYS)}", list(self.film))
+        super().__post_init__()
         for key in ("force_N", "distance_mm", "rings"):
             numbers = getattr(self, key)
             if any(number >= next_number for number, next_number in pairwise(numbers)):
@@ -200,3 +141,42 @@ class _File(Struct):
     def shape(self) -> tuple[int, int, int, int]:
         """Shape of the table: the numbers of forces, distances, rings and angles."""
         return len(self.force_N), len(self.distance_mm), len(self.rings), self.angles
+
+    @property
+    def deflection_mm(self) -> Array:
+        """The deflections as an array of the shape `shape`, mm."""
+        steps = np.frombuffer(self.deflection, "<u2").reshape(self.shape)
+        return np.asarray(steps * (self.scale_mm / N_STEPS))
+
+
+def _is_close(given: object, value: float) -> bool:
+    """Return whether `given` is a number that is equal to `value`, except for rounding errors."""
+    return isinstance(given, int | float) and math.isclose(given, value, rel_tol=1e-6, abs_tol=1e-12)
+
+
+def read_deflection_field(path: Path) -> DeflectionField:
+    """Read a deflection field from its file.
+
+    Args:
+        path: The file.
+
+    Raises:
+        InputError: If the file cannot be read, is damaged, or has an unsupported version.
+    """
+    return read_json(path, "a deflection field", InputError, DeflectionField)
+
+
+def included_deflection_field(film: Any) -> DeflectionField | None:
+    """Return the deflection field of a film that is included in isocharge, or None if there is none for this film.
+
+    The included fields belong to the films of the released models.
+
+    Args:
+        film: The film as a sensor file describes it.
+    """
+    with as_file(files("isocharge.serve.viewer") / "fields") as folder:
+        for field_path in sorted(folder.glob("*.json")):
+            field = read_deflection_field(field_path)
+            if field.fits(film):
+                return field
+    return None

@@ -384,7 +384,7 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
         "force_range_N": list(metadata.force_range_N),
         "probes": list(metadata.probes),
         "unnoticed": to_builtins(metadata.unnoticed),
-        "deflection": None if field is None else field.to_json(),
+        "deflection": to_builtins(field),
         "sample": SampleFormat(metadata.electrodes).describe(),
     }
     if leads_mm:

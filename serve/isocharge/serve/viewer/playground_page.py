@@ -13,6 +13,8 @@ import re
 from importlib.resources import as_file, files
 from typing import Any
 
+from msgspec import to_builtins
+
 from isocharge.common.errors import ModelError
 from isocharge.serve.flags import BEYOND, MEANINGS, MISFIT, OUTSIDE, STRESS
 from isocharge.serve.model.model_folder import load_model
@@ -82,7 +84,7 @@ def playground_html(models: tuple[str, ...] = MODELS) -> str:
 def _page_data(series: StressSeries, models: tuple[str, ...]) -> dict[str, Any]:
     """Return the data of the page: the stress of the film, the models, and the meanings of the flags it can show."""
     return {
-        "stress": series.to_json(),
+        "stress": to_builtins(series),
         "models": [_describe_model(model, series) for model in models],
         "flags": {flag: MEANINGS[flag] for flag in (OUTSIDE, BEYOND, MISFIT, STRESS)},
     }

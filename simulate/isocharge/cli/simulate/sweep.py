@@ -1,9 +1,8 @@
 """Command `isocharge simulate sweep`, which writes a dataset of many simulated presses."""
 
 import json as json_module
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -43,21 +42,6 @@ This value corresponds to an error of the solver of 0.05 % of the charge.
 """
 
 
-class Orientation(StrEnum):
-    """Values of the option `--orientation`, which determines the orientation of the probe in a sweep."""
-
-    fixed = "fixed"
-    random = "random"
-
-
-class Sampling(StrEnum):
-    """Values of the option `--sampling`, which determines how positions and forces of a sweep are chosen."""
-
-    sobol = "sobol"
-    random = "random"
-    grid = "grid"
-
-
 def sweep_command(
     sensor: SensorArgument,
     output: Annotated[
@@ -78,12 +62,13 @@ def sweep_command(
     force: ForceRangeOption = DEFAULT_FORCE_RANGE,
     samples: Annotated[int, typer.Option("--samples", help="Number of presses of all probes together.")] = 20_000,
     orientation: Annotated[
-        Orientation, typer.Option("--orientation", help="Angle of the probe: as given, or random for each press.")
-    ] = Orientation.fixed,
+        Literal["fixed", "random"],
+        typer.Option("--orientation", help="Angle of the probe: as given, or random for each press."),
+    ] = "fixed",
     sampling: Annotated[
-        Sampling,
+        Literal["sobol", "random", "grid"],
         typer.Option("--sampling", help="Sampling of positions and forces. A grid has at most --samples presses."),
-    ] = Sampling.sobol,
+    ] = "sobol",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the presses. Equal seeds give equal data.")] = 0,
     stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
@@ -102,7 +87,7 @@ def sweep_command(
     if output.suffix.lower() in TABLES:
         table = output
         folder = output.with_suffix("")
-        has_one_orientation = len(probes) == 1 and orientation is Orientation.fixed
+        has_one_orientation = len(probes) == 1 and orientation == "fixed"
         _check_table(table, folder, samples, has_one_orientation=has_one_orientation)
     refuse_existing(folder)
 
@@ -110,7 +95,7 @@ def sweep_command(
     warn_of_stress(film_sensor.film, probes, max_force, stress_limit)
     with shown_progress(), executor_for(workers, cluster) as executor:
         largest_distance = sweep_radius(radius, film_sensor, probes, force)
-        sweep = Sweep(largest_distance, force, samples, seed, orientation.value, sampling.value)
+        sweep = Sweep(largest_distance, force, samples, seed, orientation, sampling)
         run_sweep(folder, film_sensor, probes, sweep, executor=executor)
     write_deflection(folder, film_sensor.film, probes)
     if table is not None:

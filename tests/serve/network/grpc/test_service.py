@@ -261,7 +261,8 @@ def test_end_of_a_connection_is_not_logged_as_an_error(store, caplog):
     service = Service(Handler(store))
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(service._handle("ModelStreamInfer", None, context))
-    assert ("grpc", "ModelStreamInfer", "CANCELLED") in service._traffic.requests()
+    labels = {"transport": "grpc", "route": "ModelStreamInfer", "status": "CANCELLED"}
+    assert service._traffic.registry.get_sample_value("isocharge_requests_total", labels) == 1
     assert not caplog.records
 
 

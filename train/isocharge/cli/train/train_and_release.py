@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from msgspec import json
 
 from isocharge.cli.shared.forward_maps import write_deflection
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
@@ -93,7 +94,7 @@ def _add_deflection(released: Release, dataset: Path | None) -> None:
     if dataset is not None:
         path = dataset / DEFLECTION_FILE
         if path.is_file():
-            write_whole(released.folder / DEFLECTION_FILE, read_deflection_field(path).to_bytes())
+            write_whole(released.folder / DEFLECTION_FILE, json.encode(read_deflection_field(path)))
     elif "film" in released.metadata.sensor:
         probes = [parse_probe(notation) for notation in released.metadata.probes]
         write_deflection(released.folder, sensor_from_dict(released.metadata.sensor).film, probes)

@@ -69,7 +69,7 @@ class Service:
         # Timeouts of the calls that wait for a message, in the order in which they began to wait. A dictionary without
         # values is used as an ordered set.
         self._waiting: dict[asyncio.Timeout, None] = {}
-        self._traffic.open["grpc"] = lambda: self._open_count
+        self._traffic.open.labels("grpc").set_function(lambda: self._open_count)
         self._answer_functions = self._create_answer_functions()
 
     def _create_answer_functions(self) -> dict[str, Callable[[Any], Any]]:

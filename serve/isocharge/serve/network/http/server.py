@@ -78,7 +78,7 @@ class HttpServer:
         self._address = address
         self._socket = address.listen(config.backlog)
         self.url = address.url(self._socket, secure=tls is not None)
-        traffic.open["http"] = lambda: len(self._server.server_state.connections)
+        traffic.open.labels("http").set_function(lambda: len(self._server.server_state.connections))
 
     def run(self) -> None:
         """Answer requests until `stop` is called, and then finish the requests that have already begun."""

@@ -16,9 +16,7 @@ from typing import NamedTuple
 from isocharge.common.errors import UnknownPath, WrongMethod
 from isocharge.serve.network.address import ServerLimits, Token
 from isocharge.serve.network.browser_check import BrowserCheck, header_values
-from isocharge.serve.network.metrics import Metrics
 from isocharge.serve.network.model_store import ModelStore
-from isocharge.serve.network.protocol import describe
 from isocharge.serve.network.protocol.response import Response, decompress, error_response
 from isocharge.serve.network.protocol.routes import ROUTES, Request, Route, Service
 from isocharge.serve.network.traffic import Client, Exchange, Traffic
@@ -108,8 +106,7 @@ class Handler:
         has_token = token is not None
         self._browser_check = browser_check or BrowserCheck(any_host=has_token)
         self.traffic = traffic or Traffic()
-        metrics = Metrics(store, self.traffic, describe.server_metadata()["version"])
-        self._service = Service(store, self.limits, metrics)
+        self._service = Service(store, self.limits, self.traffic)
 
     def may_block(self, path: str) -> bool:
         """Return whether computing the response for a path may take a long time.

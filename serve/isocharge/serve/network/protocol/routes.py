@@ -7,10 +7,12 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
+from prometheus_client import generate_latest
+
 from isocharge.common.errors import RequestError
 from isocharge.common.structs import parse_json
 from isocharge.serve.network.address import ServerLimits
-from isocharge.serve.network.metrics import CONTENT_TYPE, Metrics
+from isocharge.serve.network.metrics import CONTENT_TYPE
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol import describe
 from isocharge.serve.network.protocol.bodies import IndexBody
@@ -18,6 +20,7 @@ from isocharge.serve.network.protocol.inference import answer_inference, read_in
 from isocharge.serve.network.protocol.openapi import openapi_document
 from isocharge.serve.network.protocol.page import PAGE_HEADERS, START_PAGE, START_PAGE_POLICY, card
 from isocharge.serve.network.protocol.response import Response, compress, json_response, response_of
+from isocharge.serve.network.traffic import Traffic
 
 
 class Service(NamedTuple):
@@ -26,12 +29,12 @@ class Service(NamedTuple):
     Attributes:
         store: Store of the models that the server uses.
         limits: Limits of the size of a body and of a batch.
-        metrics: Counters of the server in the format of Prometheus.
+        traffic: Counters of the requests to the server.
     """
 
     store: ModelStore
     limits: ServerLimits
-    metrics: Metrics
+    traffic: Traffic
 
 
 class Request(NamedTuple):
@@ -100,7 +103,9 @@ def _show_openapi(request: Request) -> Response:
 
 
 def _show_metrics(request: Request) -> Response:
-    return response_of(200, CONTENT_TYPE, request.service.metrics.text())
+    service = request.service
+    texts = [generate_latest(registry) for registry in (service.store.metrics.registry, service.traffic.registry)]
+    return response_of(200, CONTENT_TYPE, b"".join(texts))
 
 
 def _show_server(_: Request) -> Response:
