@@ -5,14 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.serve import (
-    Chunk,
-    Frame,
-    PressWatch,
-    ReadingStream,
-    device_from_table,
-    encode_frame,
-)
 from isocharge.simulate import load_amplifier
 from stage_runner import StageRunner
 
@@ -74,53 +66,3 @@ def test_three_minutes_of_rest_give_no_touch():
 
 
 PRESS_PC = np.array([800.0, 400.0, 300.0, 500.0])
-
-
-def steady_presses(level, seed, table, tau_error=0.0, press_s=1.2):
-    """Errors (n, 4), pC, of eight steady presses through an amplifier, and the reasons of those refused."""
-    rng, names = np.random.default_rng(seed), ("A", "B", "C", "D")
-    measurement = replace(load_amplifier(level), gain_mismatch=0.0).start(4, RATE_HZ, rng)
-    if "leak" in table:
-        tau = measurement.leak_time * (1.0 + tau_error * rng.standard_normal(4))
-        table = table | {"leak": {"tau_s": dict(zip(names, tau.tolist(), strict=True))}}
-    t = np.arange(round(press_s * RATE_HZ)) / RATE_HZ
-    rise = np.clip(np.minimum(t, press_s - t) / 0.1, 0.0, 1.0)[:, None]
-    pressed = rng.uniform(0.15, 1.6, (8, 1)) * PRESS_PC
-    pause = np.zeros((round(0.8 * RATE_HZ), 4))
-    clean = np.concatenate([np.zeros((600, 4)), *(part for press in pressed for part in (rise * press, pause))])
-    stream, watch = ReadingStream(names, device_from_table(table, "test")), PressWatch(names)
-    taken, reasons = [], []
-    for k, row in enumerate(measurement(clean)):
-        for reading in stream.frames(Chunk(encode_frame(Frame(k, 5000 * k, tuple(row))), 1e9 + k / RATE_HZ, 0)):
-            watched = watch.feed(reading)
-            if watched.press is not None:
-                taken.append(watched.press.charge_pC)
-            reasons += [watched.reason] * (watched.phase == "refused")
-    return np.array(taken) - pressed if len(taken) == len(pressed) else np.array(taken), reasons
-
-
-@pytest.mark.parametrize(
-    ("level", "table", "tau_error", "most_pC"),
-    [
-        ("reference", {}, 0.0, 0.3),  # 0.20: white noise of 1 pC and 0.2 % over 100 frames, and of the rest before
-        ("bench", {"leak": {}}, 0.0, 0.45),  # 0.35: hum not followed
-        ("bench", {"leak": {}, "hum": {"frequency_Hz": 50.0}}, 0.0, 0.45),  # 0.34, of which 0.31 are the film's warming
-        ("bench", {"leak": {}, "hum": {"frequency_Hz": 50.0}}, 0.05, 0.8),  # 0.49
-    ],
-)
-def test_charges_of_steady_presses(level, table, tau_error, most_pC):
-    """The errors by hum, leak, bias current and slow warming of the film are smaller than the noise of one frame."""
-    errors = []
-    for seed in range(4):
-        error, reasons = steady_presses(level, seed, table, tau_error)
-        assert reasons == []
-        errors.append(error)
-    assert np.sqrt((np.concatenate(errors) ** 2).mean()) < most_pC
-
-
-def test_a_leak_that_nobody_undoes_is_refused_and_named():
-    """Not one wrong press in 32, and the time constant is said once they are held long enough."""
-    for seed, press_s in enumerate((1.2, 1.2, 1.2, 5.0)):
-        taken, reasons = steady_presses("bench", seed, {}, press_s=press_s)
-        assert len(taken) == 0
-        assert any("[leak] tau_s = " in reason for reason in reasons) == (press_s > 2.0)

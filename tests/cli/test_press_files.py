@@ -1,15 +1,11 @@
 """All commands that read a file of presses give the same error messages for the same faults."""
 
-import io
-from types import SimpleNamespace
-
 import pyarrow
 import pytest
-from pyarrow.parquet import ParquetFile, read_metadata, write_table
+from pyarrow.parquet import write_table
 
 from isocharge.serve import Predictor
 from isocharge.serve.prediction.table import BLOCK_ROWS
-from isocharge.serve.presses import parquet_table
 
 COMMANDS = {
     "predict": ("serve", "predict", "four-25um-biaxial"),
@@ -41,18 +37,6 @@ def test_a_file_in_utf_16(refuses, name):
     refuses(name, data, "p.csv: the file is UTF-16: save it as UTF-8")
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_file_in_latin_1(refuses, name):
-    data = f"x_mm,y_mm,Maßkraft,A,B,C,D\n{PRESS}".encode("latin-1")
-    refuses(name, data, "p.csv, line 1: the byte 0xdf is not text in UTF-8: save the file as UTF-8")
-
-
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "fit alone"])
-def test_electrodes_in_lower_case(refuses, name):
-    data = f"x_mm,y_mm,force_N,a,b,c,d\n{PRESS}".encode()
-    refuses(name, data, "column 'a' differs from electrode 'A' only by case: rename it to 'A'")
-
-
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name != "predict"])
 def test_a_force_in_another_language(refuses, name):
     data = f"x_mm,y_mm,Kraft [N],A,B,C,D\n{PRESS}".encode()
@@ -62,19 +46,6 @@ def test_a_force_in_another_language(refuses, name):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_file_that_is_named_as_parquet_and_is_none(refuses, name):
     refuses(name, f"x_mm,y_mm,force_N,A,B,C,D\n{PRESS}".encode(), "p.parquet: not a Parquet file", suffix="parquet")
-
-
-@pytest.mark.parametrize("rows_per_batch", [1, 2, 3])
-def test_a_parquet_file_with_surplus_rows(refuses, monkeypatch, rows_per_batch):
-    """The metadata declare two rows, and the file has three. The surplus row may be the only one of its batch."""
-    columns = {name: [1.0, 2.0, 3.0] for name in ("x_mm", "y_mm", "force_N", *"ABCD")}
-    file = io.BytesIO()
-    write_table(pyarrow.table(columns), file)
-    schema = read_metadata(file).schema
-    monkeypatch.setattr(ParquetFile, "metadata", SimpleNamespace(num_rows=2, num_row_groups=1, schema=schema))
-    monkeypatch.setattr(parquet_table, "ROWS_PER_BATCH", rows_per_batch)
-    message = "expected 2 rows as in the metadata of the file, got another number"
-    refuses("check", file.getvalue(), message, suffix="parquet")
 
 
 def test_presses_of_a_parquet_file_are_named_by_their_rows(command, tmp_path):

@@ -351,22 +351,3 @@ def test_bad_input_is_refused_before_the_first_press(refused, desk, words, messa
     is_port_or_output = bool({"noise.bin", "-o"} & {*words})
     refused(*PRESS, *words, message=message, code=1 if is_port_or_output else 2)
     assert sorted(desk.iterdir()) == before
-
-
-CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial", "-o", "film")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ([], "or --from FOLDER with --temperature C, got none of them"),
-        (["list.csv", "--temperature", "nan"], "--temperature: expected -100 to 200 degrees Celsius, got nan"),
-        (["--next", "2"], "nothing is calibrated without PRESSES.csv"),
-        (["metres.csv"], "were they written in metres"),
-        (["list.csv", "--port", "some.bin"], "No such option: --port"),
-    ],
-)
-def test_calibrate_refuses_bad_input_before_it_writes(refused, desk, words, message):
-    (desk / "metres.csv").write_text("x_mm,y_mm,force_N,A,B,C,D\n0.001,0,1,9,8,7,6\n0,0.002,1,9,8,7,6\n")
-    refused(*CALIBRATE, *words, message=message)
-    assert not (desk / "film").exists()

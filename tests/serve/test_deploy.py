@@ -257,13 +257,6 @@ def test_every_image_is_pinned():
         assert re.fullmatch(r"[\w./-]+:[\w.-]+@sha256:[0-9a-f]{64}", image), image
 
 
-def test_every_action_of_a_workflow_is_pinned_by_its_commit():
-    workflows = "".join(path.read_text() for path in (ROOT / ".github/workflows").iterdir())
-    actions = re.findall(r"uses: (\S+)", workflows)
-    assert actions
-    assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", action) for action in actions)
-
-
 def test_the_manifests_with_and_without_kserve_run_the_same_container():
     """And the Service and the PodDisruptionBudget without KServe select the pods of the Deployment."""
     kserve = yaml.safe_load((DEPLOY / "kserve/inference_service.yaml").read_text())["spec"]["predictor"]

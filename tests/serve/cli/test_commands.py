@@ -4,7 +4,6 @@ Commands whose stdin, stdout or stderr is closed, full, or read by somebody slow
 """
 
 import contextlib
-import csv
 import json
 import os
 import re
@@ -14,7 +13,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections import deque
 from itertools import chain, pairwise
 
 import numpy as np
@@ -23,7 +21,6 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from boards import TcpBoard, interrupt, taps
-from isocharge.cli.serve.records import write_records
 from isocharge.common.errors import InputError
 from isocharge.serve import Predictor, Recording, Script, VirtualSensor, load_device
 from isocharge.serve.signal_chain.gain import GainRule
@@ -97,21 +94,6 @@ def test_check_options_position_std_and_force_std(measured, models, command):
     assert values["model"] == "linear/1"
 
 
-def test_check_of_many_presses_shows_the_worst(measured, models, command):
-    """Of forces that are off by the same share these are the largest, for their noise is the least share."""
-    words = ["serve", "check", "linear", measured(count=100, known="force_N", scale=0.97), "--models", models]
-    out, values = command(*words)[1], json.loads(command(*words, "--json")[1])
-    worst = sorted(sorted(values["each"], key=lambda row: row["force_N"])[-40:], key=lambda row: row["line"])
-    form = "{line} {x_mm:.5g} {y_mm:.5g} {force_N:.5g} - {force_error_percent:.5g} none -"
-    assert [" ".join(line.split()) for line in out.splitlines()[2:42]] == [form.format(**row) for row in worst]
-    per_degree = values["chi_squared_per_degree"]
-    assert per_degree == pytest.approx(values["chi_squared"] / 100)
-    assert re.search(rf"chi_squared_per_degree +{per_degree:.5g}\n", out)
-    assert values["force_scale"] == pytest.approx(1.0 / 0.97, rel=1e-4)
-    assert re.search(rf"force_scale +{values['force_scale']:.5g}\n", out)
-    assert "position_mm" not in out
-
-
 @pytest.mark.parametrize(
     ("text", "words", "message"),
     [
@@ -157,19 +139,6 @@ def test_stream_ends_cleanly_when_the_pipe_closes(board, models, start):
     assert "Error" not in process.stderr.read()
 
 
-def test_stream_to_csv_and_udp(frames, models, run):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.settimeout(5.0)
-        address = f"127.0.0.1:{listener.getsockname()[1]}"
-        words = ["--output", "csv", "--output", f"udp://{address}", "--count", 120, "--models", models]
-        result = run("stream", "linear", "--port", frames, *words)
-        datagrams = [json.loads(listener.recv(65536)) for _ in range(120)]
-    rows = list(csv.DictReader(result.stdout.splitlines()))
-    assert [int(row["seq"]) for row in rows] == [datagram["seq"] for datagram in datagrams]
-    assert float(rows[-1]["charge_pC.A"]) == pytest.approx(datagrams[-1]["charge_pC"]["A"], abs=1e-6)
-
-
 def test_stream_option_seconds_ends_a_silent_port(models, run):
     """Also where no record ever comes."""
     silent = PseudoPort()
@@ -193,28 +162,6 @@ def test_stream_that_waits_for_its_port_can_be_stopped(models, tmp_path, run, st
     assert f"{tmp_path / 'film'}: the command was stopped before the port was open" in result.stderr
     assert time.monotonic() - start_s < 10.0
     assert list(tmp_path.iterdir()) == []
-
-
-def test_new_tare_is_announced_once(record, capsys):
-    """A frame with `nan` or `ovf` has no tare, and a tare that follows a drift changes in each frame."""
-    records = []
-    for tare_pC in (None, {"A": 1.0}):
-        records += [record(tare_pC=None, flags=("tare",))] * 3
-        records += [record(tare_pC={"A": 0.1 * number}, flags=()) for number in range(3)]
-        records += [record(tare_pC=None, flags=("invalid",)), record(tare_pC=tare_pC, flags=())]
-    write_records(records, [], deque())
-    assert capsys.readouterr().err.count("tared: ") == 2
-
-
-def test_stream_without_frames_that_is_stopped_by_ctrl_c_exits_with_0(models, run):
-    silent = PseudoPort()
-    ctrl_c = threading.Timer(0.2, interrupt)
-    ctrl_c.start()
-    result = run("stream", "linear", "--port", silent.url, "--seconds", 30, "--models", models)
-    ctrl_c.join()
-    silent.close()
-    assert result.exit_code == 0
-    assert "no frames were recognised" in result.stderr
 
 
 def test_stream_keeps_the_policy_the_name_and_the_limit_of_the_tare(board, models, tmp_path, run):
@@ -436,13 +383,6 @@ def test_a_file_waits_for_a_slow_reader(models, frames):
     """Nothing is lost of a file, however slow the reader is."""
     script = f"{ISOCHARGE} serve stream linear --port {frames} --models {models} | (sleep 1; wc -l)"
     assert bash(script).stdout == "300\n"
-
-
-@pytest.mark.parametrize("reader", ["stream", "doctor"])
-def test_a_recording_as_a_port_names_replay(recorded, models, refused, reader):
-    path, _ = recorded
-    words = ["stream", "linear", "--models", models] if reader == "stream" else ["doctor"]
-    refused("serve", *words, "--port", path, message=f"got a recording; play it with: isocharge serve replay {path}")
 
 
 def test_a_board_that_is_not_recognised_names_the_doctor(models, command):

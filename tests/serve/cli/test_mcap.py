@@ -4,9 +4,7 @@ lines on stdout, in a file that other tools open.
 `serve plot`: a recording becomes a picture, whatever it holds.
 """
 
-import errno
 import json
-import os
 import re
 
 import numpy as np
@@ -17,7 +15,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from isocharge.cli.serve import plot
-from isocharge.serve import Chunk, Recorder
+from isocharge.serve import Recorder
 
 
 def messages(path):
@@ -60,21 +58,6 @@ def test_a_live_stream_that_is_stopped_ends_its_file(board_until, models, run, t
             "stream", "linear", "--port", board.url, "--models", models, "--output", "json", "--output", path
         ).stdout
     assert lines_in(path) == out.splitlines() != []
-
-
-def test_full_disk_ends_the_conversion_of_a_file(command, frames, models, tmp_path, monkeypatch):
-    path, os_write = tmp_path / "touch.mcap", os.write
-
-    def write(descriptor, data):
-        if descriptor > 2 and len(data) > 100:  # the file, after its header
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return os_write(descriptor, data)
-
-    monkeypatch.setattr("os.write", write)
-    code, _, err = command("serve", "stream", "linear", "--port", frames, "--models", models, "--output", path)
-    assert code == 1
-    assert f"{path} cannot be written: No space left on device" in err
-    assert not path.exists()
 
 
 @pytest.fixture
@@ -120,14 +103,6 @@ def test_plot_draws_a_recording(command, recorded, tmp_path, figures):
         flagged = [(record["timestamp"] - start, row) for record in records if word.get_text() in record["flags"]]
         np.testing.assert_allclose(marks.get_xydata(), flagged)
     assert {word.get_text() for word in flag_axes.get_yticklabels()} == {f for r in records for f in r["flags"]}
-
-
-def test_plot_of_a_recording_without_a_touch(command, tmp_path):
-    path, rest = tmp_path / "rest.rec", {"x_mm": None, "y_mm": None, "force_N": 0.0}
-    rest |= dict.fromkeys(("x_std_mm", "y_std_mm", "force_std_N", "misfit", "charge_pC", "charge_raw_pC"))
-    with Recorder(path, "linear/1", "every", {}) as recorder:
-        recorder.chunk(Chunk(b"", 1e9, 0, 0.0), [json.dumps({"timestamp": 1e9, "latency_us": 1.0, "flags": []} | rest)])
-    assert command("serve", "plot", path, "-o", tmp_path / "rest.png")[0] == 0
 
 
 @pytest.mark.parametrize(

@@ -89,14 +89,6 @@ def test_random_presses_come_after_a_second_of_rest(played, solved):
     assert solved == [(*DESCRIBED, 8.0, (0.05, 0.5))]
 
 
-def test_virtual_option_rest_delays_the_first_press(played):
-    """A second of rest more, which is the begin of the random presses."""
-    values, _ = played(300, "--noise", "clean", "--rest", 1.5)
-    total = values.sum(axis=1)
-    assert np.ptp(total[:2000]) < 1e-3
-    assert total.max() - total[0] > 30.0
-
-
 @pytest.mark.parametrize("frames", ["binary", "teleplot"])
 def test_virtual_option_film_plays_a_random_film_without_printing_it(played, tmp_path, frames):
     """A script: half a second without touch, then one press that is held."""
@@ -144,14 +136,6 @@ def test_random_presses_stay_below_the_yield_point_of_the_film_by_default(run, s
     assert 0.05 < played_scripts[0].force_N.max() <= 0.8
 
 
-def test_virtual_script_may_exceed_the_force_of_random_presses(run, solved, tmp_path):
-    script = tmp_path / "hard.toml"
-    script.write_text("presses = [[0, 0, 0, 0], [1, 0, 0, 0], [2, 1, 1, 1.5], [4, 1, 1, 0]]\n")
-    with suppress(SceneError):  # the small map has a smaller range of forces
-        run("virtual", "three-25um-biaxial", "--seconds", 0, "--script", script)
-    assert solved[0][-1] == pytest.approx((0.05, 1.5), rel=1e-3)
-
-
 def test_charges_below_the_smallest_force_follow_the_power_law_of_a_membrane():
     """An eighth of its smallest force is a quarter of the charge: force to the 2/3."""
     linear = SimpleNamespace(domain=Domain(3.0, (0.2, 1.0)), charges=lambda contact: 100.0 * contact[:, 2:])
@@ -174,22 +158,6 @@ def test_amplifier_gets_the_change_of_the_charges_per_kelvin():
     next(player.frames())
     assert received[0] is None
     np.testing.assert_allclose(received[1][:6, 0], [3.5, 2.8, 0.0, 3.5, 2.8, 0.0])
-
-
-def test_charges_per_kelvin_are_absent_without_expansion_coefficients():
-    forward_map = SimpleNamespace(sensor=load_sensor("three-25um-biaxial"))
-    assert virtual_sensor.film_charges_per_K(forward_map) is None
-
-
-def test_virtual_film_with_the_same_seed_is_the_same(run, solved):
-    """The same film for the same seed, another for another, the described without one."""
-    for words in ((), ("--film", 3), ("--film", 3, "--seed", 8), ("--film", 4)):
-        run("virtual", "four-25um-biaxial", "--probe", "circle:1.5", "--seconds", 0, *words)
-    described = load_sensor("four-25um-biaxial"), Circle(1.5)
-    films = [one[:2] for one in solved]
-    assert films[0] == described
-    assert films[1] == films[2] == virtual_film(*described, 3)
-    assert films[3] == virtual_film(*described, 4) != films[1]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from isocharge.serve import examine
 from isocharge.serve.examination import listening
-from isocharge.serve.examination.listening import ReceivedData, listen
+from isocharge.serve.examination.listening import listen
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.port.source import Chunk
 
@@ -148,9 +148,3 @@ def test_each_datagram_is_a_chunk(run):
         received = listen(url, (115200,), 0.3, None, lambda _: True)
         assert received.are_datagrams
         assert set(received.data) == {b"\x01\x02\x03"}
-
-
-def test_time_span_of_a_burst():
-    chunks = [Chunk(b"x", 100.0 + 0.1 * number, 0) for number in range(5)]
-    assert ReceivedData("x", 1, chunks=chunks, seconds=3.0).span_s == pytest.approx(0.5)
-    assert ReceivedData("x", 1, chunks=chunks[:1], seconds=3.0).span_s == 3.0

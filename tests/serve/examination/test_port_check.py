@@ -1,7 +1,6 @@
 """Port check of simulated boards with known faults, and health of channels with known noise, drift and hum."""
 
 import json
-import re
 import struct
 from dataclasses import asdict, replace
 from functools import partial
@@ -10,16 +9,14 @@ import numpy as np
 import pytest
 
 from isocharge.cli.serve.doctor import brief_report
-from isocharge.cli.shared.terminal import show_result
 from isocharge.common.errors import DeviceError, NoFramesError
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text
 from isocharge.serve.examination.channel_health import measure_channel_health
-from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.live.device import ANY_BOARD
 from isocharge.serve.live.stream import ReadingStream
-from isocharge.serve.port.serial_line import TELNET_ADVICE, Request
+from isocharge.serve.port.serial_line import TELNET_ADVICE
 
 RATE_HZ = 200.0
 FOUR = ("A", "B", "C", "D")
@@ -89,15 +86,6 @@ def test_check_of_a_channel_without_a_number():
     json.dumps(asdict(report), allow_nan=False)
 
 
-def test_table_of_a_board_that_sends_microcoulombs(capsys):
-    report = examine_received(
-        received(lambda k: b"A_uC:%.7f,B_uC:%.7f\n" % (4e-4 + 1e-7 * (k % 2), -3e-4 - 3e-7 * (k % 2)))
-    )
-    show_result(brief_report(report), json=False)
-    rows = [line.split()[:3] for line in capsys.readouterr().out.splitlines() if line.lstrip().startswith(("A", "B"))]
-    assert rows == [["A_uC", "0.00040005", "4.9998e-08"], ["B_uC", "-0.00030015", "1.4999e-07"]]
-
-
 @pytest.mark.parametrize(
     ("board", "message"),
     [
@@ -137,12 +125,6 @@ def test_unused_inputs_are_ignored():
     (first, *_) = brief_report(report)["channels"]
     assert {"offset_counts", "drift_counts_per_s"} <= set(first)
     assert not any("pC" in name for name in first)
-
-
-def test_too_few_used_channels_for_the_model():
-    report = examine_received(received(row), electrodes=("A", "B", "C", "D", "E"))
-    assert "6 channels, but the model has the electrodes" in missing(report)
-    assert "channels" not in report.device
 
 
 def test_channels_of_most_similar_noise_are_proposed():
@@ -200,11 +182,6 @@ def test_proposed_file_of_a_board_far_from_zero_works():
     assert "channel 1 has 311.9 pC at rest" in missing(report)
     assert report.works
     assert not examine_received(received(row)).works  # counts of which nobody has said what they are
-
-
-def test_proposed_file_has_the_request():
-    frames = examine_received(received(row, request=Request(b"?\n", 50.0, echo=True))).device["frames"]
-    assert (frames["request"], frames["request_Hz"], frames["echo"]) == ("3F 0A", 50.0, True)
 
 
 @pytest.mark.parametrize("number", [b"nan", b"ovf", b"1e30"])
@@ -275,23 +252,6 @@ def test_stream_states_that_a_serial_server_uses_the_telnet_protocol():
         [list(stream.frames(Chunk(frame.replace(b"\xff", b"\xff\xff"), 0.0, 0))) for frame in frames * 2]
 
 
-@pytest.mark.parametrize("gain", [{}, {"pC_per_unit": 0.5}])
-def test_device_text_describes_the_board(gain):
-    board = lambda k: b"%d,%d,0\n" % (303 + k % 5, 307 - k % 5)  # noqa: E731
-    text = device_text(examine_received(received(board), electrodes=("A", "B"), gain=gain))
-    assert ("\npC_per_unit = 0.5" in text) == bool(gain)
-    assert re.search(r"\n# text: 3 columns without names; 20[01] frames per second\n", text)
-    assert "channels that no electrode uses: 3" in text
-
-
-def test_check_with_a_wrong_device_file_still_reports():
-    fields = [{"name": "A", "type": "f32"}]
-    table = {"frames": {"format": "described", "sync": "AA", "length": 5, "fields": fields}}
-    report = examine_received(received(row), device=device_from_table(table, "test"))
-    assert report.good == 0
-    assert "no frames were recognised" in missing(report)
-
-
 def test_offset_drift_hum_and_noise_of_a_channel():
     t, rng = np.arange(0.0, 4.0, 0.002), np.random.default_rng(0)
     charge = 12.0 + 3.0 * t + 2.0 * np.sin(2 * np.pi * 50 * t + 1) + 0.5 * np.sin(2 * np.pi * 60 * t)
@@ -305,12 +265,3 @@ def test_offset_drift_hum_and_noise_of_a_channel():
 def test_hum_above_half_the_rate_is_not_estimated():
     t = np.arange(0.0, 4.0, 0.01)
     assert measure_channel_health("A", np.sin(t), t, 100.0).hum_pC == (None, None)
-
-
-def test_values_that_are_no_charges_are_counted_and_left_out():
-    t = np.arange(0.0, 4.0, 0.01)
-    charge = 7.0 + np.random.default_rng(0).normal(0.0, 0.3, t.size)
-    charge[[3, 90, 200]] = np.nan, 1e300, -np.inf
-    health = measure_channel_health("A", charge, t, 100.0)
-    assert health.offset_pC == pytest.approx(7.0, abs=0.05)
-    assert (health.unusable, health.noise_pC) == (3, pytest.approx(0.3, rel=0.1))

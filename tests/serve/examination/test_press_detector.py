@@ -82,12 +82,6 @@ def test_damaged_value_is_not_taken_for_a_touch():
     assert find_touch(charges, times_s, unit_is_pC=True) is None
 
 
-def test_too_few_blocks_have_no_touch():
-    charges, times_s = measured("reference", 0, PRESSES["begins"], seconds=0.5)
-    assert find_touch(charges, times_s, unit_is_pC=True) is None
-    assert len(block_medians(charges, times_s)) == 4
-
-
 def test_hum_averages_out_of_block_medians():
     times_s = np.arange(0.0, 2.0, 0.001)
     hum = 100.0 * np.sin(2.0 * np.pi * 50.0 * times_s)

@@ -222,38 +222,7 @@ fields = [{name = "seq", type = "u8"}, {type = "pad", value = "02"}, {name = "A"
     assert encode_layout(described, Frame(1, 0, (16.0,))) == bytes.fromhex("7E 01 02 10 00")
 
 
-def test_checksum_described_by_its_crc_parameters():
-    """The parameters are those of CRC-16/GENIBUS, which crcmod also computes."""
-    check = {"width": 16, "polynomial": "1021", "start": "FFFF", "final": "FFFF"}
-    fields = [{"name": "A", "type": "u8"}]
-    described = layout({"sync": "55", "length": 4, "byte_order": "big", "checksum": check, "fields": fields})
-    data = b"\x55\x07"
-    assert described.compute_checksum(data) == mkPredefinedCrcFun("crc-16-genibus")(data).to_bytes(2, "big")
-
-
 ROBOTIQ = (Path(__file__).parents[2] / "data" / "frames" / "robotiq_ft300.toml").read_text("utf-8")
-
-
-def test_counters_and_clocks_wrap_and_channels_stay_at_their_limit():
-    text = """
-sync = "55"
-length = 5
-fields = [{name = "seq", type = "u8"}, {name = "t_ms", type = "u8"}, {name = "A", type = "i16", scale = 0.5}]
-"""
-    described = layout(text)
-    parser = SyncParser(described)
-    assert parser.feed(encode_layout(described, Frame(257, 300_000, (1e6,)))) == [
-        Frame(1, 44_000, (16383.5,), names=("A",))
-    ]
-    assert (parser.seq_modulus, parser.t_us_modulus) == (256, 256_000)
-
-
-def test_signed_counter_has_no_scale():
-    described = layout({"sync": "55", "length": 3, "fields": [
-        {"name": "seq", "type": "i8", "scale": 0.5}, {"name": "A", "type": "u8"},
-    ]})  # fmt: skip
-    (frame,) = described.parser().feed(b"\x55" + struct.pack("<bB", -126, 0))
-    assert frame.seq % 256 == 130
 
 
 WRONG = [

@@ -9,7 +9,6 @@ from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
@@ -18,7 +17,6 @@ from isocharge.serve import AutoParser, BinaryParser, Frame, device_from_table, 
 from isocharge.serve.frames.frame import Parser, SequenceGaps
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_lines import TEXT_FORMATS
-from isocharge.serve.virtual_sensor.script import corrupt
 from layout_encoder import encode_layout, encode_unstuffed
 
 HEAD = [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
@@ -53,26 +51,6 @@ class Format(NamedTuple):
     junk: st.SearchStrategy
     lead: bytes = b""
     tail: bytes = b""
-
-
-class SkipsAFrame:
-    """A parser with a fault: after dropped bytes, it skips the next frame."""
-
-    def __init__(self, make):
-        self._parser = make()
-        self._skips = False
-
-    def feed(self, data):
-        frames = []
-        for byte in data:
-            dropped = self._parser.counts.bytes_dropped
-            new = self._parser.feed(bytes([byte]))
-            self._skips |= self._parser.counts.bytes_dropped > dropped
-            if new and self._skips:
-                new = new[1:]
-                self._skips = False
-            frames += new
-        return frames
 
 
 SEQ = st.integers(0, 2**16 - 1)
@@ -176,54 +154,6 @@ def test_intact_frames_are_never_lost(name):
     loses_no_intact_frame(FORMATS[name], FORMATS[name].parser)
 
 
-@every_format
-def test_parser_that_skips_a_frame_fails_the_check(name):
-    with pytest.raises(AssertionError):
-        loses_no_intact_frame(FORMATS[name], partial(SkipsAFrame, FORMATS[name].parser))
-
-
-@every_format
-def test_reset_drops_an_unfinished_frame(name):
-    """The first part of a frame and the last part of another frame are not a frame."""
-    form = FORMATS[name]
-    frame = Frame(1, 2, (100.0,) * 3)
-    parser = form.parser()
-    parser.feed(form.lead + form.encode(frame)[:-3])
-    before = parser.counts.frames
-    parser.reset()
-    assert parser.feed(form.encode(frame)[-3:]) == []
-    assert parser.counts.frames == before
-    assert parser.feed(form.encode(frame) * 4 + form.tail)[-1].values == alone(form, frame)[0].values
-
-
-def frames_of_three(n, seed):
-    values = np.random.default_rng(seed).normal(0, 800, (n, 3)).astype(np.float32)
-    return [Frame(number % 65536, 1000 * number, tuple(row)) for number, row in enumerate(values.tolist())]
-
-
-@pytest.mark.parametrize("name", ["binary", "described", "auto binary"])
-def test_damage_of_one_percent_of_bytes(name):
-    """No wrong frame is read, and no intact frame between intact frames is lost."""
-    form = FORMATS[name]
-    rng = np.random.default_rng(0)
-    sent = frames_of_three(2000, 0)
-    damaged = [corrupt(form.encode(frame), 0.01, rng) for frame in sent]
-    read_frames = form.parser().feed(b"".join(damaged) + form.encode(sent[0]))
-    is_after_intact_end = [True, *(data.endswith(b"\0") or name == "described" for data in damaged)]
-    intact_frames = [
-        frame
-        for frame, data, is_separate in zip(sent, damaged, is_after_intact_end, strict=False)
-        if is_separate and data == form.encode(frame)
-    ]
-
-    def contents(frames):
-        return {(frame.seq, frame.t_us, frame.values) for frame in frames}
-
-    intact = contents(intact_frames)
-    assert 1000 < len(intact) < 1900
-    assert intact <= contents(read_frames) <= contents(sent)
-
-
 @pytest.mark.parametrize(
     ("numbers", "modulus", "counts", "flags"),
     [
@@ -239,10 +169,3 @@ def test_sequence_gaps_repeats_and_restarts(numbers, modulus, counts, flags):
     gaps = SequenceGaps()
     assert [gaps.update(seq, *modulus) for seq in numbers] == flags
     assert (gaps.lost, gaps.repeated, gaps.restarts) == counts
-
-
-def test_reset_counts_no_gap():
-    gaps = SequenceGaps()
-    gaps.update(5)
-    gaps.reset()
-    assert gaps.update(900) == ()

@@ -2,14 +2,13 @@
 
 import math
 import pickle
-from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve import AutoParser, Frame, encode_frame, encode_text
+from isocharge.serve import AutoParser, Frame, encode_text
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import SequenceGaps
 from isocharge.serve.frames.text import TextParser
@@ -42,25 +41,6 @@ def test_documented_teleplot_lines(text, names, values):
 @pytest.mark.parametrize("text", [">myValue:hello|t", ">trajectory:12.3:45.67|xy", "", "  \r", "# a comment: 12"])
 def test_blank_and_comment_lines_are_no_readings(text):
     assert clean_text(text) == ""
-
-
-@pytest.mark.parametrize(
-    ("text", "names", "values"),
-    [
-        ("801.2,799.5,-803.3", (), (801.2, 799.5, -803.3)),
-        ("801.2, 799.5 , 803.3,", (), (801.2, 799.5, 803.3)),
-        ("801;799;803", (), (801.0, 799.0, 803.0)),
-        ("801\t799 803", (), (801.0, 799.0, 803.0)),
-        ("[801, 799.5, 1e3]", (), (801.0, 799.5, 1000.0)),
-        ("A:801.2,B:-7", ("A", "B"), (801.2, -7.0)),
-        ("A: 801.2  B: 7", ("A", "B"), (801.2, 7.0)),
-        ("A=801.2; B=7", ("A", "B"), (801.2, 7.0)),
-        ('{"seq": 3, "A": 1.5, "note": "x", "ok": true}', ("seq", "A"), (3.0, 1.5)),
-        ('{"charge": {"A": 1, "B": 2}, "q": [3, 4]}', ("charge.A", "charge.B", "q.0", "q.1"), (1.0, 2.0, 3.0, 4.0)),
-    ],
-)
-def test_lines_of_each_notation(text, names, values):
-    assert names_and_values(text) == (names or ("",) * len(values), values)
 
 
 @pytest.mark.parametrize(
@@ -411,34 +391,3 @@ def test_frame_counter_in_text_that_wraps_or_restarts(begin, end, restarts):
         for frame in feed(f"seq:{seq},A:1", parser=parser):
             gaps.update(frame.seq, parser.seq_modulus)
     assert (gaps.lost, gaps.repeated, gaps.restarts) == (0, 0, restarts)
-
-
-ENCODERS = {"binary": encode_frame} | {name: partial(encode_text, notation=name) for name in TEXT_FORMATS}
-
-
-@pytest.mark.parametrize("name", ENCODERS)
-@pytest.mark.parametrize("start", [0, 7, 19])
-def test_format_is_recognised_from_anywhere(name, start):
-    frames = [Frame(seq, 1000 * seq, (800.0 + seq, -7.5, 3.25)) for seq in range(20)]
-    data = b"".join(map(ENCODERS[name], frames))
-    parser = AutoParser()
-    parsed = parser.feed(data[start:])
-    assert len(parsed) >= 17
-    assert [frame.values[0] for frame in parsed] == [frame.values[0] for frame in frames[-len(parsed) :]]
-    assert ("binary" if name == "binary" else "text") in parser.format
-
-
-def test_bytes_before_recognition_count_as_dropped():
-    parser = AutoParser()
-    parser.feed(b"\xf0\x9f" * 500)
-    assert (parser.counts.frames, parser.counts.bytes_dropped) == (0, 1000)
-    assert parser.format == "nothing recognised yet"
-
-
-def test_moduli_are_those_of_the_recognised_text():
-    parser = AutoParser()
-    for number in range(12):
-        seq = (250 + number) % 256
-        t_ms = (65_530 + number) % 65_536
-        parser.feed(b"seq:%d,t_ms:%d,A:1\n" % (seq, t_ms))
-    assert (parser.seq_modulus, parser.t_us_modulus) == (256, 65_536_000)

@@ -19,7 +19,7 @@ from isocharge.serve import (
 from isocharge.serve.frames.formats import Frames
 from isocharge.serve.frames.frame_layout import SyncParser
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.live.device import ANY_BOARD, STAGES, create_stages, with_settings
+from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain, GainRule
 from isocharge.serve.signal_chain.hum import HumRule
@@ -91,19 +91,6 @@ def test_device_without_a_file_has_tare_and_touch(device):
     assert isinstance(ANY_BOARD.parser(), AutoParser)
 
 
-@pytest.mark.parametrize("section", ["gain", "saturation", "hum", "tare", "leak", "touch"])
-def test_stage_can_be_switched_off(device, section):
-    (rule_class,) = [stage.rule_class for stage in STAGES if stage.section == section]
-    board = device(FULL.replace(f"[{section}]", f"[{section}]\non = false"))
-    assert set(device(FULL).rules) - set(board.rules) == {rule_class}
-
-
-def test_setting_may_be_one_number_for_all_channels(device):
-    setup = device("[gain]\npC_per_unit = 2.0\n[leak]\ntau_s = 1.0\n").setup(ELECTRODES)
-    np.testing.assert_array_equal(Gain(setup).gain_pC, [2.0] * 3)
-    np.testing.assert_array_equal(Leak.c_settings(setup)["tau_s"], [1.0] * 3)
-
-
 def test_format_decides_the_parser(device):
     assert isinstance(device('[frames]\nformat = "binary"').parser(), BinaryParser)
     described = '[frames]\nformat = "described"\nsync = "55"\nlength = 5\nfields = [{name = "A", type = "f32"}]'
@@ -130,11 +117,6 @@ def test_volts_on_a_feedback_capacitance(device):
     text = "[gain]\nV_per_unit = -0.001\noffset = 1650\nfeedback_pF = {A = 1000, B = 1000, C = 500}\n"
     np.testing.assert_allclose(converted(device(text), np.full(3, 1651.0)), [-1.0, -1.0, -0.5])
     assert device(text).rule(GainRule).charge_pC("C", np.array([1651.0])) == pytest.approx(-0.5)
-
-
-def test_device_file_renames_frame_counter_and_clock(device):
-    parser = device('[frames]\nformat = "text"\nseq = "n"\nt_ms = "up"\n').parser()
-    assert parser.feed(b'\n{"n": 3, "up": 12, "A": 1}\n' * 3)[-1] == Frame(3, 12000, (1.0,), names=("A",))
 
 
 def test_device_file_with_a_request(device):
@@ -191,23 +173,6 @@ WRONG = [
 def test_device_file_that_is_refused(device, text, message):
     with pytest.raises(DeviceError, match=rf"device\.toml: .*{message}"):
         device(text)
-
-
-def test_table_of_a_device_is_unchanged(device):
-    """Recordings contain the table, and the same device can be created from it."""
-    board = device(FULL)
-    assert device_from_table(board.table, board.where) == board
-    assert board.table["tare"] == {"frames": 50}
-
-
-def test_offset_limit_changes_in_the_rule_and_in_the_table(device):
-    board = with_settings(device(FULL), "tare", offset_limit_pC=250.0)
-    assert (board.rule(TareRule).frames, board.rule(TareRule).offset_limit_pC) == (50, 250.0)
-    assert board.table["tare"] == {"frames": 50, "offset_limit_pC": 250.0}
-    other = with_settings(ANY_BOARD, "tare", offset_limit_pC=250.0)
-    assert (other.rule(TareRule).offset_limit_pC, ANY_BOARD.table) == (250.0, {})
-    with pytest.raises(DeviceError, match=r"device\.toml: tare\.offset_limit_pC: expected a number from 0"):
-        with_settings(board, "tare", offset_limit_pC=-1.0)
 
 
 def test_device_file_that_does_not_exist(tmp_path):

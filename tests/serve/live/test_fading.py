@@ -43,17 +43,8 @@ def test_leak_and_creep_of_a_long_press_are_distinguished(law, expected):
         assert re.search(expected, cause_of_fading(sizes_of_press(law, 6.0, seed, 0.007)))
 
 
-def test_long_time_constant_of_a_leak_is_written_without_an_exponent():
-    sizes = sizes_of_press(lambda t: np.exp(-t / 120.0), 60.0, seed=0, relative_noise=0.0)
-    assert "put [leak] tau_s = 120 into a device file" in cause_of_fading(sizes)
-
-
 @pytest.mark.parametrize("law", [lambda t: np.exp(-t / 20.0), lambda t: 1.0 - 0.04 * np.log10(t), lambda _: 1.0])
 @pytest.mark.parametrize(("seconds", "relative_noise"), [(1.2, 0.007), (6.0, 0.1)])
 def test_cause_is_undecided_for_short_or_noisy_presses(law, seconds, relative_noise):
     for seed in range(20):
         assert UNDECIDED in cause_of_fading(sizes_of_press(law, seconds, seed, relative_noise))
-
-
-def test_cause_is_undecided_if_the_charge_rises_first():
-    assert UNDECIDED in cause_of_fading([(1.0, 500.0), (2.0, 530.0), (3.0, 560.0), (4.0, 590.0), (5.0, 585.0)])

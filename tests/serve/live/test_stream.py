@@ -6,12 +6,11 @@ import time
 import numpy as np
 import pytest
 
-from isocharge.common.errors import ChargeError, ModelError, PortError
+from isocharge.common.errors import ChargeError, PortError
 from isocharge.serve import (
     Chunk,
     Frame,
     Policy,
-    Predictor,
     TouchStream,
     device_from_table,
     encode_frame,
@@ -66,13 +65,6 @@ def test_timestamps_of_a_file_follow_the_clock_of_the_board(predictor, tmp_path)
     np.testing.assert_allclose(np.diff(times), 0.005, atol=1e-6)
 
 
-def test_device_file_of_the_board_is_used(predictor):
-    """The device file states another unit, and a tare of two frames."""
-    device = device_from_table({"gain": {"pC_per_unit": 2.0}, "tare": {"frames": 2}}, "test")
-    *_, record = stream([chunk(*rest_frames(3))], predictor, device)
-    assert record.tare_pC == {"A": 24.0, "B": -14.0, "C": 6.0}
-
-
 def test_record_of_a_press(film, records_after_rest):
     (record,) = records_after_rest(Frame(10, 50_000, raw_press(film)))
     assert (record.x_mm, record.y_mm, record.force_N) == pytest.approx((2.0, -3.0, 0.5), rel=1e-5)
@@ -106,19 +98,6 @@ def test_policy_latest_passes_flags_of_skipped_frames_on(predictor):
     assert touch.counts.skipped == 9 + 4 + 1 + 2
 
 
-def test_use_another_model_of_the_same_electrodes(film, make_film, predictor, tmp_path):
-    touch = TouchStream(predictor, BOARD, frame_id="left")
-    *_, last_at_rest = touch.feed(chunk(*rest_frames()))
-    touch.use(Predictor(film.write(tmp_path, version=2)))
-    (record,) = touch.feed(chunk(Frame(10, 50_000, raw_press(film))))
-    assert last_at_rest.model == "linear/1"
-    assert (record.model, record.flags, record.frame_id) == ("linear/2", (), "left")
-    assert record.force_N == pytest.approx(0.5, rel=1e-5)
-    with pytest.raises(ModelError, match=r"linear/1: expected the electrodes \('A', 'B', 'C'\) of linear/2"):
-        touch.use(Predictor(make_film(4).write(tmp_path / "four")))
-    assert touch.predictor.metadata.label == "linear/2"
-
-
 def test_record_out_of_contact(records_after_rest):
     (record,) = records_after_rest(Frame(10, 50_000, tuple((OFFSET + 1.0).tolist())))
     assert (record.contact, record.force_N, record.flags) == (False, 0.0, ())
@@ -140,23 +119,6 @@ def test_record_before_the_tare(predictor):
 def test_press_outside_the_domain_is_flagged(film, records_after_rest, press, flags):
     (record,) = records_after_rest(Frame(10, 0, raw_press(film, **press)))
     assert record.flags == flags
-
-
-def test_flags_of_the_frame_are_in_the_record(film, records_after_rest):
-    """A frame with an amplifier at its limit is followed by a repeated frame and by a restart of the board.
-
-    The flag `saturated` lasts until the end of the press.
-    """
-    charges = raw_press(film)
-    records = records_after_rest(
-        Frame(10, 0, charges), Frame(13, 0, charges, bits=1), Frame(13, 0, charges), Frame(2, 0, charges)
-    )
-    assert [record.flags for record in records] == [
-        (),
-        ("gap", "saturated"),
-        ("repeat", "saturated"),
-        ("restart", "saturated"),
-    ]
 
 
 @pytest.mark.parametrize("damaged", [1.01e9, -1e38, 1e300, -1.7e308, math.inf])

@@ -50,23 +50,6 @@ def test_touch_offset_adds_the_scatter_that_random_offsets_cause(predictor, char
     np.testing.assert_allclose(stds(record), expected, rtol=0.1)
 
 
-def test_touch_offset_matters_more_for_light_presses(predictor):
-    """The charges of the strong press are eight times as large, so the same offset is an eighth of them."""
-
-    def added_relative_std(charge_pC):
-        with_offset = held_record(predictor, charge_pC, touch_offset={})
-        without_offset = held_record(predictor, charge_pC)
-        added_variance = with_offset.force_std_N**2 - without_offset.force_std_N**2
-        return np.sqrt(added_variance) / without_offset.force_N
-
-    assert added_relative_std(LIGHT_pC) > 4.0 * added_relative_std(STRONG_pC)
-
-
-def test_touch_offset_that_is_switched_off_changes_nothing(predictor):
-    off = held_record(predictor, LIGHT_pC, touch_offset={"on": False})
-    np.testing.assert_array_equal(stds(off), stds(held_record(predictor, LIGHT_pC)))
-
-
 @pytest.mark.parametrize("value", [-1.0, "much"])
 def test_touch_offset_that_is_no_charge_is_refused(value):
     with pytest.raises(DeviceError, match=r"touch_offset\.std_pC"):

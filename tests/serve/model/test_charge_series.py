@@ -12,7 +12,7 @@ from attacks.companions import ELECTRODES, charge_arrays
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
 from isocharge.serve.model.charge_file import charge_map_bytes, charge_map_from_bytes, read_charge_map
-from isocharge.serve.model.charge_series import ChargeSeries, interpolation_weights
+from isocharge.serve.model.charge_series import ChargeSeries
 
 DOMAIN = Domain(8.0, (0.05, 2.0))
 NODES = np.array([-0.5, 0.0, 0.25])
@@ -125,19 +125,6 @@ def test_states_may_differ_from_contact_to_contact():
             np.testing.assert_allclose(joint[row], single[0], rtol=1e-12)
 
 
-def test_interpolation_weights_reproduce_a_cubic_and_continue_linearly():
-    nodes = np.array([-0.6, -0.3, 0.0, 0.5])
-    cubic = np.poly1d([2.0, -1.0, 0.5, 3.0])
-    points = np.array([-0.45, 0.1, 0.9])
-    weights, slopes = interpolation_weights(nodes, points)
-    np.testing.assert_allclose(weights[:2] @ cubic(nodes), cubic(points[:2]), rtol=1e-12)
-    np.testing.assert_allclose(slopes[:2] @ cubic(nodes), cubic.deriv()(points[:2]), rtol=1e-12)
-    np.testing.assert_allclose(weights[2] @ cubic(nodes), cubic(0.5) + 0.4 * cubic.deriv()(0.5), rtol=1e-12)
-    single_weights, single_slopes = interpolation_weights(np.zeros(1), points)
-    np.testing.assert_array_equal(single_weights, np.ones((3, 1)))
-    np.testing.assert_array_equal(single_slopes, np.zeros((3, 1)))
-
-
 @pytest.mark.parametrize("is_signed", [False, True])
 def test_file_is_read_as_it_was_written(is_signed):
     written = replace(random_series(is_signed=is_signed), offset_pC=3.5)
@@ -174,10 +161,7 @@ SERIES = GOOD["series"]
     ("change", "reason"),
     [
         ({"format": None}, r"format 1 is not supported \(this version reads 2\)"),
-        ({"format": np.array(3)}, "format 3 is not supported"),
         ({"series": np.full(SERIES.shape, "text")}, "expected real numbers"),
-        ({"series": SERIES.astype(complex)}, "expected real numbers"),
-        ({"series": np.zeros(SERIES.shape, "datetime64[s]")}, "expected real numbers"),
         ({"series": SERIES[0]}, "expected an array of shape"),
         ({"series": SERIES[:, :, :1]}, "equal degrees in x and y"),
         ({"series": np.zeros((3, 200, 200, 2, 4))}, "degrees up to 100"),
@@ -187,23 +171,16 @@ SERIES = GOOD["series"]
         ({"series": None}, "the array 'series' is missing"),
         ({"node_MPa": np.array([-0.5, 0.5, 1.0])}, "with 0 among them"),
         ({"node_MPa": np.array([0.0, -0.5, 0.5])}, "rising changes"),
-        ({"node_MPa": np.array([-1e-9, 0.0, 0.5])}, "rising changes"),
         ({"node_MPa": np.array([0.0, 0.5, 1e9])}, "rising changes up to 50 MPa"),
-        ({"node_MPa": np.array([0.0, 0.5])}, r"expected an array of shape \(2, n, n, n, 4\)"),
         ({"directions": np.zeros((2, 3, 2, 2, 4))}, "directions: expected equal degrees"),
         ({"directions": np.zeros((1, 1, 1, 200, 4))}, "directions: expected up to 100"),
-        ({"directions": np.zeros((2, 2, 2, 2, 3))}, "expected an array of shape"),
         ({"log_size": np.full(3, 1e3)}, "log_size: expected values up to 100"),
         ({"force_N": np.array([0.0, 1.0])}, "a smallest force above 0"),
         ({"force_N": np.array([1.0, 0.5])}, "got 1 and 0.5 N"),
-        ({"force_N": np.array([1.0])}, "expected an array of shape"),
         ({"radius_mm": np.array(np.inf)}, "expected finite numbers"),
         ({"radius_mm": np.array(1e9)}, "expected a radius up to 10000 mm"),
-        ({"radius_mm": np.array(-1.0)}, "expected a radius"),
-        ({"radius_mm": np.array("8")}, "expected real numbers"),
         ({"charge_std": np.array(2.0)}, "charge_std: expected a number from 0 to 1, got 2"),
         ({"tension_std_MPa": np.array(-0.1)}, "tension_std_MPa: expected a number from 0"),
-        ({"pretension_MPa": None}, "the array 'pretension_MPa' is missing"),
     ],
 )
 def test_file_that_describes_no_charges_is_refused(change, reason):
@@ -229,14 +206,6 @@ def test_file_with_any_number_is_refused_or_gives_finite_charges(name, entry, nu
     contact = series.domain.to_contact(np.array([[0.0, 0.0, 0.0], [0.5, -0.5, 1.0], [3.0, 0.0, -2.0]]))
     changes = series.changes(contact, np.ones(1 + series.direction_count))
     assert all(np.isfinite(value).all() for value in changes)
-
-
-def test_number_of_directions_and_pretension_of_another_state():
-    series = random_series()
-    assert series.direction_count == 2
-    moved = series.at_state(np.array([0.2, 0.0, 0.0]))
-    assert (moved.direction_count, moved.pretension_MPa) == (0, pytest.approx(1.0))
-    assert replace(series, directions=None).direction_count == 0
 
 
 def test_an_offset_is_added_to_every_charge_and_changes_no_derivative():

@@ -2,13 +2,11 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import load_model, write_model
-from isocharge.serve.model.chebyshev_series import Series, position_degrees
 from isocharge.serve.model.golden import read_companion_file
 
 ADVICE = "train again"
@@ -52,21 +50,3 @@ def test_model_without_checksums_of_companion_files_is_refused(folder):
 def test_missing_file_is_named(folder):
     with pytest.raises(ModelError, match=r"other\.npz: cannot be read .*train again"):
         read_companion_file(folder, "other.npz", ADVICE)
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 1, 2), (1, 1, 3, 2), (3, 3, 1, 2), (2, 2, 2, 2), (4, 4, 3, 2)])
-def test_derivatives_of_a_chebyshev_series_are_its_finite_differences_also_for_degree_zero(shape):
-    rng = np.random.default_rng(0)
-    coefficients = np.zeros(shape)
-    terms = position_degrees(shape[0] - 1)
-    coefficients[terms] = rng.standard_normal(coefficients[terms].shape)
-    series = Series(coefficients)
-    coordinates = rng.uniform(-0.9, 0.9, (5, 3))
-    derivatives = series.values_and_derivatives(coordinates)[:, 1:]
-    step = 1e-5
-    for axis in range(3):
-        change = step * np.eye(3)[axis]
-        values_above = series.values_and_derivatives(coordinates + change)[:, 0]
-        values_below = series.values_and_derivatives(coordinates - change)[:, 0]
-        expected = (values_above - values_below) / (2.0 * step)
-        np.testing.assert_allclose(derivatives[:, axis], expected, atol=1e-8)

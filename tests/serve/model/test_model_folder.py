@@ -15,7 +15,7 @@ import pytest
 from isocharge.common.errors import ChargeError, ModelError, OutputExists
 from isocharge.common.files import sha256_of
 from isocharge.serve import ModelMetadata, check_golden, find_labelled_model, find_model, load_model, write_model
-from isocharge.serve.model.golden import contact_floors, make_golden
+from isocharge.serve.model.golden import make_golden
 
 
 @pytest.fixture
@@ -105,18 +105,6 @@ def test_golden_vectors_are_checked_before_a_version_appears(film, tmp_path, mon
     with pytest.raises(ModelError, match=r"contact\[0, .\]: expected"):
         write(film, tmp_path / "linear")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_golden_floors_grow_with_working_area_largest_force_and_position_error(film):
-    def floors(radius_mm, **changes):
-        working_area_mm = ((radius_mm, 0.0), (0.0, radius_mm), (-radius_mm, 0.0))
-        return np.array(contact_floors(film.metadata(working_area_mm=working_area_mm, **changes)))
-
-    reference = floors(20.0)
-    wide = floors(60.0, force_range_N=(0.05, 10.0))
-    noisy = floors(5.0, force_range_N=(0.05, 1.0), errors={"position_rms_mm": 4.0})
-    np.testing.assert_allclose(wide / reference, [3.0, 3.0, 5.0])
-    np.testing.assert_allclose(noisy, [4.0, 4.0, reference[2]])
 
 
 def test_model_in_a_folder_with_another_name_is_refused(film, tmp_path):
@@ -326,7 +314,6 @@ def test_missing_metadata_key_is_named(film, key):
     [
         ("name", '""', "expected letters, digits, '-', '_' and '.', got ''"),
         ("version", "0", "expected a whole number from 1, got 0"),
-        ("version", "true", "got True"),
         ("sensor", "{}", "key 'sensor.name' is missing"),
         ("sensor", '{"name": 3}', "sensor.name: expected a text, got 3"),
         ("electrodes", '["A", "A"]', "expected names that differ, got .'A', 'A'"),
@@ -334,20 +321,15 @@ def test_missing_metadata_key_is_named(film, key):
         ("working_area_mm", "[[0, 0], [1, 0]]", "expected a list of lists, 3 or more"),
         ("working_area_mm", "[[0, 0], [1, 0], [1]]", r"expected a list of 2 numbers, got \[1\]"),
         ("force_range_N", "[2.0, 0.05]", r"expected a smaller and a larger number, got \[2.0, 0.05\]"),
-        ("force_range_N", "[0.05]", "expected a list of 2 numbers"),
         ("errors", '{"position_mm": NaN}', "errors: expected JSON"),
         ("probes", '"circle:1.0"', "expected a list of texts, 1 or more, got 'circle"),
         ("noise", "{", "noise: expected JSON, got '{' "),
         pytest.param("noise", "[" * 100_000, "noise: expected JSON", id="noise, nested too deeply"),
         ("noise", "{}", "key 'noise.name' is missing"),
         ("noise", '{"name": "mine", "gain": 0.002}', "key 'noise.white_pC' is missing"),
-        ("noise", '{"name": "mine", "white_pC": 1.0}', "key 'noise.gain' is missing"),
         ("noise", noise_text(white_pC="-1"), "noise.white_pC: expected a number from 0, .*, got -1"),
-        ("noise", noise_text(white_pC="NaN"), "noise: expected JSON"),
         ("noise", noise_text(white_pC='"loud"'), "noise.white_pC: expected a number from 0, .*, got 'loud'"),
-        ("noise", noise_text(white_pC="[1, 1, -1]"), "noise.white_pC"),
         ("noise", noise_text(gain="[0.1, 0.1]"), r"noise.gain: expected one number for each of 3 electrodes, got .0.1"),
-        ("noise", noise_text(gain="null"), "noise.gain: expected a number from 0, .*, got None"),
     ],
 )
 def test_wrong_metadata_value_is_shown(film, key, text, message):

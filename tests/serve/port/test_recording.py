@@ -5,7 +5,7 @@ import json
 import pytest
 
 from isocharge.common.errors import OutputError, OutputExists, RecordingError
-from isocharge.serve import Chunk, RecordedClock, Recorder, Recording
+from isocharge.serve import Chunk, Recorder, Recording
 from isocharge.serve.port.recording import Event, Marker, NewModel
 
 CHUNKS = [
@@ -31,13 +31,6 @@ def test_events_are_those_that_were_recorded(recorded):
     events = list(Recording(recorded).events())
     assert [event.chunk for event in events] == [*CHUNKS[:2], None, *CHUNKS[2:]]
     assert [len(event.latencies_us) for event in events] == [0, 1, 0, 2, 3, 4]
-
-
-def test_clock_of_a_replay_repeats_the_recorded_latencies(recorded):
-    events = list(Recording(recorded).events())
-    clock = RecordedClock()
-    clock.set(events[3])
-    assert [clock(), clock(), clock()] == [2000, 2000 + 10_000, 2000]
 
 
 @pytest.mark.parametrize("cut", [1, 10, 30])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from isocharge.common.errors import OutputError, PressError
 from isocharge.serve import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.presses import measured_presses
-from isocharge.serve.presses.measured_presses import PRESS_RULES, presses_text, read_press_list, row_words
+from isocharge.serve.presses.measured_presses import PRESS_RULES, presses_text, read_press_list
 from isocharge.serve.presses.number_table import LARGEST
 
 NAMES = ("A", "B", "C")
@@ -189,12 +189,6 @@ def test_missing_press_file_is_refused(tmp_path, name):
         read_presses(tmp_path / name, NAMES)
 
 
-def test_row_words_of_a_message():
-    assert row_words([3], "line") == "line 3"
-    assert row_words([3, 5], "row") == "rows 3, 5"
-    assert row_words(range(1, 6), "line", max_listed=3) == "lines 1, 2, 3 and 2 more"
-
-
 def test_arrays_of_different_lengths_are_refused():
     ones = np.ones(2)
     with pytest.raises(PressError, match=r"charge_pC: expected an array of shape \(2, 3\), got \(2, 2\)"):
@@ -269,16 +263,3 @@ def test_a_written_file_is_plain_csv(read):
         {"x_mm": "1.0", "y_mm": "2.0", "force_N": "", "A": "10.0", "B": "", "C": "30.0"}
         | {"position_std_mm": "0.1", "force_std": "0.01"}
     ]
-
-
-@given(data=st.binary(max_size=200) | st.text(max_size=200).map(lambda text: (HEADER + "\n" + text).encode()))
-@settings(derandomize=True, max_examples=100)
-def test_any_bytes_are_presses_or_a_press_error(data, tmp_path_factory):
-    path = tmp_path_factory.getbasetemp() / "any.csv"
-    path.write_bytes(data)
-    try:
-        presses = read_presses(path, NAMES)
-    except PressError as error:
-        assert str(path) in str(error)  # noqa: PT017
-    else:
-        assert len(presses) > 0

@@ -18,7 +18,7 @@ from scipy.special import gammaincc
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, Predictor, check_presses
-from isocharge.serve.prediction.press_errors import CommonError, ErrorSummary, chi_squared_survival
+from isocharge.serve.prediction.press_errors import CommonError, chi_squared_survival
 
 RIG_STD_MM = 0.05
 RIG_FORCE_STD = 0.004
@@ -223,14 +223,6 @@ def test_constant_error_of_the_rig_reduces_the_significance_of_a_common_error():
     for rig_std_mm, constant_mm in ((0.0, 0.0), (0.2, 0.04)):
         common = CommonError.from_errors(error, variance, np.full(400, rig_std_mm))
         assert common.significance == pytest.approx(0.1 / math.hypot(common.std, constant_mm))
-
-
-def test_error_summary_of_known_numbers():
-    summary = ErrorSummary.from_errors(np.array([3.0, 4.0]), np.array([2.0, 4.0]), np.array([1.0, 0.0]))
-    assert (summary.rms, summary.median, summary.max) == (12.5**0.5, 3.5, 4.0)
-    assert (summary.noise, summary.rig, summary.explained, summary.beyond) == (3**0.5, 0.5**0.5, 3.5**0.5, 3.0)
-    assert ErrorSummary.from_errors(np.array([1.0]), np.array([4.0]), np.array([0.0])).beyond == 0.0
-    assert ErrorSummary.from_errors(np.array([]), np.array([]), np.array([])) is None
 
 
 @given(degrees=st.integers(1, 2000), sigmas=st.floats(-4.0, 20.0))

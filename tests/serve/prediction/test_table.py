@@ -92,14 +92,6 @@ def test_message_about_a_wrong_table_is_short(text, message):
     assert len(str(caught.value)) < 600
 
 
-def test_ten_of_many_missing_columns_are_named():
-    names = [f"Q{number}" for number in range(13)]
-    with pytest.raises(ChargeError, match=r"missing: 'Q1', .*'Q10' and 2 more"):
-        read_charges(io.StringIO("Q0\n1\n"), names, "presses.csv")
-    with pytest.raises(ChargeError, match=r"missing: 'Q3', .*'Q12'$"):
-        read_charges(io.StringIO("Q0,Q1,Q2\n1,2,3\n"), names, "presses.csv")
-
-
 def test_table_with_only_a_header_has_no_presses():
     assert read("A,B,C\n").shape == (0, 3)
 
@@ -188,23 +180,6 @@ def test_noise_may_differ_between_electrodes():
     corners = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
     validity = Validity(corners, (0.1, 1.0), white_pC=(1.0, 10.0))
     assert validity.is_touch(np.array([[20.0, 0.0], [0.0, 20.0]])).tolist() == [True, False]
-
-
-def test_record_has_the_fields_in_their_order(contract, record):
-    assert list(json.loads(record().to_json())) == contract
-
-
-def test_record_is_one_line_of_plain_values(record):
-    text = record().to_json()
-    assert "\n" not in text
-    got = json.loads(text)
-    expected = {"x_mm": 1.234568, "y_mm": None, "charge_pC": {"A": 800.0625, "B": None}, "flags": ["gap"]}
-    assert (expected | {"timestamp": 1763600000.123457}).items() <= got.items()
-
-
-def test_record_never_contains_nan(record):
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        record(misfit=float("nan")).to_json()
 
 
 GOOD = Contact(1.0, -2.0, 0.5, 0.1, 0.1, 0.01, 0.3)

@@ -34,12 +34,6 @@ def run(frames_pC, **sections):
     return [chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ) for number, raw_pC in enumerate(frames_pC)]
 
 
-def test_tare_is_mean_and_noise():
-    tare_pC, noise_pC = measure_tare(TareRule(), rest(10_000))
-    np.testing.assert_allclose(tare_pC, OFFSET, atol=0.05)
-    np.testing.assert_allclose(noise_pC, 1.0, rtol=0.03)
-
-
 def test_tare_under_a_resting_weight_is_refused():
     with pytest.raises(TareError, match=r"rests at 81\d.* pC, expected at most 100 pC; take off"):
         measure_tare(TareRule(), rest(100) + 800.0)
@@ -142,16 +136,6 @@ def test_touch_is_detected_from_charges_of_any_sign(ratios):
         touch.step(frame)
         contacts.append(frame.is_contact)
     assert contacts == [0, 0, 1, 1, 0, 0, 0, 1, 0]
-
-
-def test_charges_with_the_sum_zero_are_a_touch():
-    touch = touch_stage()
-    frame = Frame(None, None, (), dt_s=0.1)
-    frame.charge_pC = np.array([100.0, -50.0, -50.0])
-    frame.noise_pC = ONE_PC
-    touch.step(frame)
-    assert frame.is_contact
-    assert frame.flags == []
 
 
 @pytest.mark.parametrize("has_any_sign", [False, True])

@@ -4,20 +4,15 @@ The films creep, cool and warm by laws in closed form, or by filters of scipy. T
 the touch charges from which the simulated charges were computed.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Contact, Frame, TouchStream, device_from_table, encode_frame
-from isocharge.serve.model.contact import Sensitivity
 from isocharge.serve.signal_chain.memory import CREEP_LAW_DEVIATION, LEARN_S, WARMTH_CHANGE_PC
 from isocharge.serve.signal_chain.memory_state import DECADES_S
-from isocharge.serve.signal_chain.thermal import warming_ratios
-from isocharge.train.export_c.folder import device_header
 from stage_runner import StageRunner
 
 RATE_HZ = 200.0
@@ -269,29 +264,6 @@ def test_uncertain_memory_increases_standard_deviations_and_correlations():
     np.testing.assert_allclose(covariance_of(contact.widened(shift)), expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("movement", "is_repeated"),
-    [
-        ((0.2, -0.2, 0.02), False),
-        ((0.4, 0.0, 0.0), True),
-        ((0.0, -0.4, 0.0), True),
-        ((0.0, 0.0, 0.03), True),
-    ],
-)
-def test_second_prediction_is_repeated_after_the_contact_has_moved(movement, is_repeated):
-    """One unit of the parameter doubles the contact, so that half a unit shifts the contact by half of its values."""
-    unit = 0.1
-    sensitivity = Sensitivity(unit)
-    first = np.array([2.0, 1.0, 0.5])
-    second = first + np.array(movement)
-    for values in (first, second):
-        contact = Contact(*values, 0.1, 0.1, 0.01, 0.0)
-        doubled_contact = partial(Contact, *2.0 * values, 0.1, 0.1, 0.01, 0.0)
-        shift = sensitivity.shift(contact, 0.5 * unit, doubled_contact)
-    latest_reference = second if is_repeated else first
-    np.testing.assert_allclose(shift, 0.5 * latest_reference, rtol=1e-12)
-
-
 def test_records_have_the_standard_deviations_of_an_uncertain_memory(film, predictor):
     """Creep and step are known to 20 %, so that all charges have a common relative error.
 
@@ -318,21 +290,3 @@ def test_records_have_the_standard_deviations_of_an_uncertain_memory(film, predi
     assert record.tracked.force_std_N > 0.8 * expected_std_N
     # On the linear film, a common error of all charges does not change the position.
     assert (record.x_std_mm, record.y_std_mm) == pytest.approx((exact.x_std_mm, exact.y_std_mm))
-
-
-def test_warming_charges_are_relative_to_their_mean():
-    board = device_from_table({"common_mode": {"pC_per_K": {"A": 2.0, "B": -6.0, "C": 3.0, "D": 1.0}}}, "b")
-    np.testing.assert_allclose(warming_ratios(board.setup((*NAMES, "D"))), np.array([2.0, -6.0, 3.0, 1.0]) / 3.0)
-
-
-@pytest.mark.parametrize("per_K", [{"A": 1.0}, {"A": 0.0, "B": 0.0, "C": 0.0, "D": 0.0}])
-def test_charges_of_warming_are_for_each_electrode(per_K):
-    board = device_from_table({"common_mode": {"pC_per_K": per_K}}, "b")
-    with pytest.raises(DeviceError, match=r"b: common_mode.pC_per_K: expected a number"):
-        warming_ratios(board.setup((*NAMES, "D")))
-
-
-@pytest.mark.parametrize("table", [MEMORY, {"common_mode": {"pC_per_K": {"A": 1.0, "B": 1.0, "C": 1.0, "D": -1.0}}}])
-def test_export_to_c_refuses_stages_that_c_does_not_have(table):
-    with pytest.raises(DeviceError, match="does not exist in the signal chain in C"):
-        device_header(device_from_table(table, "b"), (*NAMES, "D"))

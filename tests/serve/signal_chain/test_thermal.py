@@ -130,20 +130,6 @@ def test_charge_and_slope_are_estimated_by_a_kalman_filter():
     assert variances == pytest.approx([posterior[0, 0], posterior[0, 1], posterior[1, 1]], rel=1e-3)
 
 
-def test_misfit_is_evaluated_twenty_times_a_second():
-    evaluation_count = 0
-
-    def count_evaluation(_):
-        nonlocal evaluation_count
-        evaluation_count += 1
-        return np.ones(5)
-
-    warming = warming_stage(count_evaluation)
-    for _ in range(1000):
-        warming._estimate(np.ones(4), 0.001)
-    assert 19 <= evaluation_count <= 20
-
-
 PRESS = UNIAXIAL @ [850.0, 3.0, -2.0]
 """Touch charges of a press on the uniaxial film, shape (4,), pC."""
 

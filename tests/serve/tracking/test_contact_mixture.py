@@ -1,7 +1,6 @@
 """Tests of the contact mixture on a film with a known fold: contacts at x and at 2 FOLD - x have the same charges."""
 
 import json
-import re
 import shutil
 from collections.abc import Sequence
 
@@ -15,7 +14,7 @@ from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import Chunk, Frame, Predictor, TouchStream, encode_frame
 from isocharge.serve.live.device import device_from_table
-from isocharge.serve.model.charge_file import charge_map_bytes, read_charge_map
+from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.tracking.contact_mixture import GAIN_STD, ContactMixture
@@ -95,16 +94,6 @@ def track(x, rate_Hz=1000.0, **options):
         tracked, _ = track_frame(tracker, MODEL_CONTACT, number / rate_Hz, (), charge_pC)
         results.append((tracked, tracker._other))
     return results
-
-
-def test_charge_series_equals_the_closed_form_and_is_a_power_of_the_force_outside_its_range():
-    contact = np.array([[3.0, -2.0, 0.5], [-5.0, 1.0, 0.01], [0.0, 0.0, 4.0]])
-    x, y, force = contact.T
-    charge, slopes = folded_series().linearised(contact)
-    x_slope, _, log_force_slope = np.moveaxis(slopes, 2, 0)
-    assert np.allclose(charge, charges(x, y, force), rtol=1e-12)
-    assert np.allclose(log_force_slope, 0.7 * charge, rtol=1e-12)
-    assert np.allclose(x_slope[:, 1], 0.1 * (1.0 - x / FOLD) * charge[:, 1], rtol=1e-12)
 
 
 def test_contact_at_rest_beside_a_fold_has_an_other_contact_of_equal_probability():
@@ -259,23 +248,3 @@ def test_stream_keeps_its_model_if_the_charges_npz_of_the_next_model_is_damaged(
     with pytest.raises(ModelError, match=r"charges\.npz"):
         stream.use(Predictor(model))
     assert stream.predictor is first
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda data: data[:200], "zip"),
-        (lambda data: data[::-1], "zip"),
-        (lambda data: re.sub(rb"(PK\x01\x02.{4})\0", rb"\g<1>" b"\x01", data, flags=re.DOTALL), "encrypted"),
-        (
-            lambda _: charge_map_bytes(folded_series(coefficients=np.zeros((1, 3, 3, 2, 4)))),
-            r"shape \(1, n, n, n, 3\), got \(1, 3, 3, 2, 4\)",
-        ),
-        (lambda _: charge_map_bytes(folded_series(coefficients=np.full((1, 3, 3, 2, 3), np.nan))), "finite"),
-        (lambda _: charge_map_bytes(folded_series(domain=Domain(6.0, (2.0, 1.0)))), "got 2 and 1 N"),
-    ],
-)
-def test_damaged_charges_npz_raises_a_model_error(model, spoil, message):
-    put_charges(model, spoil(charge_map_bytes(folded_series())))
-    with pytest.raises(ModelError, match=rf"charges\.npz: .*({message}).*train again"):
-        read_charge_map(model, ELECTRODES)

@@ -28,16 +28,6 @@ def test_only_the_frames_near_the_largest_force_are_averaged():
     np.testing.assert_allclose(peak.mean_charge_pC, [100.0, 50.0])
 
 
-def test_frame_at_another_position_is_not_averaged():
-    peak = peak_of([contact(1.0), contact(0.99, x_mm=3.0)], [[100.0], [400.0]])
-    np.testing.assert_allclose(peak.mean_charge_pC, [100.0])
-
-
-def test_larger_force_at_another_position_starts_a_new_average():
-    peak = peak_of([contact(1.0), contact(1.01, x_mm=3.0)], [[100.0], [400.0]])
-    np.testing.assert_allclose(peak.mean_charge_pC, [400.0])
-
-
 def test_long_touch_is_averaged_over_the_first_frames_only():
     steady = [[100.0]] * MAX_AVERAGED_FRAMES
     changed = [[200.0]] * 10
@@ -79,15 +69,3 @@ def test_filtered_noise_is_hardly_reduced_by_the_average():
     variance_pC2 = noise_pC.var(axis=0)
     ratio = peak_of([contact(1.0)] * 32, 500.0 + noise_pC[-32:]).relative_noise_variance(variance_pC2)
     assert ratio > 0.9
-
-
-def test_single_frame_has_the_noise_of_a_frame():
-    assert peak_of([contact(1.0)], [[100.0]]).relative_noise_variance(np.array([4.0])) == 1.0
-
-
-def test_given_charges_are_not_changed():
-    charge = np.array([100.0])
-    peak = TouchPeak()
-    peak.add_frame(contact(1.0), charge)
-    peak.add_frame(contact(1.0), np.array([200.0]))
-    assert charge[0] == 100.0

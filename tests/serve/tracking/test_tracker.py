@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 from msgspec import structs
-from scipy.signal import lfilter
 
 from isocharge.serve import Chunk, Contact, Device, Frame, TouchStream, encode_frame
 from isocharge.serve.flags import INVALID
@@ -14,7 +13,6 @@ from isocharge.serve.live.device import device_from_table, with_settings
 from isocharge.serve.tracking.tracker import TrackRule
 from isocharge.serve.tracking.two_mode_filter import (
     MIN_ACCELERATION_SHARE,
-    POSITION_MOTION,
     MotionModel,
     NoiseEstimate,
     TwoModeFilter,
@@ -125,26 +123,6 @@ def test_moving_mode_equals_the_kalman_filter_with_constant_velocity():
         assert filtered == pytest.approx(mean.tolist(), rel=1e-6, abs=1e-6)
         variances = [two_modes.moving_variance, two_modes.moving_covariance, two_modes.velocity_variance]
         assert variances == pytest.approx([covariance[0, 0], covariance[0, 1], covariance[1, 1]], rel=1e-6)
-
-
-@pytest.mark.parametrize(("noise_ratio", "autocorrelation"), [(0.2, 0.0), (1.0, 0.0), (3.0, 0.0), (1.0, 0.5)])
-def test_measurement_noise_is_estimated_during_a_slide(noise_ratio, autocorrelation):
-    """A slide of 50 mm/s at uneven times; `autocorrelation` is that of noise that is 1 ms apart."""
-    estimates = []
-    for _ in range(10):
-        contacts = noisy_contacts(np.zeros(1500), std=noise_ratio * STD)
-        white = [complex(contact.x_mm, contact.y_mm) for contact in contacts]
-        noise = lfilter([math.sqrt(1.0 - autocorrelation**2)], [1.0, -autocorrelation], white)
-        positions = noise + 0.05 * np.arange(1500)
-        times_ms = np.cumsum(RNG.choice([1, 2, 5], 500))
-        latest_ms = times_ms[0]
-        two_modes = TwoModeFilter.start(positions[latest_ms], STD**2, POSITION_MOTION)
-        for time_ms in times_ms[(times_ms > latest_ms) & (times_ms < 1500)]:
-            two_modes.predict(1e-3 * (time_ms - latest_ms))
-            two_modes.update(positions[time_ms], STD**2)
-            latest_ms = time_ms
-        estimates.append(two_modes.noise.relative_variance)
-    assert np.mean(estimates) == pytest.approx(noise_ratio**2, rel=0.15, abs=0.02)
 
 
 @pytest.mark.parametrize("noise_ratio", [0.2, 4.0])

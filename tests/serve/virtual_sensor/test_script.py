@@ -28,12 +28,6 @@ def test_wander_stays_inside_radius_and_forces(script):
     assert np.isnan([script.x_mm[~on], script.y_mm[~on]]).all()
 
 
-def test_wander_is_reproducible_with_the_same_seed():
-    one, same, other = (wander(seed=seed, seconds=5.0).force_N for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one, same)
-    assert not np.array_equal(one, other)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [

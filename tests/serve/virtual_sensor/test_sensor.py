@@ -37,11 +37,6 @@ def test_frames_contain_script_charges_noise_and_offset(film):
         assert frame.t_us == number * 2000
 
 
-def test_default_offset_is_small_and_not_zero(film):
-    (frame,) = sent(VirtualSensor(film.charges, wander(seed=1, seconds=0.5)), 1)
-    assert 0.0 < np.abs(frame.values).max() <= 20.0
-
-
 def test_amplifier_receives_the_repeated_script_in_the_order_of_time(film):
     """The amplifier of this test counts the rows that it has received."""
     seen = []

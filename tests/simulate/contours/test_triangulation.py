@@ -19,7 +19,6 @@ from isocharge.simulate import (
     load_sensor,
     noise_model,
 )
-from isocharge.simulate.contours.candidates import NODE_SPACING, SeedGrid
 from isocharge.simulate.contours.fix import Meeting
 from kept import kept
 
@@ -61,22 +60,6 @@ def test_triangulation_of_circular_contours_finds_the_position(layout):
     assert fix.found.mean() > 0.98  # two contours touch on the line between their electrodes
     assert errors(fix, contact).max() < 1e-3
     assert np.median(fix.spread[fix.found]) < 1e-5
-
-
-def test_seed_grid_estimates_the_distance_from_contours():
-    """The charges are (10 + x) F and (10 + y) F, so their contours are parallel to the axes."""
-    plane = FunctionMap(lambda c: (10.0 + c[:, :2]) * c[:, 2:], ("A", "B"), Domain(5.0, (0.5, 2.0)))
-    grid = SeedGrid.from_charge_map(plane)
-    at = draw(200, seed=2, radius=5.0, forces=(0.5, 2.0))
-    charge = plane.charges(at)
-    distance = np.linalg.norm(at[:, None, :2] - grid.position, axis=2)
-    assert distance.min(axis=1).max() < 0.75 * NODE_SPACING
-    np.testing.assert_allclose(grid.distance(charge, at[:, 2:]), np.sqrt(0.5) * distance, atol=0.02)
-    force = np.clip(charge.sum(axis=1)[:, None] / (20.0 + grid.position.sum(axis=1)), 0.5, 2.0)
-    np.testing.assert_allclose(grid.matching_force(charge), force, rtol=1e-3)
-    for x, outside in ((at[:, 0], False), (5.5, True), (-5.5, True)):
-        charge[:, 0] = (10.0 + x) * at[:, 2]
-        assert (grid.is_out_of_range(charge, at[:, 2]) == outside).all()
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -8,7 +8,6 @@ from scipy import stats
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Polygon, Sweep
-from isocharge.simulate.numerics.disk import lattice
 
 PROBES = (Circle(1.0), Polygon.rectangle(4.0, 2.0), Polygon.triangle(4.0))
 
@@ -93,15 +92,6 @@ def test_grid_has_every_force_and_rotation_at_every_position():
         np.testing.assert_allclose(rotations, probe.period * np.arange(rotations.size) / rotations.size)
         assert np.hypot(*places.T).max() == pytest.approx(sweep.radius, rel=1e-12)
     assert not presses.rotation[presses.probe == 0].any()  # a circle would only press the same again
-
-
-def test_lattice_has_one_spacing_and_the_largest_possible_number_of_points():
-    sizes = [lattice(most).size for most in range(1, 30)]
-    expected = [1] * 4 + [5] * 4 + [9] * 4 + [13] * 8 + [21] * 4 + [25] * 4 + [29]
-    assert sizes == expected
-    points = lattice(500)
-    apart = np.abs(points[:, None] - points[None]) + np.eye(points.size)
-    np.testing.assert_allclose(apart.min(axis=0), apart.min())
 
 
 # Refused

@@ -107,12 +107,6 @@ def test_in_order_returns_results_in_order_and_consumes_jobs_as_needed():
         assert [0.0, *results] == [0.002 * (number % 3) for number in range(20)]
 
 
-def test_in_order_runs_jobs_in_parallel():
-    both = threading.Barrier(2)
-    with ThreadPoolExecutor(2) as pool:
-        assert sorted(in_order(pool, lambda _: both.wait(timeout=5.0), range(4))) == [0, 0, 1, 1]
-
-
 def waited(seconds: float) -> float:
     time.sleep(seconds)
     return seconds

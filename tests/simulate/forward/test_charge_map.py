@@ -121,14 +121,3 @@ def test_domain_to_unit_and_to_contact_are_inverse_and_accept_the_edge():
 def test_invalid_arguments_raise_error_with_their_names(check, message):
     with pytest.raises((SceneError, ChargeError), match=message):
         check()
-
-
-def test_as_charges_converts_to_float64():
-    assert as_charges(np.ones((2, 3), dtype=np.float32), ("A", "B", "C")).dtype == np.float64
-
-
-def test_contacts_outside_a_domain_are_found():
-    domain = Domain(5.0, (0.1, 2.0))
-    nan = np.nan
-    contact = np.array([[3.0, 4.0, 1.0], [3.0, 4.01, 1.0], [0.0, 0.0, 0.09], [0.0, 0.0, 2.1], [nan, nan, 1.0]])
-    assert domain.is_outside(contact).tolist() == [False, True, True, True, False]

@@ -54,13 +54,6 @@ def test_gradients_equal_differences_of_the_charges_across_a_correction(near_spl
         np.testing.assert_allclose(gradients[..., axis], slope, atol=1e-5 * np.abs(slope).max())
 
 
-def test_crosstalk_of_the_calibration_is_added_to_the_splines(near_map, near_spline):
-    sensor = near_map.sensor
-    calibrated = replace(sensor, calibration=replace(sensor.calibration, crosstalk=0.03))
-    charges = kept(ChargeSpline.of, replace(near_map, sensor=calibrated), spacing=0.25).charges(spread(50))
-    np.testing.assert_allclose(charges, calibrated.calibration.read(near_spline.charges(spread(50))), rtol=1e-9)
-
-
 def test_stress_charges_for_all_forces_equal_the_charges_of_the_map(near_map):
     """The charges for all forces come from fields in single precision. Charges that are not needed are zero."""
     position = spread(40)[:, :2]

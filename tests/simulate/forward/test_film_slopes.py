@@ -10,18 +10,12 @@ from isocharge.simulate import (
     Circle,
     FilmPrior,
     FilmSlopes,
-    ForwardMap,
     Polygon,
-    Resolution,
-    SideForceMap,
-    SolveSettings,
     load_sensor,
     press,
     touch_charge,
 )
 from isocharge.simulate.mechanics.film_temperature import warmed
-from isocharge.simulate.solver.friction import friction_force
-from kept import kept
 
 PROBE = Circle(1.0)
 
@@ -69,35 +63,6 @@ def test_derivatives_equal_differences_of_direct_solves(film_slopes, name):
     expected = (charges[0] - charges[1]) / (2.0 * STEPS[name])
     jacobian = film_slopes.jacobian(contact)[name]
     np.testing.assert_allclose(jacobian, expected, atol=1e-2 * np.abs(expected).max())
-
-
-@pytest.mark.slow
-def test_derivatives_of_an_uneven_film_equal_differences_of_direct_solves():
-    """The film has two moduli, an uneven tension and an oval clamp."""
-    film = replace(
-        drawn_sensor().film, deviator=(0.3, -0.1), young_ratio=1.4, axis=0.3, shear=1100.0, oval=0.01, oval_axis=-0.5
-    )
-    sensor = replace(drawn_sensor(), film=film)
-    forward_map = kept(ForwardMap.build, sensor, PROBE, 4.0, (0.3, 0.6), SolveSettings(resolution=Resolution(4, 8, 4)))
-    x, y, force = 2.5, -1.5, 0.5
-
-    def charges(half_difference: float, side_force: tuple[float, float]) -> np.ndarray:
-        """Return the charges with a change of (T11 - T22) / 2 in MPa and a side force in N."""
-        changed = replace(film, deviator=(0.3 + half_difference, -0.1))
-        solved = press(changed, PROBE, (x, y), force, forward_map.settings, side_force=side_force)
-        return touch_charge(replace(sensor, film=changed), solved)
-
-    contact = np.array([[x, y, force]])
-    t11, t22, _ = FilmSlopes.build(forward_map).tension_jacobian(contact)[0].T
-    expected = (charges(0.02, (0.0, 0.0)) - charges(-0.02, (0.0, 0.0))) / 0.04
-    np.testing.assert_allclose(t11 - t22, expected, atol=1e-2 * np.abs(expected).max())
-
-    side_force_map = SideForceMap.build(forward_map)
-    along_y = (charges(0.0, (0.0, 0.01)) - charges(0.0, (0.0, -0.01))) / 0.02
-    np.testing.assert_allclose(side_force_map.jacobian(contact)[0, :, 1], along_y, atol=2e-2 * np.abs(along_y).max())
-    holding = friction_force(press(film, PROBE, (x, y), force, forward_map.settings), 1.0)
-    (interpolated,) = side_force_map.friction_forces(contact, 1.0)
-    np.testing.assert_allclose(interpolated, holding, atol=2e-2 * np.hypot(*holding))
 
 
 def test_temperature_jacobian_equals_the_difference_of_warmed_films(film_slopes):

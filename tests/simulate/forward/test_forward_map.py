@@ -20,7 +20,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.forward.family import NODE_COUNTS, Family, NodeCount, spread_check_presses
+from isocharge.simulate.forward.family import NODE_COUNTS, Family, NodeCount
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
 
@@ -234,45 +234,6 @@ DOMAIN = Domain(8.0, (0.05, 2.0))
 
 
 FILM = load_sensor("three-25um-biaxial").film
-SCALENE = Polygon.of([(0.0, 0.0), (3.0, 0.0), (0.0, 1.0)])
-SQUARE = Polygon.rectangle(2.0, 2.0)
-
-
-@pytest.mark.parametrize(
-    ("probe", "folds", "rotations"),
-    [(SCALENE, 1, 14), (Ellipse(2.0, 1.0), 2, 14), (Polygon.triangle(2.0), 3, 15), (SQUARE, 4, 16)],
-)
-def test_orientations_are_spread_evenly_and_solved_once_each(probe, folds, rotations):
-    family = Family.spread(DOMAIN, FILM, probe, NodeCount(3, 2, 14))
-    assert family.rotation.size == rotations
-    np.testing.assert_allclose(np.diff(family.rotation), 2.0 * np.pi / rotations, rtol=1e-12)
-    assert family.solved_rotations.size * folds == rotations
-
-
-@pytest.mark.parametrize("probe", [SCALENE, Ellipse(2.0, 1.0), Polygon.triangle(2.0)])
-@pytest.mark.parametrize("changes", [{}, {"young_ratio": 1.4}])
-def test_family_weights_interpolate_smooth_functions(probe, changes):
-    """The function is a power of the force, smooth in the distance, and has the first harmonics of both angles.
-
-    On a film that is not axisymmetric, it also has two harmonics of the angle between the probe and the film.
-    """
-    film = replace(FILM, **changes)
-    rng = np.random.default_rng(9)
-    distance, force = 8.0 * np.sqrt(rng.random(200)), np.exp(rng.uniform(np.log(0.05), np.log(2.0), 200))
-    angle, rotation = rng.uniform(-7.0, 7.0, (2, 200))
-
-    def smooth(d: np.ndarray, f: np.ndarray, turn: np.ndarray, t: np.ndarray) -> np.ndarray:
-        even = f**0.02 / (1.0 + (d / 12.0) ** 2) + 0.1 * np.cos(t - 0.3) + 0.05 * np.sin(3.0 * t)
-        return even if film.is_axisymmetric else even * (1.0 + 0.1 * np.cos(2.0 * turn) + 0.02 * np.sin(6.0 * turn))
-
-    for count, expected in ((NodeCount(8, 3), 1e-4), (NodeCount(15, 8), 1e-7)):
-        family = Family.spread(DOMAIN, film, probe, count)
-        d, f, turn, t = np.meshgrid(family.distance, family.force, family.direction, family.rotation, indexing="ij")
-        # The solved presses cover one period of the probe, within which the sum of both angles is a node.
-        period = 2.0 * np.pi / family.symmetry_order
-        node_values = smooth(d, f, turn + period * np.floor(t / period + 1e-9), t)
-        found = family.weights(distance * np.exp(1j * angle), force, rotation) @ node_values.ravel()
-        np.testing.assert_allclose(found, smooth(distance, force, angle + rotation, rotation), rtol=expected)
 
 
 def test_family_interpolates_fields_that_change_over_the_distance_to_the_clamp():
@@ -283,12 +244,3 @@ def test_family_interpolates_fields_that_change_over_the_distance_to_the_clamp()
     weights = family.weights(distance.astype(complex), np.ones(300), np.zeros(300))
     found = weights @ np.log(1.0 - (family.distance / 45.0) ** 2)
     np.testing.assert_allclose(found, np.log(1.0 - (distance / 45.0) ** 2), atol=1e-5)
-
-
-def test_check_presses_cover_the_distances_and_forces():
-    presses = spread_check_presses(DOMAIN, 7)
-    force = np.array([press.force for press in presses])
-    assert len(set(force)) == 7
-    assert (0.05 <= force.min() < 0.1, 1.0 < force.max() <= 2.0) == (True, True)
-    assert (presses[0].distance < 2.0, presses[-1].distance) == (True, DOMAIN.radius)
-    assert np.hypot(*presses[3].position) == pytest.approx(presses[3].distance)

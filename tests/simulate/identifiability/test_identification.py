@@ -19,7 +19,7 @@ from isocharge.simulate import (
     load_sensor,
     noise_model,
 )
-from isocharge.simulate.identifiability.identification import Identification, map_to_search, search_radius
+from isocharge.simulate.identifiability.identification import Identification, map_to_search
 from kept import kept
 
 REFERENCE = noise_model("reference")
@@ -79,12 +79,6 @@ def test_condition_is_the_ratio_of_the_standard_deviations_of_the_position(ident
     np.testing.assert_allclose(limits.condition.ravel(), np.sqrt(np.linalg.cond(covariance[:, :2, :2])), rtol=0.02)
 
 
-def test_summary_states_the_determined_share_if_the_map_folds(identification):
-    folded = replace(identification.area, folds=np.ones((1, 2)), radius=2.5)
-    message = [replace(identification, area=area).summary for area in (identification.area, folded)]
-    assert ["5 mm that was searched. The working area is 25 %" in text for text in message] == [False, True]
-
-
 def test_working_area_with_an_electrode_at_the_centre_is_small(film):
     """The area is smaller than the spacing of the rings on the whole film."""
     places = ((0.0, 0.0), (8.66, 5.0), (-8.66, 5.0))
@@ -97,12 +91,6 @@ def test_working_area_with_an_electrode_at_the_centre_is_small(film):
 def test_identify_without_noise_or_electrodes_raises_before_the_film_is_solved():
     with pytest.raises(SceneError, match="at least three electrodes, got 2"):
         identify(replace(SENSOR, electrodes=SENSOR.electrodes[:2]))
-
-
-def test_search_radius_covers_the_electrodes_but_not_the_rim():
-    assert search_radius(SENSOR, Circle(1.0)) == pytest.approx(np.hypot(10.160254, 6.5))
-    small = replace(SENSOR, film=replace(SENSOR.film, radius=14.0))
-    assert search_radius(small, Circle(1.0)) == pytest.approx(11.6)
 
 
 def test_search_radius_is_reduced_if_charges_cannot_be_interpolated(monkeypatch):

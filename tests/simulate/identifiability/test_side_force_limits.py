@@ -11,19 +11,15 @@ from isocharge.simulate import (
     Electrode,
     ForwardMap,
     Sensor,
-    SolveSettings,
     load_sensor,
     noise_model,
-    press,
-    touch_charge,
 )
 from isocharge.simulate.forward.derivative_maps import SideForceMap
 from isocharge.simulate.identifiability.identification import Identification
-from isocharge.simulate.identifiability.side_force_limits import ANGLE_COUNT, SideForceLimits, side_force_limits
+from isocharge.simulate.identifiability.side_force_limits import side_force_limits
 
 REFERENCE = noise_model("reference")
 PROBE = Circle(1.0)
-ACCURATE = SolveSettings(accuracy=1e-4)
 
 
 def sensor_with_electrodes(count: int) -> Sensor:
@@ -57,33 +53,6 @@ def identification(forward_map, side_force_map_with_six_electrodes) -> Identific
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SideForceMap, "build", lambda *_, **__: side_force_map_with_six_electrodes)
         return Identification.of(forward_map, REFERENCE)
-
-
-@pytest.mark.slow
-def test_side_force_limit_equals_that_of_direct_solves(forward_map, side_force_map_with_six_electrodes):
-    """The derivatives with respect to (x, y, ln F, Fx / F, Fy / F) are finite differences of direct solves."""
-    sensor = forward_map.sensor
-    force = 0.5
-
-    def charges(parameters: np.ndarray) -> np.ndarray:
-        x, y, log_force, share_x, share_y = parameters.tolist()
-        newtons = float(np.exp(log_force))
-        side_force = (newtons * share_x, newtons * share_y)
-        return touch_charge(sensor, press(sensor.film, PROBE, (x, y), newtons, ACCURATE, side_force=side_force))
-
-    centre = np.array([0.0, 3.0, np.log(force), 0.0, 0.0])
-    steps = np.diag([0.05, 0.05, 0.02, 0.05, 0.05])
-    jacobian = np.stack([(charges(centre + step) - charges(centre - step)) / (2.0 * step.max()) for step in steps], 1)
-    variance = 1.0 + (0.002 * charges(centre)) ** 2
-    covariance = np.linalg.inv(jacobian.T @ (jacobian / variance[:, None]))
-
-    limits = SideForceLimits.of(side_force_map_with_six_electrodes, forward_map, REFERENCE, force, 6.0)
-    ring = 4  # the rings lie at 0.6, 1.2, ... 6.0 mm
-    angle = 9  # 90 degrees
-    number = ring * ANGLE_COUNT + angle
-    assert limits.side_force[number] == pytest.approx(np.sqrt(covariance[3, 3] + covariance[4, 4]), rel=0.02)
-    assert limits.position[number] == pytest.approx(np.sqrt(covariance[0, 0] + covariance[1, 1]), rel=0.02)
-    assert limits.relative_force[number] == pytest.approx(np.sqrt(covariance[2, 2]), rel=0.02)
 
 
 def test_identify_reports_the_side_force_with_six_electrodes(identification):

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Film, Polygon, SolveSettings, Theory, load_sensor, press, touch_charge
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared
 from isocharge.simulate.mechanics.theory import (
     choose_theory,
     modelling_error,
@@ -84,25 +83,6 @@ def test_chosen_theory_is_accurate_or_the_full_theory(thickness, pretension, for
     assert theory.name.endswith("+ bending") or modelling_error(film, PROBE, force, theory) <= accuracy
     assert modelling_error(film, PROBE, force, finer) <= modelling_error(film, PROBE, force, theory)
     assert modelling_error(film, PROBE, force, Theory(True, True, pretension > 0.0)) == 0.0
-
-
-@given(
-    thickness=st.floats(0.005, 2.0),
-    pretension=st.just(0.0) | st.floats(1e-3, 20.0),
-    force=st.floats(1e-5, 10.0),
-    poisson=st.floats(0.0, 0.49),
-)
-@settings(derandomize=True)
-def test_amplitude_solves_the_cubic_equation(thickness, pretension, force, poisson):
-    """The scale A satisfies A^3 + (1.6 pretension / E + 16 pi b) A = F / (E h a)."""
-    film = Film(45.0, thickness, 3000.0, poisson, pretension)
-    a = np.sqrt(amplitude_squared(film, force))
-    b = (thickness / 45.0) ** 2 / (12.0 * (1.0 - poisson**2))
-    total = a**3 + (1.6 * pretension / 3000.0 + 16.0 * np.pi * b) * a
-    assert total == pytest.approx(force / (3000.0 * thickness * 45.0), rel=1e-7)
-    groups = DimensionlessGroups.of(film, force, bending=True)
-    assert groups.height == pytest.approx(1.0, rel=1e-6)
-    assert 0.0 <= groups.induced <= 1.0 + 1e-6
 
 
 def test_theory_for_a_sensor_suffices_for_all_forces_and_the_surface(film):

@@ -130,29 +130,6 @@ def test_footprint_elements_have_the_area_centroid_and_load_of_the_probe(scene):
         assert mean.imag == pytest.approx(0.0, abs=exact * probe.reach / RADIUS)
 
 
-@pytest.mark.parametrize("distance", [0.0, 0.4, 0.85])
-@pytest.mark.parametrize(
-    "probe",
-    [Polygon.rectangle(9.0, 4.5, 0.7), Polygon.triangle(4.5, 0.3)],
-    ids=["rectangle", "triangle"],
-)
-def test_load_is_uniform_over_a_polygon(probe, distance):
-    """The second moments of the load equal the closed form for polygons to round-off."""
-    resolution = Resolution(4, 8, 3)
-    mesh = template_for(probe, resolution)
-    placed = place(FILM, probe, (distance * RADIUS, 0.0), resolution, 0.05)
-    load = placed.geometry.load
-    about = placed.node_points - distance
-    outline = probe.outline / RADIUS
-    (x, y), (u, v) = (np.stack([z.real, z.imag]) for z in (outline, np.roll(outline, -1)))
-    cross = (x * v - u * y) / (12.0 * probe.area / RADIUS**2)
-    assert load @ about.real**2 == pytest.approx(np.sum(cross * (x * x + x * u + u * u)), rel=1e-11)
-    assert load @ about.imag**2 == pytest.approx(np.sum(cross * (y * y + y * v + v * v)), rel=1e-11)
-    mixed = 0.5 * np.sum(cross * (x * v + 2 * x * y + 2 * u * v + u * y))
-    assert load @ (about.real * about.imag) == pytest.approx(mixed, abs=1e-12 * (probe.reach / RADIUS) ** 2)
-    assert not load[~np.isin(np.arange(mesh.n_node), mesh.nodes[mesh.footprint])].any()
-
-
 def test_ellipse_too_near_the_rim_is_refused():
     ellipse = Ellipse(16.0, 16.0 * 0.999, 0.0)
     with pytest.raises(SceneError, match=r"comes within 0\.1\d* mm of the rim: expected at least 1\.6 mm"):

@@ -33,18 +33,6 @@ def test_resolution_rejects_values_out_of_range(wrong):
         Resolution(*wrong)
 
 
-def edges_of(mesh: Template) -> list[frozenset]:
-    n = mesh.resolution.order
-    corner = mesh.nodes[:, [0, n, (n + 1) ** 2 - 1, n * (n + 1)]]
-    return [frozenset(pair) for quad in corner.tolist() for pair in zip(quad, quad[1:] + quad[:1], strict=True)]
-
-
-def test_euler_characteristic_of_a_disk(built):
-    """The number of vertices minus edges plus faces is 1, counted from the node numbers of the corners."""
-    edges = set(edges_of(built))
-    assert len(set().union(*edges)) - len(edges) + built.n_element == 1
-
-
 @pytest.mark.parametrize(
     ("probe", "folds"), [(Polygon.triangle(4.0), 3), (Ellipse(4.0, 2.0), 2)], ids=["triangle", "ellipse"]
 )

@@ -41,12 +41,3 @@ def test_minimise_is_not_worse_than_scipy_with_constraints():
             options={"ftol": 1e-13},
         )
         assert (residual[row] ** 2).sum() <= solution.fun + 2e-6 * (1.0 + solution.fun)
-
-
-def test_into_domain_moves_only_points_outside_the_domain():
-    unit = RNG.normal(size=(500, 3))
-    inside = into_domain(unit)
-    assert np.hypot(inside[:, 0], inside[:, 1]).max() <= 1.0 + 1e-12
-    assert np.abs(inside[:, 2]).max() <= 1.0
-    within = unit[(np.hypot(unit[:, 0], unit[:, 1]) < 1.0) & (np.abs(unit[:, 2]) < 1.0)]
-    assert np.array_equal(into_domain(within), within)

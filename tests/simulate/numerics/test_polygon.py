@@ -115,23 +115,6 @@ def test_area_in_disk_of_a_square(centre, radius, expected):
     assert area_in_disk(SQUARE, centre, radius) == pytest.approx(expected, abs=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("shift", "within", "expected"),
-    [
-        pytest.param(0.5, 0.0, True, id="common area"),
-        pytest.param(1.0, 0.0, False, id="common edge"),
-        pytest.param(1.0 + 1.0j, 0.0, False, id="common corner"),
-        pytest.param(1.0, 1e-3, True, id="common edge within a distance"),
-        pytest.param(1.5, 0.4, False, id="farther than the distance"),
-        pytest.param(1.5, 0.6, True, id="nearer than the distance"),
-        pytest.param(1.5 + 1.5j, 0.7, False, id="corners farther than the distance"),
-        pytest.param(1.5 + 1.5j, 0.8, True, id="corners nearer than the distance"),
-    ],
-)
-def test_overlap_of_two_squares(shift, within, expected):
-    assert overlap(corners_of(SQUARE), corners_of(SQUARE + shift), within) is expected
-
-
 def test_centroid_of_a_triangle_is_the_mean_of_its_corners():
     corners = np.array([[0.0, 0.0], [6.0, 0.0], [0.0, 3.0]])
     np.testing.assert_allclose(centroid_of(corners), [2.0, 1.0], atol=1e-15)

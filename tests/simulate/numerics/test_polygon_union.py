@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from matplotlib.path import Path
 
 from isocharge.simulate.numerics.polygon import area_of, to_corners
-from isocharge.simulate.numerics.polygon_union import is_simple, subdivide, trace_outline, union_parts
+from isocharge.simulate.numerics.polygon_union import is_simple, trace_outline, union_parts
 
 GRID = np.stack(np.meshgrid(np.linspace(-4.0, 4.0, 97), np.linspace(-4.0, 4.0, 101)), axis=-1).reshape(-1, 2) + 1e-3 / 7
 COMB = np.array([0, 7, 7 + 2j, 6 + 2j, 6 + 1j, 5 + 1j, 5 + 2j, 4 + 2j, 4 + 1j, 3 + 1j, 3 + 3j, 1 + 3j, 1 + 1j, 1j])
@@ -50,15 +50,6 @@ def test_trapezoids_cover_each_point_of_the_union_and_intersection_once(front, b
     in_back = count_containing([back], GRID) > 0
     np.testing.assert_array_equal(count_containing(union_parts(front), GRID), in_front)
     np.testing.assert_array_equal(count_containing(union_parts(front, [back]), GRID), in_front & in_back)
-
-
-@given(polygons=st.lists(star_polygons().filter(is_simple), min_size=1, max_size=3))
-@settings(derandomize=True, deadline=None, max_examples=40)
-def test_subdivide_gives_short_sides_and_keeps_the_area(polygons):
-    trapezoids = union_parts(polygons)
-    small_parts = [small for part in trapezoids for small in subdivide(part, 0.5)]
-    assert total_area(small_parts) == pytest.approx(total_area(trapezoids), rel=1e-9)
-    assert max(np.abs(np.roll(part, -1) - part).max() for part in small_parts) <= 0.5 + 1e-9
 
 
 def test_union_area_agrees_with_monte_carlo():
@@ -122,8 +113,3 @@ def test_trace_outline_has_the_given_width_and_mitred_bends():
     outline = trace_outline(np.array([0.0, 4.0, 4.0 + 3.0j, 8.0 + 6.0j]), 0.5)
     np.testing.assert_allclose(area(outline), 0.5 * 12.0, rtol=1e-12)
     np.testing.assert_allclose(outline[[1, -2]], [4.25 - 0.25j, 3.75 + 0.25j], atol=1e-12)
-
-
-def test_trace_outline_of_a_sharp_bend_is_nan():
-    outline = trace_outline(np.array([0.0, 4.0, 0.1j]), 0.5)
-    assert np.isnan(outline[[1, -2]]).all()

@@ -5,28 +5,22 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from isocharge.simulate import (
     Circle,
     Ellipse,
     Finger,
-    ForwardMap,
     Polygon,
     Probe,
-    Resolution,
     SolveSettings,
     Theory,
     deflection,
     load_sensor,
-    parse_probe,
     press,
     touch_charge,
 )
 from isocharge.simulate.forward.readout import contact_charge
-from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.numerics.polygon import area_of, to_corners
-from isocharge.simulate.plots.film import draw_probe
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
@@ -81,19 +75,6 @@ def test_area_reach_and_period_are_the_closed_forms(shape):
     assert shape.probe.reach == pytest.approx(shape.reach, rel=1e-12)
 
 
-def test_rotation_changes_neither_area_nor_reach_nor_period(shape):
-    rotated = shape.probe.rotated(0.3)
-    assert (rotated.area, rotated.reach, rotated.period) == (shape.probe.area, shape.probe.reach, shape.probe.period)
-    if not shape.probe.is_axisymmetric:
-        np.testing.assert_allclose(rotated.outline, shape.probe.outline * np.exp(0.3j), atol=1e-14)
-
-
-def test_rotation_by_the_period_shifts_the_boundary_parameter(shape):
-    parameter = np.linspace(0.0, 2.0 * np.pi, 41)
-    rotated = shape.probe.rotated(shape.period).boundary(parameter)
-    np.testing.assert_allclose(rotated, shape.probe.boundary(parameter + shape.period), atol=1e-12)
-
-
 def test_boundary_goes_round_the_area_anticlockwise(shape):
     points = boundary_points(shape.probe, 4000)
     assert area_of(to_corners(points)) == pytest.approx(shape.area, rel=1e-3)
@@ -104,11 +85,6 @@ def test_footprint_contains_the_points_inside_its_boundary(shape):
     points = boundary_points(shape.probe, 97)
     assert shape.probe.contains((1.0 - 1e-9) * points).all()
     assert not shape.probe.contains((1.0 + 1e-9) * points).any()
-
-
-def test_area_of_the_points_that_the_footprint_contains(shape):
-    share = shape.probe.contains(grid_of(shape.probe)).mean()
-    assert share * (2.02 * shape.reach) ** 2 == pytest.approx(shape.area, rel=5e-3)
 
 
 def test_covered_area_of_a_triangle_is_that_of_a_grid(shape):
@@ -127,21 +103,6 @@ def test_covered_area_of_a_triangle_is_that_of_a_grid(shape):
 def test_farthest_distance_is_that_of_the_farthest_boundary_point(shape, at):
     expected = np.abs(complex(*at) + boundary_points(shape.probe, 20000)).max()
     assert shape.probe.farthest_distance(at) == pytest.approx(expected, rel=3e-5)
-
-
-def test_notation_and_angle_describe_the_probe(shape):
-    read = parse_probe(f"{shape.probe.notation}@{np.rad2deg(shape.probe.angle)}")
-    np.testing.assert_allclose(read.outline, shape.probe.outline, atol=1e-9)
-
-
-@pytest.mark.parametrize("distance", [0.0, 20.0, 40.0], ids=["centre", "half-way", "rim"])
-def test_mesh_elements_of_the_footprint_have_its_area_and_centroid(shape, distance):
-    mesh = place(SENSOR.film, shape.probe, (0.0, distance), Resolution(5, 16, 3), 0.05)
-    weights = mesh.geometry.weights[mesh.template.footprint]
-    assert mesh.geometry.weights.min() > 0.0
-    assert mesh.template.copies * weights.sum() * SENSOR.film.radius**2 == pytest.approx(shape.area, rel=1e-5)
-    centroid = mesh.template.copies * mesh.geometry.load @ mesh.node_points
-    assert centroid.real * SENSOR.film.radius == pytest.approx(distance, abs=1e-4)
 
 
 def test_mean_of_the_relative_pressure_is_one_and_its_centre_is_the_centroid(shape):
@@ -179,20 +140,6 @@ def test_curved_probe_has_the_charges_of_a_polygon_with_many_corners(shape):
     np.testing.assert_allclose(curved_charge, polygon_charge, rtol=3e-4)
 
 
-def test_outline_is_drawn_where_the_probe_presses(shape):
-    axes = Figure().subplots()
-    draw_probe(axes, shape.probe, (2.0, -1.0))
-    drawn = axes.patches[0].get_xy()[:-1] @ [1.0, 1.0j]
-    np.testing.assert_allclose(drawn, 2.0 - 1.0j + shape.probe.outline)
-
-
-def test_ellipse_with_equal_axes_has_the_charges_of_a_circle():
-    uniaxial = load_sensor("three-25um-uniaxial")
-    ellipse = touch_charge(uniaxial, press(uniaxial.film, Ellipse(4.0, 4.0), (5.0, 3.0), 1.0))
-    circle = touch_charge(uniaxial, press(uniaxial.film, Circle(2.0), (5.0, 3.0), 1.0))
-    np.testing.assert_allclose(ellipse, circle, rtol=2e-5)
-
-
 def test_pressure_charge_of_an_ellipse_on_an_electrode():
     """The ellipse lies wholly on electrode A. The mean stress is minus half of the pressure, so Q = -d33 F / 2."""
     sensor = replace(SENSOR, piezo=replace(SENSOR.piezo, d33=-20.0))
@@ -222,9 +169,3 @@ def test_taut_membrane_under_a_finger_deflects_as_the_closed_form():
     tension = film.pretension * film.thickness
     expected = 0.1 / (2.0 * np.pi * tension) * (np.log(film.radius / 6.0) + half_harmonic_number)
     assert deflection(solved, np.zeros((1, 2)))[0] == pytest.approx(expected, rel=1e-5)
-
-
-def test_forward_map_of_a_finger_interpolates_its_solved_charges():
-    forward_map = ForwardMap.build(SENSOR, Finger(6.0), 8.0, (0.5, 1.0))
-    solved = touch_charge(SENSOR, press(SENSOR.film, Finger(6.0), (3.0, -4.0), 0.7))
-    np.testing.assert_allclose(forward_map.charges(np.array([[3.0, -4.0, 0.7]]))[0], solved, rtol=1e-3)

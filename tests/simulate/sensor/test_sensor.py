@@ -21,10 +21,7 @@ def three() -> Sensor:
     ("changes", "message"),
     [
         ({"radius": -1.0}, "film radius: expected at least 1 mm, got -1 mm$"),
-        ({"thickness": np.nan}, "film thickness: expected at least 0.0001 mm, got nan"),
-        ({"young": np.inf}, r"film young: expected 1 to 1e\+06 MPa, got inf MPa$"),
         ({"poisson": 0.5}, "film poisson: expected 0 <= poisson < 0.5, got 0.5"),
-        ({"poisson": -0.1}, "film poisson: expected 0 <= poisson < 0.5, got -0.1"),
         ({"pretension": -11.0}, r"film pretension: expected -10 to 300 MPa, got -11 MPa$"),
         ({"young_ratio": 0.0}, "film young: expected E1 / E2 from 1/10 to 10, got 0"),
         ({"oval": 0.2}, "film oval: expected a share up to 0.1, got 0.2"),
@@ -32,7 +29,6 @@ def three() -> Sensor:
         ({"radius": 0.045}, r"film radius: expected at least 1 mm, got 0\.045 mm; 0\.045 m are 45 mm"),
         ({"thickness": 25e-6}, r"film thickness: .* got 2\.5e-05 mm; 2\.5e-05 m are 0\.025 mm"),
         ({"young": 3e9}, r"film young: .* got 3e\+09 MPa; 3e\+09 Pa are 3000 MPa"),
-        ({"pretension": 3e6}, r"film pretension: .* 3e\+06 Pa are 3 MPa"),
     ],
 )
 def test_invalid_film_raises_error(film, changes, message):
@@ -45,8 +41,6 @@ def test_invalid_film_raises_error(film, changes, message):
     ("coefficients", "message"),
     [
         ({"d31": np.nan}, "piezo d31: expected a number up to 100000 in size, got nan"),
-        ({"pyro": np.inf}, "piezo pyro: .* got inf"),
-        ({"d31": 1e308}, r"piezo d31: .* got 1e\+308"),
         ({"d31": 0.0, "d32": 0.0, "d33": -30.0}, "piezo d31 and d32 are both 0: such a film gives no charge"),
         ({"d32": 8e-12}, r"piezo d32: expected pC/N, got 8e-12 pC/N; 8e-12 C/N are 8 pC/N"),
         ({"d33": -30e-12}, r"piezo d33: expected pC/N, .* are -30 pC/N"),
@@ -55,12 +49,6 @@ def test_invalid_film_raises_error(film, changes, message):
 def test_invalid_piezo_coefficients_raise_error(coefficients, message):
     with pytest.raises(SensorError, match=message):
         Piezo(**({"d31": 1.0, "d32": 1.0} | coefficients))
-
-
-def test_area_and_centre():
-    square = Electrode.of_square("A", (2.0, -1.0), 3.0)
-    assert (square.area, *square.centre) == pytest.approx((9.0, 2.0, -1.0))
-    assert Electrode("T", ((0.0, 0.0), (4.0, 0.0), (0.0, 3.0))).area == pytest.approx(6.0)
 
 
 SIMPLE = r"electrode 'A': expected a polygon that does not cross itself, .* anticlockwise, got \[\["
@@ -72,8 +60,6 @@ THREE = "electrode 'A': expected 3 to 256 corners"
     [
         (((0, 0), (0, 3), (3, 3), (3, 0)), SIMPLE),  # clockwise
         (((0, 0), (3, 0), (0, 3), (3, 3)), SIMPLE),  # an hourglass
-        (tuple((3 * np.cos(0.8 * np.pi * i), 3 * np.sin(0.8 * np.pi * i)) for i in range(5)), SIMPLE),  # a star
-        (((0.0, 0.0), (1.0, 0.0)), THREE),
         (((0.0, 0.0), (1.0, 0.0), (0.0, np.nan)), SIMPLE),
         ((), THREE),
         (((44.0, 0.0), (48.0, 0.0), (46.0, 3.0)), r"'A' .* centre \(46\.0, 1\.0\) mm, corners up to 2\.23607 mm from"),
@@ -96,11 +82,9 @@ def test_invalid_electrodes_raise_error(three, corners, message):
             {"film": Film(45.0, 0.025, 3000.0, 0.34, oval=0.05), "calibration": Calibration(shift=(0.0, -31.5))},
             r"'A' lies outside the film: centre \(0\.0, -41\.5\) mm, half side 1\.5 mm, film radius 42\.75 mm$",
         ),
-        ({"calibration": Calibration(shift=(0.0, -35.0))}, r"'A' lies outside the film: centre \(0\.0, -45\.0\) mm"),
         ({"calibration": Calibration(shift=(np.nan, 0.0))}, r"'A' lies outside the film: centre \(nan, -10\.0\) mm"),
         ({"calibration": Calibration(gain={"E": 1.1})}, r"no electrode named \['E'\], have \('A', 'B', 'C'\)"),
         ({"calibration": Calibration(gain={"A": -1.0})}, "calibration gain: expected positive numbers, got .*-1.0"),
-        ({"calibration": Calibration(gain={"A": np.inf})}, "calibration gain: expected positive numbers, got .*inf"),
         ({"electrodes": ()}, r"electrodes: expected 1 to 64 different names, got 0: \(\)"),
         ({"electrodes": (SQUARE, SQUARE)}, "expected 1 to 64 different names, got 2: .*'D'"),
         *(
@@ -112,12 +96,10 @@ def test_invalid_electrodes_raise_error(three, corners, message):
             for name in ("", "A,B", "A\0", "A\nB", " A")
         ),
         ({"electrodes": (Electrode("T", SQUARE.corners),), "readout": "edge"}, "'edge' needs square .* 'T' is a polyg"),
-        ({"electrodes": (TRACED,), "readout": "edge"}, "'edge' needs square .* 'D' is a polygon"),
         (
             {"electrodes": (SQUARE.with_trace(((0, 0), (46, 0)), 0.5),)},
             r"'D' lies outside the film: .* film radius 45\.0 mm; end its traces before the rim",
         ),
-        ({"electrodes": (replace(SQUARE, more=TRACED.more),)}, "'D': expected the corners of a square"),
         (
             {"electrodes": (Electrode("A", ((0.0, 0.0), (4.0, 0.0), (0.0, 3.0)), square=True),)},
             "electrode 'A': expected the corners of a square along the axes",
@@ -134,7 +116,6 @@ def test_invalid_electrodes_raise_error(three, corners, message):
             {"electrodes": (replace(TRACED, more=600 * (SQUARE.corners,)),)},
             "'D': expected at most 2048 corners of all polygons, got 2404",
         ),
-        ({"readout": "mean"}, r"expected one of \(.*\), got 'mean'"),
         ({"surface": "inside"}, r"expected one of \(.*\), got 'inside'"),
     ],
 )
@@ -159,9 +140,7 @@ def test_only_electrodes_that_share_area_overlap(three):
     [
         (((0, 0),), 0.5, "trace of electrode 'D': expected 3 to 256 corners"),
         (((0, 0), (9, 0), (0, 1)), 0.5, "trace of electrode 'D': expected a polygon that does not cross itself"),
-        (((0, 0), (0, 0)), 0.5, "trace of electrode 'D': expected a polygon that does not cross itself"),
         (((0, 0), (9, 0)), 0.0, "does not cross itself"),
-        (((0, 0), (9, 0), (5, 0)), 0.5, "does not cross itself"),
         (((0, 0), (9, 0), (9, 5), (5, -5)), 0.5, "does not cross itself"),
     ],
 )

@@ -10,11 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from isocharge.common.errors import OutputExists, SensorError
-from isocharge.common.printable_text import printable
 from isocharge.simulate import (
     Calibration,
     Electrode,
@@ -80,9 +77,6 @@ def at(table: dict[str, Any], path: tuple[str, ...]) -> dict[str, Any]:
     return table
 
 
-CLOSED = [path for path in tables(whole()) if path not in (("electrodes",), ("calibration", "gain"))]
-"""Tables with fixed keys. The keys of the other two tables are the names of electrodes."""
-
 KEYS = [(*path, key) for path in tables(whole()) for key in at(whole(), path)]
 
 
@@ -139,19 +133,6 @@ def test_traces_and_back_metal_are_read():
 # Errors
 
 
-@given(path=st.sampled_from(CLOSED), key=st.text(min_size=1, max_size=12))
-@settings(derandomize=True, max_examples=30)
-def test_error_message_names_the_unknown_key(path, key):
-    table = whole()
-    if key in at(table, path):
-        return
-    at(table, path)[key] = 1.0
-    with pytest.raises(SensorError) as caught:
-        sensor_from_dict(table, "mine.toml")
-    shown_key = printable(".".join((*path, key)))
-    assert str(caught.value).startswith(f"mine.toml: unknown key {shown_key!r}; ")
-
-
 @pytest.mark.parametrize("path", [p for p in KEYS if p[-1] not in OPTIONAL], ids=".".join)
 def test_error_message_names_the_missing_key(path):
     table = whole()
@@ -180,14 +161,8 @@ def test_error_message_names_the_key_of_the_wrong_type(path):
     ("path", "value", "message"),
     [
         (("piezo", "d32"), -2e-4, r"piezo d32: expected pC/N, got -0\.0002 pC/N"),
-        (("film", "poisson"), 0.5, "film poisson: expected 0 <= poisson < 0.5, got 0.5"),
         (("film", "thickness_um"), -25.0, r"film\.thickness_um: expected at least 0\.1 um, got -25\.0"),
-        (("film", "thickness_um"), 0.025, r"film\.thickness_um: expected at least 0\.1 um, got 0\.025"),
         (("film", "young_GPa"), 3000, r"film\.young_GPa: expected .* 0\.001 to 1000 GPa .*, got 3000"),
-        (("film", "young_GPa"), [3.0, 3e9], r"film\.young_GPa\[1\]: expected .* 0\.001 to 1000 GPa .*, got 3000000000"),
-        (("film", "shear_GPa"), 1100, r"film\.shear_GPa: expected .* 0\.001 to 1000 GPa .*, got 1100"),
-        (("film", "pretension_MPa"), 500.0, r"film pretension: expected -10 to 300 MPa, got 500 MPa"),
-        (("film", "radius_mm"), 1e300, r"film\.radius_mm: expected a number above 0 and at most 1e\+06, got 1e\+300"),
         (("film", "radius_mm"), 0.03, r"film radius: expected at least 1 mm, .* 0\.03 m are 30 mm"),
         (("film", "pretension_MPa"), -11, r"film pretension: expected -10 to 300 MPa, got -11 MPa"),
         (("film", "thickness_um"), 3000.3, r"film thickness: .* radius \(30 mm\), got 3\.0003 mm"),
@@ -200,13 +175,11 @@ def test_error_message_names_the_key_of_the_wrong_type(path):
         (("name",), "", "name: expected a text"),
         (("roles",), {"A": "watcher"}, "roles.A: expected one of position, guard, got 'watcher'"),
         (("roles",), {"Z": "guard"}, "roles.Z: expected the name of an electrode of the section `electrodes`, got 'Z'"),
-        (("roles",), {"side_mm": "guard"}, "roles.side_mm: expected the name of an electrode"),
         (
             ("electrodes", "A"),
             {"polygon_mm": [3]},
             r"electrodes\.A\.polygon_mm\[0\]: expected \[x, y\] in mm",
         ),
-        (("electrodes", "A"), {"polygon_mm": []}, "electrode 'A': expected 3 to 256 corners"),
         (
             ("electrodes", "A"),
             {"polygon_mm": [[0, 0], [1, 0], [0, 1]], "trace_mm": [[0, 0], [9, 0]]},
@@ -257,16 +230,6 @@ def test_too_many_electrodes_raise_error_quickly(tmp_path, count):
 # Writing
 
 
-def test_written_sensor_file_reads_as_the_designed_sensor():
-    assert sensor_to_dict(sensor_from_dict(whole())) == whole()
-    sections = sensor_to_toml(sensor_from_dict(whole())).split("\n\n")
-    assert [section.splitlines()[0] for section in sections] == [
-        *('name = "mine"', "[film]", "[piezo]", "[electrodes]", "[calibration]"),
-    ]
-    assert sections[3].splitlines()[1:] == ["side_mm = 3.0", "A = [0.0, -10.0]", "B = [8.660254, 5.0]"]
-    assert "gain = {A = 1.02}" in sections[4]
-
-
 def test_the_role_of_a_guard_electrode_is_read_and_written():
     guarded = sensor_from_dict(whole() | {"roles": {"B": "guard"}})
     assert guarded.guard_names == ("B",)
@@ -303,14 +266,6 @@ def test_sensor_that_cannot_be_written_raises_error(tmp_path, name, message):
     with pytest.raises(SensorError, match=message):
         write_sensor(replace(load_sensor("three-25um-biaxial"), name=name), tmp_path / "mine.toml")
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("expansion", [None, (0.0, 0.0), (1e-4, 1e-4)])
-@pytest.mark.parametrize("ring_expansion", [0.0, 23e-6, 1.5e-5])
-def test_the_expansion_of_film_and_ring_is_written_and_read(expansion, ring_expansion):
-    sensor = load_sensor("three-25um-biaxial")
-    sensor = replace(sensor, film=replace(sensor.film, expansion=expansion, ring_expansion=ring_expansion))
-    assert sensor_from_dict(tomllib.loads(sensor_to_toml(sensor))) == sensor
 
 
 def test_write_and_load_round_trip(tmp_path):

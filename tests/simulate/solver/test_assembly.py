@@ -7,7 +7,7 @@ from tests.simulate.conftest import assembled
 from isocharge.simulate import Circle, Ellipse, Polygon, Resolution
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.mesh.template import Template, template_for
+from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.solver.assembly import Assembly
 
 SMALL = (
@@ -30,25 +30,6 @@ def dense_solution(mesh: Template, matrix: np.ndarray, right: np.ndarray) -> np.
     solution = np.zeros(free.size)
     solution[keep] = np.linalg.solve(assembled(mesh, matrix)[np.ix_(keep, keep)], padded[keep])
     return solution.reshape(-1, components)[:, :3]
-
-
-def random_matrices(mesh: Template, components: int, seed: int) -> np.ndarray:
-    """Return random symmetric, positive definite matrices of the elements, in which all components are coupled."""
-    size = components * mesh.nodes.shape[1]
-    root = np.random.default_rng(seed).standard_normal((mesh.n_element, size, size))
-    matrix = root @ root.transpose(0, 2, 1) + size * np.eye(size)
-    return matrix.reshape(mesh.n_element, -1, components, size // components, components)
-
-
-@pytest.mark.parametrize("components", [3, 4])
-@pytest.mark.parametrize(("resolution", "probe"), SMALL, ids=str)
-def test_sparse_solution_equals_dense_solution(resolution, probe, components):
-    mesh = template_for(probe, resolution)
-    matrix = random_matrices(mesh, components, 1)
-    right = np.random.default_rng(1).standard_normal((mesh.n_node, 3))
-    solution = Assembly(mesh, components).factor(matrix).solve(right)
-    np.testing.assert_allclose(solution, dense_solution(mesh, matrix, right), atol=1e-12)
-    assert not solution[mesh.on_rim].any()
 
 
 @pytest.mark.parametrize("bending", [0.0, 1e-7, 1e-3, 10.0])

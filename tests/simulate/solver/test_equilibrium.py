@@ -18,8 +18,7 @@ from isocharge.simulate import (
     touch_charge,
     touch_stress,
 )
-from isocharge.simulate.mechanics.stress import rotate_stress, stress
-from isocharge.simulate.solver.equilibrium import nodal_stress, principal_stress
+from isocharge.simulate.solver.equilibrium import principal_stress
 from isocharge.simulate.solver.error_estimate import cautions, estimated_error, mesh_error
 
 FULL = Theory(stretching=True, bending=True, pretensioned=False)
@@ -69,21 +68,6 @@ def test_points_off_the_film_raise_scene_error(made_up, read):
 
 
 # Made-up fields
-
-
-@pytest.mark.parametrize("at", [(0.0, 0.0), (-9.0, 14.0)])
-def test_stress_of_a_linear_field_is_constant_and_rotated(film, made_up, at):
-    """Patch test of `touch_stress`: the field is linear in the frame of the press."""
-    gradient = np.array([[0.3, -0.1, 0.4], [0.2, 0.1, -0.6]])
-    solved = made_up(lambda x: x @ gradient, at)
-    f = np.eye(3, 2) + (gradient * np.array([0.1, 0.1, np.sqrt(0.1)])).T
-    green = 0.5 * (f.T @ f - np.eye(2)) / 0.1
-    local = film.young * 0.1 * stress(np.array([green[0, 0], green[1, 1], 2.0 * green[0, 1]]), film.poisson)
-    points = np.random.default_rng(0).uniform(-25.0, 25.0, (50, 2))
-    expected = rotate_stress(local, np.arctan2(at[1], at[0]))
-    np.testing.assert_allclose(touch_stress(solved, points) / expected, 1.0, rtol=1e-9)
-    nodal = film.young * 0.1 * nodal_stress(solved)
-    np.testing.assert_allclose(nodal - local, 0.0, atol=1e-9 * np.abs(local).max())
 
 
 # Real ones

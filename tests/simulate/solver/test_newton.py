@@ -66,16 +66,6 @@ def test_starting_equilibrium_saves_newton_steps(film, probe):
     np.testing.assert_allclose(touch_charge(sensor, near), touch_charge(sensor, cold), rtol=1e-6)
 
 
-def test_starting_equilibrium_on_another_mesh_is_not_used(film):
-    scene = film, Circle(1.0), (5.0, 0.0), 1.0
-    coarse = press(*scene, SolveSettings(resolution=Resolution(3, 8, 4)))
-    other = press(film, PROBES["rectangle"], (5.0, 0.0), 1.0)
-    cold = press(*scene)
-    for start in (coarse, other):
-        solved = press(*scene, SolveSettings(resolution=cold.mesh.resolution), start=start)
-        np.testing.assert_array_equal(solved.field, cold.field)
-
-
 def test_failed_solve_raises_solve_error_or_returns_status(film, monkeypatch):
     scene = film, Circle(1.0), (2.0, -3.0), 1.5, FAILING
     message = r"no equilibrium at 1\.5 N, position \(2, -3\) mm: .*; residual .* \(expected 1e-30\) after \d+ steps"

@@ -1,16 +1,13 @@
 """The posterior against closed forms and against summation over a grid, and the Bayes limit."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from bayes.limit import BayesProblem, bayes_estimate
-from bayes.posterior import Cells, Posterior
+from bayes.posterior import Posterior
 from scipy import stats
 
-from isocharge.common.errors import ChargeError, InputError
-from isocharge.simulate import Circle, Domain, ForwardMap, NoiseModel, noise_model
-from isocharge.train.data.contact_errors import ContactErrorStatistics
+from isocharge.simulate import Domain, NoiseModel, noise_model
 from isocharge.train.data.presses import draw_contacts
 
 REFERENCE = noise_model("reference")
@@ -101,18 +98,6 @@ def test_cells_are_not_dropped_if_a_weight_of_the_force_is_negative():
         assert std[0, :2] == pytest.approx(np.sqrt(np.diag(covariance)), rel=5e-3)
 
 
-def test_at_the_edge_of_the_disk_the_gaussian_is_truncated():
-    """The disk is so large that its edge is practically a straight line."""
-    charges = QuadraticCharges(
-        np.array([100.0, 100.0]), np.eye(2), np.zeros((2, 2)), domain=Domain(1000.0, (1.0, 1.0 + 1e-9))
-    )
-    noisy = np.array([[1100.0, 100.0]])  # of the position (1000, 0) mm
-    mean, std = Posterior(charges, NoiseModel("white", 1.0, 0.0), 1000.0).mean_and_std(noisy)
-    half_normal = stats.halfnorm()
-    assert mean[0, :2] == pytest.approx([1000.0 - half_normal.mean(), 0.0], abs=0.003)
-    assert std[0, :2] == pytest.approx([half_normal.std(), 1.0], rel=0.01)
-
-
 def test_two_positions_with_the_same_charges_are_both_found():
     """The charges are even in x, so the posterior has two maxima, and its mean lies between them."""
     charges = QuadraticCharges(
@@ -170,75 +155,3 @@ def test_the_integrals_are_sums_over_a_grid(spline, noise, contact):
     expected_mean, expected_std = sum_over_grid(spline, noise, charge[0], centre, half_width, (100, 100, 20))
     assert std[0] == pytest.approx(expected_std, rel=0.01)
     assert (np.abs(mean[0] - expected_mean) < 0.01 * expected_std).all()
-
-
-def test_the_standard_deviations_are_those_of_the_errors(spline):
-    """On simulated presses with noise, the mean square of error over standard deviation is one."""
-    contact, charge = draw_presses(spline, 120, seed=3)
-    mean, std = Posterior(spline, REFERENCE, spline.domain.radius).mean_and_std(charge)
-    squares = np.mean(((mean - contact) / std) ** 2, axis=0)
-    assert squares == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 120))
-
-
-def test_charges_of_no_contact_give_a_finite_answer_in_the_disk(spline):
-    mean, std = Posterior(spline, REFERENCE, spline.domain.radius).mean_and_std(np.array([[0.0, -5.0, 1e6]]))
-    assert np.isfinite([mean, std]).all()
-    assert np.hypot(*mean[0, :2]) <= spline.domain.radius * (1.0 + 1e-12)
-
-
-@pytest.mark.parametrize(
-    ("changes", "charge", "message"),
-    [
-        ({}, np.ones((2, 4)), r"shape \(n, 3\), n at least 1, got shape \(2, 4\)"),
-        ({}, np.array([[np.nan, 1.0, 1.0]]), "finite"),
-        ({"noise": noise_model("clean")}, np.ones((2, 3)), "white noise"),
-        ({"radius": 9.0}, np.ones((2, 3)), "up to the charge table's 8 mm"),
-    ],
-)
-def test_bad_input_is_refused(spline, changes, charge, message):
-    with pytest.raises((ChargeError, InputError), match=message):
-        replace(Posterior(spline, REFERENCE, spline.domain.radius), **changes).mean_and_std(charge)
-
-
-@pytest.fixture
-def problem(sensor):
-    return BayesProblem(sensor, Circle(1.0))
-
-
-def test_the_error_of_the_posterior_mean_is_computed_without_a_new_map(problem, spline, monkeypatch):
-    monkeypatch.setattr(ForwardMap, "build", None)  # the map is given
-    contact = draw_contacts(np.random.default_rng(5), spline.domain, 40)
-    charge = REFERENCE.add(spline.charges(contact), np.random.default_rng(6))
-    estimate, std = bayes_estimate(problem, charge, charge_map=spline)
-    limit = ContactErrorStatistics.of(estimate, contact)
-    assert 0.05 < limit.position_median_mm < limit.position_rms_mm < 0.4
-    assert std.shape == (40, 3)
-
-
-def test_errors_of_two_contacts():
-    truth = np.array([[0.0, 0.0, 1.0], [1.0, 1.0, 2.0]])
-    limit = ContactErrorStatistics.of(truth + np.array([[0.3, 0.4, 0.01], [0.0, 0.0, 0.0]]), truth)
-    position = limit.position_rms_mm, limit.position_median_mm, limit.position_p95_mm
-    assert position == pytest.approx((0.5 / np.sqrt(2.0), 0.25, 0.475))
-    assert (limit.force_rms_percent, limit.force_median_percent) == pytest.approx((1.0 / np.sqrt(2.0), 0.5))
-
-
-def test_a_map_of_other_forces_is_refused(sensor, spline):
-    with pytest.raises(InputError, match="expected the problem's"):
-        bayes_estimate(BayesProblem(sensor, Circle(1.0), force_range=(0.1, 1.0)), np.ones((1, 3)), charge_map=spline)
-
-
-@pytest.mark.parametrize("radius", [0.4, 30.0])
-def test_cells_cover_the_disk_once(radius):
-    """The first cells, and the finer cells that replace them, have the area and the centroid of the disk."""
-    first_cells = Cells.roots(radius)
-    for levels in ([first_cells], list(first_cells.finer(radius))):
-        total_area = 0.0
-        first_moment = np.zeros(2)
-        for cells in levels:
-            fraction, centroid = cells.fraction_and_centroid_inside(radius)
-            area = cells.side**2 * fraction
-            total_area += area.sum()
-            first_moment += area @ centroid
-        assert total_area == pytest.approx(np.pi * radius**2, rel=2e-4)
-        assert np.abs(first_moment).max() < 1e-6 * radius * total_area

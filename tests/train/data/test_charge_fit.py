@@ -18,7 +18,6 @@ from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, relea
 from isocharge.train.data.charge_fit import fit_charge_series, fit_film_series
 from isocharge.train.data.contact_errors import rms
 from isocharge.train.data.invertible_domain import invertible_domain
-from isocharge.train.data.misfit_charges import draw_misfit_examples
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.training.source import TrainingData
 
@@ -159,12 +158,6 @@ def test_contacts_far_apart_with_the_same_charges_are_a_caution():
     assert sorted(x_mm) == pytest.approx([-3.0, 3.0], abs=0.5)
 
 
-def test_a_poor_fit_reports_no_contacts_with_the_same_charges():
-    field, presses = fit_field(charges_along_a_nodal_cubic)
-    _, cautions = invertible_domain(replace(field, charge_std=1e-2), presses, REFERENCE)
-    assert cautions == ()
-
-
 def test_caution_about_a_fold_is_in_log_card_and_metadata(film, sensor, tmp_path, caplog):
     """One of the three electrodes is at the centre, where the map folds at a distance of about 0.2 mm."""
     centres = {"A": (0.0, 0.0), "B": (8.66, 5.0), "C": (-8.66, 5.0)}
@@ -235,17 +228,6 @@ def test_scipy_finds_no_nearer_contact(field, held_out_presses, fault):
         assert distance <= smallest + 0.01 + 1e-3 * smallest
 
 
-def test_misfit_examples_are_reproducible_and_have_small_and_large_misfits(field, trained):
-    """A third of the examples are presses with noise, whose misfits are small."""
-    charge, residual = draw_misfit_examples(trained.split.train, field, REFERENCE, 600, seed=1)
-    repeated = draw_misfit_examples(trained.split.train, field, REFERENCE, 600, seed=1)
-    np.testing.assert_array_equal(repeated, [charge, residual])
-    distance = np.linalg.norm(residual, axis=1)
-    assert 0.3 < np.mean(distance < 3.0) < 0.8
-    assert np.mean(distance > 100.0) > 0.1
-    assert 1.0 <= charge.min() <= charge.max() <= 1e6
-
-
 def test_series_of_a_film_at_several_pretensions_agrees_with_its_closed_form():
     """ln Q falls by 0.3 per MPa, by more beside an electrode; the exponent of the force does not change."""
     contact = draw_contacts(np.random.default_rng(0), DOMAIN, 2000)
@@ -261,13 +243,3 @@ def test_series_of_a_film_at_several_pretensions_agrees_with_its_closed_form():
     np.testing.assert_allclose(series.changes(contact, np.array([0.1])).charge_pC, charges(0.1), rtol=1e-4)
     np.testing.assert_allclose(series.charges(contact), charges(0.0), rtol=1e-4)
     assert series.charge_std < 1e-4
-
-
-def test_series_of_presses_with_a_single_force_is_independent_of_the_force():
-    domain = Domain(8.0, (0.5, 0.5))
-    contact = draw_contacts(np.random.default_rng(0), domain, 1000)
-    x, y, _force = contact.T
-    charge = 500.0 * np.exp(0.05 * np.stack([x + y, x - y, -x], axis=1))
-    presses = LabelledPresses(contact, charge)
-    series = fit_charge_series(domain, ("A", "B", "C"), presses[:900], presses[900:])
-    np.testing.assert_allclose(series.charges(contact * [1.0, 1.0, 1.04]), charge, rtol=1e-4)

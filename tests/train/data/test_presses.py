@@ -41,14 +41,6 @@ def test_split_puts_each_position_into_one_part(repeated_positions):
     assert len(test_positions) == pytest.approx(0.2 * len(train_positions | test_positions), abs=1)
 
 
-def test_split_depends_on_the_seed_only(repeated_positions):
-    _, test = split_by_position(repeated_positions, 0.2, seed=3)
-    _, same_seed = split_by_position(repeated_positions, 0.2, seed=3)
-    _, other_seed = split_by_position(repeated_positions, 0.2, seed=4)
-    assert np.array_equal(same_seed.contact, test.contact)
-    assert not np.array_equal(other_seed.contact, test.contact)
-
-
 def test_domain_is_that_of_the_manifest_or_of_the_samples(dataset):
     assert domain_of(dataset) == Domain(8.0, (0.05, 2.0))
     samples = dataset.samples
@@ -99,15 +91,12 @@ def test_dataset_that_a_network_cannot_be_trained_on_is_refused(dataset, change,
             lambda d: with_one_charge(d, 1e30),
             r"^sample 17, column 'B': expected a value of the size of the others.*got 1e\+30",
         ),
-        (lambda d: with_one_charge(d, 1e39), r"^sample 17, column 'B': expected a charge in pC, got 1e\+39"),
-        (lambda d: with_samples(d, charge_pC=d.samples.charge_pC[:, [0, 0, 2]]), "channels 'A', 'B': expected charges"),
-        (lambda d: with_samples(d, charge_pC=1e-310 * d.samples.charge_pC), "channel 'A': expected charges in pC"),
         (
             lambda d: with_samples(d, force_N=2.0 + 0.01 * d.samples.force_N),
             r"expected forces that vary, got 2.00\d to 2.02 N in all 6000 presses; .* CSV file",
         ),
     ],
-    ids=["large charge", "impossible charge", "copied channel", "tiny charges", "one force"],
+    ids=["large charge", "one force"],
 )
 def test_a_measured_dataset_with_a_fault_is_refused(dataset, change, message):
     measured = replace(dataset, manifest={})

@@ -1,7 +1,5 @@
 """Every activation of hidden layers: its values, and networks with it in PyTorch, NumPy, ONNX and C."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -10,12 +8,9 @@ from tests.train.random_networks import random_network
 
 from isocharge.common.errors import ConfigError
 from isocharge.serve import Predictor, find_model, load_model, write_model
-from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config, release
+from isocharge.train import load_config
 from isocharge.train.model_release.onnx_graph import read_graph, write_graph
 from isocharge.train.training.activations import ACTIVATIONS
-from isocharge.train.training.network import TrainablePerceptron
-from isocharge.train.training.perceptron import evaluate
-from isocharge.train.training.split import Split
 
 CLOSED_FORMS = {
     "tanh": lambda x: (np.exp(x) - np.exp(-x)) / (np.exp(x) + np.exp(-x)),
@@ -46,24 +41,6 @@ def test_numpy_and_torch_compute_the_closed_form(name):
 
 
 @pytest.mark.parametrize("name", ACTIVATIONS)
-def test_a_torch_perceptron_and_its_numpy_copy_agree(name):
-    torch.manual_seed(0)
-    perceptron = TrainablePerceptron(4, (12, 10), 6, ACTIVATIONS[name]).double()
-    torch.nn.init.normal_(perceptron.skip.weight)
-    x = np.random.default_rng(1).standard_normal((50, 4))
-    hidden = x
-    first, second, last = (
-        (layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in perceptron.linear_layers()
-    )
-    for weight, bias in (first, second):
-        hidden = CLOSED_FORMS[name](hidden @ weight.T + bias)
-    expected = hidden @ last[0].T + last[1] + x @ perceptron.skip.weight.detach().numpy().T
-    with torch.no_grad():
-        np.testing.assert_allclose(perceptron(torch.tensor(x)), expected, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(evaluate(perceptron.to_numpy(), x), expected, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ACTIVATIONS)
 def test_onnx_and_c_give_the_network(name, build, tmp_path):
     """Both are compared with the network in double precision, and the graph gives the same network back."""
     network = random_network(4, (24, 20), (16, 12), activation=ACTIVATIONS[name])
@@ -81,25 +58,6 @@ def test_onnx_and_c_give_the_network(name, build, tmp_path):
     read_network = read_graph(graph, "graph")
     assert read_network.layers.activation.name == name
     check_close(np.concatenate(read_network.predict(charge_pC.astype(float)), axis=1), expected)
-
-
-@pytest.mark.parametrize("name", ACTIVATIONS)
-def test_a_student_with_8_bits_is_trained_and_served(name, dataset, fitted, trained, monkeypatch, tmp_path):
-    # The search for folds would take most of the time.
-    monkeypatch.setattr(Split, "by_position", lambda *_: trained.split)
-    teacher = Teacher("teacher/1", lambda charge: fitted.predict(charge)[0])
-    config = FitConfig(
-        network=NetworkConfig(hidden=(24, 24), misfit_hidden=(16, 16), activation=name, weights="int8"),
-        training=TrainingConfig(steps=400, misfit_steps=100, misfit_charges=1_000, batch=256),
-    )
-    student = fit(replace(TrainingData.of(dataset), teacher=teacher), config)
-    folder = release(student, tmp_path / "student").folder
-    test = student.test
-    contact = np.stack(Predictor(folder).predict_batch(test.charge), axis=1)
-    error_mm = np.hypot(*(contact[:, :2] - test.contact[:, :2]).T)
-    assert np.median(error_mm) < 0.6
-    assert load_model(folder).metadata.made_with["config"]["network"]["activation"] == name
-    assert read_graph((folder / "model.onnx").read_bytes(), "student").layers.activation.name == name
 
 
 def test_an_unknown_activation_is_refused(tmp_path):

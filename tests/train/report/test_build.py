@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from isocharge.cli.train import report as report_module
-from isocharge.common.errors import DatasetError, ModelError, OutputExists
+from isocharge.common.errors import ModelError, OutputExists
 from isocharge.serve import benchmark, find_model
-from isocharge.simulate import Sweep, load_sensor, parse_probe
+from isocharge.simulate import Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.report import QUICK, case, evaluation, page, write_report
-from isocharge.train.report.case import EvaluationCase
 from isocharge.train.report.measures import contact_errors
 
 NAME = "three-25um-biaxial"
@@ -114,17 +113,6 @@ def test_dataset_with_larger_forces_than_the_model_is_refused(dataset, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_dataset_with_one_position_in_the_working_area_is_refused(dataset, tmp_path):
-    """Every second press is moved to the centre; the others are moved out of the working area of the model."""
-    samples = dataset.samples
-    is_moved_out = np.arange(len(samples)) % 2
-    moved = replace(samples, x_mm=is_moved_out * (20.0 + samples.x_mm), y_mm=is_moved_out * samples.y_mm)
-    one_position = replace(dataset, samples=moved, manifest={"solver": dataset.manifest["solver"]})
-    with pytest.raises(DatasetError, match="50 positions, got 3000 at 1"):
-        write_report(tmp_path / "out", [(one_position, find_model(NAME))], SMALL)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_existing_folder_is_refused(dataset, tmp_path):
     with pytest.raises(OutputExists):
         write_report(tmp_path, [(dataset, find_model(NAME))], SMALL)
@@ -146,39 +134,3 @@ def test_report_command_takes_the_model_of_the_sensor_unless_another_is_given(
     assert command(*words, "--model", f"{NAME}-student")[0] == 0
     assert evaluated_models == [find_model(NAME), find_model(f"{NAME}-student")]
     refused(*words, "--model", NAME, "--model", NAME, message="expected one model for each of 1 datasets, got 2")
-
-
-def dataset_with_probes(dataset, probe_names, angles_deg):
-    """Return the first presses of a dataset with other probes and angles, which are used in turn."""
-    count = len(dataset.samples)
-    probe_index = np.arange(count) % len(probe_names)
-    angle_columns = [np.broadcast_to(angle_deg, count) for angle_deg in angles_deg]
-    samples = replace(
-        dataset.samples,
-        probe=np.array(probe_names)[probe_index],
-        orientation_deg=np.choose(probe_index, angle_columns),
-    )
-    return replace(dataset, samples=samples)
-
-
-def test_case_has_the_same_number_of_presses_for_each_probe(dataset):
-    """The number of presses is rounded down from 101 to a multiple of the number of probes."""
-    names = ["circle:1.0", "rectangle:4x2", "triangle:4.0"]
-    angles_deg = [0.0, 30.0, np.linspace(0.0, 90.0, len(dataset.samples))]
-    rotated_rectangle = parse_probe("rectangle:4x2").rotated(np.deg2rad(30.0))
-
-    all_probes = EvaluationCase.for_dataset(dataset_with_probes(dataset, names, angles_deg), 101, 0)
-    assert all_probes.probes == (parse_probe("circle:1.0"), rotated_rectangle, parse_probe("triangle:4.0"))
-    assert all_probes.press_count == 99
-    assert all_probes.is_rotated
-
-    fixed_probes = EvaluationCase.for_dataset(dataset_with_probes(dataset, names[:2], angles_deg[:2]), 101, 0)
-    assert fixed_probes.probes == (parse_probe("circle:1.0"), rotated_rectangle)
-    assert fixed_probes.press_count == 100
-    assert not fixed_probes.is_rotated
-
-
-def test_test_sweep_multiplies_the_ranges_of_the_dataset(dataset):
-    sweep = EvaluationCase.for_dataset(dataset, 101, 0).test_sweep(2.0)
-    assert sweep.radius == pytest.approx(16.0)
-    assert sweep.force_range == pytest.approx((0.025, 4.0))

@@ -106,9 +106,3 @@ def test_the_same_minimum_as_scipy_finds(search, known):
     charge = presses.noisy(NOISE, 8)
     expected = [scipy_square_sum(known, row[None], start) for row, start in zip(charge, presses.contact, strict=True)]
     np.testing.assert_allclose(square_sum(known, charge, search.predict(charge)), expected, rtol=1e-3, atol=1e-3)
-
-
-def test_gauss_newton_on_a_fitted_series_answers_as_on_the_map(search, known, task):
-    series = GaussNewton(task.domain, NOISE).fit(task.presses.charge, task.presses.contact)
-    charge = known.presses(200, 12).noisy(NOISE, 13)
-    assert np.median(position_error(series.predict(charge), search.predict(charge))) < 0.002

@@ -170,44 +170,6 @@ def test_binary_input_at_any_offset_in_the_body(ask, bare, film, datatype, blank
     np.testing.assert_array_equal(contact, bare(film.golden_pC())["contact"].ravel())
 
 
-def outputs_of(headers, body):
-    """Return the outputs of an answer with binary tensors, by name."""
-    length = int(headers["inference-header-content-length"])
-    raw = body[length:]
-    found = {}
-    for output in orjson.loads(body[:length])["outputs"]:
-        size = output.get("parameters", {}).get("binary_data_size")
-        numbers = np.float32(output["data"]) if size is None else np.frombuffer(raw[:size], "<f4")
-        found[output["name"]] = numbers.reshape(output["shape"])
-        raw = raw[size or 0 :]
-    assert raw == b""
-    return found
-
-
-@pytest.mark.parametrize(
-    ("options", "names"),
-    [
-        ({"parameters": {"binary_data_output": True}}, ("contact", "contact_std", "misfit")),
-        ({"outputs": [{"name": "misfit", "parameters": {"binary_data": True}}, {"name": "contact"}]}, None),
-        ({"parameters": {"binary_data_output": True}, "outputs": [{"name": "contact_std"}]}, ("contact_std",)),
-        (
-            {
-                "parameters": {"binary_data_output": True},
-                "outputs": [{"name": "misfit", "parameters": {"binary_data": False}}, {"name": "contact"}],
-            },
-            ("misfit", "contact"),
-        ),
-    ],
-)
-def test_binary_outputs(ask, bare, film, options, names):
-    status, headers, body = ask("POST", INFER, orjson.dumps(request(film.golden_pC(), **options)))
-    assert (status, headers["content-type"]) == (200, "application/octet-stream")
-    found = outputs_of(headers, body)
-    assert tuple(found) == (names or ("misfit", "contact"))
-    for name, rows in found.items():
-        np.testing.assert_array_equal(rows, bare(film.golden_pC())[name])
-
-
 @pytest.mark.parametrize(("way", "pack"), [("gzip", gzip.compress), ("deflate", zlib.compress), ("identity", bytes)])
 def test_compressed_request_body(ask, film, way, pack):
     plain = orjson.dumps(request(film.golden_pC()))
@@ -262,7 +224,6 @@ BAD = {
         r"out of range - at .*data\[1\]",
     ),
     "beyond float32": (changed(data=[1, 2, 1e39]), 400, r"finite charges .* electrode 'C' \(1e\+39\)"),
-    "beyond int64": (changed(data=[1, 2, 3]).replace(b"[1,2,3]", b"[1,%d,3]" % 10**40), 400, "electrode 'B'"),
     "nested": (b"[" * 100_000, 400, "expected JSON, got"),
     "nested data": (
         changed(data=[1, 2, 3]).replace(b"[1,2,3]", b"[" * 500 + b"]" * 500),
@@ -271,24 +232,16 @@ BAD = {
     ),
     "no inputs": (b'{"inputs": []}', 400, "inputs: expected a list with one tensor"),
     "two inputs": (orjson.dumps({"inputs": request(PRESS)["inputs"] * 2}), 400, "a list with one tensor"),
-    "inputs no list": (b'{"inputs": {}}', 400, "inputs: expected a list"),
     "other name": (changed(name="charges"), 400, r"inputs\[0\].name: expected one of charge_pC, got 'charges'"),
     "other type": (changed(datatype="INT64"), 400, "expected one of FP32, FP64, got 'INT64'"),
-    "type no text": (changed(datatype=["FP32"]), 400, "expected one of FP32, FP64"),
-    "wrong width": (changed(shape=[1, 4]), 400, r"shape \[n, 3\] with n > 0, a column for each of \('A', 'B', 'C'\)"),
     "no rows": (changed(shape=[0, 3], data=[]), 400, "with n > 0"),
-    "negative": (changed(shape=[-1, 3]), 400, "with n > 0"),
     "a fraction": (changed(shape=[1.5, 3]), 400, r"shape\[0\]: expected a whole number, got 1.5"),
     "yes rows": (changed(shape=[True, 3]), 400, "expected a whole number, got True"),
-    "three dimensions": (changed(shape=[1, 3, 1]), 400, "with n > 0"),
     "too many": (changed(shape=[10**12, 3]), 413, "at most 4096 presses in one request, got 1000000000000"),
     "too few numbers": (changed(data=[1, 2]), 400, r"shape \[1, 3\], flat or in rows, got \[1.0, 2.0\]"),
     "ragged": (changed(shape=[2, 3], data=[[1, 2, 3], [1, 2]]), 400, "expected `data`, numbers"),
-    "texts": (changed(data=["1", "2", "3"]), 400, r"data\[0\]: expected a finite number or .*, got '1'"),
     "yes": (changed(data=[1, 2, True]), 400, r"data\[2\]: expected a finite number or .*, got True"),
     "no": (changed(data=[[1, 2, False]]), 400, r"data\[0\]\[2\]: expected a finite number, got False"),
-    "null": (changed(data=[1, None, 3]), 400, r"data\[1\]: expected a finite number or .*, got None"),
-    "a text": (changed(data="123"), 400, "data: expected numbers, flat or in rows, got '123'"),
     "no data": (changed(data=None), 400, "expected `data`, numbers"),
     "id no text": (orjson.dumps(request(PRESS, id=7)), 400, "id: expected a text, got 7"),
     "other output": (
@@ -296,7 +249,6 @@ BAD = {
         400,
         "one of contact, contact_std, contact_correl",
     ),
-    "output no object": (orjson.dumps(request(PRESS, outputs=["contact"])), 400, "expected a table, got 'contact'"),
     "output twice": (orjson.dumps(request(PRESS, outputs=[{"name": "misfit"}] * 2)), 400, "each name once"),
     "parameters": (orjson.dumps(request(PRESS, parameters=[])), 400, "parameters: expected a table"),
     "no flag": (orjson.dumps(request(PRESS, parameters={"binary_data_output": 1})), 400, "true or false, got 1"),
@@ -522,10 +474,3 @@ def test_server_conforms_to_its_openapi_document(operations, mode):
 
         conforms()
     assert answered & ({200} if mode is GenerationMode.POSITIVE else {400, 404})
-
-
-def test_openapi_describes_each_output(ask):
-    _, _, body = ask("GET", "/openapi.json")
-    schema = orjson.loads(body)["components"]["schemas"]["answer"]["properties"]["outputs"]["items"]
-    for name in ("contact", "contact_std", "contact_correlation", "misfit", "flags"):
-        assert f"`{name}`: " in schema["properties"]["name"]["description"]
