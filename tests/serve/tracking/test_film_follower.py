@@ -59,7 +59,7 @@ def model_in(folder, series: ChargeSeries) -> SimpleNamespace:
 
     def predict(charge_pC) -> Contact:
         contact = np.array([0.0, 0.0, np.log(0.5)])
-        for _ in range(12):
+        for _ in range(6):
             place = np.array([[contact[0], contact[1], np.exp(contact[2])]])
             charge, slopes = calibrated.linearised(place)
             weight = 1.0 / NOISE.sigma(charge[0])
@@ -84,7 +84,7 @@ def touches(series, state, gains, rng, count):
     return contact, series.changes(contact, state).charge_pC * gains
 
 
-def followed(model, charge, rng, frames=6) -> FilmFollower:
+def followed(model, charge, rng, frames=4) -> FilmFollower:
     """Return a follower that has observed touches of several frames each."""
     follower = FilmFollower(model)
     clock_s = 0.0

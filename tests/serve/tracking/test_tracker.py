@@ -141,19 +141,19 @@ def test_reported_std_adapts_to_a_board_whose_noise_differs_from_the_training(no
 
 
 def test_held_contact_has_little_noise_and_correct_standard_deviations():
-    settled = np.concatenate([track_path(np.zeros(400))[0][50:] for _ in range(20)])
+    settled = np.concatenate([track_path(np.zeros(400))[0][50:] for _ in range(10)])
     assert np.sqrt(np.mean(settled[:, [X, Y]] ** 2)) < 0.2 * STD
     assert np.mean(np.abs(settled[:, X]) < 1.96 * settled[:, X_STD]) > 0.93
     np.testing.assert_array_equal(settled[:, Y_STD], settled[:, X_STD])
 
 
-@pytest.mark.parametrize("speed", [5.0, 20.0, 50.0, 200.0])
+@pytest.mark.parametrize("speed", [5.0, 50.0, 200.0])
 def test_slide_is_tracked_without_lag_and_better_than_by_any_moving_average(speed):
     path, t = slide(speed)
     is_moving = (t > 0.3) & (t < 0.6)
     errors = []
     measured = []
-    for _ in range(20):
+    for _ in range(10):
         errors.append(position_errors(track_path(path)[0], path))
         measured.append([complex(contact.x_mm, contact.y_mm) for contact in noisy_contacts(path)])
     errors = np.array(errors)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import RequestError
@@ -86,6 +86,7 @@ def test_live_page_refuses_replay_requests():
         parse('{"do": "seek", "value": 1}', LiveRequest)
 
 
+@settings(max_examples=20)
 @given(st.text() | st.recursive(st.none() | st.text() | st.floats(), st.lists, max_leaves=5).map(json.dumps))
 @example("[" * 5000)
 @example('{"do": "seek", "value": NaN}')

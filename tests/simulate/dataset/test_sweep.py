@@ -24,7 +24,8 @@ from isocharge.simulate import (
     run_sweep,
     touch_charge,
 )
-from isocharge.simulate.dataset.sweep import SHARD_SIZE, TASK_SIZE, outside_samples, write_sweep
+from isocharge.simulate.dataset import sweep as sweep_module
+from isocharge.simulate.dataset.sweep import outside_samples, write_sweep
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
@@ -144,13 +145,14 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path):
     assert read_dataset(tmp_path / "fixed").samples.orientation_deg[:3].tolist() == [30.0, 330.0, 0.0]
 
 
-def test_shards_and_tasks_keep_the_order_of_the_presses(tmp_path):
+def test_shards_and_tasks_keep_the_order_of_the_presses(tmp_path, monkeypatch):
     """The sweep has two shards, and the first shard has several tasks. Each press has its own charges."""
-    sweep = Sweep(samples=SHARD_SIZE + 10, orientation="random", outside=0)
+    monkeypatch.setattr(sweep_module, "SHARD_SIZE", 600)
+    monkeypatch.setattr(sweep_module, "TASK_SIZE", 150)
+    sweep = Sweep(samples=610, orientation="random", outside=0)
     maps = [Spy(Polygon.rectangle(side, 2.0)) for side in (3.0, 4.0, 5.0)]
     read = read_dataset(write_sweep(tmp_path / "large", maps, sweep))
-    assert SHARD_SIZE > TASK_SIZE
-    assert [shard["samples"] for shard in read.manifest["shards"]] == [SHARD_SIZE, 10]
+    assert [shard["samples"] for shard in read.manifest["shards"]] == [600, 10]
     presses = sweep.over([made.probe for made in maps])
     np.testing.assert_array_equal(read.samples.x_mm, presses.contact[:, 0])
     np.testing.assert_array_equal(read.samples.charge_pC[:, :2], presses.contact[:, :2])

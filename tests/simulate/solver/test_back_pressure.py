@@ -166,7 +166,7 @@ def membrane_state(film: Film, probe_radius: float, force: float, pressure: floa
     return CubicHermiteSpline(solved.x, total, np.gradient(total, solved.x)), float(moment[-1])
 
 
-@pytest.mark.first_cases(3)
+@pytest.mark.first_cases(2)
 @pytest.mark.parametrize(
     ("back_volume", "static_pressure", "force"),
     [(10.0 * CAVITY, 2e-6, 0.2), (CAVITY, 0.0, 0.5), (None, -20e-6, 0.5), (CAVITY, 0.0, 0.05), (None, 2e-6, 0.1)],

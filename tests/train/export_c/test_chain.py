@@ -40,10 +40,8 @@ BOARDS = {
         "gain": {"pC_per_unit": GAIN, "offset": {"A": 8388608.0, "B": -3.5, "C": 0.0, "D": 2048.0}},
         "saturation": {"limit_pC": 900.0},
     },
-    "gain and limit": {"gain": {"pC_per_unit": GAIN}, "saturation": {"limit_pC": 900.0}},
     "hum": {"hum": {"frequency_Hz": 60.0, "settle_s": 0.3}, "leak": {"tau_s": 10.0}},
     "no tare": {"tare": {"on": False}},
-    "no touch": {"touch": {"on": False}, "leak": {"tau_s": 10.0}},
     "short tare": {"tare": {"frames": 7, "noise_limit_pC": 3.0}, "touch": {"sigmas": 4.0, "floor_pC": 5.0}},
     "warming": {"common_mode": {}},
     "warming and leak": {"common_mode": {"every_s": 0.02, "tell_pC": 3.0}, "leak": {"tau_s": 5.0}, "hum": {}},
@@ -155,7 +153,7 @@ def test_c_and_python_give_the_same_charges_and_states_for_each_frame(board, bui
     max_share_of_other_flags = 0.002 if estimates_warming else 0.0
     other_bits = ALL_BITS - WARMING_BITS
     for seed in range(2):
-        frames = draw_frames(board, seed)
+        frames = draw_frames(board, seed, seconds=12.0)
         expected_charge, expected_tare, expected_contact, expected_flags = python_chain(device(board), frames, misfit)
         charge, tare, contact, flags = exported.chain(*frames)
         np.testing.assert_array_equal(contact, expected_contact)
@@ -168,7 +166,7 @@ def test_c_and_python_give_the_same_charges_and_states_for_each_frame(board, bui
         assert release_count >= 3 or device(board).rule(TouchRule) is None
 
 
-@pytest.mark.parametrize("board", ["any board", "leak", "gain and limit", "hum"])
+@pytest.mark.parametrize("board", ["any board", "hum"])
 def test_single_precision_changes_charges_by_less_than_a_twentieth_of_a_picocoulomb(board, build, misfit):
     """The compiler option -Wdouble-promotion refuses double precision, which small processors would emulate."""
     exported = build(
@@ -265,7 +263,7 @@ def exported(build):
 
 
 @given(pieces=st.lists(PIECES, max_size=6), damage=DAMAGE)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_c_and_python_parse_any_bytes_into_the_same_frames_and_counters(exported, pieces, damage):
     data = bytearray(b"".join(pieces) + b"\0")
     for position, value in damage:
@@ -280,7 +278,7 @@ def test_c_and_python_parse_any_bytes_into_the_same_frames_and_counters(exported
 
 
 @given(frame=FRAMES)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_c_and_python_write_the_same_frames(exported, frame):
     assert exported.encode(frame.seq, frame.t_us, frame.bits, frame.values) == encode_frame(frame)
 

@@ -403,7 +403,7 @@ def flat_presses(force_N):
 @pytest.mark.parametrize(("force_N", "stated_N", "stated_std"), [(2.0, 2.0, 0.005), (np.nan, 1.0, 1.0)])
 def test_presses_of_one_force_or_without_forces_train_x_and_y(force_N, stated_N, stated_std, tmp_path, caplog):
     presses = flat_presses(force_N)
-    fitted = fit_presses(presses, "pad", QUICK)
+    fitted = fit_presses(presses, "pad", QUICKER)
     assert "learns x and y alone" in caplog.text
     contact, std, _ = fitted.predict(presses.charge_pC)
     np.testing.assert_allclose(contact[:, 2], stated_N, rtol=1e-6)

@@ -171,7 +171,7 @@ def test_the_loss_of_the_covariance_is_smallest_at_the_covariance_of_normal_erro
     rng = np.random.default_rng(5)
     turn = np.array([0.4, -0.7, 0.2])
     true_factor = np.array([0.3, 0.2, 0.5])[:, None] * cholesky_factors(turn[None])[0]
-    error = torch.tensor(rng.standard_normal((20_000, 3)) @ true_factor.T)
+    error = torch.tensor(rng.standard_normal((8_000, 3)) @ true_factor.T)
     error[::200] *= 10.0
     parameters = torch.zeros((2, 3), dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.Adam([parameters], lr=0.05)
