@@ -96,6 +96,7 @@ def whole_films_are_solved_once():
 @pytest.fixture
 def command(monkeypatch, capsys):
     """Function that runs `isocharge ...` in this process and returns (exit code, stdout, stderr)."""
+    monkeypatch.setenv("COLUMNS", "100")  # the width of the terminal decides how tables are printed
 
     def run(*words):
         monkeypatch.setattr(sys, "argv", ["isocharge", *map(str, words)])

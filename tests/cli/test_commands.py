@@ -353,3 +353,8 @@ def test_demo_plays_the_working_area_of_the_released_model_of_the_sensor():
     assert played_radius_mm("three-25um-biaxial") == pytest.approx(8.0)
     assert played_radius_mm("four-25um-biaxial-15mm") == pytest.approx(15.0)
     assert played_radius_mm("no-such-sensor") == 8.0
+
+
+def test_demo_refuses_an_unknown_sensor(refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refused("demo", "--sensor", "no-such-sensor", message="no-such-sensor", code=2)

@@ -4,6 +4,7 @@ Commands whose stdin, stdout or stderr is closed, full, or read by somebody slow
 """
 
 import contextlib
+import csv
 import json
 import os
 import re
@@ -94,6 +95,21 @@ def test_check_options_position_std_and_force_std(measured, models, command):
     assert values["model"] == "linear/1"
 
 
+def test_check_of_many_presses_shows_the_worst(measured, models, command):
+    """Of forces that are off by the same share these are the largest, for their noise is the least share."""
+    words = ["serve", "check", "linear", measured(count=100, known="force_N", scale=0.97), "--models", models]
+    out, values = command(*words)[1], json.loads(command(*words, "--json")[1])
+    worst = sorted(sorted(values["each"], key=lambda row: row["force_N"])[-40:], key=lambda row: row["line"])
+    form = "{line} {x_mm:.5g} {y_mm:.5g} {force_N:.5g} - {force_error_percent:.5g} none -"
+    assert [" ".join(line.split()) for line in out.splitlines()[2:42]] == [form.format(**row) for row in worst]
+    per_degree = values["chi_squared_per_degree"]
+    assert per_degree == pytest.approx(values["chi_squared"] / 100)
+    assert re.search(rf"chi_squared_per_degree +{per_degree:.5g}\n", out)
+    assert values["force_scale"] == pytest.approx(1.0 / 0.97, rel=1e-4)
+    assert re.search(rf"force_scale +{values['force_scale']:.5g}\n", out)
+    assert "position_mm" not in out
+
+
 @pytest.mark.parametrize(
     ("text", "words", "message"),
     [
@@ -137,6 +153,19 @@ def test_stream_ends_cleanly_when_the_pipe_closes(board, models, start):
     process.stdout.close()
     assert process.wait(timeout=60) == 0
     assert "Error" not in process.stderr.read()
+
+
+def test_stream_to_csv_and_udp(frames, models, run):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(5.0)
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
+        words = ["--output", "csv", "--output", f"udp://{address}", "--count", 120, "--models", models]
+        result = run("stream", "linear", "--port", frames, *words)
+        datagrams = [json.loads(listener.recv(65536)) for _ in range(120)]
+    rows = list(csv.DictReader(result.stdout.splitlines()))
+    assert [int(row["seq"]) for row in rows] == [datagram["seq"] for datagram in datagrams]
+    assert float(rows[-1]["charge_pC.A"]) == pytest.approx(datagrams[-1]["charge_pC"]["A"], abs=1e-6)
 
 
 def test_stream_option_seconds_ends_a_silent_port(models, run):

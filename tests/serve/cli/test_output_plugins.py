@@ -10,6 +10,9 @@ import zipfile
 
 import pytest
 
+from isocharge.common.errors import InputError
+from isocharge.serve.outputs.targets import output_kind
+
 PLUGIN = '''
 """An output that counts the records of each touch."""
 from pathlib import Path
@@ -84,3 +87,13 @@ def test_installed_package_adds_an_output(installed, recorded, models, tmp_path,
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
     contacts = sum(json.loads(line)["contact"] for line in printed.splitlines())
     assert int((tmp_path / "touch.count").read_text()) == contacts > 0
+
+
+@pytest.mark.parametrize(
+    ("entry_point", "reason"),
+    [("isocharge_count:ABSENT", "cannot be loaded"), ("isocharge_count:CountOutput", "expected an OutputKind")],
+)
+def test_broken_package_is_named(installed, monkeypatch, entry_point, reason):
+    monkeypatch.syspath_prepend(installed(entry_point))
+    with pytest.raises(InputError, match=rf"output count \({entry_point}\): {reason}"):
+        output_kind("touch.count")

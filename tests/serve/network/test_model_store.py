@@ -1,6 +1,7 @@
 """Store of models: broken versions, loading and unloading during requests. Log: one line of JSON for each request."""
 
 import json
+import logging
 import os
 import shutil
 import socket
@@ -23,7 +24,7 @@ from isocharge.serve.network.grpc.messages import SERVICE
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.routes import ROUTES
-from isocharge.serve.network.traffic import RequestLog, Traffic
+from isocharge.serve.network.traffic import MAX_TEXT_CHARACTERS, RequestLog, Traffic
 
 
 @pytest.fixture
@@ -230,6 +231,26 @@ def test_client_cannot_forge_a_log_line_or_log_a_secret(released, method, path, 
     assert set(content) == NAMES
     assert SECRET not in str(content)
     assert content["route"] in {"unknown", *(route.paths[0] for route in ROUTES)}
+
+
+def test_log_has_the_messages_of_python_loggers(lines):
+    """The messages contain tracebacks, line feeds, single surrogates, secrets, and too much text."""
+    log = RequestLog(lines.append, secret=SECRET)
+    logger = logging.Logger("isocharge.test")
+    logger.addHandler(log)
+    logger.warning("two\nlines \udc80 %s", FORGED + SECRET)
+    try:
+        raise ValueError(f"{SECRET}\n" * 1000)
+    except ValueError:
+        logger.exception("a request failed")
+    warning, failure = map(json.loads, lines)
+    assert (warning["level"], warning["logger"]) == ("warning", "isocharge.test")
+    assert warning["message"] == f"two\nlines ? {FORGED}[secret]"
+    assert (failure["level"], failure["message"]) == ("error", "a request failed")
+    assert "Traceback" in failure["traceback"]
+    assert "ValueError" in failure["traceback"]
+    assert len(failure["traceback"]) < MAX_TEXT_CHARACTERS + 20
+    assert not any("sesame" in line for line in lines)
 
 
 def test_log_has_a_line_for_each_grpc_call(store, lines):

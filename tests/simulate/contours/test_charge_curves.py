@@ -53,6 +53,15 @@ def test_curves_are_the_charges_of_presses(film):
     np.testing.assert_array_equal(curves.own_charge, curves.charge[..., 0])
 
 
+def test_polynomials_agree_with_numpy(film):
+    curves = Curves.of(film, Mapping.lines(SENSOR, "A", (60 * DEG, 90 * DEG), length=16.0), 1.0)
+    for line, polynomial in zip(curves.own_charge, curves.polynomials(2), strict=True):
+        expected = np.polyval(np.polyfit(curves.mapping.distance, line, 2), [5.0, 13.0])
+        np.testing.assert_allclose(polynomial(np.array([5.0, 13.0])), expected, rtol=1e-9)
+    with pytest.raises(SceneError, match="degree: expected 1 to 3 for 4 presses on a line, got 4"):
+        curves.polynomials(4)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

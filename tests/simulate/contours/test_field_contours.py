@@ -65,6 +65,14 @@ def test_charge_is_constant_on_a_contour(field):
         assert np.abs(away).max() < 5e-3
 
 
+def test_even_charges_lie_within_the_charge_range(field):
+    low, high = field.charge_range("A")
+    charges = field.even_charges("A", 5)
+    assert low < min(charges) < max(charges) < high
+    np.testing.assert_allclose(np.diff(np.log(charges)), np.diff(np.log(charges))[0], rtol=1e-9)
+    assert all(field.contours("A", charge) for charge in charges)
+
+
 def test_charge_out_of_range_has_no_contour(field):
     assert field.contours("A", 9e3) == field.contours("A", -500.0) == ()
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from isocharge.cli.train import report as report_module
-from isocharge.common.errors import ModelError, OutputExists
+from isocharge.common.errors import DatasetError, ModelError, OutputExists
 from isocharge.serve import benchmark, find_model
 from isocharge.simulate import Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
@@ -110,6 +110,17 @@ def test_dataset_with_larger_forces_than_the_model_is_refused(dataset, tmp_path)
     stronger = replace(dataset, samples=samples, manifest={"solver": dataset.manifest["solver"]})
     with pytest.raises(ModelError, match=r"forces from 0.05 to 2 N, for which .* a dataset with forces from 0.1"):
         write_report(tmp_path / "out", [(stronger, find_model(NAME))], SMALL)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_dataset_with_one_position_in_the_working_area_is_refused(dataset, tmp_path):
+    """Every second press is moved to the centre; the others are moved out of the working area of the model."""
+    samples = dataset.samples
+    is_moved_out = np.arange(len(samples)) % 2
+    moved = replace(samples, x_mm=is_moved_out * (20.0 + samples.x_mm), y_mm=is_moved_out * samples.y_mm)
+    one_position = replace(dataset, samples=moved, manifest={"solver": dataset.manifest["solver"]})
+    with pytest.raises(DatasetError, match="50 positions, got 3000 at 1"):
+        write_report(tmp_path / "out", [(one_position, find_model(NAME))], SMALL)
     assert list(tmp_path.iterdir()) == []
 
 
