@@ -28,7 +28,7 @@ from isocharge.simulate import Circle, ForwardMap, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.calibration import session as session_module
-from isocharge.train.calibration.calibrate import solve_start
+from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.press_file import open_press_file
 from kept import kept
 
@@ -199,7 +199,7 @@ def film(problem):
 
 @pytest.fixture(scope="module")
 def places(problem):
-    return np.array([press.contact for press in next_presses(problem, kept(solve_start, problem), 3)])
+    return np.array([press.contact for press in next_presses(problem, kept(solve_even, problem), 3)])
 
 
 def board_rows(film, places, seed=0) -> Iterator[tuple[float, ...]]:
@@ -263,9 +263,9 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk
 
     The described film is solved once for all tests, and the film that the presses determine is not solved.
     """
-    described_film = kept(solve_start, problem)
-    monkeypatch.setattr(session_module, "solve_start", lambda *_: described_film)
-    monkeypatch.setattr(calibrate_module, "solve_start", lambda *_: described_film)
+    described_film = kept(solve_even, problem)
+    monkeypatch.setattr(session_module, "solve_even", lambda *_: described_film)
+    monkeypatch.setattr(calibrate_module, "solve_even", lambda *_: described_film)
     monkeypatch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
     _, _, err = command(*PRESS, "--port", "some.bin", "--press-list", "list.csv")
     assert "presses.csv has 2 presses; the same command continues the session" in err

@@ -1,5 +1,7 @@
 """Tests of the estimator of a film on films whose charges are a closed formula."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -7,6 +9,7 @@ from scipy.stats import chi2
 from tests.benchmarks.measured_films import measured_presses, with_rig_errors
 from tests.train.calibration.conftest import rig
 
+from isocharge.serve.model.robust_estimate import robust_estimate
 from isocharge.train.calibration import estimator
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.discrepancy import terms
@@ -24,8 +27,7 @@ def _one_hypothesis(monkeypatch):
     """Estimate a film under one hypothesis, with nearly normal weights of the presses."""
     monkeypatch.setattr(estimator, "hypotheses", lambda _: [ONE])
     monkeypatch.setattr(estimator, "typical", lambda _: ONE)
-    monkeypatch.setattr(estimator, "DEGREES_OF_FREEDOM", 1e6)
-    monkeypatch.setattr(estimator, "TOLERANCE", 1e-4)
+    monkeypatch.setattr(estimator, "robust_estimate", partial(robust_estimate, freedom=np.inf, tolerance=1e-4))
 
 
 def draw_unknowns(problem, hypothesis, rng):

@@ -12,7 +12,7 @@ from isocharge.serve.presses.measured_presses import read_presses
 from isocharge.simulate import Circle, ForwardMap, load_sensor, local_workers, parse_probe, press, touch_charge
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import CalibrationProblem, FitConfig, TrainingConfig, calibrate, write_calibration
-from isocharge.train.calibration.calibrate import solve_start
+from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.data.contact_errors import position_error
 from isocharge.train.data.presses import draw_contacts
@@ -22,7 +22,7 @@ from kept import kept
 @pytest.fixture(scope="module")
 def solved(problem) -> FilmCharges:
     """The solved film of the sensor file."""
-    return kept(solve_start, problem)
+    return kept(solve_even, problem)
 
 
 PRESSES_FILE = Path(__file__).parents[3] / "train" / "examples" / "presses.csv"

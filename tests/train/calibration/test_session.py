@@ -50,7 +50,7 @@ pytestmark = pytest.mark.usefixtures("never_solved")
 @pytest.fixture(autouse=True)
 def _synthetic_films(monkeypatch, synthetic):
     """The film of the sensor file is the synthetic film."""
-    monkeypatch.setattr(session_module, "solve_start", lambda *_: synthetic)
+    monkeypatch.setattr(session_module, "solve_even", lambda *_: synthetic)
 
 
 @pytest.fixture(scope="module")

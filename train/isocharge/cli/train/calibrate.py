@@ -20,7 +20,7 @@ from isocharge.serve.presses.measured_presses import MAX_TEMPERATURE_C, MIN_TEMP
 from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.simulate.solver.friction import MAX_FRICTION
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
-from isocharge.train.calibration.calibrate import solve_start
+from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.folder import (
     calibration_folder,
     read_earlier,
@@ -158,7 +158,7 @@ def calibrate_command(
             _write(result, output, executor)
         if next_count:
             # The next presses are chosen for the calibrated film, or for the mean film if nothing was calibrated.
-            charges = solve_start(problem, executor) if result is None else result.charges
+            charges = solve_even(problem, executor) if result is None else result.charges
             film = None if result is None else result.film
             proposed_presses = next_presses(
                 problem, charges, next_count, film, position_std_mm=position_std_mm, force_std=force_std

@@ -1,7 +1,7 @@
 """Calibration of a film: estimation of its properties from measured presses, by solving the film that is found."""
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -20,7 +20,7 @@ from isocharge.train.calibration.diagnosis import (
     misfit,
     unexplained_error,
 )
-from isocharge.train.calibration.estimator import Estimation, estimate, is_unexplained
+from isocharge.train.calibration.estimator import BAD_PROBABILITY, Estimation, estimate, is_unexplained
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.press_data import PressData, known_temperatures
@@ -42,28 +42,14 @@ The neglected second-order effect is about the square of this value.
 SUSPICIOUS_MISFIT = 8.0
 """Misfit of the recorded presses, as `misfit` returns it, above which mistakes are searched for before the fit."""
 
-UNEXPLAINED_PROBABILITY = 1e-6
-"""Probability of residuals as large as those of the best film, below which no film explains the presses."""
-
 UNEXPLAINED_CHI2 = 9.0
 """Mean squared residual above which no film explains the presses, in units of the noise variance."""
 
 MIN_SCATTER_PROBABILITY = 0.01
 """Probability of residuals as large as those of the fit, below which the stated errors are increased."""
 
-MIN_POSITION_EXTENT_MM = 1.0
-"""Range of the positions below which the presses do not determine the electrodes' positions, mm."""
-
 UNUSUAL_SHIFT = 3.0
 """Ratio of a shift or rotation of the electrodes to its prior standard deviation above which a caution is given."""
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """A solved film, and the estimate that was computed with it."""
-
-    charges: FilmCharges
-    estimation: Estimation
 
 
 def calibrate(
@@ -97,42 +83,61 @@ def calibrate(
     ordered_presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
     check_places(ordered_presses, problem.sensor.film.radius)
     _check_enough_measured(ordered_presses)
-    used_presses, cautions = _within_domain(ordered_presses, problem)
+    # Presses at the edge may lie outside the working area by their errors.
+    is_outside = problem.solved_domain.is_outside(ordered_presses.contact)
+    outside_caution = ""
+    used_presses = ordered_presses
+    if is_outside.any():
+        outside_caution = _outside_words(ordered_presses[is_outside], problem)
+        if len(ordered_presses) == 1:
+            raise PressError(outside_caution)
+        used_presses = ordered_presses[~is_outside]
     problem = _at_temperature_of(problem, used_presses)
     with threadpool_limits(1):  # the matrices are small, so a second thread would only wait
-        charges = start or solve_start(problem, executor)
-        if cautions is None:
+        charges = start or solve_even(problem, executor)
+        if is_outside.mean() > 0.5:
             raise unexplained_error(ordered_presses, charges, MOSTLY_OUTSIDE)
         check_channels(used_presses, charges)
         is_suspicious = not _is_one_place(used_presses) and misfit(used_presses, charges) > SUSPICIOUS_MISFIT
         if is_suspicious and find_mistakes(used_presses, charges):
             raise unexplained_error(used_presses, charges, FAR_FROM_ALL_FILMS)
         data = PressData.of(used_presses, problem.noise, problem.solved_domain)
-        fit = _fit_even_film(problem, data, charges, executor)
+        estimation = _fit_even_film(problem, data, charges, executor)
         if accurate:
-            fit = _fit_uneven_film(problem, data, fit, executor)
-        _refuse_unexplained(used_presses, fit)
-        estimation, scatter_cautions = _scaled_by_scatter(fit.estimation)
-        sensitivity = ContactSensitivity.of(problem, fit.charges, estimation.film.values)
+            estimation = _fit_uneven_film(problem, data, estimation, executor)
+        if is_unexplained(estimation, BAD_PROBABILITY, UNEXPLAINED_CHI2):
+            reason = large_residual_reason(np.sqrt(estimation.chi2 / estimation.redundancy))
+            raise unexplained_error(used_presses, estimation.charges, reason)
+        estimation, scatter_caution = _scaled_by_scatter(estimation)
+        sensitivity = ContactSensitivity.of(problem, estimation.charges, estimation.film.values)
+    cautions = (f"{outside_caution}; left out" if outside_caution else "", scatter_caution)
     return CalibrationResult(
         problem=problem,
         presses=used_presses,
         estimation=estimation,
-        charges=fit.charges,
         sensitivity=sensitivity,
-        cautions=(*cautions, *scatter_cautions, *_cautions(used_presses, estimation)),
+        cautions=(*filter(None, cautions), *_cautions(used_presses, estimation)),
     )
 
 
-def solve_start(problem: CalibrationProblem, executor: Executor | None = None) -> FilmCharges:
-    """Solve the film with which a calibration begins."""
-    with_side_forces = problem.friction > 0.0 or problem.side_force > 0.0
+def solve_even(
+    problem: CalibrationProblem, executor: Executor | None = None, values: Array | None = None
+) -> FilmCharges:
+    """Solve the axisymmetric film with given properties under a circular probe.
+
+    Args:
+        problem: The calibration problem.
+        executor: Executor that runs the solves; None for this process.
+        values: Properties of the film, shape (n_property,), of which the imperfections are ignored; None for those with
+            which a calibration begins.
+    """
+    layout = problem.prior.layout
     return FilmCharges.solve_roughly(
-        problem.prior.layout.prior,
-        problem.start,
+        layout.prior,
+        problem.prior.mean[layout.film] if values is None else values,
         problem.solved_domain,
         executor,
-        with_side_forces=with_side_forces,
+        with_side_forces=problem.friction > 0.0 or problem.side_force > 0.0,
     )
 
 
@@ -144,40 +149,37 @@ def solve_film(problem: CalibrationProblem, film: FilmEstimate, executor: Execut
         film: The estimate.
         executor: Executor that runs the solves; None for this process.
     """
-    charges = solve_start(replace(problem, earlier=film), executor)
+    charges = solve_even(problem, executor, film.film_values)
     contact = spread_contacts(problem.domain, N_CONTACTS)
     return charges if _is_exact(charges, film.film_values, contact) else charges.solved(film.film_values, executor)
 
 
 def _fit_even_film(
     problem: CalibrationProblem, data: PressData, charges: FilmCharges, executor: Executor | None
-) -> _Fit:
+) -> Estimation:
     """Solve axisymmetric films and estimate the properties in turn, until the estimate hardly changes."""
-    estimation: Estimation | None = None
-    for _ in range(MAX_SOLVED_FILMS):
-        estimation = _estimated(problem, data, charges, estimation)
+    estimation = _estimated(problem, data, charges, None)
+    for _ in range(MAX_SOLVED_FILMS - 1):
         values = estimation.film.film_values
-        if _solved_distance(charges, values) < SAME_FILM_STD:
+        if _solved_distance(estimation.charges, values) < SAME_FILM_STD:
             break
-        charges = FilmCharges.solve_roughly(
-            charges.prior, values, charges.domain, executor, with_side_forces=charges.side_forces is not None
-        )
-    assert estimation is not None
-    return _Fit(charges, estimation)
+        estimation = _estimated(problem, data, solve_even(problem, executor, values), estimation)
+    return estimation
 
 
-def _fit_uneven_film(problem: CalibrationProblem, data: PressData, fit: _Fit, executor: Executor | None) -> _Fit:
+def _fit_uneven_film(
+    problem: CalibrationProblem, data: PressData, estimation: Estimation, executor: Executor | None
+) -> Estimation:
     """Solve the film that was found with its imperfections and its real probe, and estimate the properties again.
 
     The film is solved at most twice. A film that is nearly even under a circular probe is not solved again.
     """
     for _ in range(2):
-        charges, estimation = fit.charges, fit.estimation
-        if _is_exact(charges, estimation.film.film_values, estimation.contact):
+        charges, values = estimation.charges, estimation.film.film_values
+        if _is_exact(charges, values, estimation.contact):
             break
-        solved = charges.solved(estimation.film.film_values, executor)
-        fit = _Fit(solved, _estimated(problem, data, solved, estimation))
-    return fit
+        estimation = _estimated(problem, data, charges.solved(values, executor), estimation)
+    return estimation
 
 
 def _estimated(
@@ -228,34 +230,14 @@ def _at_temperature_of(problem: CalibrationProblem, presses: MeasuredPresses) ->
     return replace(problem, earlier=problem.earlier.at_temperature(float(temperature_C.mean())))
 
 
-def _within_domain(
-    presses: MeasuredPresses, problem: CalibrationProblem
-) -> tuple[MeasuredPresses, tuple[str, ...] | None]:
-    """Select the presses within the domain.
-
-    Returns:
-        The presses within the domain, and warnings about the others. If most of several presses lie outside, all
-        presses are returned, with None instead of the warnings.
-
-    Raises:
-        PressError: If a single press lies outside.
-    """
-    domain = problem.solved_domain  # presses at the edge may lie outside the working area by their errors
-    contact = presses.contact
+def _outside_words(presses: MeasuredPresses, problem: CalibrationProblem) -> str:
+    """Return words that name presses outside the domain."""
+    domain = problem.solved_domain
     low, high = domain.force_range
-    is_far = np.hypot(contact[:, 0], contact[:, 1]) > domain.radius  # False for an unknown position
-    is_outside = is_far | (contact[:, 2] < low) | (contact[:, 2] > high)
-    if not is_outside.any():
-        return presses, ()
-    sentence = (
-        f"{row_words(presses[is_outside].lines, presses.row_noun)}: a calibration takes presses within "
+    return (
+        f"{row_words(presses.lines, presses.row_noun)}: a calibration takes presses within "
         f"{domain.radius:.3g} mm of the centre and of {low:.2g} to {high:.2g} N"
     )
-    if is_outside.all() and len(presses) == 1:
-        raise PressError(sentence)
-    if is_outside.mean() > 0.5:
-        return presses, None
-    return presses[~is_outside], (f"{sentence}; left out",)
 
 
 def _check_enough_measured(presses: MeasuredPresses) -> None:
@@ -268,18 +250,14 @@ def _check_enough_measured(presses: MeasuredPresses) -> None:
         )
 
 
-def _refuse_unexplained(presses: MeasuredPresses, fit: _Fit) -> None:
-    """Raise PressError if the residuals are so large that no film explains the presses."""
-    estimation = fit.estimation
-    if is_unexplained(estimation, UNEXPLAINED_PROBABILITY, UNEXPLAINED_CHI2):
-        ratio = float(np.sqrt(estimation.chi2 / estimation.redundancy))
-        raise unexplained_error(presses, fit.charges, large_residual_reason(ratio))
+def _scaled_by_scatter(estimation: Estimation) -> tuple[Estimation, str]:
+    """Increase the covariance by Birge's ratio (Birge 1932) if the presses scatter more than expected.
 
-
-def _scaled_by_scatter(estimation: Estimation) -> tuple[Estimation, tuple[str, ...]]:
-    """Increase the covariance by Birge's ratio (Birge 1932) if the presses scatter more than expected."""
+    Returns:
+        The estimate, and a caution, which is empty if the covariance is unchanged.
+    """
     if not is_unexplained(estimation, MIN_SCATTER_PROBABILITY, 1.0):
-        return estimation, ()
+        return estimation, ""
     ratio = estimation.chi2 / estimation.redundancy
     film = replace(estimation.film, covariance=ratio * estimation.film.covariance)
     caution = (
@@ -287,7 +265,7 @@ def _scaled_by_scatter(estimation: Estimation) -> tuple[Estimation, tuple[str, .
         "the rig explain; the stated errors are increased by this factor: are positions and forces as certain as "
         "assumed?"
     )
-    return replace(estimation, film=film), (caution,)
+    return replace(estimation, film=film), caution
 
 
 def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
@@ -317,6 +295,6 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
 
 
 def _is_one_place(presses: MeasuredPresses) -> bool:
-    """Return whether the presses have known positions, which are all at one place."""
+    """Return whether the presses have known positions, which are the same within their errors."""
     position = presses.contact[np.isfinite(presses.contact[:, 0]), :2]
-    return len(position) > 0 and float(np.ptp(position, axis=0).max()) < MIN_POSITION_EXTENT_MM
+    return len(position) > 0 and float(np.ptp(position, axis=0).max()) <= 6.0 * float(presses.position_std_mm.max())

@@ -18,15 +18,9 @@ from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.train.calibration.film_charges import FilmCharges
 
 MAX_DEAD_RATIO = 0.02
-"""Ratio of the median charge of a channel to that of the other channels, below which the channel counts as dead.
+"""Ratio of the typical charge of a channel to that of all channels, below which the channel counts as dead.
 
 The limit is lower for a channel whose charges are smaller than those of the other channels on some possible film."""
-
-MIN_TYPICAL_CHARGE_pC = 1e-9
-"""Smallest charge by which other charges are divided, pC."""
-
-MAX_REVERSED_FRACTION = 0.8
-"""Fraction of charges with the opposite sign to that of every film, above which a channel counts as reversed."""
 
 MIN_POSITION_RANGE_MM = 0.05
 """Smallest credible range of the positions, mm. Positions in a smaller range were probably written in metres."""
@@ -76,24 +70,11 @@ OFFSET_STD = 0.6
 
 The piezoelectric coefficients cause such an offset."""
 
-MIN_CHARGE_RATIO = 1e-3
-"""Lower limit of measured divided by expected charges.
-
-Smaller ratios and ratios of opposite signs are replaced by it."""
-
 MAX_SQUARED_DEVIATION = 4.0
 """Upper limit of the squared deviation between logarithms of charges, which bounds the effect of outliers."""
 
-MAX_OUTSIDE_FRACTION = 0.2
-"""Largest fraction of presses outside the domain for which a misfit is computed."""
-
 BETTER_MISFIT_RATIO = 0.25
-"""Ratio of two misfits below which one explanation of the presses counts as clearly better than another.
-
-For example, the correction of a mistake must reduce the misfit to less than this fraction."""
-
-MAX_MISFIT_RATIO = 2.0
-"""Largest misfit after a correction for which the mistake is named, relative to that after the best correction."""
+"""Ratio of two misfits below which one explanation of the presses counts as clearly better than another."""
 
 AXES = (
     ("they are turned by 90 degrees", np.array([[0.0, -1.0], [1.0, 0.0]])),
@@ -169,24 +150,22 @@ def _check_dead_channels(presses: MeasuredPresses, film_charges: Array) -> None:
         film_charges: Charges of the presses with a known place and force, on a few films, shape (n_film, n_placed,
             n_electrode), pC.
     """
-    smallest_film_ratios = np.ones(len(presses.electrodes))
-    if film_charges.shape[1]:
-        film_ratios = [_charge_ratios(film_charge) for film_charge in film_charges]
-        smallest_film_ratios = np.minimum(np.min(film_ratios, axis=0), 1.0)
-    ratios = _charge_ratios(presses.charge_pC)
-    for name, channel_charge, ratio, film_ratio in zip(
-        presses.electrodes, presses.charge_pC.T, ratios, smallest_film_ratios, strict=True
-    ):
-        if ratio < MAX_DEAD_RATIO * film_ratio:
-            raise PressError(
-                f"electrode {name!r} is dead: half of its charges are below "
-                f"{np.nanmedian(np.abs(channel_charge)):.3g} pC, {100.0 * ratio:.2g} % of those of the others; check "
-                "the channel, its cable and its amplifier"
-            )
+    smallest_film_ratio = np.ones(len(presses.electrodes))
+    for film_charge in film_charges if film_charges.size else ():
+        smallest_film_ratio = np.minimum(smallest_film_ratio, _charge_ratios(film_charge))
+    typical_charge = np.nanmedian(np.abs(presses.charge_pC), axis=0)
+    ratio = _charge_ratios(presses.charge_pC)
+    is_dead = ratio < MAX_DEAD_RATIO * smallest_film_ratio
+    for channel in np.flatnonzero(is_dead):
+        raise PressError(
+            f"electrode {presses.electrodes[channel]!r} is dead: half of its charges are below "
+            f"{typical_charge[channel]:.3g} pC, {100.0 * ratio[channel]:.2g} % of those of the others; check "
+            "the channel, its cable and its amplifier"
+        )
 
 
 def _check_signs(presses: MeasuredPresses, film_charges: Array) -> None:
-    """Raise an error if nearly all charges of a channel have the opposite sign to that of every film.
+    """Raise an error if most charges of a channel have the opposite sign to that of every film.
 
     Args:
         presses: The measured presses with a known place and force.
@@ -195,14 +174,13 @@ def _check_signs(presses: MeasuredPresses, film_charges: Array) -> None:
     is_opposite = (presses.charge_pC * film_charges < 0.0).all(axis=0)  # False for NaN
     opposite_counts = is_opposite.sum(axis=0)
     measured_counts = np.isfinite(presses.charge_pC).sum(axis=0)
-    reversed_channels = np.flatnonzero(opposite_counts > MAX_REVERSED_FRACTION * measured_counts)
+    reversed_channels = np.flatnonzero(opposite_counts > 0.5 * measured_counts)
     if reversed_channels.size == len(presses.electrodes):
         raise PressError(
             "the charges of all electrodes have the opposite sign to those of the film; exchange the wires, change the "
             "sign of the charges, or change the signs of d31 and d32 in the sensor file"
         )
-    if reversed_channels.size:
-        channel = reversed_channels[0]
+    for channel in reversed_channels:
         raise PressError(
             f"electrode {presses.electrodes[channel]!r}: {opposite_counts[channel]} of its {measured_counts[channel]} "
             "charges have the opposite sign to those of the film; exchange its wires or its sign"
@@ -210,23 +188,16 @@ def _check_signs(presses: MeasuredPresses, film_charges: Array) -> None:
 
 
 def _charge_ratios(charge: Array) -> Array:
-    """Return the typical charge of each channel, divided by the typical charge of the other channels.
+    """Return the typical charge of each channel, divided by that of all channels, shape (n_electrode,).
 
-    The typical charge of one channel is the median of the magnitudes of its charges. The typical charge of several
-    channels is the median of the typical charges of these channels.
+    A typical charge is the median of magnitudes. The ratio is 1 for channels whose typical charges are all zero.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC; NaN where a charge was not measured.
-
-    Returns:
-        Ratios, shape (n_electrode,).
     """
-    typical_charge = np.nanmedian(np.abs(charge), axis=0)  # shape (n_electrode,)
-    typical_of_others = []
-    for channel in range(typical_charge.size):
-        other_channels = np.delete(typical_charge, channel)
-        typical_of_others.append(np.median(other_channels))
-    return np.asarray(typical_charge / np.maximum(typical_of_others, MIN_TYPICAL_CHARGE_pC))
+    typical_charge = np.nanmedian(np.abs(charge), axis=0)
+    middle = np.median(typical_charge)
+    return np.asarray(np.divide(typical_charge, middle, out=np.ones_like(typical_charge), where=middle > 0.0))
 
 
 def expected_charges(charges: FilmCharges, contact: Array) -> Array:
@@ -253,9 +224,8 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     """Find the mistakes whose correction makes the presses agree far better with a film.
 
-    A mistake is returned if its correction reduces the misfit to less than `BETTER_MISFIT_RATIO` times the misfit
-    without corrections. The misfit after the correction must also be at most `MAX_MISFIT_RATIO` times the misfit after
-    the best correction.
+    A mistake is returned if the presses agree clearly better with a film after its correction than before, and no other
+    correction is clearly better.
 
     Args:
         presses: The measured presses. A press whose place or force is unknown is not used.
@@ -268,31 +238,19 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     placed_presses = presses[presses.placed]
     if not len(placed_presses):
         return []
-    corrections = list(_possible_corrections(placed_presses, charges))
-
-    # The charges of the films are computed for all corrected contacts in one call, because this is faster. The result
-    # has the shape (n_film, n_correction * n, n_electrode), and is then split into one array for each correction.
-    all_contacts = np.concatenate([correction.contact for correction in corrections])
-    charges_by_correction = np.split(expected_charges(charges, all_contacts), len(corrections), axis=1)
-    corrected_misfits = {}  # misfit after each correction, by the sentence about the mistake
-    for correction, film_charges in zip(corrections, charges_by_correction, strict=True):
-        corrected_misfits[correction.sentence] = charge_misfit(
-            charges, correction.contact, correction.charge, film_charges
-        )
-
-    # A correction must improve the misfit clearly, and must be nearly as good as the best correction.
-    improvement_limit = BETTER_MISFIT_RATIO * misfit(presses, charges)
-    similarity_limit = MAX_MISFIT_RATIO * min(corrected_misfits.values())
-    sentences_best_first = sorted(corrected_misfits, key=lambda sentence: corrected_misfits[sentence])
-    return [
-        sentence
-        for sentence in sentences_best_first
-        if corrected_misfits[sentence] < improvement_limit and corrected_misfits[sentence] <= similarity_limit
+    misfits = {
+        correction.sentence: contact_misfit(correction.contact, correction.charge, charges)
+        for correction in _possible_corrections(placed_presses, charges)
+    }
+    limit = BETTER_MISFIT_RATIO * misfit(presses, charges)
+    clear = [
+        sentence for sentence in sorted(misfits, key=lambda sentence: misfits[sentence]) if misfits[sentence] < limit
     ]
+    return [sentence for sentence in clear if misfits[clear[0]] >= BETTER_MISFIT_RATIO * misfits[sentence]]
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
-    """Return the misfit of all presses with a known place and force; see `charge_misfit`.
+    """Return the misfit of all presses with a known place and force; see `contact_misfit`.
 
     If there are no such presses, the misfit is 0. Correctly recorded presses usually have a misfit of about 1. A misfit
     of 20 indicates a mistake in the records.
@@ -304,11 +262,10 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
     placed_presses = presses[presses.placed]
     if not len(placed_presses):
         return 0.0
-    film_charges = expected_charges(charges, placed_presses.contact)
-    return charge_misfit(charges, placed_presses.contact, placed_presses.charge_pC, film_charges)
+    return contact_misfit(placed_presses.contact, placed_presses.charge_pC, charges)
 
 
-def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected: Array) -> float:
+def contact_misfit(contact: Array, charge: Array, charges: FilmCharges) -> float:
     """Compute the misfit between measured charges and the charges of the most similar film.
 
     The misfit of one film is computed from the logarithms of the ratio of measured charge to expected charge. It is the
@@ -317,37 +274,33 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
     median of the logarithms, divided by `OFFSET_STD` squared. The function returns the smallest misfit of all films.
 
     Args:
-        charges: Charges of a film and of similar films, with their domain. The misfit is infinite if more than
-            `MAX_OUTSIDE_FRACTION` of the contacts lie outside this domain.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         charge: Measured charges, shape (n, n_electrode), pC; NaN where a charge was not measured.
-        expected: Charges of each film, shape (n_film, n, n_electrode), pC.
+        charges: Charges of a film and of similar films. The misfit is infinite if most of the contacts lie outside
+            their domain.
     """
-    # A contact lies outside the domain if it differs from the nearest contact of the domain.
-    is_outside = (charges.into_domain(contact) != contact).any(axis=1)
-    if is_outside.mean() > MAX_OUTSIDE_FRACTION:
+    if charges.domain.is_outside(contact).mean() > 0.5:
         return np.inf
-    # For each film, the offset is the median over all charges. The scatter is the mean squared deviation from this
-    # offset. Both have the shape (n_film,).
-    log_ratio = _log_ratio(charge, expected)  # shape (n_film, n, n_electrode)
+    # The offset of a film is the median over all charges, shape (n_film,).
+    log_ratio = _log_ratio(charge, expected_charges(charges, contact))  # shape (n_film, n, n_electrode)
     offset = np.nanmedian(log_ratio, axis=(1, 2))
     squared_deviation = np.minimum((log_ratio - offset[:, None, None]) ** 2, MAX_SQUARED_DEVIATION)
     scatter = np.nanmean(squared_deviation, axis=(1, 2))
-    film_misfit = scatter / SCATTER_STD**2 + (offset / OFFSET_STD) ** 2
-    return float(np.min(film_misfit))
+    return float(np.min(scatter / SCATTER_STD**2 + (offset / OFFSET_STD) ** 2))
 
 
 def _log_ratio(measured: Array, expected: Array) -> Array:
     """Return the logarithms of measured divided by expected charges. NaN remains NaN.
 
-    Ratios below `MIN_CHARGE_RATIO`, and negative ratios of charges with opposite signs, are first set to this limit.
+    The logarithm of a charge with the opposite sign, or of one whose expected charge is zero, is very small.
 
     Args:
         measured: Measured charges, pC.
         expected: Charges of films, pC, of a shape that can be broadcast with that of the measured charges.
     """
-    not_zero = np.where(np.abs(expected) < MIN_TYPICAL_CHARGE_pC, MIN_TYPICAL_CHARGE_pC, expected)
-    return np.asarray(np.log(np.maximum(measured / not_zero, MIN_CHARGE_RATIO)))
+    tiny = np.finfo(float).tiny
+    ratio = measured * expected / np.maximum(expected**2, tiny)
+    return np.asarray(np.log(np.maximum(ratio, tiny)))
 
 
 class Correction(NamedTuple):
@@ -437,9 +390,6 @@ FAR_FROM_ALL_FILMS = "their charges are very different from those of its films"
 
 MOSTLY_OUTSIDE = "most of them lie outside the places and forces of a calibration"
 """Reason why presses are refused if more than half of them lie outside the domain of the films."""
-
-UNUSUAL_FILM = "only a film that differs unusually from its description has such charges"
-"""Reason why presses are refused if a common mistake in the records would explain them far better."""
 
 
 def large_residual_reason(residual_over_noise: float) -> str:

@@ -25,19 +25,8 @@ from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout
 from isocharge.train.calibration.press_data import PressData
 
-MAX_LOG_FORCE = 20.0
-"""Largest logarithm of a force during the search, so that no number overflows."""
-
 UNKNOWN_CHARGE_STD = 1e9
 """Standard deviation of a charge that was not measured, pC."""
-
-TOLERANCE = 0.02
-"""Reduction of the minimised function by one step, below which the search ends.
-
-A step of 0.2 posterior standard deviations causes such a reduction."""
-
-DEGREES_OF_FREEDOM = 5.0
-"""Degrees of freedom of Student's t distribution, from which the weights of the presses follow."""
 
 BAD_PROBABILITY = 1e-5
 """Probability of residuals as large as those of a press, below which the press is left out."""
@@ -157,6 +146,25 @@ class Linearised:
     jacobian: Array
     contact_jacobian: Array
 
+    @classmethod
+    def of(cls, model: ModelValues, data: PressData, contact: Array) -> "Linearised":
+        """Compare the charges of a model with those of presses.
+
+        Args:
+            model: Charges of the presses at the contacts, and their derivatives.
+            data: The presses.
+            contact: Contacts (x, y, ln F), shape (n, 3).
+        """
+        weight = 1.0 / data.charge_std
+        contact_weight = 1.0 / data.contact_std
+        charge_residual = weight * (model.charge_pC - data.charge)
+        contact_rows = contact_weight[:, :, None] * np.eye(3)
+        return cls(
+            np.column_stack([charge_residual, contact_weight * (contact - data.contact)]),
+            np.pad(weight[:, :, None] * model.by_state, ((0, 0), (0, 3), (0, 0))),
+            np.concatenate([weight[:, :, None] * model.by_contact, contact_rows], axis=1),
+        )
+
     def eliminated(self) -> tuple[Array, Array]:
         """Return the residuals and their derivatives after the best change of each contact.
 
@@ -180,6 +188,7 @@ class Estimation:
     """Result of the estimator.
 
     Attributes:
+        charges: The solved film, with whose charges and derivatives the unknowns were estimated.
         film: The estimate, averaged over the hypotheses.
         contact: Most probable contacts (x, y, F), shape (n, 3), mm and N.
         is_bad: Whether each press was left out, shape (n,).
@@ -191,6 +200,7 @@ class Estimation:
         hypothesis: The most probable hypothesis.
     """
 
+    charges: FilmCharges
     film: FilmEstimate
     contact: Array
     is_bad: Booleans
@@ -234,22 +244,13 @@ def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns
 
 def linearise(charges: FilmCharges, layout: Layout, data: PressData, unknowns: Array, contact: Array) -> Linearised:
     """Compute the residuals of presses and their derivatives; see `model_values`."""
-    model = model_values(charges, layout, data, unknowns, contact)
-    weight = 1.0 / data.charge_std
-    contact_weight = 1.0 / data.contact_std
-    charge_residual = weight * (model.charge_pC - data.charge)
-    contact_rows = contact_weight[:, :, None] * np.eye(3)
-    padding = np.zeros((len(data), 3, len(unknowns)))
-    return Linearised(
-        np.column_stack([charge_residual, contact_weight * (contact - data.contact)]),
-        np.concatenate([weight[:, :, None] * model.by_state, padding], axis=1),
-        np.concatenate([weight[:, :, None] * model.by_contact, contact_rows], axis=1),
-    )
+    return Linearised.of(model_values(charges, layout, data, unknowns, contact), data, contact)
 
 
 def _in_domain(contact: Array, charges: FilmCharges) -> Array:
     """Convert contacts (x, y, ln F) to (x, y, F), and move contacts outside the domain to its nearest contact."""
-    return charges.into_domain(np.column_stack([contact[:, :2], np.exp(np.minimum(contact[:, 2], MAX_LOG_FORCE))]))
+    log_force = np.clip(contact[:, 2], *np.log(charges.domain.force_range))  # no number overflows
+    return charges.into_domain(np.column_stack([contact[:, :2], np.exp(log_force)]))
 
 
 def estimate(
@@ -280,15 +281,19 @@ def estimate(
     all_hypotheses = list(hypotheses(data))
     used_data, used_contact = data[is_used], log_contact[is_used]
     for _ in range(2):
-        linearised = linearise(charges, layout, used_data, unknowns, used_contact)
-        estimates = [_posterior(linearised, used_data, prior, one, unknowns) for one in all_hypotheses]
+        model = model_values(charges, layout, used_data, unknowns, used_contact)
+        evidence_by_scatter = {
+            scatter: _Evidence.of(model, used_data.with_force_scatter(scatter), used_contact)
+            for scatter, _ in FORCE_SCATTERS
+        }
+        estimates = [evidence_by_scatter[one.force_scatter].posterior(prior, one, unknowns) for one in all_hypotheses]
         log_evidence = np.array([one.log_evidence for one in estimates])
         weight = np.exp(log_evidence - log_evidence.max())
         weight /= weight.sum()
         means = np.array([one.mean for one in estimates])
         mean = weight @ means
         best = estimates[int(weight.argmax())]
-        used_contact = used_contact + linearised.contact_change(mean - unknowns)
+        used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
         unknowns = _bounded(mean, layout)
     deviation = means - mean
     covariance = sum(w * one.covariance for w, one in zip(weight, estimates, strict=True))
@@ -300,6 +305,7 @@ def estimate(
     final_chi2 = (final_residual**2).sum(axis=1)
     film = FilmEstimate(layout, unknowns, np.asarray(covariance), data.mean_C)
     return Estimation(
+        charges=charges,
         film=film,
         contact=_in_domain(log_contact, charges),
         is_bad=is_bad,
@@ -350,8 +356,6 @@ def _search(charges: FilmCharges, data: PressData, prior: Prior, unknowns: Array
         contact,
         measured=MeasuredContacts(data.contact, data.contact_std),
         state_bounds=(low[is_free], high[is_free]),
-        freedom=DEGREES_OF_FREEDOM,
-        tolerance=TOLERANCE,
     )
     return found._replace(state=all_unknowns(found.state))
 
@@ -366,55 +370,54 @@ class _Posterior:
     chi2: float
 
 
-def _posterior(
-    linearised: Linearised, data: PressData, prior: Prior, hypothesis: Hypothesis, unknowns: Array
-) -> _Posterior:
-    """Compute the estimate and the evidence of a hypothesis from the linearised problem.
+@dataclass(frozen=True)
+class _Evidence:
+    """What presses with one scatter of the forces state about the unknowns, in the linearised problem.
 
-    Args:
-        linearised: Residuals at `unknowns`, and their derivatives, with the stated errors of the forces.
-        data: The presses of the residuals.
-        prior: Prior distribution.
-        hypothesis: The hypothesis.
-        unknowns: Unknowns at which the residuals were computed.
+    Attributes:
+        residual: Residuals from which the contacts are eliminated, shape (n_residual,).
+        jacobian: Their derivatives with respect to the unknowns, shape (n_residual, n_unknown).
+        log_volume: Logarithm of the density of the measured contacts, and of the volume of the possible contacts.
     """
-    log_scatter_volume = 0.0
-    if hypothesis.force_scatter > 0.0:
-        stated_std = data.contact_std[:, 2]
-        scattered_std = data.with_force_scatter(hypothesis.force_scatter).contact_std[:, 2]
-        ratio = np.divide(stated_std, scattered_std, out=np.ones(len(data)), where=np.isfinite(stated_std))
-        scale = np.ones_like(linearised.residual)
-        scale[:, -1] = ratio
-        linearised = Linearised(
-            scale * linearised.residual,
-            linearised.jacobian,
-            scale[:, :, None] * linearised.contact_jacobian,
-        )
-        log_scatter_volume = float(np.log(ratio).sum())
-    residual, jacobian = linearised.eliminated()
-    log_contact_volume = (
-        -0.5 * np.linalg.slogdet(linearised.contact_jacobian.swapaxes(1, 2) @ linearised.contact_jacobian)[1].sum()
-    )
-    covariance = prior.covariance(hypothesis)
-    is_free = np.diag(covariance) > 0.0
-    prior_covariance = covariance[np.ix_(is_free, is_free)]
-    precision = np.linalg.inv(prior_covariance)
-    flat_jacobian = jacobian[:, :, is_free].reshape(-1, int(is_free.sum()))
-    at_prior = residual.ravel() - jacobian.reshape(-1, len(unknowns)) @ (unknowns - prior.mean)
-    matrix = precision + flat_jacobian.T @ flat_jacobian
-    posterior_covariance = np.linalg.inv(matrix)
-    change = -posterior_covariance @ (flat_jacobian.T @ at_prior)
-    mean = prior.mean.copy()
-    mean[is_free] += change
-    misfit = at_prior + flat_jacobian @ change
-    chi2 = float(misfit @ misfit + change @ precision @ change)
-    log_determinant = np.linalg.slogdet(matrix)[1] + np.linalg.slogdet(prior_covariance)[1]
-    log_evidence = (
-        -0.5 * (chi2 + log_determinant) + log_contact_volume + log_scatter_volume + np.log(hypothesis.probability)
-    )
-    full_covariance = np.zeros_like(covariance)
-    full_covariance[np.ix_(is_free, is_free)] = posterior_covariance
-    return _Posterior(mean, full_covariance, float(log_evidence), chi2)
+
+    residual: Array
+    jacobian: Array
+    log_volume: float
+
+    @classmethod
+    def of(cls, model: ModelValues, data: PressData, contact: Array) -> "_Evidence":
+        """Eliminate the contacts; the arguments are those of `Linearised.of`."""
+        linearised = Linearised.of(model, data, contact)
+        residual, jacobian = linearised.eliminated()
+        by_contact = linearised.contact_jacobian
+        log_contact_volume = -0.5 * np.linalg.slogdet(by_contact.swapaxes(1, 2) @ by_contact)[1].sum()
+        force_std = data.contact_std[:, 2]
+        log_density = -np.log(force_std[np.isfinite(force_std)]).sum()
+        return cls(residual.ravel(), jacobian.reshape(residual.size, -1), float(log_contact_volume + log_density))
+
+    def posterior(self, prior: Prior, hypothesis: Hypothesis, unknowns: Array) -> _Posterior:
+        """Compute the estimate and the evidence of a hypothesis.
+
+        Args:
+            prior: Prior distribution.
+            hypothesis: The hypothesis, whose scatter of the forces is that of the presses.
+            unknowns: Unknowns at which the residuals were computed.
+        """
+        covariance = prior.covariance(hypothesis)
+        is_free = np.diag(covariance) > 0.0
+        free = np.ix_(is_free, is_free)
+        precision = np.linalg.inv(covariance[free])
+        free_jacobian = self.jacobian[:, is_free]
+        at_prior = self.residual - self.jacobian @ (unknowns - prior.mean)
+        matrix = precision + free_jacobian.T @ free_jacobian
+        posterior_covariance = np.zeros_like(covariance)
+        posterior_covariance[free] = np.linalg.inv(matrix)
+        change = -posterior_covariance @ (self.jacobian.T @ at_prior)
+        misfit = at_prior + self.jacobian @ change
+        chi2 = float(misfit @ misfit + change[is_free] @ precision @ change[is_free])
+        log_determinant = np.linalg.slogdet(matrix)[1] + np.linalg.slogdet(covariance[free])[1]
+        log_evidence = -0.5 * (chi2 + log_determinant) + self.log_volume + np.log(hypothesis.probability)
+        return _Posterior(prior.mean + change, posterior_covariance, float(log_evidence), chi2)
 
 
 def _redundancy(data: PressData) -> Array:

@@ -23,9 +23,6 @@ SOLVED_STEP = 1.0 / 3.0
 READING_STEP = 0.05
 """Step of the difference quotients for which the solved film is only read again, in prior standard deviations."""
 
-MIN_DISTANCE_MM = 1e-9
-"""Smallest distance from the centre by which is divided, mm."""
-
 MAX_LOG_CHANGE = 1.0
 """Largest change of the logarithm of a charge to which a first-order change is applied."""
 
@@ -139,7 +136,7 @@ class FilmCharges:
         """Move each contact (x, y, F), shape (n, 3), that lies outside the domain to the nearest contact in it."""
         position = contact[:, :2]
         distance = np.hypot(position[:, 0], position[:, 1])[:, None]
-        shrink = np.minimum(1.0, self.domain.radius / np.maximum(distance, MIN_DISTANCE_MM))
+        shrink = self.domain.radius / np.maximum(distance, self.domain.radius)
         return np.column_stack([shrink * position, np.clip(contact[:, 2], *self.domain.force_range)])
 
     def charges(self, values: Array, contact: Array) -> Array:

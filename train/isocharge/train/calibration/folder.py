@@ -260,6 +260,7 @@ def read_moved(
         problem=problem,
         presses=no_presses(problem.electrodes),
         estimation=Estimation(
+            charges=charges,
             film=moved,
             contact=np.empty((0, 3)),
             is_bad=np.empty(0, dtype=bool),
@@ -268,7 +269,6 @@ def read_moved(
             redundancy=0.0,
             hypothesis=PLANNED,
         ),
-        charges=charges,
         sensitivity=ContactSensitivity.of(problem, charges, moved.values),
         move_text=f"moved from {film.at_C:.1f} C, {version}, to {to_C:.1f} C by the change in its calibration",
     )

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Domain, FilmPrior, NoiseModel, Probe, Sensor, noise_model
@@ -92,8 +90,3 @@ class CalibrationProblem:
         largest_radius = self.sensor.film.inner_radius - RIM_MARGIN * reach
         radius = min(self.radius + POSITION_MARGIN_MM, max(self.radius, largest_radius))
         return Domain(radius, (low / FORCE_MARGIN, high * FORCE_MARGIN))
-
-    @property
-    def start(self) -> np.ndarray:
-        """Properties of the film that is solved first, shape (n_property,)."""
-        return self.prior.mean[self.prior.layout.film]

@@ -17,9 +17,6 @@ from isocharge.train.calibration.problem import CalibrationProblem
 IDENTIFIED_RATIO = 0.5
 """Ratio of the standard deviation after the presses to that before, up to which a property counts as identified."""
 
-SHOWN = 5
-"""Largest number of properties in a sentence."""
-
 
 @dataclass(frozen=True)
 class PropertyEstimate:
@@ -53,7 +50,6 @@ class CalibrationResult:
         problem: The calibration problem.
         presses: The presses, with those that were left out as bad.
         estimation: Result of the estimator.
-        charges: The solved film.
         sensitivity: Effects of noise and of errors of the film on contacts.
         cautions: Warnings for the user.
         move_text: Description of the change of temperature, if an earlier calibration was moved without presses.
@@ -62,10 +58,14 @@ class CalibrationResult:
     problem: CalibrationProblem
     presses: MeasuredPresses
     estimation: Estimation
-    charges: FilmCharges
     sensitivity: ContactSensitivity
     cautions: tuple[str, ...] = ()
     move_text: str = ""
+
+    @property
+    def charges(self) -> FilmCharges:
+        """The solved film."""
+        return self.estimation.charges
 
     @property
     def film(self) -> FilmEstimate:
@@ -125,7 +125,7 @@ class CalibrationResult:
         if identified:
             shown = [
                 f"{name.replace('_', ' ')} {one.value:.3g} +- {one.std:.2g}{'' if one.unit == '1' else ' ' + one.unit}"
-                for name, one in list(identified.items())[:SHOWN]
+                for name, one in identified.items()
             ]
             sentences.append(f"The presses determine {', '.join(shown)}.")
         unidentified = [name.replace("_", " ") for name in self.properties if name not in identified]

@@ -17,7 +17,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.train.calibration.calibrate import calibrate, solve_start
+from isocharge.train.calibration.calibrate import calibrate, solve_even
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.estimator import FEW_PRESSES
 from isocharge.train.calibration.film_charges import FilmCharges
@@ -216,7 +216,7 @@ class PressSession:
     def _charges(self) -> FilmCharges:
         """The film that was solved last, or the film of the sensor file."""
         if self._solved is None:
-            self._solved = solve_start(self.problem, self._executor)
+            self._solved = solve_even(self.problem, self._executor)
         return self._solved
 
     @property
