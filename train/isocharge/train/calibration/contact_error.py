@@ -32,10 +32,7 @@ from isocharge.train.calibration.press_data import PressData
 from isocharge.train.calibration.problem import CalibrationProblem
 
 N_CONTACTS = 200
-"""Number of contacts over which the errors are averaged."""
-
-N_CANDIDATES = 80
-"""Number of positions that are compared for the next press."""
+"""Number of contacts over which the errors are averaged, and of positions that are compared for the next press."""
 
 CANDIDATE_FORCES = (0.15, 0.45, 0.95)
 """Forces that are compared, on a logarithmic scale from 0 (smallest force) to 1 (largest force)."""
@@ -45,9 +42,6 @@ GRID_MM = 0.5
 
 GRID_N = 0.05
 """Grid to which proposed forces are rounded, N."""
-
-AVOIDED_DISTANCE_MM = 1.0
-"""Distance from an avoided position within which no press is proposed, mm."""
 
 PLANNED = Hypothesis(0.5, 0.01, (0.0,) * len(SESSION), 0.0, 1.0)
 """Imperfections and discrepancy that are assumed when presses are planned before the first press."""
@@ -210,12 +204,12 @@ def spread_contacts(domain: Domain, count: int) -> Array:
 def _candidates(problem: CalibrationProblem, avoid_mm: Array | None) -> Array:
     """Return the presses that are compared, (x, y, F), shape (n, 3)."""
     domain = problem.domain
-    point = sunflower(N_CANDIDATES) * domain.radius
-    position = np.unique(np.round(np.column_stack([point.real, point.imag]) / GRID_MM) * GRID_MM, axis=0)
+    grid_position = np.unique(np.round(spread_contacts(domain, N_CONTACTS)[:, :2] / GRID_MM), axis=0)
+    position = GRID_MM * grid_position
     position = position[np.hypot(*position.T) <= domain.radius]
     if avoid_mm is not None and len(avoid_mm):
         distance = np.linalg.norm(position[:, None] - avoid_mm, axis=2).min(axis=1)
-        position = position[distance > AVOIDED_DISTANCE_MM]
+        position = position[distance > 2.0 * GRID_MM]  # not beside the avoided position either
     low, high = domain.force_range
     strongest = force_within_stress(problem.sensor.film, problem.probe, problem.stress_limit, domain.force_range)
     high = min(high, strongest)

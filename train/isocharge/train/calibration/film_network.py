@@ -18,6 +18,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.model.charge_series import ChargeSeries, series_size
 from isocharge.serve.model.chebyshev_series import Series
+from isocharge.serve.presses.measured_presses import CONTACT
 from isocharge.simulate import Domain, ForwardMap, NoiseModel
 from isocharge.simulate.forward.derivative_maps import NODE_COUNT
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
@@ -44,16 +45,9 @@ MIN_DIRECTION = 0.1
 """Smallest root-mean-square effect of a direction on a charge, in standard deviations of the noise, that is kept."""
 
 NODES_MPa = (-0.7, -0.3, 0.0, 0.4, 0.9)
-"""Changes of the pretension at the nodes of a film that can be followed, MPa."""
+"""Changes of the pretension at the nodes of a film that can be followed, MPa.
 
-MIN_NODE_PRETENSION_MPa = 0.02
-"""Smallest pretension of a film at a node, MPa."""
-
-MIN_NODE_DISTANCE_MPa = 0.1
-"""Smallest distance of the lowest node from the next node, MPa."""
-
-FEWEST_FOLLOWED = 4
-"""Smallest number of electrodes with which a film can be followed. Three charges only determine the contact."""
+The negative changes are smaller for a film that they would make slack."""
 
 PRESSES = 60_000
 """Number of presses from which the network learns."""
@@ -97,7 +91,7 @@ def compact_charges(
     contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
     charge = _film_charges(charges, film, contact)
     names = charges.prior.sensor.electrode_names
-    node_MPa = _nodes(film) if len(names) >= FEWEST_FOLLOWED else np.zeros(1)
+    node_MPa = _nodes(film) if len(names) > len(CONTACT) else np.zeros(1)  # three charges only determine the contact
     factors = _tension_factors(charges, film, contact, node_MPa, executor)
     series = fit_film_series(domain, names, contact, charge[:, None] * factors, node_MPa)
 
@@ -127,12 +121,10 @@ def _film_charges(charges: FilmCharges, film: FilmEstimate, contact: Array) -> A
 
 def _nodes(film: FilmEstimate) -> Array:
     """Return the changes of the pretension at the nodes, of which none makes the film slack, shape (n_node,), MPa."""
-    lowest = MIN_NODE_PRETENSION_MPa - film.value(PRETENSION.name)
-    reachable = [change for change in NODES_MPa if change >= min(lowest, 0.0)]
-    # If the film cannot reach the lowest node, the lowest reachable pretension replaces it.
-    if reachable[0] > NODES_MPa[0] and lowest < reachable[0] - MIN_NODE_DISTANCE_MPa:
-        reachable.insert(0, lowest)
-    return np.array(reachable)
+    node_MPa = np.array(NODES_MPa)
+    lowest_MPa = -0.95 * film.value(PRETENSION.name)
+    reach = min(1.0, lowest_MPa / node_MPa.min()) if node_MPa.min() < 0.0 else 1.0
+    return np.unique(np.where(node_MPa < 0.0, reach * node_MPa, node_MPa))
 
 
 def _tension_factors(

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, MaxNLocator
 from matplotlib.tri import Triangulation
 
 from isocharge.common.arrays import Array
@@ -30,9 +30,6 @@ The map is averaged, because neighbouring contacts have different forces."""
 
 MAX_DRAWN_RESIDUAL = 10.0
 """Height of the largest bar of a residual, relative to the expected size of the residual."""
-
-MAX_TICKS = 20
-"""Approximate number of labelled presses on the axis of the residuals."""
 
 
 def calibration_picture(result: CalibrationResult) -> Figure:
@@ -181,14 +178,11 @@ def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
     # A press without redundant measurements has no residual.
     relative_residual = np.sqrt(np.nan_to_num(result.estimation.press_chi2))
     colours = [FELT if bad else FITTED for bad in result.estimation.is_bad]
-    axes.bar(np.arange(len(lines)), np.minimum(relative_residual, MAX_DRAWN_RESIDUAL), color=colours)
+    axes.bar(lines, np.minimum(relative_residual, MAX_DRAWN_RESIDUAL), color=colours)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.axhline(1.0, color=INK, lw=0.8, ls="--")  # the expected size
-    tick_distance = max(1, len(lines) // MAX_TICKS)
-    ticks = np.arange(0, len(lines), tick_distance)
     axes.set(
         title="residuals of the presses",
         xlabel=f"{result.presses.row_noun} of the press",
         ylabel="residual, relative to its expected size",
-        xticks=ticks,
-        xticklabels=[lines[tick] for tick in ticks],
     )

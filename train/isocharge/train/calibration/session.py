@@ -25,9 +25,6 @@ from isocharge.train.calibration.press_data import no_presses
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import CalibrationResult
 
-MIN_PRESSES = 2
-"""Smallest number of presses after which the remaining error is reported. One press does not determine this error."""
-
 ENOUGH = 0.5
 """Ratio of two position errors up to which a session is complete.
 
@@ -327,12 +324,12 @@ class PressSession:
     def summary(self) -> tuple[str, ...]:
         """Sentences about contact errors due to the film, and about presses that do not agree with the others.
 
-        If no film explains the presses, there is only one sentence, which states the reason. There are no sentences if
-        fewer than `MIN_PRESSES` presses were made.
+        If no film explains the presses, there is only one sentence, which states the reason. Without presses, there are
+        no sentences.
         """
         if self.refusal:
             return (f"No film explains these presses: {self.refusal}",)
-        if self.result is None or len(self) < MIN_PRESSES:
+        if self.result is None:
             return ()
         film_error = self.result.film_error
         noise_error = self.result.sensitivity.noise_error
