@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 
-from isocharge.common.npz import finite_array, finite_number, npz_arrays
+from isocharge.common.npz import npz_arrays
 
 MEBIBYTE = 1 << 20
 
@@ -35,10 +35,6 @@ def test_arrays_are_those_that_numpy_wrote(array, compressed, is_fortran):
     read = npz_arrays(npz(compressed, a=array))["a"]
     assert read.dtype == array.dtype
     np.testing.assert_array_equal(read, array)
-
-
-def test_array_with_a_side_of_zero_is_read():
-    assert npz_arrays(npz(a=np.zeros((3, 0))))["a"].shape == (3, 0)
 
 
 def test_bomb_is_refused_before_it_is_unpacked():
@@ -100,41 +96,3 @@ def test_compression_method_that_numpy_does_not_write_is_refused():
     for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
         with pytest.raises(ValueError, match=f"an array has the compression method {method}"):
             npz_arrays(bytes(entry(npy(np.zeros(1)), method=method)))
-
-
-ARRAYS = {
-    "numbers": np.arange(6).reshape(2, 3),
-    "text": np.array("some text"),
-    "complex": np.ones(3, complex),
-    "dates": np.array(["2026-01-01"], "datetime64[s]"),
-    "infinite": np.array([1.0, np.inf]),
-    "one": np.array(2.5),
-}
-
-
-def test_checked_arrays_are_float64():
-    assert finite_array(ARRAYS, "numbers", (2, None)).tolist() == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]
-    assert finite_number(ARRAYS, "one") == 2.5
-
-
-@pytest.mark.parametrize(
-    ("name", "shape", "reason"),
-    [
-        ("absent", (1,), "the array 'absent' is missing"),
-        ("numbers", (2, 4), r"expected an array of shape \(2, 4\), got \(2, 3\)"),
-        ("numbers", (None,), r"expected an array of shape \(n\), got \(2, 3\)"),
-        ("text", (), "expected real numbers, got an array of <U9"),
-        ("complex", (3,), "expected real numbers, got an array of complex128"),
-        ("dates", (1,), "expected real numbers, got an array of datetime64"),
-        ("infinite", (2,), "expected finite numbers, got inf"),
-    ],
-)
-def test_array_of_another_kind_is_refused(name, shape, reason):
-    with pytest.raises(ValueError, match=reason):
-        finite_array(ARRAYS, name, shape)
-
-
-@pytest.mark.parametrize("content", [b"no array", b""])
-def test_entry_without_an_array_is_no_number(content):
-    with pytest.raises(ValueError, match="a: expected real numbers"):
-        finite_number(npz_arrays(bytes(entry(content, name="a"))), "a")

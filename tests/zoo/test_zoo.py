@@ -10,7 +10,6 @@ import binascii
 import json
 import struct
 import threading
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
@@ -18,7 +17,6 @@ from functools import cache
 import crcmod.predefined
 import numpy as np
 import pytest
-from cobs import cobs
 
 from isocharge.serve import Chunk, Predictor, TouchStream, load_device
 from isocharge.serve.examination.device_text import device_text
@@ -30,9 +28,7 @@ from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 RATE_HZ = 400.0
 predictor = cache(Predictor)
 
-ccitt, modbus, x25, maxim = map(
-    crcmod.predefined.mkPredefinedCrcFun, ("crc-ccitt-false", "modbus", "x-25", "crc-8-maxim")
-)
+modbus, maxim = map(crcmod.predefined.mkPredefinedCrcFun, ("modbus", "crc-8-maxim"))
 
 FOUR, THREE = "four-25um-biaxial", "three-25um-biaxial"
 PRESSES = {FOUR: [520.0, 610.0, 700.0, 590.0], THREE: [850.0, 790.0, 905.0]}
@@ -41,22 +37,6 @@ PRESSES = {FOUR: [520.0, 610.0, 700.0, 590.0], THREE: [850.0, 790.0, 905.0]}
 
 def counts(charge_pC, pC_per_count, zero=0):
     return [round(q / pC_per_count) + zero for q in charge_pC]
-
-
-def i24(count, order):
-    return int(count).to_bytes(3, order, signed=True)
-
-
-def big_24_bit(k, q):
-    """24 bits, big-endian, as an ADS131 gives them; the checksum skips the sync."""
-    body = struct.pack(">H", k % 65536) + b"".join(i24(c, "big") for c in counts(q, 2e-4))
-    return b"\xa5\x5a" + body + struct.pack(">H", ccitt(body))
-
-
-def offset_binary(k, q):
-    """16 bits about half scale, a clock of 16 bits, sum of all bytes."""
-    data = b"\xaa\x0c" + struct.pack("<H4H", (65_000 + round(2.5 * k)) % 65536, *counts(q, 0.0625, 32768))
-    return data + bytes([sum(data) & 0xFF])
 
 
 def csv_counts(k, q):
@@ -113,11 +93,6 @@ def bare_struct(k, q):
     return struct.pack("<I4f", k, *q)
 
 
-def stuffed_by_cobs(k, q):
-    body = struct.pack("<BH", 3, k % 65536) + b"".join(i24(c, "little") for c in counts(q, 1e-3))
-    return cobs.encode(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
-
-
 def stuffed_by_slip(k, q):
     body = struct.pack(">H3f", k % 65536, *q)
     data = body + struct.pack(">H", binascii.crc_hqx(body, 0))
@@ -150,8 +125,6 @@ class Kind:
 
 
 ZOO = {
-    "24 bits, big-endian": Kind(big_24_bit, {"pC_per_unit": 2e-4}),
-    "offset binary": Kind(offset_binary, {"pC_per_unit": 0.0625}),
     "CSV counts, dead inputs": Kind(csv_counts, {"pC_per_unit": 0.05}),
     "JSON of other names": Kind(other_names),
     "length-prefixed": Kind(length_prefixed, {"pC_per_unit": 1e-3}),
@@ -162,7 +135,6 @@ ZOO = {
     "volts": Kind(volts, {"V_per_unit": -1.0, "feedback_pF": 1000.0}),
     "structs over UDP": Kind(bare_struct, url="udp://127.0.0.1:9"),
     "JSON over UDP": Kind(other_names, url="udp://127.0.0.1:9"),
-    "COBS": Kind(stuffed_by_cobs, {"pC_per_unit": 1e-3}),
     "SLIP": Kind(stuffed_by_slip, model=THREE),
     "odd ticks": Kind(ticks),
 }

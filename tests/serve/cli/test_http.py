@@ -90,13 +90,10 @@ def test_http_command_refuses_wrong_options_and_models(command, models, tmp_path
             (models, ("--port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port}: another program listens"),
             (models, ("--port", 0, "--grpc-port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port} for gRPC"),
             (models, ("--host", "0.0.0.0"), 2, "InputError: 0.0.0.0 lets other machines in: give --token TOKEN"),
-            (models, ("--uds", "x", "--host", "0.0.0.0", "--grpc-port", 0), 2, "InputError: 0.0.0.0 lets other"),
             (models, ("--token", ""), 2, "InputError: token: expected printable ASCII"),
             (models, ("--tls-key", "x"), 2, "InputError: --tls-key: expected --tls-cert too"),
             (models, ("--tls-cert", tmp_path / "cert.pem"), 2, f"InputError: {tmp_path}/cert.pem: not a certificate"),
-            (models, ("--tls-cert", tmp_path / "none.pem"), 2, f"InputError: {tmp_path}/none.pem: not a certificate"),
             (tmp_path / "empty", (), 2, f"ModelError: {tmp_path}/empty: expected models"),
-            (tmp_path / "none", (), 2, f"ModelError: {tmp_path}/none: expected a folder of models"),
             (tmp_path / "damaged", (), 2, "ModelError: no model can be served: "),
         ]
         for folder, words, code, message in cases:

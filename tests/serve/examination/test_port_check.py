@@ -67,15 +67,6 @@ def test_check_of_a_healthy_board():
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]
 
 
-def test_check_uses_no_stage_that_is_switched_off():
-    """A gain that is switched off is not applied. A leak that is switched off is reported as missing."""
-    off = {"gain": {"on": False, "pC_per_unit": 2.0}, "leak": {"on": False, "tau_s": 10.0}}
-    report = examine_received(received(charges()), device=device_from_table(off, "test"))
-    assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]
-    assert "in a device file ([leak] tau_s)" in missing_for_held_presses(report)
-    assert report.missing == ()
-
-
 def test_check_of_a_channel_without_a_number():
     """A board sends `nan` for a missing amplifier. The other channels are reported as usual, also as valid JSON."""
     report = examine_received(received(lambda _: b"A:nan,B:1.5,C:2.5\n"))
@@ -136,13 +127,6 @@ def test_channels_of_most_similar_noise_are_proposed():
         "B": "3",
         "C": "4",
     }
-
-
-def test_channels_that_the_device_file_omits_are_ignored():
-    board = {"channels": {"A": "ch1", "B": "3", "C": "4"}, "gain": {"pC_per_unit": 0.5, "offset": 300}}
-    report = examine_received(received(row), device=device_from_table(board, "test"))
-    assert ([channel.name for channel in report.channels], report.unused) == (["1", "3", "4"], ("2", "5", "6"))
-    assert all(abs(channel.offset_pC) < 10 for channel in report.channels)
 
 
 def test_proposed_device_file_reads_the_same_charges():

@@ -112,15 +112,6 @@ def test_record_before_the_tare(predictor):
         assert record.charge_raw_pC == {"A": 12.0, "B": -7.0, "C": 3.0}
 
 
-@pytest.mark.parametrize(
-    ("press", "flags"),
-    [({"x_mm": 9.0}, ("outside",)), ({"force_N": 2.5}, ("outside",)), ({"force_N": 0.049}, ("outside",)), ({}, ())],
-)
-def test_press_outside_the_domain_is_flagged(film, records_after_rest, press, flags):
-    (record,) = records_after_rest(Frame(10, 0, raw_press(film, **press)))
-    assert record.flags == flags
-
-
 @pytest.mark.parametrize("damaged", [1.01e9, -1e38, 1e300, -1.7e308, math.inf])
 def test_value_that_is_no_charge_makes_only_its_frame_invalid(film, predictor, damaged):
     """Text has no checksum, so a damaged exponent may give a huge number. The later frames must not be affected."""
@@ -185,11 +176,3 @@ def test_file_without_a_frame_raises_an_error(predictor, data):
 def test_wrong_number_of_charges_raises_an_error(records_after_rest):
     with pytest.raises(ChargeError, match=r"model linear/1 expects 3 charges \('A', 'B', 'C'\), frame 10 has 4"):
         records_after_rest(Frame(10, 0, (1.0, 2.0, 3.0, 4.0)))
-
-
-def test_bytes_without_frames_raise_an_error(predictor):
-    noise = [Chunk(bytes(range(128, 256)) * 4, 0.0, 0)] * 50
-    with pytest.raises(
-        PortError, match=r"no intact frame among the first \d+ bytes .*nothing recognised yet: check baud"
-    ):
-        list(stream(noise, predictor))

@@ -114,17 +114,6 @@ def test_charges_beyond_the_domain_continue_linearly_in_position_and_as_a_power_
     assert np.isfinite(series.charges(np.array([[1e9, 0.0, 1e-300], [0.0, -1e9, 1e300]]))).all()
 
 
-def test_states_may_differ_from_contact_to_contact():
-    series = random_series()
-    contact = random_contacts(3)
-    states = np.array([[0.0, 0.0, 0.0], [0.2, 1.0, -1.0], [-0.4, 0.0, 2.0]])
-    together = series.changes(contact, states)
-    for row in range(3):
-        alone = series.changes(contact[row : row + 1], states[row])
-        for joint, single in zip(together, alone, strict=True):
-            np.testing.assert_allclose(joint[row], single[0], rtol=1e-12)
-
-
 @pytest.mark.parametrize("is_signed", [False, True])
 def test_file_is_read_as_it_was_written(is_signed):
     written = replace(random_series(is_signed=is_signed), offset_pC=3.5)
@@ -134,17 +123,6 @@ def test_file_is_read_as_it_was_written(is_signed):
     np.testing.assert_array_equal(read.changes(contact, state).charge_pC, written.changes(contact, state).charge_pC)
     for name in ("domain", "electrodes", "is_folded", "charge_std", "offset_pC", "pretension_MPa", "tension_std_MPa"):
         assert getattr(read, name) == getattr(written, name)
-
-
-def test_map_with_a_single_force_is_read_and_does_not_depend_on_the_force():
-    coefficients = np.zeros((1, 2, 2, 1, 4))
-    coefficients[0, 0, 0, 0] = 5.0
-    coefficients[0, 1, 0, 0] = coefficients[0, 0, 1, 0] = 0.1
-    series = ChargeSeries(domain=Domain(8.0, (0.5, 0.5)), electrodes=ELECTRODES, coefficients=coefficients)
-    read = charge_map_from_bytes(charge_map_bytes(series), ELECTRODES)
-    charge, slopes = read.linearised(np.array([[4.0, 0.0, 0.5], [4.0, 0.0, 0.9]]))
-    np.testing.assert_allclose(charge, np.exp(5.05), rtol=1e-6)
-    np.testing.assert_array_equal(slopes[:, :, 2], 0.0)
 
 
 def packed(arrays):

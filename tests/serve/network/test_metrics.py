@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from isocharge.serve import Predictor, find_model
@@ -100,18 +99,6 @@ def test_misfit_alarms_are_the_flags_of_records():
     handler.answer("POST", path, [], body(charges, **contact_only))
     samples = scrape(handler)
     of = {"model": MODEL, "version": "1"}
-    stats_body = handler.answer("GET", f"/v2/models/{MODEL}/stats", [], b"").body
-    stats = json.loads(stats_body)["model_stats"][0]["inference_stats"]
-    seconds = [
-        value(samples, "inference_stage_seconds_total", stage="compute_infer", **of),
-        value(samples, "inference_seconds_sum", **of),
-    ]
-    assert seconds == pytest.approx([1e-9 * stats[stage]["ns"] for stage in ("compute_infer", "success")])
-    assert all(  # Markov's inequality
-        value(samples, "inference_seconds_count", **of) - count <= seconds[1] / float(labels[0][1])
-        for (name, *labels), count in samples.items()
-        if name.endswith("inference_seconds_bucket") and ("model", MODEL) in labels
-    )
     counts = [value(samples, f"{name}_total", **of) for name in ("presses", "misfit_alarms")]
     assert counts == [700, 2 * sum(alarms) + 2 * sum(alarms[:50])]
 

@@ -95,15 +95,6 @@ def test_default_uncertainty_fills_empty_cells(read):
     assert (plain.position_std_mm.tolist(), plain.force_std.tolist()) == ([0.1], [0.01])
 
 
-def test_selection_of_presses_by_index_and_mask(read):
-    presses = read("force_N,A,B,C,d\n" + "".join(f"{n},1,2,3,\n" for n in (1, 2, 3)))
-    last = presses[2]
-    assert (len(last), last.lines, last.contact[0, 2], last.ignored) == (1, (4,), 3.0, ("d",))
-    assert presses[-1] == last
-    assert presses[1:] == presses[[1, 2]] == presses[np.array([False, True, True])] != presses
-    assert ([press.lines for press in presses], len(presses[:0])) == ([(2,), (3,), (4,)], 0)
-
-
 def test_presses_with_semicolons_decimal_commas_and_a_row_of_units(read):
     header = f"{HEADER},force_std,temperature_C".replace(",", ";")
     presses = read(f"{header}\nmm;mm;N;pC;pC;pC;-;°C\n2;-6;0,2;502,3;244,8;215,8;0,01;21,5\n")

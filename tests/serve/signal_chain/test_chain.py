@@ -228,18 +228,6 @@ def test_flags_of_the_frame_come_before_those_of_the_chain():
     assert reading.flags == ("gap", "tare", "saturated")
 
 
-def test_base_that_relaxes_to_zero_is_no_touch():
-    """After a long press, the charge may be below zero. If the base decays like the charge, no touch is detected."""
-    totals_pC = -100.0 * np.exp(-np.arange(1000) / 200.0)
-
-    def has_touch(base_relax_s):
-        touch = touch_stage()
-        return any(detect(touch, total_pC, ONE_PC, base_relax_s) for total_pC in [-100.0, *totals_pC.tolist()])
-
-    assert not has_touch(base_relax_s=200.0)
-    assert has_touch(base_relax_s=math.inf)
-
-
 @pytest.mark.parametrize("drift_pC_per_s", [0.3, -0.3, 1.0])
 def test_tare_follows_a_slow_drift_of_an_untouched_film(drift_pC_per_s):
     """Without a leak, the zero of a board drifts for half a minute. A press after that has nearly no offset."""

@@ -37,13 +37,6 @@ def test_mapping_lines_follow_the_scheme_of_the_paper():
     np.testing.assert_allclose(np.linalg.norm(mapping.points - [0.0, -10.0], axis=2), np.tile(mapping.distance, (7, 1)))
 
 
-def test_mapping_lines_without_angles_are_symmetric_about_the_centre():
-    mapping = Mapping.lines(SENSOR, "B")
-    middle = mapping.angle[len(mapping.angle) // 2]
-    assert middle / DEG == pytest.approx(210.0, abs=1e-4)
-    np.testing.assert_allclose(mapping.angle - middle, -(mapping.angle - middle)[::-1], atol=1e-12)
-
-
 def test_curves_are_the_charges_of_presses(film):
     curves = Curves.of(film, Mapping.lines(SENSOR, "A", (60 * DEG, 90 * DEG), length=16.0), 1.0)
     for line, step in ((0, 0), (3, 3)):

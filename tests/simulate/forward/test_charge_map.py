@@ -9,7 +9,6 @@ from isocharge.simulate.forward.charge_map import (
     as_charges,
     check_forces,
     check_radius,
-    differences,
     one_sided_differences,
     within,
 )
@@ -88,14 +87,6 @@ def test_contacts_outside_the_domain_raise_error_with_the_limits(charge_map):
                 ask(np.array([inside, outside]))
             with pytest.raises(SceneError, match=r"expected contacts \(x, y, F\), shape \(n, 3\), .* got shape \(3,\)"):
                 ask(inside)
-
-
-def test_central_differences_are_exact_for_quadratic_functions():
-    contact = contacts(DOMAIN)
-    slope = differences(linear, contact)
-    np.testing.assert_allclose(slope[:, 0], np.tile([1.0, 2.0, 3.0], (60, 1)), rtol=1e-9)
-    x, y, _ = contact.T
-    np.testing.assert_allclose(slope[:, 1], np.stack([y, x, 0.0 * x], axis=1), atol=1e-10)
 
 
 def test_domain_to_unit_and_to_contact_are_inverse_and_accept_the_edge():

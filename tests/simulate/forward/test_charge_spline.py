@@ -27,22 +27,6 @@ def test_spline_charges_equal_those_of_the_forward_map(near_map, near_spline):
     assert ChargeSpline.of(near_map, spacing=0.6).error > 2.0 * near_spline.error
 
 
-def test_correction_near_an_electrode_joins_the_coarse_spline_smoothly(near_spline):
-    """On the edges of its rectangle, the correction of a charge and its slopes are zero."""
-    assert len(near_spline.patches) == 4
-    for patch in near_spline.patches:
-        x = np.linspace(patch.low[0], patch.high[0], 20)
-        edge = np.column_stack([x, np.full(20, patch.low[1])])
-        middle = 0.5 * (patch.low + patch.high)[None]
-        scale = np.abs(patch.table(middle)).max()
-        assert scale > 0.0
-        assert np.abs(patch.table(edge)).max() < 1e-12 * scale
-        for order in ((1, 0), (0, 1)):
-            assert np.abs(patch.table(edge, nu=order)).max() < 1e-12 * scale
-        assert not patch.contains(edge).any()
-        assert patch.contains(middle).all()
-
-
 def test_gradients_equal_differences_of_the_charges_across_a_correction(near_spline):
     patch = near_spline.patches[0]
     line = np.linspace(patch.low + 0.3, patch.high - 0.3, 40)
@@ -52,16 +36,6 @@ def test_gradients_equal_differences_of_the_charges_across_a_correction(near_spl
         above, below = (near_spline.scaled_charges(position + sign * step) for sign in (1.0, -1.0))
         slope = (above - below) / 2e-4
         np.testing.assert_allclose(gradients[..., axis], slope, atol=1e-5 * np.abs(slope).max())
-
-
-def test_stress_charges_for_all_forces_equal_the_charges_of_the_map(near_map):
-    """The charges for all forces come from fields in single precision. Charges that are not needed are zero."""
-    position = spread(40)[:, :2]
-    is_needed = np.array([True, False, True, True])
-    together = near_map.stress_charges_by_force(position, is_needed)
-    for number, force in enumerate(near_map.family.force.tolist()):
-        single = near_map.charges(np.column_stack([position, np.full(40, force)])) * is_needed
-        np.testing.assert_allclose(together[:, number], single, atol=2e-6 * np.abs(single).max())
 
 
 def test_spline_includes_the_charge_of_contact_pressure(near_map):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate import Circle, Polygon, SolveSettings, Theory, deflection, load_sensor, press
+from isocharge.simulate import Circle, Polygon, SolveSettings, Theory, load_sensor, press
 from isocharge.simulate import touch_charge as charge_of
 from isocharge.simulate.forward.derivative_maps import SideForceMap
 from isocharge.simulate.solver.equilibrium import Equilibrium
@@ -118,16 +118,6 @@ def test_side_force_map_of_a_square_probe_raises_a_scene_error(side_force_map):
     map_of_square = replace(side_force_map.film, probe=Polygon.rectangle(2.0, 2.0))
     with pytest.raises(SceneError, match="expected a circular probe"):
         SideForceMap.build(map_of_square)
-
-
-def test_a_press_without_a_side_force_is_solved_as_before():
-    film = load_sensor("four-25um-biaxial").film
-    point = np.array([[3.0, -2.0]])
-    plain = press(film, PROBE, (3.0, -2.0), 0.5)
-    zero = press(film, PROBE, (3.0, -2.0), 0.5, side_force=(0.0, 0.0))
-    assert plain.mesh.template.half
-    assert zero.field.tobytes() == plain.field.tobytes()
-    assert deflection(zero, point) == deflection(plain, point)
 
 
 @pytest.mark.parametrize("side_force", [(0.8, 0.8), (np.nan, 0.0), (0.0, np.inf)])

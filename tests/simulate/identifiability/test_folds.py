@@ -27,7 +27,6 @@ from isocharge.simulate.identifiability.folds import (
     has_reversed_orientation,
     scaled_derivatives,
 )
-from isocharge.simulate.identifiability.nearest_contact import explain
 from isocharge.simulate.numerics.disk import Rings
 from kept import kept
 
@@ -215,17 +214,6 @@ def test_ambiguous_pairs_are_mirror_images_in_the_fold_line(forces):
 
 def test_no_ambiguous_pairs_where_a_charge_distinguishes_the_sides():
     assert len(find_ambiguous_pairs(folded_map(0.3), REFERENCE, 0.5, places=400)) == 0
-
-
-@pytest.mark.parametrize(("force", "forces"), [(0.7, FORCES), (0.5, (0.5, 0.5))], ids=["a range", "one force"])
-def test_nearest_contact_finds_the_true_contact(force, forces):
-    charge_map = folded_map(0.3, forces=forces)
-    truth = np.array([[1.0, -2.0, force], [-3.0, 1.0, force]])
-    start = np.array([[0.0, 0.0, np.sqrt(np.prod(forces))]] * 2)
-    charge = charge_map.charges(truth)
-    contact, residual = explain(charge_map, charge, REFERENCE.sigma(charge), start)
-    np.testing.assert_allclose(contact, truth, rtol=1e-4)
-    np.testing.assert_allclose(residual, 0.0, atol=0.01)
 
 
 def test_fold_line_bounds_the_working_area():

@@ -64,15 +64,6 @@ def test_determined_share_agrees_with_random_positions(film, identification):
     np.testing.assert_allclose(medians, expected, rtol=0.05)
 
 
-def test_limit_statistics_are_ordered_and_decrease_with_the_force(identification):
-    rows = identification.to_dict()["limits_in_working_area"]
-    assert [row["force_N"] for row in rows] == [0.05, 1.0, 2.0]
-    for row in rows:
-        assert 0.0 < row["position_median_mm"] <= row["position_rms_mm"] <= row["position_worst_mm"] < 1.0
-        assert row["condition_worst"] >= 1.0
-    assert rows[0]["position_rms_mm"] > 2.0 * rows[1]["position_rms_mm"] > rows[2]["position_rms_mm"]
-
-
 def test_condition_is_the_ratio_of_the_standard_deviations_of_the_position(identification):
     limits = identification.maps[1]
     covariance = limits_at(identification.charges, limits.rings.contacts(limits.force), REFERENCE).covariance

@@ -154,14 +154,6 @@ def test_wrong_amplifier_file_raises_input_error(tmp_path, text, message):
         load_amplifier(str(path))
 
 
-def test_infinite_tau_and_limit_mean_no_leak_and_no_limit(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text('like = "bench"\ntau_s = inf\nlimit_pC = inf\nbits = 0\n')
-    readings = load_amplifier(str(path)).start(3, 100.0, np.random.default_rng(1))(np.full((50, 3), 5e3))
-    assert np.isfinite(readings).all()
-    assert readings[-1].min() > 4.5e3
-
-
 def test_unknown_noise_level_raises_input_error():
     with pytest.raises(
         InputError, match=r"expected one of clean, reference, measured, bench, surgery, or a TOML file, got 'lab'"

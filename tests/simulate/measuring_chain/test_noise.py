@@ -26,13 +26,6 @@ def test_added_noise_is_gaussian_with_sigma(charge):
     assert stats.kstest(drawn, "norm").pvalue > 0.01
 
 
-def test_noise_is_independent_between_channels_and_readings():
-    """The noise of different electrodes and of successive readings is not correlated."""
-    noise = noise_model("reference").add(np.zeros((20_000, 3)), np.random.default_rng(1))
-    joined = np.concatenate([noise[1:], noise[:-1]], axis=1)
-    assert np.abs(np.corrcoef(joined.T) - np.eye(6)).max() < 4.0 / np.sqrt(20_000)
-
-
 def test_noise_level_clean_adds_nothing():
     charge = np.random.default_rng(2).normal(0.0, 1e3, (5, 3))
     np.testing.assert_array_equal(noise_model("clean").add(charge, np.random.default_rng(3)), charge)

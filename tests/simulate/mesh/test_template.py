@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import Circle, Ellipse, Film, Polygon, Resolution
-from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.template import Template, template_for
 
 FILM = Film(45.0, 0.025, 3000.0, 0.34)
@@ -31,14 +30,3 @@ def built(request, resolution) -> Template:
 def test_resolution_rejects_values_out_of_range(wrong):
     with pytest.raises(ValueError, match=f"got {wrong[0]}, {wrong[1]}, {wrong[2]}, {wrong[3]}"):
         Resolution(*wrong)
-
-
-@pytest.mark.parametrize(
-    ("probe", "folds"), [(Polygon.triangle(4.0), 3), (Ellipse(4.0, 2.0), 2)], ids=["triangle", "ellipse"]
-)
-def test_rotation_by_the_period_maps_elements_onto_elements(probe, folds, resolution):
-    """At the centre of the film, the nodes of a rotated element lie 1 / folds of a turn after those of the element."""
-    mesh = place(FILM, probe, (0.0, 0.0), resolution, 0.1)
-    for fold in range(folds):
-        rotated_back = mesh.points[mesh.template.rotated(fold, folds)] * np.exp(-2j * np.pi * fold / folds)
-        np.testing.assert_allclose(rotated_back, mesh.points, atol=1e-12)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from isocharge.simulate.numerics.polygon import area_in_disk, area_of, centroid_of, is_convex, overlap, shared_area
+from isocharge.simulate.numerics.polygon import area_in_disk, area_of, centroid_of, is_convex, shared_area
 
 SQUARE = np.array([0.0, 1.0, 1.0 + 1.0j, 1.0j])
 COMMON = settings(derandomize=True, deadline=None, max_examples=40)
@@ -48,21 +48,6 @@ def test_area_and_centroid_add_up(z):
     assert not is_convex(whole[::-1])
 
 
-@given(a=convex(), b=convex())
-@COMMON
-def test_shared_area_is_symmetric_bounded_and_additive(a, b):
-    common = shared_area(a, b)
-    tiny = 1e-9 * (area_of(corners_of(a)) + area_of(corners_of(b)))
-    assert common == pytest.approx(shared_area(b, a), abs=tiny)
-    assert -tiny <= common <= min(area_of(corners_of(a)), area_of(corners_of(b))) + tiny
-    assert sum(shared_area(part, b) for part in halves(a)) == pytest.approx(common, abs=tiny)
-    assert shared_area(a, a) == pytest.approx(area_of(corners_of(a)), rel=1e-9)
-    if common > 10.0 * tiny:
-        assert overlap(corners_of(a), corners_of(b))
-    if not overlap(corners_of(a), corners_of(b)):
-        assert common <= tiny
-
-
 @given(a=convex(), x=st.floats(-2, 2), y=st.floats(-2, 2), radius=st.floats(1e-3, 3.0))
 @COMMON
 def test_area_in_a_disk_is_bounded_and_additive_and_a_polygons_limit(a, x, y, radius):
@@ -92,27 +77,6 @@ def test_area_in_a_disk_is_bounded_and_additive_and_a_polygons_limit(a, x, y, ra
 )
 def test_shared_area_of_two_squares(shift, expected):
     assert shared_area(SQUARE, SQUARE + shift) == pytest.approx(expected, abs=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("centre", "radius", "expected"),
-    [
-        pytest.param(0.5 + 0.5j, 0.3, np.pi * 0.09, id="disk inside"),
-        pytest.param(0.5 + 0.5j, 5.0, 1.0, id="square inside"),
-        pytest.param(0.0, 0.5, np.pi / 16, id="disk about a corner"),
-        pytest.param(0.5, 0.4, np.pi * 0.08, id="disk about the middle of an edge"),
-        pytest.param(3.0, 1.0, 0.0, id="separate"),
-        pytest.param(2.0 + 0.5j, 1.0, 0.0, id="touching"),
-        pytest.param(
-            0.5 + 0.5j,
-            0.6,
-            0.36 * (np.pi - 4 * (np.arccos(5 / 6) - 5 / 6 * np.sqrt(11) / 6)),
-            id="disk without four segments",
-        ),
-    ],
-)
-def test_area_in_disk_of_a_square(centre, radius, expected):
-    assert area_in_disk(SQUARE, centre, radius) == pytest.approx(expected, abs=1e-14)
 
 
 def test_centroid_of_a_triangle_is_the_mean_of_its_corners():

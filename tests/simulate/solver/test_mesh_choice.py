@@ -88,17 +88,6 @@ def test_needs_second_mesh_near_the_rim_and_for_large_probes(probe, distance, ac
     assert needs_second_mesh(case) == needed
 
 
-def test_equilibrium_on_two_meshes_can_start_a_neighbouring_press():
-    """The mesh of the equilibrium has a higher order than the first mesh of the neighbouring press."""
-    probe, at, force = NEAR_THE_RIM
-    first = press(FILM, probe, at, force)
-    cold, warm = (press(FILM, probe, at, 1.05 * force, start=start) for start in (None, first))
-    assert first.proven_error is not None
-    assert warm.mesh.resolution == cold.mesh.resolution
-    assert warm.iterations < cold.iterations
-    assert worst_error(FILM, warm, cold) < 1e-5
-
-
 def test_meshes_with_different_equilibria_raise_solve_error(monkeypatch):
     """A difference above a tenth is an error. A smaller difference is the error estimate."""
     scene = FILM, *NEAR_THE_RIM

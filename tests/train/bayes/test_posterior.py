@@ -65,39 +65,6 @@ def test_the_posterior_of_linear_charges_with_white_noise_is_a_gaussian(seed):
     assert std[0, :2] == pytest.approx(np.sqrt(np.diag(covariance)), rel=5e-3)
 
 
-@dataclass(frozen=True)
-class OppositeTermCharges(QuadraticCharges):
-    """The same charges as the sum of two terms with opposite gradients, of which one has a negative weight."""
-
-    def force_weights(self, logs):
-        return np.exp(logs)[..., None] * [2.0, -1.0]
-
-    def scaled_charges(self, position):
-        change = super().scaled_charges(position) - self.offset  # shape (n, 1, n_electrode)
-        return np.concatenate([self.offset + change / 3.0, self.offset - change / 3.0], axis=1)
-
-    def scaled_gradients(self, position):
-        gradient = super().scaled_gradients(position)
-        return np.concatenate([gradient / 3.0, -gradient / 3.0], axis=1)
-
-
-def test_cells_are_not_dropped_if_a_weight_of_the_force_is_negative():
-    """One direction is much more certain than the other, so that the cell of the contact is not the best one at first.
-
-    The interpolation between the forces of a `ChargeSpline` has negative weights, too.
-    """
-    steep_and_flat = np.array([[1.0, 0.05], [0.6, -0.05]])
-    charges = OppositeTermCharges(np.array([100.0, 100.0]), steep_and_flat, np.zeros((2, 2)))
-    white_pC = 1e-4
-    for seed in range(10):
-        position = np.random.default_rng(seed).uniform(-0.6, 0.6, (1, 2))
-        noisy = charges.offset + position @ charges.linear
-        mean, std = Posterior(charges, NoiseModel("white", white_pC, 0.0), 1.0).mean_and_std(noisy)
-        covariance = white_pC**2 * np.linalg.inv(charges.linear @ charges.linear.T)
-        assert (np.abs(mean[:, :2] - position) < 0.02 * std[:, :2]).all()
-        assert std[0, :2] == pytest.approx(np.sqrt(np.diag(covariance)), rel=5e-3)
-
-
 def test_two_positions_with_the_same_charges_are_both_found():
     """The charges are even in x, so the posterior has two maxima, and its mean lies between them."""
     charges = QuadraticCharges(

@@ -246,14 +246,6 @@ def test_outline_of_a_square_grid_is_larger_by_half_the_grid_step():
     assert PressedArea.of_contacts(contact).radius == pytest.approx(5.5 * np.sqrt(2.0))
 
 
-def test_presses_at_one_place_are_in_the_same_fold():
-    contact = np.repeat(contacts_on_l(100, 5), 7, axis=0)
-    fold = folds_by_place(contact, 5)
-    assert (fold.reshape(100, 7) == fold[::7, None]).all()
-    assert np.bincount(fold).tolist() == [140] * 5
-    np.testing.assert_array_equal(fold == 0, held_out(contact))
-
-
 def test_no_fold_is_empty_beside_a_reference_position_with_many_presses():
     contact = np.concatenate([contacts_on_l(600, 5), np.tile([[1.0, 2.0, 3.0]], (400, 1))])
     assert (np.bincount(folds_by_place(contact, 5), minlength=5) > 50).all()

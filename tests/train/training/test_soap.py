@@ -28,18 +28,6 @@ def run_adam(parameter, loss, steps, rate):
     run(optimiser.step, parameter, loss, steps)
 
 
-def test_vectors_are_trained_by_adam():
-    target = torch.linspace(-1.0, 2.0, 7)
-    ours, theirs = (nn.Parameter(torch.zeros(7)) for _ in range(2))
-
-    def loss(parameter):
-        return ((parameter - target) ** 4).sum()
-
-    run_soap(ours, loss, 50, rate=0.03)
-    run_adam(theirs, loss, 50, rate=0.03)
-    torch.testing.assert_close(ours, theirs)
-
-
 def test_a_matrix_with_a_diagonal_gradient_is_trained_by_adam():
     """The eigenvectors of diagonal moments are the unit vectors, and their signs do not matter."""
     target = torch.diag(torch.tensor([3.0, 2.0, 1.0]))
