@@ -1,4 +1,4 @@
-"""Errors and flags on a film with a closed back: the table of simulate/docs/imperfections_results.md.
+"""Errors and flags on a film with a closed back: the table of simulate/docs/imperfections.md.
 
     python tests/benchmarks/bench_closed_back.py [--sensor four-25um-biaxial] [--presses 1000] [--json]
 
