@@ -173,7 +173,7 @@ def test_note_for_a_calibrated_film_that_does_not_fit_states_the_explaining_rig_
     check = check_presses(predictor, presses)
     assert (check.fits, check.verdict.endswith(" beyond noise")) == (False, True)
     assert "calibrated already" in check.notes[1]
-    assert "from 50 presses on" in check.notes[1]
+    assert "from 500 presses on" in check.notes[1]
     position_std, force_std = map(float, re.findall(r"-std ([\d.e-]+)", check.notes[0]))
     assert position_std == pytest.approx(np.hypot(0.2, RIG_STD_MM), rel=0.3)
     known = replace(presses, position_std_mm=np.full(30, position_std), force_std=np.full(30, force_std))

@@ -270,7 +270,7 @@ def test_factors_of_standard_deviations_are_the_ratio_of_errors_to_standard_devi
 
 
 def test_too_few_presses_are_refused():
-    message = "expected at least 500 presses at 50 places with .* got 499 at 499; .*--sensor"
+    message = "expected at least 500 presses at 50 places with .* got 499 at 499; .*train calibrate"
     with pytest.raises(PressError, match=message):
         usable_presses(presses_on_l()[:499])
 

@@ -61,7 +61,7 @@ MIN_COMMON_SIGNIFICANCE = 3.0
 MAX_LISTED_PRESSES = 5
 """Largest number of presses that a note lists."""
 
-MIN_FIT_PRESSES = 50
+MIN_FIT_PRESSES = 500
 """Smallest number of presses from which `isocharge train fit` trains a model."""
 
 

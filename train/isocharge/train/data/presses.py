@@ -233,7 +233,7 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
     if len(presses) < fewest or n_position < fewest_positions:
         raise DatasetError(
             f"expected at least {fewest} presses at {fewest_positions} positions, got {len(presses)} at "
-            f"{n_position}; sweep or measure more (from 50 measured presses on, train on a CSV file with --sensor)"
+            f"{n_position}; sweep or measure more (of a described film, `isocharge train calibrate` needs only a few)"
         )
 
     n_electrode = presses.charge.shape[1]

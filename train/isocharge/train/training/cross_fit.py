@@ -226,7 +226,8 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     if len(usable) < FEWEST or place_count < FEWEST_POSITIONS:
         raise PressError(
             f"expected at least {FEWEST} presses at {FEWEST_POSITIONS} places with known place, force and charges, got "
-            f"{len(usable)} at {place_count}; measure more, or describe the sensor (--sensor): 50 presses then suffice"
+            f"{len(usable)} at {place_count}; measure more, or describe the sensor in a file and use "
+            "`isocharge train calibrate`, which needs only a few"
         )
     check_measured_presses(usable)
 
