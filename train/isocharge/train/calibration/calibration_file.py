@@ -1,9 +1,8 @@
 """Writer and reader of `calibration.json`, the file with the estimate of a film.
 
-The file contains the value, the standard deviation and the unit of each unknown with a name, and the values and
-standard deviations of the coefficients of the discrepancy. `correlations` is the lower triangle of the correlation
-matrix of all unknowns, in this order: one row for each unknown, without the diagonal, rounded to six digits. The
-correlations of an unknown whose standard deviation is zero are zero.
+The file contains the value, the standard deviation and the unit of each unknown. `correlations` is the lower triangle of
+the correlation matrix of all unknowns, in this order: one row for each unknown, without the diagonal, rounded to six
+digits. The correlations of an unknown whose standard deviation is zero are zero.
 """
 
 import json
@@ -18,10 +17,10 @@ from isocharge.common.errors import PressError, cut, shown
 from isocharge.common.json_values import plain_values
 from isocharge.common.structs import Text, convert, read_json
 from isocharge.serve.presses.measured_presses import MAX_TEMPERATURE_C, MIN_TEMPERATURE_C
-from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate
+from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.problem import CalibrationProblem
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Version of the file format that this module writes and reads."""
 
 DIGITS = 6
@@ -43,13 +42,6 @@ class _Unknown(Struct, frozen=True):
     std: Std
 
 
-class _Coefficients(Struct, frozen=True):
-    """Values and standard deviations of the coefficients of the discrepancy."""
-
-    values: list[Number]
-    std: list[Std]
-
-
 class _CalibrationFile(Struct, frozen=True):
     """Entries of calibration.json that `read_film` uses."""
 
@@ -59,7 +51,6 @@ class _CalibrationFile(Struct, frozen=True):
     force_range_N: tuple[Number, Number]
     at_C: Temperature | None
     unknowns: dict[str, _Unknown]
-    coefficients: _Coefficients
     correlations: list[list[Correlation]]
 
 
@@ -72,7 +63,6 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
     """
     layout = film.layout
     std = np.sqrt(np.diag(film.covariance))
-    units = [*(one.unit for one in layout.prior.properties), *(one.unit for one in SESSION)]
     product = np.outer(std, std)
     correlations = np.divide(film.covariance, product, out=np.zeros_like(product), where=product > 0.0)
     rounded = np.clip(np.round(correlations, DIGITS), -1.0, 1.0)
@@ -84,10 +74,9 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
         "force_range_N": list(problem.force_range),
         "at_C": film.at_C,
         "unknowns": {
-            name: {"value": film.value(name), "std": film.std(name), "unit": unit}
-            for name, unit in zip(layout.names, units, strict=True)
+            name: {"value": value, "std": one_std, "unit": unit}
+            for name, value, one_std, unit in zip(layout.names, film.values, std, layout.units, strict=True)
         },
-        "coefficients": {"values": film.values[layout.coefficients], "std": std[layout.coefficients]},
         "correlations": [row[:index] for index, row in enumerate(rounded)],
     }
 
@@ -121,8 +110,8 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
 
     layout = problem.prior.layout
     unknowns = content.unknowns.values()
-    values = np.array([*(one.value for one in unknowns), *content.coefficients.values])
-    std = np.array([*(one.std for one in unknowns), *content.coefficients.std])
+    values = np.array([one.value for one in unknowns])
+    std = np.array([one.std for one in unknowns])
     low, high = layout.prior.bounds
     for index, name in enumerate(layout.prior.names):
         if not low[index] <= values[index] <= high[index]:
@@ -137,20 +126,17 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
 def _check_same_problem(path: Path, content: _CalibrationFile, problem: CalibrationProblem) -> None:
     """Raise PressError if a file belongs to another calibration problem."""
     layout = problem.prior.layout
-    count = layout.coefficients.stop - layout.coefficients.start
     for key, expected, got in (
         ("sensor", problem.sensor.name, content.sensor),
         ("probe", problem.probe.notation, content.probe),
         ("radius_mm", problem.radius, content.radius_mm),
         ("force_range_N", problem.force_range, content.force_range_N),
         ("unknowns", ", ".join(layout.names), ", ".join(content.unknowns)),
-        ("coefficients.values", f"{count} numbers", f"{len(content.coefficients.values)} numbers"),
-        ("coefficients.std", f"{count} numbers", f"{len(content.coefficients.std)} numbers"),
     ):
         if got != expected:
             raise PressError(
-                f"{path}: {key}: expected {expected}, as in this calibration, got {cut(str(got))}; calibrate without "
-                "the earlier calibration"
+                f"{path}: {key}: expected {cut(str(expected))}, as in this calibration, got {cut(str(got))}; calibrate "
+                "without the earlier calibration"
             )
 
 

@@ -58,9 +58,9 @@ def _degrees() -> Integers:
     return np.asarray(all_degrees[all_degrees.sum(axis=1) <= DEGREE])
 
 
-def coefficient_count(n_electrode: int) -> int:
-    """Return the number of coefficients of all electrodes."""
-    return len(_degrees()) * n_electrode
+def term_names() -> list[str]:
+    """Return the name of each term, which consists of its degrees in x, y and ln F."""
+    return ["".join(map(str, degrees)) for degrees in _degrees().tolist()]
 
 
 def unit_covariance(n_electrode: int) -> Array:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.simulate import FilmPrior
 from isocharge.simulate.sensor.film_properties import PRETENSION
-from isocharge.train.calibration.discrepancy import coefficient_count
+from isocharge.train.calibration.discrepancy import term_names
 from isocharge.train.calibration.press_data import PressData
 
 COEFFICIENT_DRIFT = 0.002
@@ -91,10 +92,18 @@ class Layout:
 
     prior: FilmPrior
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the unknowns that have names; the coefficients follow them."""
-        return (*self.prior.names, *(one.name for one in SESSION))
+        """Names of all unknowns."""
+        electrodes = self.prior.sensor.electrode_names
+        coefficients = [f"discrepancy {term} {name}" for term in term_names() for name in electrodes]
+        return (*self.prior.names, *(one.name for one in SESSION), *coefficients)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of all unknowns."""
+        count = self.coefficients.stop - self.coefficients.start
+        return (*(one.unit for one in (*self.prior.properties, *SESSION)), *("1",) * count)
 
     @property
     def film(self) -> slice:
@@ -109,11 +118,10 @@ class Layout:
     @property
     def coefficients(self) -> slice:
         """Coefficients of the discrepancy."""
-        count = coefficient_count(len(self.prior.sensor.electrode_names))
-        return slice(self.session.stop, self.session.stop + count)
+        return slice(self.session.stop, len(self.names))
 
     def index(self, name: str) -> int:
-        """Return the index of a named unknown."""
+        """Return the index of an unknown."""
         return self.names.index(name)
 
 

@@ -11,7 +11,7 @@ calibrated film, times the ratio of the charges of axisymmetric films with both 
 
 import hashlib
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from isocharge.simulate.solver.stress_limit import yield_force
 from isocharge.train.calibration.discrepancy import terms
 from isocharge.train.calibration.film_charges import FilmCharges, axisymmetric, circle_of
 from isocharge.train.calibration.film_estimate import FilmEstimate
+from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.charge_fit import fit_film_series, fit_series
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.training.source import TrainingData
@@ -62,32 +63,19 @@ SEED = 3
 """Seed of the contacts and of the drawn films."""
 
 
-@dataclass(frozen=True)
-class SideForces:
-    """Side forces of later contacts.
-
-    Attributes:
-        friction: Estimated coefficient of friction of the presses, and its standard deviation. Later contacts have this
-            friction or none, each with the probability 0.5.
-        share: Largest side force in any direction, relative to the force.
-    """
-
-    friction: tuple[float, float] = (0.0, 0.0)
-    share: float = 0.0
-
-
 def compact_charges(
-    charges: FilmCharges, film: FilmEstimate, domain: Domain, noise: NoiseModel, executor: Executor | None
+    problem: CalibrationProblem, charges: FilmCharges, film: FilmEstimate, executor: Executor | None
 ) -> ChargeSeries:
     """Compute the compact charge map of an estimated film.
 
     Args:
+        problem: The calibration problem, with the contacts for which the map is needed, and with the noise of the
+            charges, which decides how many directions are needed.
         charges: Charges of the solved film and of similar films.
         film: The estimate.
-        domain: Contacts for which the map is needed. It lies within the domain of `charges`.
-        noise: Noise of the charges, which decides how many directions are needed.
         executor: Executor that solves the films at the nodes; None for this process.
     """
+    domain, noise = problem.domain, problem.noise
     contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
     charge = _film_charges(charges, film, contact)
     names = charges.prior.sensor.electrode_names
@@ -196,19 +184,19 @@ def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge
 
 
 def training_data(
+    problem: CalibrationProblem,
     charges: FilmCharges,
     film: FilmEstimate,
     series: ChargeSeries,
-    side_forces: SideForces,
     executor: Executor | None,
 ) -> TrainingData:
     """Draw the presses from which the network of a calibrated film learns.
 
     Args:
+        problem: The calibration problem, with the side forces of later contacts.
         charges: Charges of the solved film and of similar films.
         film: The estimate of the film.
         series: The compact charge map of the film.
-        side_forces: Side forces of later contacts.
         executor: Executor that solves the presses outside the working area; None for this process.
     """
     rng = np.random.default_rng([SEED, 1])
@@ -218,7 +206,7 @@ def training_data(
     drift = np.hypot(film.value("drift"), film.std("drift")) / np.sqrt(12.0)  # all gains of the session can occur
     charge = charge * (1.0 + drift * rng.standard_normal((PRESSES, 1)))
     charge = charge + film.std("offset") * rng.standard_normal((PRESSES, 1))
-    charge = charge + _side_charges(charges, side_forces, rng, contact)
+    charge = charge + _side_charges(problem, charges, film, rng, contact)
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(
         sensor=sensor,
@@ -242,9 +230,12 @@ def _drawn_charges(series: ChargeSeries, rng: np.random.Generator, contact: Arra
     return np.concatenate(drawn)
 
 
-def _side_charges(charges: FilmCharges, side_forces: SideForces, rng: np.random.Generator, contact: Array) -> Array:
+def _side_charges(
+    problem: CalibrationProblem, charges: FilmCharges, film: FilmEstimate, rng: np.random.Generator, contact: Array
+) -> Array:
     """Draw the charges that side forces of later contacts add, shape (n, n_electrode), pC.
 
+    Later contacts have the friction of the presses or none, each with the probability 0.5.
     The effect of side forces is computed at a few contacts, and described by a series.
     """
     charge = np.zeros((len(contact), len(charges.prior.sensor.electrode_names)))
@@ -259,18 +250,18 @@ def _side_charges(charges: FilmCharges, side_forces: SideForces, rng: np.random.
         series = Series(fit_series(domain.to_unit(sample), values, *DIRECTION_DEGREES))
         return series.values_and_derivatives(domain.to_unit(contact))[:, 0]
 
-    coefficient, std = side_forces.friction
-    if coefficient > 0.0:
+    coefficient = film.value("friction")
+    if problem.friction > 0.0 and coefficient > 0.0:
         reference = min(coefficient, MAX_FRICTION)
         friction_charge = at_contacts(side_force_map.friction_charges(sample, reference) / reference)
-        drawn = coefficient + std * rng.standard_normal(len(contact))
+        drawn = coefficient + film.std("friction") * rng.standard_normal(len(contact))
         has_friction = rng.random(len(contact)) < 0.5
         charge += (drawn * has_friction)[:, None] * friction_charge
-    if side_forces.share > 0.0:
+    if problem.side_force > 0.0:
         jacobian = at_contacts(side_force_map.jacobian(sample).reshape(len(sample), -1)).reshape(*charge.shape, 2)
         angle = 2.0 * np.pi * rng.random(len(contact))
         direction = np.column_stack([np.cos(angle), np.sin(angle)])
-        charge += side_forces.share * contact[:, 2:] * np.einsum("nek,nk->ne", jacobian, direction)
+        charge += problem.side_force * contact[:, 2:] * np.einsum("nek,nk->ne", jacobian, direction)
     return charge
 
 

@@ -39,7 +39,7 @@ from isocharge.train.calibration.calibration_file import film_table, json_text, 
 from isocharge.train.calibration.contact_error import PLANNED, ContactSensitivity
 from isocharge.train.calibration.estimator import Estimation
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate
-from isocharge.train.calibration.film_network import SideForces, compact_charges, training_data
+from isocharge.train.calibration.film_network import compact_charges, training_data
 from isocharge.train.calibration.press_data import no_presses
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import IDENTIFIED_RATIO, CalibrationResult
@@ -182,10 +182,8 @@ def write_calibration(
 
     check_calibration_folder(folder, result.problem.electrodes)
     problem, film = result.problem, result.film
-    series = compact_charges(result.charges, film, problem.domain, problem.noise, executor)
-    friction = (film.value("friction"), film.std("friction")) if problem.friction else (0.0, 0.0)
-    side_forces = SideForces(friction, problem.side_force)
-    fitted = fit(training_data(result.charges, film, series, side_forces, executor), config)
+    series = compact_charges(problem, result.charges, film, executor)
+    fitted = fit(training_data(problem, result.charges, film, series, executor), config)
 
     sensor, _ = result.sensor_and_probe
     is_folded = CHARGES in fitted.provenance.files
