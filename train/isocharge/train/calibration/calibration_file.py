@@ -1,7 +1,7 @@
 """Writer and reader of `calibration.json`, the file with the estimate of a film.
 
-The file contains the value, the standard deviation and the unit of each unknown. `correlations` is the lower triangle of
-the correlation matrix of all unknowns, in this order: one row for each unknown, without the diagonal, rounded to six
+The file contains the value, the standard deviation and the unit of each unknown. `correlations` is the lower triangle
+of the correlation matrix of all unknowns, in this order: one row for each unknown, without the diagonal, rounded to six
 digits. The correlations of an unknown whose standard deviation is zero are zero.
 """
 
