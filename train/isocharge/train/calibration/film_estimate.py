@@ -103,7 +103,8 @@ class Layout:
     def units(self) -> tuple[str, ...]:
         """Units of all unknowns."""
         count = self.coefficients.stop - self.coefficients.start
-        return (*(one.unit for one in (*self.prior.properties, *SESSION)), *("1",) * count)
+        named = (*(one.unit for one in self.prior.properties), *(one.unit for one in SESSION))
+        return (*named, *("1",) * count)
 
     @property
     def film(self) -> slice:
