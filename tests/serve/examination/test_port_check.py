@@ -1,6 +1,7 @@
 """Port check of simulated boards with known faults, and health of channels with known noise, drift and hum."""
 
 import json
+import re
 import struct
 from dataclasses import asdict, replace
 from functools import partial
@@ -12,6 +13,7 @@ from isocharge.cli.serve.doctor import brief_report
 from isocharge.common.errors import DeviceError, NoFramesError
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text
 from isocharge.serve.examination.channel_health import measure_channel_health
+from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.live.device import ANY_BOARD
@@ -116,6 +118,12 @@ def test_unused_inputs_are_ignored():
     (first, *_) = brief_report(report)["channels"]
     assert {"offset_counts", "drift_counts_per_s"} <= set(first)
     assert not any("pC" in name for name in first)
+
+
+def test_too_few_used_channels_for_the_model():
+    report = examine_received(received(row), electrodes=("A", "B", "C", "D", "E"))
+    assert "6 channels, but the model has the electrodes" in missing(report)
+    assert "channels" not in report.device
 
 
 def test_channels_of_most_similar_noise_are_proposed():
@@ -234,6 +242,15 @@ def test_stream_states_that_a_serial_server_uses_the_telnet_protocol():
     stream = ReadingStream(("A", "B", "C"), device_from_table({"frames": {"format": "binary"}}, "test"))
     with pytest.raises(NoFramesError, match="raw TCP"):
         [list(stream.frames(Chunk(frame.replace(b"\xff", b"\xff\xff"), 0.0, 0))) for frame in frames * 2]
+
+
+@pytest.mark.parametrize("gain", [{}, {"pC_per_unit": 0.5}])
+def test_device_text_describes_the_board(gain):
+    board = lambda k: b"%d,%d,0\n" % (303 + k % 5, 307 - k % 5)  # noqa: E731
+    text = device_text(examine_received(received(board), electrodes=("A", "B"), gain=gain))
+    assert ("\npC_per_unit = 0.5" in text) == bool(gain)
+    assert re.search(r"\n# text: 3 columns without names; 20[01] frames per second\n", text)
+    assert "channels that no electrode uses: 3" in text
 
 
 def test_offset_drift_hum_and_noise_of_a_channel():
