@@ -58,8 +58,7 @@ class Release:
 
 
 SIMULATED_TRUTH = """\
-- These figures compare with the simulator, not with a real film. On a real film, an unknown pretension and unknown
-  gains cause larger errors.
+- These figures compare with the simulator. On a real film, unknown gains and pretension cause larger errors.
 """
 
 MEASURED_TRUTH = """\
@@ -73,11 +72,9 @@ No noise was added to these presses. The errors include those of the places and 
 """
 
 LIMITS = """\
-- The model assumes one press at a time, inside its working area and its range of forces. The answer to any other press
-  is finite and wrong. It carries a flag only if the charges differ enough from those of every press inside the working
-  area and the range of forces.
-- The standard deviations are valid for the noise named above. Gains that are wrong by 1 % cause larger errors than this
-  noise.
+- The answer to a press outside the working area or the range of forces, or to several presses at a time, is wrong. It
+  carries a flag only if the charges differ enough from those of every press that the model covers.
+- The standard deviations are valid for the noise named above, and not for wrong gains.
 """
 
 
@@ -175,7 +172,7 @@ def yield_text(metadata: ModelMetadata) -> str:
         return ""
     return (
         f"; beyond {metadata.yield_force_N:g} N the film is stressed to more than {DEFAULT_STRESS_LIMIT:g} MPa: PVDF "
-        "yields, and a dent remains (flag `stress`)"
+        "yields (flag `stress`)"
     )
 
 
@@ -251,7 +248,7 @@ def _misfit_section(metadata: ModelMetadata, fitted: Fitted) -> str:
         presses_text = "simulated good presses"
     else:
         presses_text = "good presses"
-    rare_text = f",\n0.1 % exceed {errors['misfit_p999']:g}" if "misfit_p999" in errors else ""
+    rare_text = f", 0.1 % exceed {errors['misfit_p999']:g}" if "misfit_p999" in errors else ""
     faults_text = ""
     if "found_dead_electrode" in errors:
         gain_percent = 100 * errors["found_gain_20_percent"]
@@ -260,19 +257,13 @@ def _misfit_section(metadata: ModelMetadata, fitted: Fitted) -> str:
             f"An alarm at {errors['misfit_p99']:g} finds {gain_percent:.3g} % of the presses of about 1 N with one\n"
             f"gain that is wrong by 20 %, and {dead_percent:.3g} % of those with one dead electrode."
         )
-    meaning_text = (
-        "The misfit is large if the charges do not belong to one press (a wrong gain, a dead electrode, two presses)."
-    )
+    meaning_text = "It is large if the charges do not belong to one press."
     if len(metadata.electrodes) == 3:
-        meaning_text = (
-            "Because there are three charges and three unknowns, nearly all charges fit some contact. The misfit is\n"
-            "therefore large only for charges whose contact lies outside the working area or the range of forces."
-        )
+        meaning_text = "Three charges nearly always fit some contact, so it is large only outside the model's range."
     return f"""\
-The misfit is the distance, in units of the noise{unit_text}, of the charges from the charges of the nearest single
-contact. A network estimates it, which was trained on the results of exact searches. 1 % of {presses_text} exceed \
-{errors["misfit_p99"]:g}{rare_text}.
+The misfit is the distance of the charges from those of the nearest single contact, in units of the noise{unit_text}.
 {meaning_text}
+1 % of {presses_text} exceed {errors["misfit_p99"]:g}{rare_text}.
 {faults_text}
 """
 
