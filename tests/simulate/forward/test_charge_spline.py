@@ -38,6 +38,16 @@ def test_gradients_equal_differences_of_the_charges_across_a_correction(near_spl
         np.testing.assert_allclose(gradients[..., axis], slope, atol=1e-5 * np.abs(slope).max())
 
 
+def test_stress_charges_for_all_forces_equal_the_charges_of_the_map(near_map):
+    """The charges for all forces come from fields in single precision. Charges that are not needed are zero."""
+    position = spread(40)[:, :2]
+    is_needed = np.array([True, False, True, True])
+    together = near_map.stress_charges_by_force(position, is_needed)
+    for number, force in enumerate(near_map.family.force.tolist()):
+        single = near_map.charges(np.column_stack([position, np.full(40, force)])) * is_needed
+        np.testing.assert_allclose(together[:, number], single, atol=2e-6 * np.abs(single).max())
+
+
 def test_spline_includes_the_charge_of_contact_pressure(near_map):
     """The charges of d33 are proportional to the force, while those of the stress depend on the squared amplitude.
 
