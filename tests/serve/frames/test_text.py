@@ -57,6 +57,12 @@ def test_damaged_line_of_text_is_refused_with_the_reason(text, reason):
         parse_line(clean_text(text))
 
 
+@pytest.mark.parametrize("line", ["\u2212{},1,2", "A:\u2212{},B:1,C:2", ">A:\u2212{}"])
+def test_minus_sign_of_unicode_is_a_negative_sign(line):
+    frames = feed("1.5,1,2" if line[0] == "\u2212" else "", *[line.format(f"{number}.5") for number in range(4)])
+    assert [frame.values[0] for frame in frames][-4:] == [-0.5, -1.5, -2.5, -3.5]
+
+
 @pytest.mark.parametrize("text", ["booting v1.2 on ESP32-S3", "{", "ch3,A0", "10.0.0.1", "1_0", ">A"])
 def test_digits_in_words_are_no_numbers(text):
     assert parse_line(text).numbers == ()
