@@ -184,6 +184,17 @@ def test_unnamed_crc_is_recognised_by_its_polynomial():
     assert parser.counts.crc_errors == 0
 
 
+@pytest.mark.parametrize("tick_rate_Hz", [31250.0, 32768.0])
+def test_clock_has_the_nearest_usual_tick_rate(tick_rate_Hz):
+    ticks = np.round(np.arange(FRAMES) * tick_rate_Hz / RATE_HZ).astype(int)
+    charges = np.random.default_rng(0).normal(800.0, 9.0, (FRAMES, 3)).round().astype(int)
+    rows = zip(ticks.tolist(), charges.tolist(), strict=True)
+    stream = b"".join(b"\xaa\x55" + struct.pack("<I3h", tick, *charge) for tick, charge in rows)
+    section = described_frames_section([stream], FRAMES / RATE_HZ)
+    clocks = [field for field in section["fields"] if field["name"] == "t_us"]
+    assert [clock["scale"] for clock in clocks] == pytest.approx([1e6 / tick_rate_Hz])
+
+
 @pytest.mark.parametrize(
     ("lines", "expected"),
     [

@@ -30,7 +30,7 @@ STEADY_SPREAD = 0.7
 
 CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
     tick_rate_Hz: ("t_us", 1e6 / tick_rate_Hz)
-    for tick_rate_Hz in (100.0, 1e4, 1e5, 1024.0, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6)
+    for tick_rate_Hz in (100.0, 1e4, 1e5, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6)
 }
 """Name of the field, and value of one tick in the unit of that name, by the tick rate of a clock, Hz."""
 
@@ -73,10 +73,9 @@ def identify_clock(steps: Array, frame_rate_Hz: float) -> tuple[str, float] | No
     """
     ticks_per_frame = steady_step(steps)
     tick_rate_Hz = ticks_per_frame * frame_rate_Hz
-    for usual_tick_rate_Hz, name_and_tick_duration in CLOCKS.items():
-        if abs(tick_rate_Hz / usual_tick_rate_Hz - 1.0) < CLOCK_RATE_TOLERANCE:
-            return name_and_tick_duration
-    return None
+    deviations = {usual_tick_rate_Hz: abs(tick_rate_Hz / usual_tick_rate_Hz - 1.0) for usual_tick_rate_Hz in CLOCKS}
+    nearest_tick_rate_Hz = min(deviations, key=deviations.__getitem__)
+    return CLOCKS[nearest_tick_rate_Hz] if deviations[nearest_tick_rate_Hz] < CLOCK_RATE_TOLERANCE else None
 
 
 @dataclass(frozen=True)
