@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import DatasetError, PressError
 from isocharge.serve import MeasuredPresses
-from isocharge.simulate import Circle, Domain, Samples
+from isocharge.simulate import Circle, Domain, Samples, parse_probe
 from isocharge.train.data.presses import dataset_of, domain_of, held_out, is_measured, presses_of, split_by_position
 from isocharge.train.training.source import TrainingData
 
@@ -151,6 +151,15 @@ def test_simulated_and_measured_datasets_are_distinguished(dataset, sensor):
     assert not is_measured(dataset)
     presses = measured_presses(random_contacts(60, 2), np.ones((60, 3)))
     assert is_measured(dataset_of(presses, sensor, Circle(1.0)))
+
+
+def test_measured_presses_keep_the_orientation_of_their_probe(sensor):
+    presses = measured_presses(random_contacts(60, 2), np.ones((60, 3)))
+    probe = parse_probe("rectangle:4x2@30")
+    samples = dataset_of(presses, sensor, probe).samples
+    assert samples.orientation_deg == pytest.approx(30.0)
+    described_probe = parse_probe(str(samples.probe[0])).rotated(np.deg2rad(samples.orientation_deg[0]))
+    assert described_probe.angle == pytest.approx(probe.angle)
 
 
 def test_presses_with_unknown_places_forces_or_charges_are_left_out(sensor):
