@@ -228,6 +228,18 @@ def test_scipy_finds_no_nearer_contact(field, held_out_presses, fault):
         assert distance <= smallest + 0.01 + 1e-3 * smallest
 
 
+@pytest.mark.parametrize("forces", [(0.5,), (0.1, 0.5, 2.0)])
+def test_charges_of_both_signs_are_fitted_with_few_different_forces(forces):
+    rng = np.random.default_rng(0)
+    contact = draw_contacts(rng, DOMAIN, 2500)
+    contact[:, 2] = rng.choice(forces, len(contact))
+    charge = contact[:, 2:] * (contact[:, :2] @ [[10.0, 0.0, 4.0], [0.0, 10.0, -4.0]] + [0.0, 0.0, 50.0])
+    presses = LabelledPresses(contact, charge)
+    domain = Domain(8.0, (min(forces), max(forces)))
+    series = fit_charge_series(domain, ("A", "B", "C"), presses[:2000], presses[2000:])
+    np.testing.assert_allclose(series.charges(contact), charge, atol=1e-2)
+
+
 def test_series_of_a_film_at_several_pretensions_agrees_with_its_closed_form():
     """ln Q falls by 0.3 per MPa, by more beside an electrode; the exponent of the force does not change."""
     contact = draw_contacts(np.random.default_rng(0), DOMAIN, 2000)

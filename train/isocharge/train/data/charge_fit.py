@@ -234,7 +234,8 @@ class _SeriesFitter:
 def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
     """Fit a polynomial in l, the scaled logarithm of the force, to ln S, the logarithm of the size of the charges.
 
-    For each press, the size S is the root of the sum of the squared charges, but at least `LOWEST_CHARGE`.
+    For each press, the size S is the root of the sum of the squared charges, but at least `LOWEST_CHARGE`. Presses with
+    few different forces determine only a polynomial of a lower degree.
 
     Args:
         unit_log_force: Logarithms l of the forces scaled to [-1, 1], shape (n,).
@@ -244,7 +245,10 @@ def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
         Coefficients of the Chebyshev polynomials, shape (SIZE_DEGREE + 1,).
     """
     size = np.maximum(np.linalg.norm(charge, axis=1), LOWEST_CHARGE)
-    return np.asarray(chebyshev.chebfit(unit_log_force, np.log(size), SIZE_DEGREE))
+    degree = min(SIZE_DEGREE, np.unique(unit_log_force).size - 1)
+    coefficients = np.zeros(SIZE_DEGREE + 1)
+    coefficients[: degree + 1] = chebyshev.chebfit(unit_log_force, np.log(size), degree)
+    return coefficients
 
 
 def series_term_count(degree: int, force_degree: int) -> int:
