@@ -32,7 +32,7 @@ MAX_PADDING = 4096
 
 ByteOrder = Literal["little", "big"]
 Hexadecimal = Annotated[
-    str, Meta(pattern=r"^\s*([0-9A-Fa-f]{2}\s*)+$", description="bytes in hexadecimal, as in '20 4E'")
+    str, Meta(pattern=r"^[ \t\r\n]*([0-9A-Fa-f]{2}[ \t\r\n]*)+$", description="bytes in hexadecimal, as in '20 4E'")
 ]
 
 
