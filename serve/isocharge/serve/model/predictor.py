@@ -56,7 +56,7 @@ class Predictor:
         >>> touch = Predictor("three-25um-biaxial")
         >>> contact = touch.predict([593.9, 573.5, 435.2])
         >>> contact
-        Contact(x_mm=2.989 +- 0.054, y_mm=-1.991 +- 0.036, force_N=0.5014 +- 0.0012, misfit=0.023)
+        Contact(x_mm=2.992 +- 0.053, y_mm=-1.991 +- 0.035, force_N=0.5013 +- 0.0012, misfit=0.021)
         >>> touch.flags(contact)  # empty: the contact is valid
         ()
     """
