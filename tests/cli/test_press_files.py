@@ -55,6 +55,7 @@ def test_presses_of_a_parquet_file_are_named_by_their_rows(command, tmp_path):
     write_table(pyarrow.table(columns), tmp_path / "p.parquet")
     code, out, err = command("serve", "check", "four-25um-biaxial", tmp_path / "p.parquet")
     assert (code, err) == (1, "")
+    assert out.split()[:2] == ["each:", "row"]
     assert "(row 2)" in out
 
 

@@ -15,7 +15,7 @@ from isocharge.serve.prediction.press_check import PressCheck, check_presses
 MAX_ROWS = 40
 """Largest number of presses in the table. If there are more, the presses with the largest errors are listed."""
 
-SHOWN = ("line", "x_mm", "y_mm", "force_N", "position_error_mm", "force_error_percent", "flags", "left_out")
+SHOWN = ("x_mm", "y_mm", "force_N", "position_error_mm", "force_error_percent", "flags", "left_out")
 """Values of a press in the table."""
 
 
@@ -48,7 +48,9 @@ def check_command(
         del result["each"]
         summaries = {name: result.pop(name) for name in ("position_mm", "force_percent")}
         errors = {name: summary for name, summary in summaries.items() if summary is not None}
-        presses = [{name: row[name] for name in SHOWN} for row in _worst_presses(check)]
+        presses = [
+            {check.errors.row_noun: row["line"]} | {name: row[name] for name in SHOWN} for row in _worst_presses(check)
+        ]
         result = {"each": presses, "errors": errors} | result
         result["std_factor"] = check.std_factor and check.std_factor.statement
     show_result(result, json=json)

@@ -20,7 +20,7 @@ from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.serve.model.validity import Validity
 from isocharge.serve.presses.csv_table import CsvTable
-from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, ignored_columns_message
+from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, TableSource, ignored_columns_message
 from isocharge.serve.presses.table_file import open_table
 from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
 
@@ -52,7 +52,7 @@ def read_charges(
         ChargeError: If a column is missing or occurs twice, a cell is not a finite number, or there are more rows than
             `MAX_CHARGE_ROWS`.
     """
-    table = CsvTable(lines, electrodes, where, ChargeError, _expected_header(electrodes))
+    table = CsvTable(lines, TableSource(electrodes, where, ChargeError, _expected_header(electrodes)))
     return _read_electrode_charges(table, electrodes, warn)
 
 
@@ -101,7 +101,7 @@ def _read_electrode_charges(table: NumberTable, electrodes: tuple[str, ...], war
     column_rules = table.choose_columns(rule_of_each_electrode)
     ignored_names = [name for name in table.header if name not in electrodes]
     if ignored_names:
-        warn(ignored_columns_message(table.where, ignored_names))
+        warn(ignored_columns_message(table.source.where, ignored_names))
     columns = table.read(column_rules, MAX_CHARGE_ROWS)
     return np.column_stack([columns.values[name] for name in electrodes])
 

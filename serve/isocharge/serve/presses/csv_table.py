@@ -26,7 +26,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, shown
 from isocharge.serve.presses.header_advice import OTHER_UNITS
-from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, NumberTable
+from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, NumberTable, TableSource
 from isocharge.serve.presses.number_text import parse_number
 
 _SEPARATORS = ",;\t|"
@@ -76,28 +76,22 @@ class CsvTable(NumberTable):
 
     row_noun = "line"
 
-    def __init__(
-        self, lines: Iterable[str], names: Collection[str], where: str, error_class: type[InputError], expected: str
-    ) -> None:
+    def __init__(self, lines: Iterable[str], source: TableSource) -> None:
         """Find and read the header.
 
         Args:
             lines: Lines of the text.
-            names: Names of columns that have a meaning. A header whose first name is one of these names is not a
-                comment, even if the name begins with #.
-            where: Name of the file, for error messages.
-            error_class: Class of the error that is raised for every mistake in the file.
-            expected: Description of the expected header, for error messages.
+            source: Name of the file, its known columns, and the class of errors.
 
         Raises:
             error_class: If the file is empty, is not CSV text in UTF-8, or has too many columns.
         """
-        checked_lines = _checked_lines(lines, where, error_class)
+        checked_lines = _checked_lines(lines, source)
         first_lines = list(islice(checked_lines, _MAX_LINES_TO_HEADER))
         if first_lines and "\0" in first_lines[0]:
-            raise error_class(f"{where}: {_null_advice(first_lines[0])}")
-        self._separator, header_line = _find_header(first_lines, names)
-        self._rows = _numbered_rows(chain(first_lines, checked_lines), names, self._separator, where, error_class)
+            raise source.error(f": {_null_advice(first_lines[0])}")
+        self._separator, header_line = _find_header(first_lines, source.names)
+        self._rows = _numbered_rows(chain(first_lines, checked_lines), self._separator, source)
         self._rows_above: list[tuple[int, list[str]]] = []  # rows above the header, which may state units
         header = None
         for line_number, cells in self._rows:
@@ -106,8 +100,8 @@ class CsvTable(NumberTable):
                 break
             self._rows_above.append((line_number, cells))
         if header is None:
-            raise error_class(f"{where}: empty; expected {expected}")
-        super().__init__(header, names, where, error_class, expected)
+            raise source.error(f": empty; expected {source.expected}")
+        super().__init__(header, source)
         self._mark_changes: dict[int, int] = {}  # `_SWAPPED_MARKS` if the file has decimal commas
         self._is_mark_certain = False
         self._marked_number = ""  # position and text of the first number with a mark, for error messages
@@ -181,8 +175,8 @@ class CsvTable(NumberTable):
         """
         separator = repr(self._separator)[1:-1]  # the tab as `tr` expects it
         command = "" if separator == "," else f", as with: tr ',{separator}' '.,' < FILE > NEW.csv"
-        raise self.error_class(
-            f"{self.where}, {self._marked_number} has a decimal mark or a separator of thousands, and no number in the "
+        raise self.source.error(
+            f", {self._marked_number} has a decimal mark or a separator of thousands, and no number in the "
             "file excludes one of them; write commas between the columns, decimal points and no separators of "
             f"thousands{command}"
         )
@@ -210,8 +204,8 @@ class CsvTable(NumberTable):
         for name, unit in given_units.items():
             expected_unit = expected_units[name] or "-"
             if unit not in ("", expected_unit):
-                raise self.error_class(
-                    f"{self.where}, line {line_number}, column {shown(name)}: expected the unit {expected_unit}, got "
+                raise self.source.error(
+                    f", line {line_number}, column {shown(name)}: expected the unit {expected_unit}, got "
                     f"{shown(unit)}; convert the column and write {expected_unit}"
                 )
         return True
@@ -228,8 +222,8 @@ class CsvTable(NumberTable):
         """
         additional_cells = cells[len(self.header) :]
         if len(cells) < len(self.header) or any(cell.strip() for cell in additional_cells):
-            raise self.error_class(
-                f"{self.where}, line {line_number}: expected {len(self.header)} cells as in the header, got "
+            raise self.source.error(
+                f", line {line_number}: expected {len(self.header)} cells as in the header, got "
                 f"{len(cells)}: {shown(cells)}"
             )
 
@@ -253,9 +247,8 @@ class CsvTable(NumberTable):
         words = cell.split()
         if len(words) == 2 and _number(words[0]) is not None and _number(words[1]) is None:
             advice = f"; write the number without {shown(words[1])}"
-        raise self.error_class(
-            f"{self.where}, line {line_number}, column {shown(name)}: expected {rule.description}, got "
-            f"{shown(cell)}{advice}"
+        raise self.source.error(
+            f", line {line_number}, column {shown(name)}: expected {rule.description}, got {shown(cell)}{advice}"
         )
 
     def _refuse_header(self, reason: str) -> NoReturn:
@@ -331,13 +324,12 @@ class _LinesWithoutComments:
         return "\n" if is_comment else line
 
 
-def _checked_lines(lines: Iterable[str], where: str, error_class: type[InputError]) -> Iterator[str]:
+def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
     """Yield the lines of a text.
 
     Args:
         lines: Lines of the text, each with its line end.
-        where: Name of the file, for error messages.
-        error_class: Class of the error that is raised.
+        source: Name of the file and class of the error, for error messages.
 
     Raises:
         error_class: If the lines are not text in UTF-8, or a line is too long.
@@ -352,14 +344,12 @@ def _checked_lines(lines: Iterable[str], where: str, error_class: type[InputErro
     except InputError:  # the iterator `lines` has raised an error with its own message
         raise
     except UnicodeDecodeError as cause:
-        raise error_class(where + _decoding_advice(cause, line_count)) from cause
+        raise source.error(_decoding_advice(cause, line_count)) from cause
     except ValueError as cause:  # the next line is too long
-        raise error_class(f"{where}, line {line_count + 1}: not CSV text ({cause})") from cause
+        raise source.error(f", line {line_count + 1}: not CSV text ({cause})") from cause
 
 
-def _numbered_rows(
-    lines: Iterable[str], names: Collection[str], separator: str, where: str, error_class: type[InputError]
-) -> Iterator[tuple[int, list[str]]]:
+def _numbered_rows(lines: Iterable[str], separator: str, source: TableSource) -> Iterator[tuple[int, list[str]]]:
     """Yield the line number and the cells of each row that is neither blank nor a comment.
 
     The first line has the number 1. If a row extends over several lines, the line number is the number of its last
@@ -367,16 +357,13 @@ def _numbered_rows(
 
     Args:
         lines: Lines of the text, each with its line end.
-        names: Names of columns that have a meaning. A line whose first cell is one of these names is not a comment,
-            even if the name begins with #.
         separator: Character between the columns.
-        where: Name of the file, for error messages.
-        error_class: Class of the error that is raised.
+        source: Name of the file, its known columns, and the class of errors.
 
     Raises:
         error_class: If the lines are not CSV text.
     """
-    lines_without_comments = _LinesWithoutComments(lines, names, separator)
+    lines_without_comments = _LinesWithoutComments(lines, source.names, separator)
     reader = csv.reader(lines_without_comments, delimiter=separator, strict=True)
     try:
         for cells in reader:
@@ -384,7 +371,7 @@ def _numbered_rows(
             if any(cell.strip() for cell in cells):
                 yield reader.line_num, cells
     except csv.Error as cause:
-        raise error_class(f"{where}, line {reader.line_num}: not CSV text ({cause})") from cause
+        raise source.error(f", line {reader.line_num}: not CSV text ({cause})") from cause
 
 
 def _find_header(lines: list[str], names: Collection[str]) -> tuple[str, int]:
@@ -401,11 +388,12 @@ def _find_header(lines: list[str], names: Collection[str]) -> tuple[str, int]:
     Returns:
         The separator, and the number of the line of the header.
     """
+    source = TableSource(names, "", InputError, "")
     best_score = (-1, 0, 0)
     best_separator = _SEPARATORS[0]
     for separator in _SEPARATORS:
         with suppress(InputError):  # the error is raised again when the table is read
-            for line_number, cells in _numbered_rows(lines, names, separator, "", InputError):
+            for line_number, cells in _numbered_rows(lines, separator, source):
                 texts = {cell.strip() for cell in cells if cell.strip()}
                 numbers = {text for text in texts if _number(text.replace(",", ".")) is not None}
                 has_number = bool(numbers.difference(names))

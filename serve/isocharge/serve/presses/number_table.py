@@ -124,41 +124,55 @@ def _value_text(value: float) -> str:
     return short_text if is_exact else repr(value)
 
 
+@dataclass(frozen=True)
+class TableSource:
+    """File of a table, for its reader and for error messages.
+
+    Attributes:
+        names: Names of columns that have a meaning. These names are kept unchanged. A header whose first name is one of
+            these names is not a comment, even if the name begins with #.
+        where: Name of the file.
+        error_class: Class of the error that is raised for every mistake in the file.
+        expected: Description of the expected header.
+    """
+
+    names: Collection[str]
+    where: str
+    error_class: type[InputError]
+    expected: str
+
+    def error(self, message: str) -> InputError:
+        """Return an error whose message consists of the name of the file and the given text."""
+        return self.error_class(f"{self.where}{message}")
+
+
 class NumberTable(ABC):
     """Base class for a file with a header and columns of numbers. The columns can be read only once.
 
+    Every mistake in the file raises the error class of `source`.
+
     Attributes:
         header: Names of the columns in the file.
-        where: Name of the file, for error messages.
-        error_class: Class of the error that is raised for every mistake in the file.
-        expected: Description of the expected header, for error messages.
+        source: The file.
         row_noun: What the row numbers of the format count, for error messages: "line" or "row".
     """
 
     row_noun: ClassVar[str]
 
-    def __init__(
-        self, header: Sequence[str], names: Collection[str], where: str, error_class: type[InputError], expected: str
-    ) -> None:
-        """Check the number of columns, and store the names of the columns.
+    def __init__(self, header: Sequence[str], source: TableSource) -> None:
+        """Check the number of columns, and store the names of the columns without blanks at their ends.
 
         Args:
             header: Names of the columns in the file.
-            names: Names of columns that have a meaning. These names are kept unchanged. Blanks at the ends of all other
-                names are removed.
-            where: Name of the file, for error messages.
-            error_class: Class of the error that is raised for every mistake in the file.
-            expected: Description of the expected header, for error messages.
+            source: The file.
 
         Raises:
             error_class: If the file has too many columns.
         """
         if len(header) > MAX_COLUMNS:
-            raise error_class(f"{where}: expected at most {MAX_COLUMNS:,} columns, got {len(header):,}")
-        self.header = tuple(name if name in names else name.strip() for name in header)
-        self.where = where
-        self.error_class = error_class
-        self.expected = expected
+            raise source.error(f": expected at most {MAX_COLUMNS:,} columns, got {len(header):,}")
+        self.header = tuple(name if name in source.names else name.strip() for name in header)
+        self.source = source
 
     def choose_columns(
         self, required: Mapping[str, ColumnRule], optional: Mapping[str, ColumnRule] | None = None
@@ -223,7 +237,7 @@ class NumberTable(ABC):
                 column.
         """
         columns = self._read_columns(rules, max_rows)
-        columns.check(rules, f"{self.where}, ", self.error_class)
+        columns.check(rules, f"{self.source.where}, ", self.source.error_class)
         return columns
 
     @abstractmethod
@@ -239,8 +253,8 @@ class NumberTable(ABC):
         Raises:
             error_class: Always.
         """
-        raise self.error_class(
-            f"{self.where}: expected {self.expected}, got the header {shown(list(self.header))}; {reason}"
+        raise self.source.error(
+            f": expected {self.source.expected}, got the header {shown(list(self.header))}; {reason}"
         )
 
     def _refuse_row_count(self, max_rows: int) -> NoReturn:
@@ -249,7 +263,7 @@ class NumberTable(ABC):
         Raises:
             error_class: Always.
         """
-        raise self.error_class(f"{self.where}: expected at most {max_rows:,} presses, got more; split the file")
+        raise self.source.error(f": expected at most {max_rows:,} presses, got more; split the file")
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -6,16 +6,16 @@ width. Null and NaN stand for empty cells. The other columns of the file may hav
 """
 
 import io
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import InputError, cut, shown
+from isocharge.common.errors import cut, shown
 from isocharge.common.extras import require
-from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, NumberTable
+from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, NumberTable, TableSource
 
 if TYPE_CHECKING:
     from pyarrow import Array as ArrowArray
@@ -45,17 +45,8 @@ class ParquetTable(NumberTable):
 
     row_noun = "row"
 
-    def __init__(
-        self, file: BinaryIO, names: Collection[str], where: str, error_class: type[InputError], expected: str
-    ) -> None:
-        """Read the metadata of the file.
-
-        Args:
-            file: The file, which is open for reading. It must remain open until the columns have been read.
-            names: Names of columns that have a meaning.
-            where: Name of the file, for error messages.
-            error_class: Class of the error that is raised for every mistake in the file.
-            expected: Description of the expected header, for error messages.
+    def __init__(self, file: BinaryIO, source: TableSource) -> None:
+        """Read the metadata of the file, which must remain open until the columns have been read.
 
         Raises:
             error_class: If the file is not Parquet, is damaged, or has too many columns.
@@ -64,13 +55,13 @@ class ParquetTable(NumberTable):
         require_pyarrow()
         from pyarrow.parquet import ParquetFile
 
-        _check_ends(file, where, error_class)
-        with _pyarrow_errors_converted(where, error_class):
+        _check_ends(file, source)
+        with _pyarrow_errors_converted(source):
             self._parquet = ParquetFile(file)
             self._metadata = self._parquet.metadata
             self._schema = self._parquet.schema_arrow
             header = self._schema.names
-        super().__init__(header, names, where, error_class, expected)
+        super().__init__(header, source)
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Decode the requested columns.
@@ -109,11 +100,11 @@ class ParquetTable(NumberTable):
 
         field = self._schema.field(self.header.index(name))
         if not _is_number_type(field.type):
-            raise self.error_class(
-                f"{self.where}, column {shown(name)}: expected numbers ({rule.description}), got a column of type "
+            raise self.source.error(
+                f", column {shown(name)}: expected numbers ({rule.description}), got a column of type "
                 f"{cut(str(field.type))}; convert it to float64"
             )
-        with _pyarrow_errors_converted(self.where, self.error_class):
+        with _pyarrow_errors_converted(self.source):
             numbers = self._decode(self._leaf_index(field.name), name)
         if is_integer(field.type):
             self._refuse_rounded_integers(numbers, name)
@@ -143,8 +134,8 @@ class ParquetTable(NumberTable):
                 break
             numbers[first_row:row_count] = _as_float64(batch.column(0))  # the only column of the batch
         if row_count != declared_row_count:
-            raise self.error_class(
-                f"{self.where}, column {shown(name)}: expected {declared_row_count:,} rows as in the metadata of the "
+            raise self.source.error(
+                f", column {shown(name)}: expected {declared_row_count:,} rows as in the metadata of the "
                 "file, got another number; the file is damaged, write it again"
             )
         return numbers
@@ -164,8 +155,8 @@ class ParquetTable(NumberTable):
         schema = self._parquet.schema
         indices = [index for index in range(len(schema)) if schema.column(index).path == field_name]
         if len(indices) != 1:
-            raise self.error_class(
-                f"{self.where}: expected one column {shown(field_name)}, got {len(indices)} that are stored under "
+            raise self.source.error(
+                f": expected one column {shown(field_name)}, got {len(indices)} that are stored under "
                 "this name; rename the others"
             )
         return indices[0]
@@ -183,8 +174,8 @@ class ParquetTable(NumberTable):
         inexact_rows = np.flatnonzero(np.abs(numbers) >= FIRST_INEXACT_INTEGER)
         if inexact_rows.size:
             row = inexact_rows[0]
-            raise self.error_class(
-                f"{self.where}, row {row + 1}, column {shown(name)}: expected an integer of a magnitude below 2^53, "
+            raise self.source.error(
+                f", row {row + 1}, column {shown(name)}: expected an integer of a magnitude below 2^53, "
                 f"which float64 holds exactly, got {numbers[row]:.0f}; convert the column to float64"
             )
 
@@ -219,15 +210,14 @@ def require_pyarrow() -> None:
         import pyarrow.parquet  # noqa: F401
 
 
-def _check_ends(file: BinaryIO, where: str, error_class: type[InputError]) -> None:
+def _check_ends(file: BinaryIO, source: TableSource) -> None:
     """Check the marks at both ends of a Parquet file, and the size of the metadata.
 
     The size is checked before pyarrow reads the metadata, because large metadata need much memory.
 
     Args:
         file: The file, which is open for reading. Its position is 0 before and after the call.
-        where: Name of the file, for error messages.
-        error_class: Class of the error that is raised.
+        source: Name of the file and class of the error, for error messages.
 
     Raises:
         error_class: If the file is not Parquet, is incomplete, or has very large metadata.
@@ -242,21 +232,20 @@ def _check_ends(file: BinaryIO, where: str, error_class: type[InputError]) -> No
     file.seek(0)  # pyarrow reads the file from its beginning
 
     if first_mark != MARK or last_mark != MARK:
-        raise error_class(f"{where}: not a Parquet file, or one that was cut off; write it again, or as CSV")
+        raise source.error(": not a Parquet file, or one that was cut off; write it again, or as CSV")
     if metadata_bytes > MAX_FOOTER_BYTES:
-        raise error_class(
-            f"{where}: expected metadata of at most {MAX_FOOTER_BYTES:,} bytes, got {metadata_bytes:,}; write the file "
+        raise source.error(
+            f": expected metadata of at most {MAX_FOOTER_BYTES:,} bytes, got {metadata_bytes:,}; write the file "
             "with fewer columns or row groups"
         )
 
 
 @contextmanager
-def _pyarrow_errors_converted(where: str, error_class: type[InputError]) -> Iterator[None]:
+def _pyarrow_errors_converted(source: TableSource) -> Iterator[None]:
     """If pyarrow raises an exception for a damaged file in the `with` block, raise a given error instead.
 
     Args:
-        where: Name of the file, for the error message.
-        error_class: Class of the error that is raised.
+        source: Name of the file and class of the error, for the error message.
 
     Raises:
         error_class: If the block raises one of the exceptions of pyarrow.
@@ -265,13 +254,11 @@ def _pyarrow_errors_converted(where: str, error_class: type[InputError]) -> Iter
 
     try:
         yield
-    except error_class:  # the block has raised an error with its own message; it may also be a ValueError
+    except source.error_class:  # the block has raised an error with its own message; it may also be a ValueError
         raise
     except (ArrowException, OSError, ValueError, MemoryError, OverflowError) as cause:
         reason = cut(" ".join(str(cause).split()))
-        raise error_class(
-            f"{where}: not a Parquet file, or a damaged one ({reason}); write it again, or as CSV"
-        ) from cause
+        raise source.error(f": not a Parquet file, or a damaged one ({reason}); write it again, or as CSV") from cause
 
 
 def _is_number_type(given_type: "DataType") -> bool:

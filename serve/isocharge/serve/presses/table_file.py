@@ -11,7 +11,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.files import as_output_errors, bounded_lines, open_regular, write_whole
 from isocharge.serve.presses.csv_table import CsvTable, csv_text
-from isocharge.serve.presses.number_table import NumberTable
+from isocharge.serve.presses.number_table import NumberTable, TableSource
 from isocharge.serve.presses.parquet_table import SUFFIX, ParquetTable, parquet_bytes, require_pyarrow
 
 
@@ -40,16 +40,17 @@ def open_table(
         error_class: If the file cannot be read, either when it is opened or when the block reads the columns.
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
+    source = TableSource(names, str(path), error_class, expected)
     if is_parquet(path):
         require_pyarrow()
         with _os_errors_converted(path, error_class, "a Parquet file of presses"), open_regular(path) as file:
-            yield ParquetTable(file, names, str(path), error_class, expected)
+            yield ParquetTable(file, source)
     else:
         with (
             _os_errors_converted(path, error_class, "a CSV file of presses"),
             path.open(encoding="utf-8-sig", newline="") as text,  # `newline=""`: the CSV reader handles the line ends
         ):
-            yield CsvTable(bounded_lines(text), names, str(path), error_class, expected)
+            yield CsvTable(bounded_lines(text), source)
 
 
 def write_columns(path: Path, columns: Mapping[str, Array]) -> None:

@@ -1,7 +1,7 @@
 """`isocharge train distil`: train a small network for microcontrollers on the answers of a model."""
 
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -10,12 +10,12 @@ from isocharge.cli.shared.options import ConfigOption, JsonOption, ModelArgument
 from isocharge.cli.shared.terminal import shown_progress
 from isocharge.cli.train.train_and_release import (
     ModelFolderOption,
-    ReleaseOptions,
     VersionOption,
     train_and_release,
 )
 from isocharge.common.errors import InputError
 from isocharge.serve import find_model, load_model
+from isocharge.serve.model.model_folder import check_target
 from isocharge.train import StudentCase, fit, load_config, student_config, student_data
 
 
@@ -45,19 +45,14 @@ def distil_command(
             "file instead"
         )
     model_folder = find_model(model, models)  # MODEL, which is the teacher of the student
-    if config is not None:
-        fit_config = load_config(config)
-    elif int8:
-        fit_config = student_config("int8")
-    else:
-        fit_config = student_config("float32")
+    weights: Literal["int8", "float32"] = "int8" if int8 else "float32"
+    fit_config = load_config(config) if config is not None else student_config(weights)
 
     case = StudentCase.of(load_model(model_folder).metadata)
-    options = ReleaseOptions(output, version, json=json)
-    version_folder = options.check_version_folder(case.sensor.electrode_names)  # raises before the long computation
+    version_folder = check_target(output, version, case.sensor.electrode_names)  # raises before the long computation
 
     # The student is trained on simulated presses and the contacts that the teacher estimates for them.
     with shown_progress():
         presses = simulated_presses(case.sensor, case.probes, case.domain.radius, case.domain.force_range)
     data = student_data(model_folder, presses)
-    train_and_release(partial(fit, data, fit_config), version_folder, options)
+    train_and_release(partial(fit, data, fit_config), version_folder, json=json)

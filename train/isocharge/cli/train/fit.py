@@ -16,13 +16,13 @@ from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.cli.train.train_and_release import (
     ModelFolderOption,
-    ReleaseOptions,
     VersionOption,
     train_and_release,
 )
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.serve import MeasuredPresses
+from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import (
     built_in_sensors,
     load_sensor,
@@ -97,7 +97,6 @@ def fit_command(
     Example: isocharge train fit presses.csv -o models/pad
     """
     notations = probe or [DEFAULT_PROBE]
-    options = ReleaseOptions(output, version, json=json)
     if dataset is not None and _is_sensor(dataset):
         if sensor is not None:
             raise InputError(f"expected one sensor, got {dataset} and --sensor {sensor}; leave one of them out")
@@ -117,56 +116,27 @@ def fit_command(
     fit_config = load_config(config) if config else FitConfig()
     if press_file is not None:
         presses = _read_presses_of_unknown_sensor(press_file, radius, position_std_mm, force_std)
+        version_folder = check_target(output, version, presses.electrodes)
+        sensor_name = output.resolve().name  # the sensor has no other name than that of the model
         pressing_probes = tuple(probe or ["unknown"])
-        _release_presses_model(presses, pressing_probes, fit_config, options)
+        train = partial(fit_presses, presses, sensor_name, fit_config, probes=pressing_probes)
+        train_and_release(train, version_folder, json=json)
         return
 
     # A dataset folder or --sensor alone: train a network on the dataset, or on presses that are simulated here.
     if sensor is not None:
         # Refuse an unsuitable model folder before the simulation, which takes a while.
-        options.check_version_folder(load_sensor(sensor).electrode_names)
+        check_target(output, version, load_sensor(sensor).electrode_names)
     with shown_progress():
         data = _read_or_simulate_data(dataset, sensor, notations, radius)
-    _release_data_model(data, fit_config, options, dataset)
+    version_folder = check_target(output, version, data.sensor.electrode_names)
+    train_and_release(partial(fit, data, fit_config), version_folder, json=json, dataset=dataset)
 
 
 def _is_sensor(argument: Path) -> bool:
     """Return whether an argument is the name of a built-in sensor or a sensor file, and not a dataset or presses."""
     is_built_in = str(argument) in built_in_sensors() and not argument.exists()
     return is_built_in or argument.suffix.lower() == ".toml"
-
-
-def _release_presses_model(
-    presses: MeasuredPresses, notations: tuple[str, ...], fit_config: FitConfig, options: ReleaseOptions
-) -> None:
-    """Train a network on measured presses alone, and release it.
-
-    Args:
-        presses: Measured presses of a sensor without a description.
-        notations: Notations of the probes, or "unknown".
-        fit_config: Settings of the network and its training.
-        options: Options of the command.
-    """
-    version_folder = options.check_version_folder(presses.electrodes)
-    sensor_name = options.model_folder.resolve().name  # the sensor has no other name than that of the model
-
-    train = partial(fit_presses, presses, sensor_name, fit_config, probes=notations)
-    train_and_release(train, version_folder, options)
-
-
-def _release_data_model(
-    data: TrainingData, fit_config: FitConfig, options: ReleaseOptions, dataset: Path | None
-) -> None:
-    """Train a network on the training data of a known sensor, and release it.
-
-    Args:
-        data: Presses of the sensor for training and test.
-        fit_config: Settings of the training.
-        options: Folder and version of the model.
-        dataset: Dataset folder of the training data; None if there is none.
-    """
-    version_folder = options.check_version_folder(data.sensor.electrode_names)
-    train_and_release(partial(fit, data, fit_config), version_folder, options, dataset)
 
 
 def _read_or_simulate_data(dataset: Path | None, sensor: str | None, notations: list[str], radius: str) -> TrainingData:

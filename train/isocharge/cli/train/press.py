@@ -2,10 +2,7 @@
 
 import shlex
 import sys
-from collections.abc import Iterator
-from concurrent.futures import Executor
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,9 +13,8 @@ from isocharge.cli.shared.port_hints import no_frames_advice_added
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json
-from isocharge.cli.train.press_dialogue import Dialogue, OnTaken, Screen
+from isocharge.cli.train.press_dialogue import Dialogue, Screen
 from isocharge.cli.train.press_events import PressEvents
-from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError, PressError, error_prefix
 from isocharge.serve import ReadingStream, load_device, open_source
@@ -27,27 +23,8 @@ from isocharge.serve.presses.measured_presses import CONTACT, read_press_list
 from isocharge.serve.signal_chain.thermal import ThermalRule
 from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.train import CalibrationProblem, read_earlier
-from isocharge.train.calibration.press_file import PressFile, open_press_file
+from isocharge.train.calibration.press_file import open_press_file
 from isocharge.train.calibration.session import PressSession
-
-
-@dataclass(frozen=True)
-class SensorPort:
-    """Port of a sensor, as the options of the command describe it.
-
-    Attributes:
-        url: Device path or pyserial URL of the port, or a file of bytes.
-        device: Device file of the board; None for the default board.
-        baud: Speed of the port, bits per second.
-        reconnects: Whether to wait until a lost port is available again.
-        keyboard: File descriptor of the keyboard; None if no questions are asked.
-    """
-
-    url: str
-    device: Path | None
-    baud: int
-    reconnects: bool
-    keyboard: int | None
 
 
 def press_command(
@@ -140,108 +117,53 @@ def press_command(
     # unless --yes is given.
     contacts = None if press_list is None else read_press_list(press_list)
     asks_person = contacts is None and not yes
-    sensor_port = SensorPort(
-        url=port,
-        device=device,
-        baud=baud,
-        reconnects=contacts is None,  # a machine goes on while the port is lost, so its session must end
-        keyboard=_keyboard_descriptor() if asks_person else None,
-    )
-    on_taken: OnTaken = _ignore_press
-    if json:  # only a person needs the next proposal
-        on_taken = _print_press_and_proposal if contacts is None else _print_press
+    keyboard = _keyboard_descriptor() if asks_person else None
+    board = load_device(device)
+    if board.rule(ThermalRule) is not None:
+        say(f"{device}: [common_mode] is not used for these presses, because it needs a model of the film")
+
+    def on_taken(session: PressSession, press: SteadyPress) -> None:
+        """Print one line of JSON with the last press and, for a person, the proposed press."""
+        if json:
+            is_last = contacts is not None or session.enough
+            show_json(_press_table(session, press) | {"next": None if is_last else vars(session.proposed)})
 
     stds = {"position_std_mm": position_std_mm, "force_std": force_std}
     with (
         open_press_file(output, problem.sensor, problem.probe, fresh=fresh) as press_file,
         local_workers(worker_count(None)) as executor,
     ):
-        session = _open_session(press_file, problem, until, stds, executor)
-        if contacts is not None:
-            _check_list(contacts, session, str(press_list))
+        presses = press_file.read(**stds)
+        if presses is not None:
+            say(f"{output} has {len(presses)} presses; the session continues with them (--fresh deletes them)")
+        say("solving the film of the sensor file")
+        session = PressSession(problem, save=press_file.write, presses=presses, until=until, executor=executor, **stds)
+        for number, contact in enumerate([] if contacts is None else contacts, start=1):
+            with error_prefix(f"{press_list}, press {number}: ", PressError):
+                session.check(contact)
+        stream = ReadingStream(problem.electrodes, board, reader=f"sensor {problem.sensor.name}")
         try:
-            with _open_events(sensor_port, problem) as events:
+            with (
+                no_frames_advice_added(port, device),  # first, because it changes the errors of the next two
+                # A machine goes on while the port is lost, so its session must end.
+                open_source(port, baud=baud, reconnect=contacts is None, request=board.request) as source,
+                PressEvents(source, stream, PressWatch(problem.electrodes), keyboard) as events,
+            ):
                 dialogue = Dialogue(session, events, Screen(problem.electrodes), on_taken)
                 if contacts is None:
                     dialogue.guide_person(asks=asks_person)
                 else:
                     dialogue.follow_machine(contacts)
         finally:
-            _say_what_is_written(session, output)
+            if len(session):
+                noun = "press" if len(session) == 1 else "presses"
+                say(f"{output} has {len(session)} {noun}; the same command continues the session")
 
     if len(session) == 0:
         raise PressError(f"no press was taken, so {output} is not written")
     if session.refusal:  # the reason why the presses cannot be used for a calibration
         raise PressError(f"{output}: {session.refusal}")
     say(f"To make a model: isocharge train calibrate {shlex.quote(str(output))} --sensor {sensor} -o my-film")
-
-
-def _open_session(
-    press_file: PressFile,
-    problem: CalibrationProblem,
-    until: float,
-    stds: dict[str, float],
-    executor: Executor | None,
-) -> PressSession:
-    """Create a session that begins with the presses that are already in the file, and print how many there are.
-
-    Args:
-        press_file: File of the presses.
-        problem: The calibration problem for which the presses are made.
-        until: Position error left by the film at which the session ends, as a share of the error by noise alone.
-        stds: Standard deviations of the stated positions and forces, by the names of the arguments of `PressSession`.
-        executor: Executor that solves films; None for this process.
-    """
-    presses = press_file.read(position_std_mm=stds["position_std_mm"], force_std=stds["force_std"])
-    if presses is not None:
-        say(f"{press_file.path} has {len(presses)} presses; the session continues with them (--fresh deletes them)")
-    say("solving the film of the sensor file")
-    return PressSession(problem, save=press_file.write, presses=presses, until=until, executor=executor, **stds)
-
-
-def _check_list(contacts: Array, session: PressSession, name: str) -> None:
-    """Raise an error if the list of a machine contains a press that a calibration would refuse.
-
-    Args:
-        contacts: Contacts (x, y, F) of the list, shape (n, 3), mm and N.
-        session: Session that checks the presses.
-        name: Name of the list, for the message.
-
-    Raises:
-        PressError: If a press would be refused. The message states its number in the list.
-    """
-    for number, contact in enumerate(contacts, start=1):
-        with error_prefix(f"{name}, press {number}: ", PressError):
-            session.check(contact)
-
-
-@contextmanager
-def _open_events(port: SensorPort, problem: CalibrationProblem) -> Iterator[PressEvents]:
-    """Provide the events of the port and of the keyboard as a context manager.
-
-    The port is open and the keyboard is read within the `with` block.
-
-    The setting `common_mode` of the device file is not used, because the removal of the common mode needs a calibrated
-    model.
-
-    Args:
-        port: Port, device file and keyboard.
-        problem: The calibration problem, which contains the names of the electrodes.
-    """
-    board = load_device(port.device)
-    if board.rule(ThermalRule) is not None:
-        say(
-            f"{port.device}: [common_mode] is not used for these presses, because it needs a model that is calibrated "
-            "for the film"
-        )
-    stream = ReadingStream(problem.electrodes, board, reader=f"sensor {problem.sensor.name}")
-    watch = PressWatch(problem.electrodes)
-    with (
-        no_frames_advice_added(port.url, port.device),  # first, because it changes the errors of the next two
-        open_source(port.url, baud=port.baud, reconnect=port.reconnects, request=board.request) as source,
-        PressEvents(source, stream, watch, port.keyboard) as events,
-    ):
-        yield events
 
 
 def _keyboard_descriptor() -> int:
@@ -257,29 +179,6 @@ def _keyboard_descriptor() -> int:
             "expected a standard input for the answers about presses, got none; give --yes for presses that are made "
             "where they are proposed, or --press-list FILE for the presses of a machine"
         ) from error
-
-
-def _say_what_is_written(session: PressSession, output: Path) -> None:
-    """Print how many presses the file has, unless it has none."""
-    count = len(session)
-    if count:
-        noun = "press" if count == 1 else "presses"
-        say(f"{output} has {count} {noun}; the same command continues the session")
-
-
-def _ignore_press(session: PressSession, press: SteadyPress) -> None:
-    """Do nothing after a press, because the results are not printed."""
-
-
-def _print_press(session: PressSession, press: SteadyPress) -> None:
-    """Print one line of JSON with the last press and the remaining errors."""
-    show_json(_press_table(session, press) | {"next": None})
-
-
-def _print_press_and_proposal(session: PressSession, press: SteadyPress) -> None:
-    """Print one line of JSON with the last press, the remaining errors, and the press that is proposed next."""
-    proposed = None if session.enough else vars(session.proposed)
-    show_json(_press_table(session, press) | {"next": proposed})
 
 
 def _press_table(session: PressSession, press: SteadyPress) -> dict[str, object]:
