@@ -1,5 +1,6 @@
 """Tests of the estimator of a film on films whose charges are a closed formula."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,6 +11,7 @@ from tests.benchmarks.measured_films import measured_presses, with_rig_errors
 from tests.train.calibration.conftest import rig
 
 from isocharge.serve.model.robust_estimate import robust_estimate
+from isocharge.simulate import NoiseModel, noise_model
 from isocharge.train.calibration import estimator
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.discrepancy import terms
@@ -18,14 +20,16 @@ from isocharge.train.calibration.film_estimate import SESSION
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.data.presses import draw_contacts
 
-ONE = Hypothesis(1.0, 0.003, tuple(20.0 if one.name == "offset" else 0.0 for one in SESSION), 0.0, 1.0)
+ONE = Hypothesis(
+    1.0, 0.003, tuple(20.0 if one.name == "offset" else 0.0 for one in SESSION), 0.0, noise_model("reference"), 1.0
+)
 """A hypothesis with an offset and a discrepancy."""
 
 
 @pytest.fixture
 def _one_hypothesis(monkeypatch):
     """Estimate a film under one hypothesis, with nearly normal weights of the presses."""
-    monkeypatch.setattr(estimator, "hypotheses", lambda _: [ONE])
+    monkeypatch.setattr(estimator, "hypotheses", lambda *_: [ONE])
     monkeypatch.setattr(estimator, "typical", lambda _: ONE)
     monkeypatch.setattr(estimator, "robust_estimate", partial(robust_estimate, freedom=np.inf, tolerance=1e-4))
 
@@ -119,19 +123,21 @@ def test_covariance_is_that_of_the_errors_on_drawn_films(problem, synthetic):
 
 
 def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(problem, synthetic, monkeypatch):
-    """The films are drawn from the hypotheses with their probabilities. To save time, there are only 16 hypotheses."""
+    """The films are drawn from the hypotheses with their probabilities. To save time, there are only 32 hypotheses."""
     monkeypatch.setattr(estimator, "IMPERFECTION_SCALES", ((0.1, 0.5), (1.5, 0.5)))
     monkeypatch.setattr(estimator, "DISCREPANCY_SIZES", ((0.001, 0.5), (0.01, 0.5)))
     monkeypatch.setattr(estimator, "FORCE_SCATTERS", ((0.0, 1.0),))
+    monkeypatch.setattr(estimator, "NOISE_RATIOS", ((1.0, 0.5), (8.0, 0.5)))
     within = []
     for seed in range(25):
         rng = np.random.default_rng([seed, 3])
         presses = measured_presses(problem, np.tile([0.0, 0.0, 1.0], (8, 1)), np.ones((8, 4)))
-        all_hypotheses = list(hypotheses(PressData.of(presses, problem.noise, problem.domain)))
+        all_hypotheses = list(hypotheses(PressData.of(presses, problem.noise, problem.domain), problem.noise))
         probability = np.array([one.probability for one in all_hypotheses])
         hypothesis = all_hypotheses[rng.choice(len(all_hypotheses), p=probability / probability.sum())]
         unknowns = draw_unknowns(problem, hypothesis, rng)
-        data = PressData.of(presses_on(problem, synthetic, unknowns, 8, rng), problem.noise, problem.solved_domain)
+        presses = presses_on(replace(problem, noise=hypothesis.noise), synthetic, unknowns, 8, rng)
+        data = PressData.of(presses, problem.noise, problem.solved_domain)
         film = estimate(synthetic, data, problem.prior).film
         gain = ContactSensitivity.of(problem, synthetic, film.values).film_gain[:, :2]
         # The offset and the drift of the session are not errors of later contacts in this comparison.
@@ -156,6 +162,16 @@ def test_bad_press_is_left_out_and_hardly_changes_the_estimate(problem, syntheti
     named = problem.prior.layout.film
     assert (np.abs(found.film.values - good.film.values)[named] < 1.5 * std[named]).all()
     assert abs(found.film.value("pretension") - values[0]) < 4.0 * found.film.std("pretension")
+
+
+@pytest.mark.parametrize(("gain", "least", "most"), [(0.002, 0.002, 0.002), (0.015, 0.008, 0.016)])
+def test_noise_is_estimated_and_noisy_presses_are_not_bad(problem, synthetic, gain, least, most):
+    noisy = replace(problem, noise=NoiseModel("bench", 1.0, gain))
+    for seed in range(3):
+        _, _, presses = rig(noisy, synthetic, 20, seed=seed)
+        found = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
+        assert least <= found.film.noise.gain <= most
+        assert not found.is_bad.any()
 
 
 def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synthetic):

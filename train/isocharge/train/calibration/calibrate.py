@@ -48,6 +48,9 @@ UNEXPLAINED_CHI2 = 9.0
 MIN_SCATTER_PROBABILITY = 0.01
 """Probability of residuals as large as those of the fit, below which the stated errors are increased."""
 
+MAX_USUAL_NOISE = 0.01
+"""Noise that is proportional to the charge, above which a caution is given, dimensionless."""
+
 UNUSUAL_SHIFT = 3.0
 """Ratio of a shift or rotation of the electrodes to its prior standard deviation above which a caution is given."""
 
@@ -109,7 +112,8 @@ def calibrate(
             reason = large_residual_reason(np.sqrt(estimation.chi2 / estimation.redundancy))
             raise unexplained_error(used_presses, estimation.charges, reason)
         estimation, scatter_caution = _scaled_by_scatter(estimation)
-        sensitivity = ContactSensitivity.of(problem, estimation.charges, estimation.film.values)
+        noisy_problem = replace(problem, noise=estimation.film.noise)
+        sensitivity = ContactSensitivity.of(noisy_problem, estimation.charges, estimation.film.values)
     cautions = (f"{outside_caution}; left out" if outside_caution else "", scatter_caution)
     return CalibrationResult(
         problem=problem,
@@ -275,6 +279,11 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     if estimation.is_bad.any():
         rows = row_words(presses[estimation.is_bad].lines, presses.row_noun)
         cautions.append(f"{rows}: does not agree with the other presses; left out")
+    if film.noise.gain > MAX_USUAL_NOISE:
+        cautions.append(
+            f"the charges scatter by about {100.0 * film.noise.gain:.2g} %, which the standard deviations of the model "
+            "contain: are the positions and forces as certain as stated, and are the charges read at rest?"
+        )
     if estimation.hypothesis.force_scatter > 0.0:
         cautions.append(
             f"the forces scatter by about {100.0 * estimation.hypothesis.force_scatter:.2g} % more than stated: does "

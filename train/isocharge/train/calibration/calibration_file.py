@@ -17,6 +17,7 @@ from isocharge.common.errors import PressError, cut, shown
 from isocharge.common.json_values import plain_values
 from isocharge.common.structs import Text, convert, read_json
 from isocharge.serve.presses.measured_presses import MAX_TEMPERATURE_C, MIN_TEMPERATURE_C
+from isocharge.simulate import NoiseModel
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.problem import CalibrationProblem
 
@@ -51,6 +52,7 @@ class _CalibrationFile(Struct, frozen=True):
     force_range_N: tuple[Number, Number]
     at_C: Temperature | None
     unknowns: dict[str, _Unknown]
+    noise: NoiseModel
     correlations: list[list[Correlation]]
 
 
@@ -73,6 +75,7 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
         "radius_mm": problem.radius,
         "force_range_N": list(problem.force_range),
         "at_C": film.at_C,
+        "noise": vars(film.noise),
         "unknowns": {
             name: {"value": value, "std": one_std, "unit": unit}
             for name, value, one_std, unit in zip(layout.names, film.values, std, layout.units, strict=True)
@@ -120,7 +123,7 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
                 f"{values[index]:g}; calibrate again"
             )
     covariance = _correlations(path, content.correlations, len(values)) * np.outer(std, std)
-    return FilmEstimate(layout, values, covariance, content.at_C)
+    return FilmEstimate(layout, values, covariance, content.at_C, content.noise)
 
 
 def _check_same_problem(path: Path, content: _CalibrationFile, problem: CalibrationProblem) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.simulate import Domain
+from isocharge.simulate import Domain, noise_model
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.estimator import Hypothesis, linearise
@@ -43,7 +43,7 @@ GRID_MM = 0.5
 GRID_N = 0.05
 """Grid to which proposed forces are rounded, N."""
 
-PLANNED = Hypothesis(0.5, 0.01, (0.0,) * len(SESSION), 0.0, 1.0)
+PLANNED = Hypothesis(0.5, 0.01, (0.0,) * len(SESSION), 0.0, noise_model("reference"), 1.0)
 """Imperfections and discrepancy that are assumed when presses are planned before the first press."""
 
 

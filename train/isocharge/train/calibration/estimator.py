@@ -5,9 +5,10 @@ contact may be known, known with an error, or unknown. The contacts are eliminat
 Golub and Pereyra 1973). Presses that do not agree with the others get a lower weight, according to Student's t
 distribution (Lange and others, 1989), and are left out of the final estimate.
 
-How uneven a film is, how large its discrepancy is, and whether the session has an offset, a drift or scattered forces,
-is not known beforehand. Each combination of these cases is a hypothesis. The evidence of a hypothesis follows from the
-linearised problem (MacKay 1992), and the estimate is the mean over the hypotheses, weighted by their evidence.
+How uneven a film is, how large its discrepancy and the noise are, and whether the session has an offset, a drift or
+scattered forces, is not known beforehand. Each combination of these cases is a hypothesis. The evidence of a hypothesis
+follows from the linearised problem (MacKay 1992), and the estimate is the mean over the hypotheses, weighted by their
+evidence.
 """
 
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from scipy.special import chdtrc, chdtri
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, RobustEstimate, robust_estimate
 from isocharge.serve.model.robust_estimate import Prior as StatePrior
+from isocharge.simulate import NoiseModel
 from isocharge.train.calibration.discrepancy import terms, unit_covariance
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout
@@ -46,6 +48,9 @@ REMAINING_DISCREPANCY = 0.3
 FORCE_SCATTERS = ((0.0, 0.8), (0.01, 0.1), (0.03, 0.1))
 """Random errors of the forces beyond the stated ones, relative to the force, with their prior probabilities."""
 
+NOISE_RATIOS = ((1.0, 0.6), (2.0, 0.1), (4.0, 0.1), (8.0, 0.1), (16.0, 0.1))
+"""Noise that is proportional to the charge, relative to that of a good amplifier, with its prior probabilities."""
+
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -56,6 +61,7 @@ class Hypothesis:
         discrepancy: Size of the discrepancy, relative to the charge.
         session_std: Prior standard deviation of each unknown of the session, shape (n_session,).
         force_scatter: Random error of the forces, relative to the force.
+        noise: Noise of the charges.
         probability: Prior probability.
     """
 
@@ -63,24 +69,33 @@ class Hypothesis:
     discrepancy: float
     session_std: tuple[float, ...]
     force_scatter: float
+    noise: NoiseModel
     probability: float
 
 
 def typical(data: PressData) -> Hypothesis:
     """Return the hypothesis with which the search for the most probable unknowns begins."""
     session_std = tuple(one.stds[-1][0] if one.is_possible(data) else 0.0 for one in SESSION)
-    return Hypothesis(1.0, 0.01, session_std, 0.0, 1.0)
+    return Hypothesis(1.0, 0.01, session_std, 0.0, data.noise, 1.0)
 
 
-def hypotheses(data: PressData) -> Iterator[Hypothesis]:
-    """Yield all hypotheses about presses. An unknown of the session that these presses cannot have is zero."""
+def hypotheses(data: PressData, noise: NoiseModel) -> Iterator[Hypothesis]:
+    """Yield all hypotheses about presses. An unknown of the session that these presses cannot have is zero.
+
+    Args:
+        data: The presses.
+        noise: Noise of a good amplifier.
+    """
+    noises = [
+        (noise if ratio == 1.0 else NoiseModel("presses", noise.white, ratio * noise.gain), probability)
+        for ratio, probability in NOISE_RATIOS
+    ]
     stds = [one.stds if one.is_possible(data) else ((0.0, 1.0),) for one in SESSION]
-    for imperfections, discrepancy, scatter, *session in product(
-        IMPERFECTION_SCALES, DISCREPANCY_SIZES, FORCE_SCATTERS, *stds
-    ):
-        cases = (imperfections, discrepancy, scatter, *session)
-        probability = float(np.prod([case[1] for case in cases]))
-        yield Hypothesis(imperfections[0], discrepancy[0], tuple(one[0] for one in session), scatter[0], probability)
+    for cases in product(IMPERFECTION_SCALES, DISCREPANCY_SIZES, FORCE_SCATTERS, noises, *stds):
+        (imperfections, discrepancy, force_scatter, assumed_noise, *session), probabilities = zip(*cases, strict=True)
+        yield Hypothesis(
+            imperfections, discrepancy, tuple(session), force_scatter, assumed_noise, float(np.prod(probabilities))
+        )
 
 
 @dataclass(frozen=True)
@@ -258,6 +273,9 @@ def estimate(
 ) -> Estimation:
     """Estimate a film from presses, with the derivatives of one solved film.
 
+    If a press seems bad, the search is repeated with the largest noise, with which the press may agree with the others.
+    The search is also repeated with the most probable noise, until it assumes this noise.
+
     Args:
         charges: Charges of a solved film and of similar films.
         data: The presses.
@@ -265,6 +283,29 @@ def estimate(
         start: Unknowns from which the search begins; None for the prior mean.
         contact: Contacts (x, y, F) from which the search begins, shape (n, 3); None for the measured contacts.
     """
+    all_hypotheses = list(hypotheses(data, data.noise))
+    estimation = _estimate_with_noise(charges, data, prior, all_hypotheses, start, contact)
+    noise = all_hypotheses[-1].noise if estimation.is_bad.any() else estimation.hypothesis.noise
+    for _ in NOISE_RATIOS:
+        if noise == data.noise:
+            break
+        data = data.with_errors(noise)
+        estimation = _estimate_with_noise(
+            charges, data, prior, all_hypotheses, estimation.film.values, estimation.contact
+        )
+        noise = estimation.hypothesis.noise
+    return estimation
+
+
+def _estimate_with_noise(
+    charges: FilmCharges,
+    data: PressData,
+    prior: Prior,
+    all_hypotheses: list[Hypothesis],
+    start: Array | None,
+    contact: Array | None,
+) -> Estimation:
+    """Search for the film and for bad presses with the noise of `data`, and estimate the film under all hypotheses."""
     layout = prior.layout
     unknowns = prior.mean if start is None else start
     log_contact = data.contact if contact is None else np.column_stack([contact[:, :2], np.log(contact[:, 2])])
@@ -278,15 +319,14 @@ def estimate(
     is_used = ~is_bad
 
     # The estimate of each hypothesis follows from the linearised problem at the most probable unknowns so far.
-    all_hypotheses = list(hypotheses(data))
     used_data, used_contact = data[is_used], log_contact[is_used]
     for _ in range(2):
         model = model_values(charges, layout, used_data, unknowns, used_contact)
-        evidence_by_scatter = {
-            scatter: _Evidence.of(model, used_data.with_force_scatter(scatter), used_contact)
-            for scatter, _ in FORCE_SCATTERS
+        evidence = {
+            errors: _Evidence.of(model, used_data.with_errors(*errors), used_contact)
+            for errors in {(one.noise, one.force_scatter) for one in all_hypotheses}
         }
-        estimates = [evidence_by_scatter[one.force_scatter].posterior(prior, one, unknowns) for one in all_hypotheses]
+        estimates = [evidence[one.noise, one.force_scatter].posterior(prior, one, unknowns) for one in all_hypotheses]
         log_evidence = np.array([one.log_evidence for one in estimates])
         weight = np.exp(log_evidence - log_evidence.max())
         weight /= weight.sum()
@@ -303,7 +343,8 @@ def estimate(
     final = linearise(charges, layout, data, unknowns, log_contact)
     final_residual, _ = final.eliminated()
     final_chi2 = (final_residual**2).sum(axis=1)
-    film = FilmEstimate(layout, unknowns, np.asarray(covariance), data.mean_C)
+    best_hypothesis = all_hypotheses[int(weight.argmax())]
+    film = FilmEstimate(layout, unknowns, np.asarray(covariance), data.mean_C, best_hypothesis.noise)
     return Estimation(
         charges=charges,
         film=film,
@@ -312,7 +353,7 @@ def estimate(
         press_chi2=np.divide(final_chi2, redundancy, out=np.full(len(data), np.nan), where=redundancy > 0),
         chi2=best.chi2,
         redundancy=float(redundancy[is_used].sum()),
-        hypothesis=all_hypotheses[int(weight.argmax())],
+        hypothesis=best_hypothesis,
     )
 
 
@@ -372,12 +413,12 @@ class _Posterior:
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What presses with one scatter of the forces state about the unknowns, in the linearised problem.
+    """What presses with one noise and one scatter of the forces state about the unknowns, in the linearised problem.
 
     Attributes:
         residual: Residuals from which the contacts are eliminated, shape (n_residual,).
         jacobian: Their derivatives with respect to the unknowns, shape (n_residual, n_unknown).
-        log_volume: Logarithm of the density of the measured contacts, and of the volume of the possible contacts.
+        log_volume: Logarithm of the density of the measurements, and of the volume of the possible contacts.
     """
 
     residual: Array
@@ -391,8 +432,8 @@ class _Evidence:
         residual, jacobian = linearised.eliminated()
         by_contact = linearised.contact_jacobian
         log_contact_volume = -0.5 * np.linalg.slogdet(by_contact.swapaxes(1, 2) @ by_contact)[1].sum()
-        force_std = data.contact_std[:, 2]
-        log_density = -np.log(force_std[np.isfinite(force_std)]).sum()
+        measured_std = np.column_stack([data.charge_std, data.contact_std])
+        log_density = -np.log(measured_std[np.isfinite(measured_std)]).sum()
         return cls(residual.ravel(), jacobian.reshape(residual.size, -1), float(log_contact_volume + log_density))
 
     def posterior(self, prior: Prior, hypothesis: Hypothesis, unknowns: Array) -> _Posterior:
@@ -400,7 +441,7 @@ class _Evidence:
 
         Args:
             prior: Prior distribution.
-            hypothesis: The hypothesis, whose scatter of the forces is that of the presses.
+            hypothesis: The hypothesis, whose noise and scatter of the forces are those of the presses.
             unknowns: Unknowns at which the residuals were computed.
         """
         covariance = prior.covariance(hypothesis)

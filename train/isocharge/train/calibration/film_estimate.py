@@ -1,14 +1,14 @@
 """Estimate of a film: a Gaussian distribution of its properties, of its discrepancy, and of what a session adds."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.simulate import FilmPrior
+from isocharge.simulate import FilmPrior, NoiseModel, noise_model
 from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.train.calibration.discrepancy import term_names
 from isocharge.train.calibration.press_data import PressData
@@ -135,12 +135,14 @@ class FilmEstimate:
         values: Most probable values, shape (n_unknown,).
         covariance: Covariance, shape (n_unknown, n_unknown).
         at_C: Temperature to which the pretension belongs, degrees Celsius; None if it is not known.
+        noise: Most probable noise of the charges.
     """
 
     layout: Layout
     values: Array
     covariance: Array
     at_C: float | None = None
+    noise: NoiseModel = field(default_factory=partial(noise_model, "reference"))
 
     @property
     def film_values(self) -> Array:

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace as replace_setting
 
 from isocharge.common.errors import ModelError, PressError
 from isocharge.common.files import as_output_errors, locked, remove_empty, write_whole
@@ -182,8 +183,12 @@ def write_calibration(
 
     check_calibration_folder(folder, result.problem.electrodes)
     problem, film = result.problem, result.film
-    series = compact_charges(problem, result.charges, film, executor)
-    fitted = fit(training_data(problem, result.charges, film, series, executor), config)
+    noisy_problem = replace(problem, noise=film.noise)
+    series = compact_charges(noisy_problem, result.charges, film, executor)
+    settings = config or FitConfig()
+    if film.noise != problem.noise:
+        settings = FitConfig(settings.network, replace_setting(settings.training, noise=film.noise))
+    fitted = fit(training_data(problem, result.charges, film, series, executor), settings)
 
     sensor, _ = result.sensor_and_probe
     is_folded = CHARGES in fitted.provenance.files
@@ -251,7 +256,7 @@ def read_moved(
             "calibrate with presses that have a column temperature_C and cover a few degrees"
         )
     moved = film.at_temperature(to_C)
-    problem = replace(problem, earlier=film)
+    problem = replace(problem, earlier=film, noise=film.noise)
     charges = solve_film(problem, moved, executor)
     version = "/".join(path.parent.parts[-2:])
     return CalibrationResult(

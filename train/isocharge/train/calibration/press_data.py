@@ -19,6 +19,7 @@ class PressData:
     Attributes:
         charge: Charges, shape (n, n_electrode), pC; zero if unknown.
         charge_std: Standard deviations of the noise, shape (n, n_electrode), pC; infinite if the charge is unknown.
+        noise: Noise of the charges, from which these standard deviations follow.
         contact: Measured contacts (x, y, ln F), shape (n, 3); the middle of the domain if unknown.
         contact_std: Standard deviations of the contacts, shape (n, 3); infinite if unknown.
         time: Time of each press in the session, from -0.5 to 0.5, shape (n,).
@@ -30,6 +31,7 @@ class PressData:
 
     charge: Array
     charge_std: Array
+    noise: NoiseModel
     contact: Array
     contact_std: Array
     time: Array
@@ -57,6 +59,7 @@ class PressData:
         return cls(
             charge=charge,
             charge_std=np.where(is_charge_known, noise.sigma(charge), UNKNOWN_STD),
+            noise=noise,
             contact=np.where(is_contact_known, log_contact, domain.centre),
             contact_std=np.where(is_contact_known, measured_std, UNKNOWN_STD),
             time=np.arange(count) / max(count - 1, 1) - 0.5,
@@ -73,11 +76,17 @@ class PressData:
         names = ("charge", "charge_std", "contact", "contact_std", "time", "warming_K", "friction_charge")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
-    def with_force_scatter(self, scatter: float) -> "PressData":
-        """Return the presses with a further random error of all forces, relative to the force."""
+    def with_errors(self, noise: NoiseModel, force_scatter: float = 0.0) -> "PressData":
+        """Return the presses with another noise of the charges, and with a further random error of all forces.
+
+        Args:
+            noise: Noise of the charges.
+            force_scatter: Standard deviation of the further error, relative to the force.
+        """
+        charge_std = np.where(np.isfinite(self.charge_std), noise.sigma(self.charge), UNKNOWN_STD)
         contact_std = self.contact_std.copy()
-        contact_std[:, 2] = np.hypot(contact_std[:, 2], scatter)
-        return replace(self, contact_std=contact_std)
+        contact_std[:, 2] = np.hypot(contact_std[:, 2], force_scatter)
+        return replace(self, charge_std=charge_std, noise=noise, contact_std=contact_std)
 
 
 def known_temperatures(presses: MeasuredPresses) -> Array | None:

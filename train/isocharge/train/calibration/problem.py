@@ -1,7 +1,7 @@
 """Problem of a calibration: the films that a sensor may have, and the contacts for which a model is needed."""
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
@@ -37,6 +37,7 @@ class CalibrationProblem:
         stress_limit: Largest stress of the film that a proposed press may cause, MPa.
         friction: Expected coefficient of friction between tip and film, for presses on a vertical stage; 0 for none.
         side_force: Largest side force of later contacts in any direction, divided by the force of the contact.
+        noise: Smallest noise of the charges, that of a good amplifier. The presses may show a larger noise.
 
     Example:
         >>> problem = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))  # doctest: +SKIP
@@ -52,6 +53,7 @@ class CalibrationProblem:
     stress_limit: float = DEFAULT_STRESS_LIMIT
     friction: float = 0.0
     side_force: float = 0.0
+    noise: NoiseModel = field(default_factory=partial(noise_model, "reference"))
 
     def __post_init__(self) -> None:
         if self.friction:
@@ -71,11 +73,6 @@ class CalibrationProblem:
     def prior(self) -> Prior:
         """Prior distribution of the unknowns."""
         return Prior(Layout(FilmPrior(self.sensor, self.probe)), self.earlier)
-
-    @property
-    def noise(self) -> NoiseModel:
-        """Noise of the charges."""
-        return noise_model("reference")
 
     @property
     def domain(self) -> Domain:

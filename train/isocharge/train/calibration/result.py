@@ -136,7 +136,8 @@ class CalibrationResult:
             )
         hypothesis = self.estimation.hypothesis
         sentences.append(
-            f"Differences that no property describes: about {100.0 * hypothesis.discrepancy:.2g} % of a charge."
+            f"Differences that no property describes: about {100.0 * hypothesis.discrepancy:.2g} % of a charge; noise: "
+            f"about {100.0 * self.film.noise.gain:.2g} % and {self.film.noise.white:.2g} pC."
         )
         return tuple(sentences)
 
