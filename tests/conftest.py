@@ -175,7 +175,12 @@ def installed(tmp_path_factory):
         absent -= {"google"}  # protobuf comes with onnxruntime
         path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"  # this environment's `isocharge` first
         search = f"{folder}:{os.environ.get('PYTHONPATH', '')}"
-        return os.environ | {"PATH": path, "PYTHONPATH": search, "ABSENT_PACKAGES": " ".join(sorted(absent))}
+        return os.environ | {
+            "PATH": path,
+            "COLUMNS": "100",
+            "PYTHONPATH": search,
+            "ABSENT_PACKAGES": " ".join(sorted(absent)),
+        }
 
     return environment
 

@@ -83,9 +83,9 @@ def identify_command(
                 (folder / MIRROR_PICTURE).write_bytes(picture_bytes(picture))
             (folder / RESULTS).write_bytes(json_module.dumps(results, indent=1).encode())
 
-    # Print the results and a summary in sentences.
-    brief = ("working_area", "limits_in_working_area")
-    show_result(results if json else {name: results[name] for name in brief}, json=json)
+    # Print the results and a summary in sentences, which state the working area.
+    limits = "limits_in_working_area"
+    show_result(results if json else {limits: results[limits]}, json=json)
     say(identification.summary)
     if identification.mirror is not None:
         say(identification.mirror.summary)
