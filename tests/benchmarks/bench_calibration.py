@@ -1,7 +1,8 @@
 """Errors of calibrated, faulty and changed films with imperfections, whose presses are solved one by one.
 
     python tests/benchmarks/bench_calibration.py [--sensor four-25um-biaxial] [--films typical] [--seeds 0,1,2,3]
-        [--presses 1,5,8,20] [--changes 0,0.3,-0.4] [--frames 10] [--cases all] [--folder build/solved_films] [--json]
+        [--presses 1,5,8,20] [--changes 0,0.3,-0.4] [--frames 10] [--cases all] [--gain-noise 0.002]
+        [--folder build/solved_films] [--json]
 
 The films are those of `solved_films.py`: orthotropic, unevenly stretched, with an oval clamp and wrong gains. With
 `--films moduli`, E1 / E2 is 1.6; with `--films tension`, the ratio of the pretensions along two axes is 3. The presses
@@ -18,8 +19,8 @@ within two reported standard deviations, and the shares within the reported 95 %
 - followed, gain: the film has not changed, and one electrode has a gain that is 3 % larger.
 - not followed: the same contacts by the calibrated model.
 
-Solved charges are stored in the folder. Solving a film takes some minutes. `--cases calibrated` leaves all rows out but
-the first.
+`--gain-noise` is the true noise relative to the charge, which the calibration does not know. Solved charges are stored
+in the folder. Solving a film takes some minutes. `--cases calibrated` leaves all rows out but the first.
 """
 
 from concurrent.futures import ProcessPoolExecutor
@@ -37,7 +38,7 @@ from solved_films import FILMS, SolvedFilm, solved_film
 
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.tracking.film_follower import FilmFollower
-from isocharge.simulate import Circle, load_sensor, local_workers
+from isocharge.simulate import Circle, NoiseModel, load_sensor, local_workers
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
 
 TOUCHES = 60
@@ -67,22 +68,26 @@ def errors(answers: list[Contact], truth: np.ndarray) -> dict[str, float]:
 class Bench:
     """One film, from its presses to the errors of its models."""
 
-    def __init__(self, problem: CalibrationProblem, films: dict[float, SolvedFilm], seed: int, executor) -> None:
+    def __init__(
+        self, problem: CalibrationProblem, noise: NoiseModel, films: dict[float, SolvedFilm], seed: int, executor
+    ) -> None:
         """Measure the presses of a film.
 
         Args:
             problem: The calibration problem.
+            noise: True noise of the charges, which the calibration does not know.
             films: The film after each change of its pretension.
             seed: Seed of the errors of the presses and of the noise.
             executor: Executor that runs the solves of the calibrations.
         """
         self.problem = problem
+        self.noise = noise
         self.films = films
         self.executor = executor
         self.rng = np.random.default_rng([seed, 51])
         first = next(iter(films.values()))
         self.contact = with_rig_errors(first.contact, self.rng)
-        self.charge = problem.noise.add(first.charge, self.rng)
+        self.charge = noise.add(first.charge, self.rng)
 
     def calibrated(self, contact: np.ndarray, charge: np.ndarray, problem: CalibrationProblem | None = None):
         """Calibrate a film by presses, and return the result, its model, and the time that both took, s."""
@@ -97,12 +102,12 @@ class Bench:
     def later(self, change: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the later contacts on the film after a change, and their charges with noise."""
         film = self.films[change]
-        return film.later_contact[TOUCHES:], self.problem.noise.add(film.later_charge[TOUCHES:], self.rng)
+        return film.later_contact[TOUCHES:], self.noise.add(film.later_charge[TOUCHES:], self.rng)
 
     def touches(self, change: float, frames: int) -> np.ndarray:
         """Return the charges of the frames of each touch, with noise, shape (n_touch, n_frame, n_electrode)."""
         charge = self.films[change].later_charge[:TOUCHES]
-        return self.problem.noise.add(np.repeat(charge[:, None], frames, axis=1), self.rng)
+        return self.noise.add(np.repeat(charge[:, None], frames, axis=1), self.rng)
 
 
 def observe(follower: FilmFollower, predictor: Predictor, touches: np.ndarray) -> None:
@@ -164,10 +169,12 @@ def main() -> None:
         changes="0,0.3,-0.4",
         frames=10,
         cases="all",
+        gain_noise=0.002,
         folder=Path("build/solved_films"),
         json=False,
     )
     problem = CalibrationProblem(load_sensor(asked.sensor), Circle(1.0))
+    noise = NoiseModel("bench", problem.noise.white, asked.gain_noise)
     changes = [float(change) for change in asked.changes.split(",")]
     counts = [int(count) for count in asked.presses.split(",")]
     counts_of_solves = (PRESSES, TOUCHES + CONTACTS)
@@ -181,7 +188,7 @@ def main() -> None:
                 for change in changes
             }
             report_progress("film", {"seed": float(seed)})
-            bench = Bench(problem, films, seed, executor)
+            bench = Bench(problem, noise, films, seed, executor)
             all_results.append(film_results(bench, counts, asked.frames, has_all_cases=asked.cases == "all"))
     summary = {}
     for name in all_results[0]:
