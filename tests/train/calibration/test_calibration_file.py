@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import PressError
-from isocharge.simulate import Circle, load_sensor, parse_probe
+from isocharge.simulate import Circle, NoiseModel, load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.calibration_file import film_table, json_text, read_film
 from isocharge.train.calibration.contact_error import PLANNED
@@ -28,7 +28,7 @@ def random_film(seed, at_C=None):
         2.0 * rng.standard_normal((len(values), 1))
     )
     root[rng.random(len(values)) < 0.1] = 0.0
-    return FilmEstimate(layout, values, root @ root.T, at_C)
+    return FilmEstimate(layout, values, root @ root.T, at_C, NoiseModel("presses", 1.0, rng.uniform(0.001, 0.1)))
 
 
 @settings(max_examples=20, deadline=None)
@@ -42,6 +42,7 @@ def test_written_films_are_read_again(tmp_path_factory, seed, at_C):
     std = np.sqrt(np.diag(film.covariance))
     np.testing.assert_allclose(read.covariance, film.covariance, rtol=0.0, atol=1e-4 * np.outer(std, std).max())
     assert read.at_C == film.at_C
+    assert read.noise == film.noise
     assert np.linalg.eigvalsh(read.covariance)[0] > -1e-9 * (std**2).max()
 
 

@@ -17,11 +17,15 @@ from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.discrepancy import terms
 from isocharge.train.calibration.estimator import Hypothesis, Prior, estimate, hypotheses
 from isocharge.train.calibration.film_estimate import SESSION
-from isocharge.train.calibration.press_data import PressData
+from isocharge.train.calibration.press_data import PressData, PressErrors
 from isocharge.train.data.presses import draw_contacts
 
 ONE = Hypothesis(
-    1.0, 0.003, tuple(20.0 if one.name == "offset" else 0.0 for one in SESSION), 0.0, noise_model("reference"), 1.0
+    1.0,
+    0.003,
+    tuple(20.0 if one.name == "offset" else 0.0 for one in SESSION),
+    PressErrors(noise_model("reference")),
+    1.0,
 )
 """A hypothesis with an offset and a discrepancy."""
 
@@ -127,6 +131,7 @@ def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(prob
     monkeypatch.setattr(estimator, "IMPERFECTION_SCALES", ((0.1, 0.5), (1.5, 0.5)))
     monkeypatch.setattr(estimator, "DISCREPANCY_SIZES", ((0.001, 0.5), (0.01, 0.5)))
     monkeypatch.setattr(estimator, "FORCE_SCATTERS", ((0.0, 1.0),))
+    monkeypatch.setattr(estimator, "POSITION_RATIOS", ((1.0, 1.0),))
     monkeypatch.setattr(estimator, "NOISE_RATIOS", ((1.0, 0.5), (8.0, 0.5)))
     within = []
     for seed in range(25):
@@ -136,7 +141,7 @@ def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(prob
         probability = np.array([one.probability for one in all_hypotheses])
         hypothesis = all_hypotheses[rng.choice(len(all_hypotheses), p=probability / probability.sum())]
         unknowns = draw_unknowns(problem, hypothesis, rng)
-        presses = presses_on(replace(problem, noise=hypothesis.noise), synthetic, unknowns, 8, rng)
+        presses = presses_on(replace(problem, noise=hypothesis.errors.noise), synthetic, unknowns, 8, rng)
         data = PressData.of(presses, problem.noise, problem.solved_domain)
         film = estimate(synthetic, data, problem.prior).film
         gain = ContactSensitivity.of(problem, synthetic, film.values).film_gain[:, :2]
@@ -172,6 +177,19 @@ def test_noise_is_estimated_and_noisy_presses_are_not_bad(problem, synthetic, ga
         found = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
         assert least <= found.film.noise.gain <= most
         assert not found.is_bad.any()
+
+
+@pytest.mark.parametrize("ratio", [3.0, 8.0])
+def test_positions_worse_than_stated_are_not_taken_for_noise(problem, synthetic, ratio):
+    for seed in range(3):
+        values, _, presses = rig(problem, synthetic, 20, seed=seed)
+        scatter_mm = np.sqrt(ratio**2 - 1.0) * presses.position_std_mm[:, None]
+        presses.contact[:, :2] += scatter_mm * np.random.default_rng(seed).standard_normal((20, 2))
+        found = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
+        assert found.hypothesis.errors.position_ratio == ratio
+        assert found.film.noise == problem.noise
+        assert found.is_bad.sum() <= 1
+        assert abs(found.film.value("pretension") - values[0]) < 3.0 * found.film.std("pretension")
 
 
 def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synthetic):

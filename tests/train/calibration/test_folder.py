@@ -11,7 +11,7 @@ from tests.train.calibration.conftest import rig
 
 from isocharge.common.errors import ModelError, OutputExists, PressError
 from isocharge.serve import Predictor, read_presses
-from isocharge.simulate import load_sensor
+from isocharge.simulate import NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, calibrate
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.calibration import film_network, folder
@@ -93,6 +93,16 @@ def test_next_calibration_is_the_next_version_and_stale_files_are_mended(written
         assert not (path / ".2.draft").exists()
         assert write_calibration(written.result, path, config=SHORTEST).name == "2"
     assert (path / "card.md").read_bytes() == (path / "2" / "card.md").read_bytes()
+
+
+def test_network_is_trained_with_the_noise_of_the_presses(written, tmp_path):
+    film = replace(written.result.film, noise=NoiseModel("presses", 1.0, 0.016))
+    result = replace(written.result, estimation=replace(written.result.estimation, film=film))
+    noisy = Predictor(write_calibration(result, tmp_path / "film", config=QUICK))
+    quiet = Predictor(written.path)
+    assert noisy.metadata.noise.gain == 0.016
+    charge_pC = written.result.presses.charge_pC[0]
+    assert noisy.predict(charge_pC).force_std_N > 1.5 * quiet.predict(charge_pC).force_std_N
 
 
 def test_unsuitable_folders_are_refused_and_left_as_they_are(written, problem, tmp_path):

@@ -45,7 +45,7 @@ class ModelMetrics:
         versions = Info("isocharge", "Versions of the server.", registry=registry)
         versions.info({"version": package_version(), "onnxruntime": ort.__version__})
         settings: dict[str, Any] = {"labelnames": VERSION_LABELS, "registry": registry}
-        self.info = Info("isocharge_model", "Versions of the models.", **settings)
+        self.descriptions = Info("isocharge_model", "Versions of the models.", **settings)
         self.ready = Gauge("isocharge_model_ready", "Whether a version is loaded.", **settings)
         self.presses = Counter("isocharge_presses", "Presses that were answered.", **settings)
         self.alarms = Counter(
@@ -73,14 +73,14 @@ class Statistics:
     """Metrics of one version of a model since the start of the server. Any thread may call any method.
 
     Attributes:
-        info: Sensor and checksum of the version.
+        description: Sensor and checksum of the version.
         ready: 1 if the version is loaded, otherwise 0.
     """
 
     def __init__(self, metrics: ModelMetrics, name: str, version: int) -> None:
         """Create the values of a version in the metrics of the server."""
         labels = (name, str(version))
-        self.info = metrics.info.labels(*labels)
+        self.description = metrics.descriptions.labels(*labels)
         self.ready = metrics.ready.labels(*labels)
         self._presses = metrics.presses.labels(*labels)
         self._alarms = metrics.alarms.labels(*labels)

@@ -381,5 +381,5 @@ def _load_version(name: str, version: int, folder: Path, statistics: Statistics)
             f"{folder}: expected the model {name}/{version}, as the folders say, got {model.metadata.label}; "
             "move it into folders of that name and version"
         )
-    statistics.info.info({"sensor": model.metadata.frame_id, "sha256": model.golden.sha256})
+    statistics.description.info({"sensor": model.metadata.frame_id, "sha256": model.golden.sha256})
     return LoadedVersion(model, model.metadata, str(version), statistics)

@@ -84,7 +84,7 @@ class CsvTable(NumberTable):
             source: Name of the file, its known columns, and the class of errors.
 
         Raises:
-            error_class: If the file is empty, is not CSV text in UTF-8, or has too many columns.
+            InputError: If the file is empty, is not CSV text in UTF-8, or has too many columns.
         """
         checked_lines = _checked_lines(lines, source)
         first_lines = list(islice(checked_lines, _MAX_LINES_TO_HEADER))
@@ -115,7 +115,7 @@ class CsvTable(NumberTable):
             max_rows: Largest number of rows that is accepted.
 
         Raises:
-            error_class: If there are too many rows, a row has the wrong number of cells, or a cell is not a finite
+            InputError: If there are too many rows, a row has the wrong number of cells, or a cell is not a finite
                 number.
         """
         column_indices = {name: self.header.index(name) for name in rules}
@@ -171,7 +171,7 @@ class CsvTable(NumberTable):
         """Raise the error for a file whose marks may be decimal marks or separators of thousands.
 
         Raises:
-            error_class: Always.
+            InputError: Always.
         """
         separator = repr(self._separator)[1:-1]  # the tab as `tr` expects it
         command = "" if separator == "," else f", as with: tr ',{separator}' '.,' < FILE > NEW.csv"
@@ -190,7 +190,7 @@ class CsvTable(NumberTable):
             rules: Rules of the requested columns, which contain the units.
 
         Raises:
-            error_class: If the row states another unit than that of a column.
+            InputError: If the row states another unit than that of a column.
         """
         given_units = {name: cells[self.header.index(name)].strip(" []()°") for name in rules}
         expected_units = {name: rule.meaning.unit for name, rule in rules.items()}
@@ -218,7 +218,7 @@ class CsvTable(NumberTable):
             cells: Cells of the row.
 
         Raises:
-            error_class: If the row has too few cells, or additional cells that are not blank.
+            InputError: If the row has too few cells, or additional cells that are not blank.
         """
         additional_cells = cells[len(self.header) :]
         if len(cells) < len(self.header) or any(cell.strip() for cell in additional_cells):
@@ -237,7 +237,7 @@ class CsvTable(NumberTable):
             cell: Content of the cell.
 
         Raises:
-            error_class: Always.
+            InputError: Always.
         """
         without_marks = cell.translate(_WITHOUT_MARKS)
         advice = ""
@@ -258,7 +258,7 @@ class CsvTable(NumberTable):
             reason: What is wrong with the header, for the error message.
 
         Raises:
-            error_class: Always.
+            InputError: Always.
         """
         advice = ""
         if len(self.header) == 1 and " " in self.header[0]:
@@ -332,7 +332,7 @@ def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
         source: Name of the file and class of the error, for error messages.
 
     Raises:
-        error_class: If the lines are not text in UTF-8, or a line is too long.
+        InputError: If the lines are not text in UTF-8, or a line is too long.
     """
     line_count = 0
     try:
@@ -361,7 +361,7 @@ def _numbered_rows(lines: Iterable[str], separator: str, source: TableSource) ->
         source: Name of the file, its known columns, and the class of errors.
 
     Raises:
-        error_class: If the lines are not CSV text.
+        InputError: If the lines are not CSV text.
     """
     lines_without_comments = _LinesWithoutComments(lines, source.names, separator)
     reader = csv.reader(lines_without_comments, delimiter=separator, strict=True)

@@ -167,7 +167,7 @@ class NumberTable(ABC):
             source: The file.
 
         Raises:
-            error_class: If the file has too many columns.
+            InputError: If the file has too many columns.
         """
         if len(header) > MAX_COLUMNS:
             raise source.error(f": expected at most {MAX_COLUMNS:,} columns, got {len(header):,}")
@@ -187,7 +187,7 @@ class NumberTable(ABC):
             The rules of the chosen columns, by the names of the columns.
 
         Raises:
-            error_class: If a required column is missing, if the file contains a chosen column twice, or if a column has
+            InputError: If a required column is missing, if the file contains a chosen column twice, or if a column has
                 a similar name as an optional column that the file does not contain. The message states which column to
                 rename.
         """
@@ -217,7 +217,7 @@ class NumberTable(ABC):
             optional: Rules of the optional columns, by the names of the columns.
 
         Raises:
-            error_class: If a column has such a name. The column is probably an optional column whose name is misspelt.
+            InputError: If a column has such a name. The column is probably an optional column whose name is misspelt.
         """
         absent_columns = {name: rule.meaning for name, rule in optional.items() if name not in self.header}
         advice = list(islice(header_advice(columns, absent_columns), MAX_LISTED_NAMES))
@@ -233,7 +233,7 @@ class NumberTable(ABC):
             max_rows: Largest number of rows that is accepted.
 
         Raises:
-            error_class: If the file is damaged or has more than `max_rows` rows, or if a cell violates the rule of its
+            InputError: If the file is damaged or has more than `max_rows` rows, or if a cell violates the rule of its
                 column.
         """
         columns = self._read_columns(rules, max_rows)
@@ -251,7 +251,7 @@ class NumberTable(ABC):
             reason: What is wrong with the header, for the error message.
 
         Raises:
-            error_class: Always.
+            InputError: Always.
         """
         raise self.source.error(
             f": expected {self.source.expected}, got the header {shown(list(self.header))}; {reason}"
@@ -261,7 +261,7 @@ class NumberTable(ABC):
         """Raise the error for a file that has more than `max_rows` rows.
 
         Raises:
-            error_class: Always.
+            InputError: Always.
         """
         raise self.source.error(f": expected at most {max_rows:,} presses, got more; split the file")
 

@@ -49,7 +49,7 @@ class ParquetTable(NumberTable):
         """Read the metadata of the file, which must remain open until the columns have been read.
 
         Raises:
-            error_class: If the file is not Parquet, is damaged, or has too many columns.
+            InputError: If the file is not Parquet, is damaged, or has too many columns.
             MissingExtra: If pyarrow is not installed.
         """
         require_pyarrow()
@@ -72,7 +72,7 @@ class ParquetTable(NumberTable):
             max_rows: Largest number of rows that is accepted.
 
         Raises:
-            error_class: If there are too many rows, if the type of a column is not a number type, or if the file is
+            InputError: If there are too many rows, if the type of a column is not a number type, or if the file is
                 damaged.
         """
         row_count = self._metadata.num_rows
@@ -93,7 +93,7 @@ class ParquetTable(NumberTable):
             The numbers of the column as float64, shape (n,); NaN for null.
 
         Raises:
-            error_class: If the type of the column is not a number type, if the conversion may have rounded an integer,
+            InputError: If the type of the column is not a number type, if the conversion may have rounded an integer,
                 or if the file is damaged.
         """
         from pyarrow.types import is_integer
@@ -121,7 +121,7 @@ class ParquetTable(NumberTable):
             The numbers of the column as float64, shape (n,); NaN for null.
 
         Raises:
-            error_class: If the column has another number of rows than the metadata declare.
+            InputError: If the column has another number of rows than the metadata declare.
         """
         declared_row_count = self._metadata.num_rows
         numbers = np.empty(declared_row_count)
@@ -150,7 +150,7 @@ class ParquetTable(NumberTable):
             field_name: Name of the column in the file.
 
         Raises:
-            error_class: If no column, or more than one column, is stored under this name.
+            InputError: If no column, or more than one column, is stored under this name.
         """
         schema = self._parquet.schema
         indices = [index for index in range(len(schema)) if schema.column(index).path == field_name]
@@ -169,7 +169,7 @@ class ParquetTable(NumberTable):
             name: Name of the column, for the error message.
 
         Raises:
-            error_class: If the magnitude of a number is at least `FIRST_INEXACT_INTEGER`.
+            InputError: If the magnitude of a number is at least `FIRST_INEXACT_INTEGER`.
         """
         inexact_rows = np.flatnonzero(np.abs(numbers) >= FIRST_INEXACT_INTEGER)
         if inexact_rows.size:
@@ -220,7 +220,7 @@ def _check_ends(file: BinaryIO, source: TableSource) -> None:
         source: Name of the file and class of the error, for error messages.
 
     Raises:
-        error_class: If the file is not Parquet, is incomplete, or has very large metadata.
+        InputError: If the file is not Parquet, is incomplete, or has very large metadata.
     """
     first_mark = file.read(len(MARK))
 
@@ -248,7 +248,7 @@ def _pyarrow_errors_converted(source: TableSource) -> Iterator[None]:
         source: Name of the file and class of the error, for the error message.
 
     Raises:
-        error_class: If the block raises one of the exceptions of pyarrow.
+        InputError: If the block raises one of the exceptions of pyarrow.
     """
     from pyarrow import ArrowException
 

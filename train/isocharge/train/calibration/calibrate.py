@@ -45,9 +45,6 @@ SUSPICIOUS_MISFIT = 8.0
 UNEXPLAINED_CHI2 = 9.0
 """Mean squared residual above which no film explains the presses, in units of the noise variance."""
 
-MIN_SCATTER_PROBABILITY = 0.01
-"""Probability of residuals as large as those of the fit, below which the stated errors are increased."""
-
 MAX_USUAL_NOISE = 0.01
 """Noise that is proportional to the charge, above which a caution is given, dimensionless."""
 
@@ -88,12 +85,13 @@ def calibrate(
     _check_enough_measured(ordered_presses)
     # Presses at the edge may lie outside the working area by their errors.
     is_outside = problem.solved_domain.is_outside(ordered_presses.contact)
-    outside_caution = ""
+    outside_cautions = []
     used_presses = ordered_presses
     if is_outside.any():
-        outside_caution = _outside_words(ordered_presses[is_outside], problem)
+        outside_words = _outside_words(ordered_presses[is_outside], problem)
         if len(ordered_presses) == 1:
-            raise PressError(outside_caution)
+            raise PressError(outside_words)
+        outside_cautions.append(f"{outside_words}; left out")
         used_presses = ordered_presses[~is_outside]
     problem = _at_temperature_of(problem, used_presses)
     with threadpool_limits(1):  # the matrices are small, so a second thread would only wait
@@ -111,16 +109,14 @@ def calibrate(
         if is_unexplained(estimation, BAD_PROBABILITY, UNEXPLAINED_CHI2):
             reason = large_residual_reason(np.sqrt(estimation.chi2 / estimation.redundancy))
             raise unexplained_error(used_presses, estimation.charges, reason)
-        estimation, scatter_caution = _scaled_by_scatter(estimation)
         noisy_problem = replace(problem, noise=estimation.film.noise)
         sensitivity = ContactSensitivity.of(noisy_problem, estimation.charges, estimation.film.values)
-    cautions = (f"{outside_caution}; left out" if outside_caution else "", scatter_caution)
     return CalibrationResult(
         problem=problem,
         presses=used_presses,
         estimation=estimation,
         sensitivity=sensitivity,
-        cautions=(*filter(None, cautions), *_cautions(used_presses, estimation)),
+        cautions=(*outside_cautions, *_cautions(used_presses, estimation)),
     )
 
 
@@ -254,24 +250,6 @@ def _check_enough_measured(presses: MeasuredPresses) -> None:
         )
 
 
-def _scaled_by_scatter(estimation: Estimation) -> tuple[Estimation, str]:
-    """Increase the covariance by Birge's ratio (Birge 1932) if the presses scatter more than expected.
-
-    Returns:
-        The estimate, and a caution, which is empty if the covariance is unchanged.
-    """
-    if not is_unexplained(estimation, MIN_SCATTER_PROBABILITY, 1.0):
-        return estimation, ""
-    ratio = estimation.chi2 / estimation.redundancy
-    film = replace(estimation.film, covariance=ratio * estimation.film.covariance)
-    caution = (
-        f"the presses scatter {np.sqrt(ratio):.2g} times as much as the noise and the stated standard deviations of "
-        "the rig explain; the stated errors are increased by this factor: are positions and forces as certain as "
-        "assumed?"
-    )
-    return replace(estimation, film=film), caution
-
-
 def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     """Return warnings about presses, the session, and electrodes far from their described places."""
     cautions = []
@@ -282,11 +260,17 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     if film.noise.gain > MAX_USUAL_NOISE:
         cautions.append(
             f"the charges scatter by about {100.0 * film.noise.gain:.2g} %, which the standard deviations of the model "
-            "contain: are the positions and forces as certain as stated, and are the charges read at rest?"
+            "contain: are the charges read at rest, and does the film lie still?"
         )
-    if estimation.hypothesis.force_scatter > 0.0:
+    errors = estimation.hypothesis.errors
+    if errors.position_ratio > 1.0:
         cautions.append(
-            f"the forces scatter by about {100.0 * estimation.hypothesis.force_scatter:.2g} % more than stated: does "
+            f"the positions scatter about {errors.position_ratio:.0f} times as much as stated (--position-std): are "
+            "they measured from the centre of the film, and does the probe touch it where the stage says?"
+        )
+    if errors.force_scatter > 0.0:
+        cautions.append(
+            f"the forces scatter by about {100.0 * errors.force_scatter:.2g} % more than stated: does "
             "the load cell lag behind, or do the charges leak between the press and its reading?"
         )
     cautions.extend(film.session_cautions())

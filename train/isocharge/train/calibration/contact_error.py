@@ -28,7 +28,7 @@ from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.estimator import Hypothesis, linearise
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate
-from isocharge.train.calibration.press_data import PressData
+from isocharge.train.calibration.press_data import PressData, PressErrors
 from isocharge.train.calibration.problem import CalibrationProblem
 
 N_CONTACTS = 200
@@ -43,7 +43,7 @@ GRID_MM = 0.5
 GRID_N = 0.05
 """Grid to which proposed forces are rounded, N."""
 
-PLANNED = Hypothesis(0.5, 0.01, (0.0,) * len(SESSION), 0.0, noise_model("reference"), 1.0)
+PLANNED = Hypothesis(0.5, 0.01, (0.0,) * len(SESSION), PressErrors(noise_model("reference")), 1.0)
 """Imperfections and discrepancy that are assumed when presses are planned before the first press."""
 
 

@@ -5,8 +5,8 @@ contact may be known, known with an error, or unknown. The contacts are eliminat
 Golub and Pereyra 1973). Presses that do not agree with the others get a lower weight, according to Student's t
 distribution (Lange and others, 1989), and are left out of the final estimate.
 
-How uneven a film is, how large its discrepancy and the noise are, and whether the session has an offset, a drift or
-scattered forces, is not known beforehand. Each combination of these cases is a hypothesis. The evidence of a hypothesis
+How uneven a film is, how large its discrepancy and the errors of the presses are, and whether the session has an offset
+or a drift, is not known beforehand. Each combination of these cases is a hypothesis. The evidence of a hypothesis
 follows from the linearised problem (MacKay 1992), and the estimate is the mean over the hypotheses, weighted by their
 evidence.
 """
@@ -14,8 +14,10 @@ evidence.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtrc, chdtri
 
 from isocharge.common.arrays import Array, Booleans
@@ -25,7 +27,7 @@ from isocharge.simulate import NoiseModel
 from isocharge.train.calibration.discrepancy import terms, unit_covariance
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout
-from isocharge.train.calibration.press_data import PressData
+from isocharge.train.calibration.press_data import PressData, PressErrors
 
 UNKNOWN_CHARGE_STD = 1e9
 """Standard deviation of a charge that was not measured, pC."""
@@ -48,8 +50,23 @@ REMAINING_DISCREPANCY = 0.3
 FORCE_SCATTERS = ((0.0, 0.8), (0.01, 0.1), (0.03, 0.1))
 """Random errors of the forces beyond the stated ones, relative to the force, with their prior probabilities."""
 
+POSITION_RATIOS = ((1.0, 0.8), (3.0, 0.1), (8.0, 0.1))
+"""Errors of the positions relative to the stated ones, with their prior probabilities."""
+
 NOISE_RATIOS = ((1.0, 0.6), (2.0, 0.1), (4.0, 0.1), (8.0, 0.1), (16.0, 0.1))
 """Noise that is proportional to the charge, relative to that of a good amplifier, with its prior probabilities."""
+
+LARGER_POSITION_RATIO = 3.0
+"""Error of the positions relative to the stated one, with which the search is repeated if a press seems bad.
+
+A press at a wrong place is still recognised.
+"""
+
+MIN_WEIGHT = 1e-6
+"""Weight of a hypothesis below which its covariance is neglected."""
+
+MAX_SEARCHES = 5
+"""Largest number of searches with other errors than the stated ones."""
 
 
 @dataclass(frozen=True)
@@ -60,23 +77,26 @@ class Hypothesis:
         imperfections: Size of the imperfections, relative to their prior standard deviations.
         discrepancy: Size of the discrepancy, relative to the charge.
         session_std: Prior standard deviation of each unknown of the session, shape (n_session,).
-        force_scatter: Random error of the forces, relative to the force.
-        noise: Noise of the charges.
+        errors: Errors of the presses.
         probability: Prior probability.
     """
 
     imperfections: float
     discrepancy: float
     session_std: tuple[float, ...]
-    force_scatter: float
-    noise: NoiseModel
+    errors: PressErrors
     probability: float
+
+    @property
+    def sizes(self) -> tuple[float, float, tuple[float, ...]]:
+        """Sizes from which the prior distribution of the unknowns follows."""
+        return self.imperfections, self.discrepancy, self.session_std
 
 
 def typical(data: PressData) -> Hypothesis:
     """Return the hypothesis with which the search for the most probable unknowns begins."""
     session_std = tuple(one.stds[-1][0] if one.is_possible(data) else 0.0 for one in SESSION)
-    return Hypothesis(1.0, 0.01, session_std, 0.0, data.noise, 1.0)
+    return Hypothesis(1.0, 0.01, session_std, PressErrors(data.noise), 1.0)
 
 
 def hypotheses(data: PressData, noise: NoiseModel) -> Iterator[Hypothesis]:
@@ -91,11 +111,10 @@ def hypotheses(data: PressData, noise: NoiseModel) -> Iterator[Hypothesis]:
         for ratio, probability in NOISE_RATIOS
     ]
     stds = [one.stds if one.is_possible(data) else ((0.0, 1.0),) for one in SESSION]
-    for cases in product(IMPERFECTION_SCALES, DISCREPANCY_SIZES, FORCE_SCATTERS, noises, *stds):
-        (imperfections, discrepancy, force_scatter, assumed_noise, *session), probabilities = zip(*cases, strict=True)
-        yield Hypothesis(
-            imperfections, discrepancy, tuple(session), force_scatter, assumed_noise, float(np.prod(probabilities))
-        )
+    for cases in product(noises, POSITION_RATIOS, FORCE_SCATTERS, IMPERFECTION_SCALES, DISCREPANCY_SIZES, *stds):
+        sizes, probabilities = zip(*cases, strict=True)
+        errors, (imperfections, discrepancy, *session) = PressErrors(*sizes[:3]), sizes[3:]
+        yield Hypothesis(imperfections, discrepancy, tuple(session), errors, float(np.prod(probabilities)))
 
 
 @dataclass(frozen=True)
@@ -273,39 +292,55 @@ def estimate(
 ) -> Estimation:
     """Estimate a film from presses, with the derivatives of one solved film.
 
-    If a press seems bad, the search is repeated with the largest noise, with which the press may agree with the others.
-    The search is also repeated with the most probable noise, until it assumes this noise.
+    The search begins with the stated errors of the presses. If a press seems bad, the search is repeated with larger
+    errors, with which the press may agree with the others. The search is then repeated with the most probable errors,
+    until it has assumed these errors.
 
     Args:
         charges: Charges of a solved film and of similar films.
-        data: The presses.
+        data: The presses with their stated errors, and with the smallest possible noise.
         prior: Prior distribution of the unknowns.
         start: Unknowns from which the search begins; None for the prior mean.
         contact: Contacts (x, y, F) from which the search begins, shape (n, 3); None for the measured contacts.
     """
     all_hypotheses = list(hypotheses(data, data.noise))
-    estimation = _estimate_with_noise(charges, data, prior, all_hypotheses, start, contact)
-    noise = all_hypotheses[-1].noise if estimation.is_bad.any() else estimation.hypothesis.noise
-    for _ in NOISE_RATIOS:
-        if noise == data.noise:
+    assumed = PressErrors(data.noise)
+    estimation = _estimate_with_errors(charges, data, assumed, prior, all_hypotheses, start, contact)
+    probable = estimation.hypothesis.errors
+    if estimation.is_bad.any():
+        probable = PressErrors(all_hypotheses[-1].errors.noise, LARGER_POSITION_RATIO)
+    for _ in range(MAX_SEARCHES):
+        if probable == assumed:
             break
-        data = data.with_errors(noise)
-        estimation = _estimate_with_noise(
-            charges, data, prior, all_hypotheses, estimation.film.values, estimation.contact
+        assumed = probable
+        estimation = _estimate_with_errors(
+            charges, data, assumed, prior, all_hypotheses, estimation.film.values, estimation.contact
         )
-        noise = estimation.hypothesis.noise
+        probable = estimation.hypothesis.errors
     return estimation
 
 
-def _estimate_with_noise(
+def _estimate_with_errors(
     charges: FilmCharges,
-    data: PressData,
+    stated: PressData,
+    assumed: PressErrors,
     prior: Prior,
     all_hypotheses: list[Hypothesis],
     start: Array | None,
     contact: Array | None,
 ) -> Estimation:
-    """Search for the film and for bad presses with the noise of `data`, and estimate the film under all hypotheses."""
+    """Search for the film and for bad presses with assumed errors, and estimate the film under all hypotheses.
+
+    Args:
+        charges: Charges of a solved film and of similar films.
+        stated: The presses with their stated errors.
+        assumed: Errors of the presses that the search assumes.
+        prior: Prior distribution of the unknowns.
+        all_hypotheses: The hypotheses.
+        start: Unknowns from which the search begins; None for the prior mean.
+        contact: Contacts (x, y, F) from which the search begins, shape (n, 3); None for the measured contacts.
+    """
+    data = stated.with_errors(assumed)
     layout = prior.layout
     unknowns = prior.mean if start is None else start
     log_contact = data.contact if contact is None else np.column_stack([contact[:, :2], np.log(contact[:, 2])])
@@ -320,13 +355,17 @@ def _estimate_with_noise(
 
     # The estimate of each hypothesis follows from the linearised problem at the most probable unknowns so far.
     used_data, used_contact = data[is_used], log_contact[is_used]
+    hypothesis_of_sizes = {one.sizes: one for one in all_hypotheses}
+    precisions = {sizes: _Precision.of(prior.covariance(one)) for sizes, one in hypothesis_of_sizes.items()}
     for _ in range(2):
         model = model_values(charges, layout, used_data, unknowns, used_contact)
         evidence = {
-            errors: _Evidence.of(model, used_data.with_errors(*errors), used_contact)
-            for errors in {(one.noise, one.force_scatter) for one in all_hypotheses}
+            errors: _Evidence.of(model, stated[is_used].with_errors(errors), used_contact, unknowns - prior.mean)
+            for errors in {one.errors for one in all_hypotheses}
         }
-        estimates = [evidence[one.noise, one.force_scatter].posterior(prior, one, unknowns) for one in all_hypotheses]
+        estimates = [
+            evidence[one.errors].posterior(precisions[one.sizes], prior.mean, one.probability) for one in all_hypotheses
+        ]
         log_evidence = np.array([one.log_evidence for one in estimates])
         weight = np.exp(log_evidence - log_evidence.max())
         weight /= weight.sum()
@@ -336,7 +375,7 @@ def _estimate_with_noise(
         used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
         unknowns = _bounded(mean, layout)
     deviation = means - mean
-    covariance = sum(w * one.covariance for w, one in zip(weight, estimates, strict=True))
+    covariance = sum(weight[index] * estimates[index].covariance for index in np.flatnonzero(weight > MIN_WEIGHT))
     covariance = covariance + (weight[:, None] * deviation).T @ deviation
 
     log_contact[is_used] = used_contact
@@ -344,7 +383,7 @@ def _estimate_with_noise(
     final_residual, _ = final.eliminated()
     final_chi2 = (final_residual**2).sum(axis=1)
     best_hypothesis = all_hypotheses[int(weight.argmax())]
-    film = FilmEstimate(layout, unknowns, np.asarray(covariance), data.mean_C, best_hypothesis.noise)
+    film = FilmEstimate(layout, unknowns, np.asarray(covariance), data.mean_C, best_hypothesis.errors.noise)
     return Estimation(
         charges=charges,
         film=film,
@@ -403,62 +442,111 @@ def _search(charges: FilmCharges, data: PressData, prior: Prior, unknowns: Array
 
 @dataclass(frozen=True)
 class _Posterior:
-    """Estimate under one hypothesis: mean, covariance, logarithm of the evidence, and sum of the squared residuals."""
+    """Estimate under one hypothesis.
+
+    Attributes:
+        mean: Most probable unknowns, shape (n_unknown,).
+        free: Elements of a matrix of all unknowns that belong to the unknowns with a prior variance.
+        factor: Cholesky factor of the inverse covariance of these unknowns, as `cho_factor` returns it.
+        log_evidence: Logarithm of the evidence.
+        chi2: Sum of the squared residuals of the presses and of the prior distribution.
+    """
 
     mean: Array
-    covariance: Array
+    free: tuple[Any, ...]
+    factor: tuple[Array, bool]
     log_evidence: float
     chi2: float
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the unknowns, shape (n_unknown, n_unknown)."""
+        covariance = np.zeros((self.mean.size, self.mean.size))
+        covariance[self.free] = cho_solve(self.factor, np.eye(len(self.factor[0])))
+        return covariance
+
+
+class _Precision(NamedTuple):
+    """Prior distribution of the unknowns that have a prior variance.
+
+    Attributes:
+        free: Elements of a matrix of all unknowns that belong to these unknowns, as `np.ix_` selects them.
+        matrix: Inverse of their covariance.
+        log_determinant: Logarithm of the determinant of their covariance.
+    """
+
+    free: tuple[Any, ...]
+    matrix: Array
+    log_determinant: float
+
+    @classmethod
+    def of(cls, covariance: Array) -> "_Precision":
+        """Invert the covariance of the unknowns, shape (n_unknown, n_unknown)."""
+        is_free = np.diag(covariance) > 0.0
+        free = np.ix_(is_free, is_free)
+        inverse = np.asarray(np.linalg.inv(covariance[free]), dtype=float)
+        return cls(free, inverse, float(np.linalg.slogdet(covariance[free])[1]))
 
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What presses with one noise and one scatter of the forces state about the unknowns, in the linearised problem.
+    """What presses with given errors state about the unknowns, in the linearised problem.
+
+    With the residuals r at the prior means, from which the contacts are eliminated, and with their derivatives J:
 
     Attributes:
-        residual: Residuals from which the contacts are eliminated, shape (n_residual,).
-        jacobian: Their derivatives with respect to the unknowns, shape (n_residual, n_unknown).
+        information: J^T J, shape (n_unknown, n_unknown).
+        gradient: J^T r, shape (n_unknown,).
+        chi2: r^T r.
         log_volume: Logarithm of the density of the measurements, and of the volume of the possible contacts.
     """
 
-    residual: Array
-    jacobian: Array
+    information: Array
+    gradient: Array
+    chi2: float
     log_volume: float
 
     @classmethod
-    def of(cls, model: ModelValues, data: PressData, contact: Array) -> "_Evidence":
-        """Eliminate the contacts; the arguments are those of `Linearised.of`."""
+    def of(cls, model: ModelValues, data: PressData, contact: Array, from_mean: Array) -> "_Evidence":
+        """Eliminate the contacts.
+
+        Args:
+            model: Charges, as `model_values` returns them.
+            data: The presses with the given errors.
+            contact: Contacts (x, y, ln F), shape (n, 3).
+            from_mean: Differences of the unknowns from their prior means, shape (n_unknown,).
+        """
         linearised = Linearised.of(model, data, contact)
         residual, jacobian = linearised.eliminated()
+        jacobian = jacobian.reshape(residual.size, -1)
+        at_mean = residual.ravel() - jacobian @ from_mean
         by_contact = linearised.contact_jacobian
         log_contact_volume = -0.5 * np.linalg.slogdet(by_contact.swapaxes(1, 2) @ by_contact)[1].sum()
         measured_std = np.column_stack([data.charge_std, data.contact_std])
         log_density = -np.log(measured_std[np.isfinite(measured_std)]).sum()
-        return cls(residual.ravel(), jacobian.reshape(residual.size, -1), float(log_contact_volume + log_density))
+        return cls(
+            information=jacobian.T @ jacobian,
+            gradient=jacobian.T @ at_mean,
+            chi2=float(at_mean @ at_mean),
+            log_volume=float(log_contact_volume + log_density),
+        )
 
-    def posterior(self, prior: Prior, hypothesis: Hypothesis, unknowns: Array) -> _Posterior:
+    def posterior(self, precision: _Precision, mean: Array, probability: float) -> _Posterior:
         """Compute the estimate and the evidence of a hypothesis.
 
         Args:
-            prior: Prior distribution.
-            hypothesis: The hypothesis, whose noise and scatter of the forces are those of the presses.
-            unknowns: Unknowns at which the residuals were computed.
+            precision: Prior distribution under the hypothesis.
+            mean: Prior means of the unknowns, shape (n_unknown,).
+            probability: Prior probability of the hypothesis.
         """
-        covariance = prior.covariance(hypothesis)
-        is_free = np.diag(covariance) > 0.0
-        free = np.ix_(is_free, is_free)
-        precision = np.linalg.inv(covariance[free])
-        free_jacobian = self.jacobian[:, is_free]
-        at_prior = self.residual - self.jacobian @ (unknowns - prior.mean)
-        matrix = precision + free_jacobian.T @ free_jacobian
-        posterior_covariance = np.zeros_like(covariance)
-        posterior_covariance[free] = np.linalg.inv(matrix)
-        change = -posterior_covariance @ (self.jacobian.T @ at_prior)
-        misfit = at_prior + self.jacobian @ change
-        chi2 = float(misfit @ misfit + change[is_free] @ precision @ change[is_free])
-        log_determinant = np.linalg.slogdet(matrix)[1] + np.linalg.slogdet(covariance[free])[1]
-        log_evidence = -0.5 * (chi2 + log_determinant) + self.log_volume + np.log(hypothesis.probability)
-        return _Posterior(prior.mean + change, posterior_covariance, float(log_evidence), chi2)
+        free = precision.free[1].ravel()  # indices of the unknowns with a prior variance
+        factor = cho_factor(precision.matrix + self.information[precision.free], lower=True)
+        change = np.zeros(mean.size)
+        change[free] = -cho_solve(factor, self.gradient[free])
+        chi2 = self.chi2 + float(self.gradient @ change)
+        log_determinant = 2.0 * float(np.log(np.diag(factor[0])).sum()) + precision.log_determinant
+        log_evidence = -0.5 * (chi2 + log_determinant) + self.log_volume + np.log(probability)
+        return _Posterior(mean + change, precision.free, factor, float(log_evidence), chi2)
 
 
 def _redundancy(data: PressData) -> Array:

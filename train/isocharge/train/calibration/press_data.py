@@ -1,6 +1,7 @@
 """Measured presses in the form that the estimator needs: charges and contacts with their standard deviations."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +11,20 @@ from isocharge.simulate import Domain, NoiseModel
 
 UNKNOWN_STD = np.inf
 """Standard deviation of a value that was not measured."""
+
+
+class PressErrors(NamedTuple):
+    """Errors of presses beyond the stated ones.
+
+    Attributes:
+        noise: Noise of the charges.
+        position_ratio: Standard deviation of the positions, relative to the stated one.
+        force_scatter: Standard deviation of a further error of the forces, relative to the force.
+    """
+
+    noise: NoiseModel
+    position_ratio: float = 1.0
+    force_scatter: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -76,16 +91,12 @@ class PressData:
         names = ("charge", "charge_std", "contact", "contact_std", "time", "warming_K", "friction_charge")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
-    def with_errors(self, noise: NoiseModel, force_scatter: float = 0.0) -> "PressData":
-        """Return the presses with another noise of the charges, and with a further random error of all forces.
-
-        Args:
-            noise: Noise of the charges.
-            force_scatter: Standard deviation of the further error, relative to the force.
-        """
+    def with_errors(self, errors: PressErrors) -> "PressData":
+        """Return presses with stated errors as presses with other errors."""
+        noise, position_ratio, force_scatter = errors
         charge_std = np.where(np.isfinite(self.charge_std), noise.sigma(self.charge), UNKNOWN_STD)
-        contact_std = self.contact_std.copy()
-        contact_std[:, 2] = np.hypot(contact_std[:, 2], force_scatter)
+        force_std = np.hypot(self.contact_std[:, 2], force_scatter)
+        contact_std = np.column_stack([position_ratio * self.contact_std[:, :2], force_std])
         return replace(self, charge_std=charge_std, noise=noise, contact_std=contact_std)
 
 
