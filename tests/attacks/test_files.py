@@ -245,13 +245,13 @@ def test_calibrations_with_faults(tmp_path, attack):
     """A film that is taken from a file with faults is finite, and the next calibration can begin with it."""
     problem = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
     prior = problem.prior
-    good = film_table(problem, FilmEstimate(prior.layout, prior.mean, prior.covariance(PLANNED), 21.5))
+    good = film_table(problem, FilmEstimate(prior.layout, prior.mean, prior.covariance(PLANNED)))
     text = json_text(good)
     path = tmp_path / "calibration.json"
 
     def read(data):
         path.write_bytes(data)
-        film = read_earlier(tmp_path, problem, knows_temperature=True)
+        film = read_earlier(tmp_path, problem)
         assert np.isfinite(film.values).all()
         assert np.linalg.eigvalsh(film.covariance)[0] > -1e-6
 

@@ -100,7 +100,8 @@ def test_presses_with_semicolons_decimal_commas_and_a_row_of_units(read):
     presses = read(f"{header}\nmm;mm;N;pC;pC;pC;-;°C\n2;-6;0,2;502,3;244,8;215,8;0,01;21,5\n")
     assert presses.contact.tolist() == [[2.0, -6.0, 0.2]]
     assert presses.charge_pC.tolist() == [[502.3, 244.8, 215.8]]
-    assert (presses.temperature_C.tolist(), presses.lines) == ([21.5], (3,))
+    assert presses.force_std.tolist() == [0.01]
+    assert (presses.electrodes, presses.lines) == (("A", "B", "C"), (3,))
 
 
 @pytest.mark.parametrize(
@@ -204,16 +205,12 @@ def some_presses(draw):
     rows = [r for r in draw(st.lists(row, min_size=1, max_size=5)) if not np.isnan(r[2]).all()]
     assume(rows)
     stds = [[draw(POSITIVE), draw(st.floats(0.0, 1.0, exclude_min=True))] for _ in rows]
-    temperatures = draw(
-        st.none() | st.lists(st.floats(-100.0, 200.0) | unknown, min_size=len(rows), max_size=len(rows))
-    )
     return MeasuredPresses(
         np.array([[*place, force] for place, force, _ in rows]),
         np.array([charges for *_, charges in rows]),
         *np.array(stds).T,
         names,
         tuple(range(1, len(rows) + 1)),
-        temperature_C=None if temperatures is None else np.array(temperatures),
     )
 
 

@@ -1,4 +1,4 @@
-"""Tests of `calibrate` on films whose charges are a closed formula: cautions, temperatures, and refused presses."""
+"""Tests of `calibrate` on films whose charges are a closed formula: cautions and refused presses."""
 
 import re
 from dataclasses import replace
@@ -75,36 +75,6 @@ def test_presses_at_one_place_are_named(problem, synthetic):
     contact = np.column_stack([np.full((4, 2), 2.0), [0.2, 0.5, 1.0, 1.5]])
     presses = measured_presses(problem, contact, synthetic.charges(values, contact))
     assert any("at one place" in caution for caution in fit(presses, problem, synthetic).cautions)
-
-
-def test_film_changes_with_the_temperature_and_a_later_calibration_begins_at_the_new_one(problem, synthetic):
-    """The pretension falls by 0.3 MPa/K. The temperatures are measured in the first session and in the second."""
-    prior = problem.prior.layout.prior
-    values = prior.mean.copy()
-    warming = np.linspace(-1.0, 1.0, 24)
-    _, contact, presses = rig(problem, synthetic, 24, seed=17, values=values)
-    charge = []
-    for warming_K, row in zip(warming, contact, strict=True):
-        values[0] = prior.mean[0] - 0.3 * warming_K
-        charge.append(synthetic.charges(values, row[None])[0])
-    presses = replace(presses, charge_pC=np.array(charge), temperature_C=22.0 + warming)
-    film = fit(presses, problem, synthetic).film
-    assert film.at_C == pytest.approx(22.0)
-    assert abs(film.value("pretension_per_K") + 0.3) < 3.0 * film.std("pretension_per_K") < 0.15
-
-    moved = film.at_temperature(24.0)
-    assert moved.value("pretension") == pytest.approx(film.value("pretension") + 2.0 * film.value("pretension_per_K"))
-    assert moved.std("pretension") > film.std("pretension")
-    with pytest.raises(PressError, match=r"at 60 C the pretension would be -\d"):
-        film.at_temperature(60.0)
-
-    # In a later session at 24 degrees, a single press suffices.
-    values[0] = prior.mean[0] - 0.6
-    _, _, later = rig(problem, synthetic, 1, seed=18, values=values)
-    later = replace(later, temperature_C=np.array([24.0]))
-    again = fit(later, replace(problem, earlier=film.drifted(knows_temperature=True)), synthetic).film
-    assert again.at_C == pytest.approx(24.0)
-    assert abs(again.value("pretension") - values[0]) < 3.0 * again.std("pretension") < 0.5
 
 
 def test_continued_calibration_needs_fewer_presses(problem, synthetic):

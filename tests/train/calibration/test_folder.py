@@ -14,8 +14,8 @@ from isocharge.serve import Predictor, read_presses
 from isocharge.simulate import NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, calibrate
 from isocharge.train.calibration import calibrate as calibrate_module
-from isocharge.train.calibration import film_network, folder
-from isocharge.train.calibration.folder import calibration_folder, read_earlier, read_moved, write_calibration
+from isocharge.train.calibration import film_network
+from isocharge.train.calibration.folder import calibration_folder, read_earlier, write_calibration
 
 QUICK = FitConfig(
     network=NetworkConfig(hidden=(32, 32), misfit_hidden=(16, 16)),
@@ -36,7 +36,6 @@ def written(problem, synthetic, tmp_path_factory):
         patch.setattr(film_network, "PRESSES", 6_000)
         patch.setattr(film_network, "_outside_presses", lambda *_: None)
         values, _, presses = rig(problem, synthetic, 20, seed=31)
-        presses = replace(presses, temperature_C=np.linspace(20.0, 23.0, 20))
         result = calibrate(presses, problem, start=synthetic, accurate=False)
         path = tmp_path_factory.mktemp("calibrated") / "film"
         write_calibration(result, path, "make it", config=QUICK)
@@ -68,17 +67,6 @@ def test_folder_contains_the_presses_the_sensor_and_the_estimate(written, proble
     assert written.result.summary[0] in card
     for name in ("sensor.toml", "calibration.json", "card.md", "calibration.png"):
         assert (written.path / name).read_bytes() == (version / name).read_bytes()
-
-
-def test_film_is_moved_to_another_temperature_without_presses(written, problem, synthetic, monkeypatch):
-    monkeypatch.setattr(folder, "solve_film", lambda *_: synthetic)
-    film = written.result.film
-    result = read_moved(written.path, problem, 22.5)
-    expected = film.value("pretension") + (22.5 - film.at_C) * film.value("pretension_per_K")
-    assert result.film.value("pretension") == pytest.approx(expected)
-    assert result.film.at_C == 22.5
-    assert result.summary[0].startswith(f"moved from {film.at_C:.1f} C, film/1, to 22.5 C")
-    assert result.to_dict()["presses"] == 0
 
 
 def test_next_calibration_is_the_next_version_and_stale_files_are_mended(written, problem, tmp_path):
@@ -118,10 +106,3 @@ def test_unsuitable_folders_are_refused_and_left_as_they_are(written, problem, t
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
     with pytest.raises(PressError, match=r"calibration\.json"):
         read_earlier(tmp_path / "mine", problem)
-
-
-def test_film_without_temperatures_cannot_be_moved(written, problem, tmp_path):
-    table = json.loads((written.path / "calibration.json").read_text()) | {"at_C": None}
-    (tmp_path / "calibration.json").write_text(json.dumps(table))
-    with pytest.raises(PressError, match="presses that have a column temperature_C"):
-        read_moved(tmp_path, problem, 22.0)

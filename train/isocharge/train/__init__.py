@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from isocharge.train.calibration.calibrate import calibrate
     from isocharge.train.calibration.contact_error import ProposedPress, next_presses
     from isocharge.train.calibration.film_estimate import FilmEstimate
-    from isocharge.train.calibration.folder import read_earlier, read_moved, write_calibration
+    from isocharge.train.calibration.folder import read_earlier, write_calibration
     from isocharge.train.calibration.problem import CalibrationProblem
     from isocharge.train.calibration.result import CalibrationResult
     from isocharge.train.calibration.session import PressSession
@@ -67,7 +67,6 @@ __all__ = [
     "load_config",
     "next_presses",
     "read_earlier",
-    "read_moved",
     "release",
     "student_config",
     "student_data",

@@ -6,7 +6,7 @@ order. An empty cell stands for an unknown value. The file may have three furthe
 
     position_std_mm   standard deviation of x and of y, mm
     force_std         standard deviation of the force relative to the force: 0.01 is 1 %
-    temperature_C     temperature of the ring of the film, degrees Celsius
+    temperature_C     temperature of the ring of the film, for the reader of the file; it is not used
 
 If the names of the electrodes are given, all other columns are ignored. If no names are given, all columns without
 another meaning are assumed to be electrodes. `isocharge serve predict` also reads files of presses.
@@ -44,20 +44,10 @@ CONTACT = ("x_mm", "y_mm", "force_N")
 UNCERTAINTY = ("position_std_mm", "force_std")
 
 TEMPERATURE = "temperature_C"
-MIN_TEMPERATURE_C = -100.0
-MAX_TEMPERATURE_C = 200.0
-"""Range of temperatures that a film of PVDF may have."""
+"""Name of a column that is neither used nor taken for an electrode."""
 
 _POSITION = "a position in mm, or an empty cell if it is unknown"
 _FORCE_WORDS = frozenset({"force", "kraft", "fuerza", "forza", "f", "load", "last"})
-
-_TEMPERATURE_RULE = ColumnRule(
-    f"a temperature of {MIN_TEMPERATURE_C:g} to {MAX_TEMPERATURE_C:g} degrees Celsius, or an empty cell if it is "
-    "unknown",
-    MIN_TEMPERATURE_C,
-    MAX_TEMPERATURE_C,
-    meaning=ColumnMeaning(unit="C"),
-)
 
 PRESS_RULES = {
     "x_mm": ColumnRule(_POSITION, meaning=ColumnMeaning(unit="mm", words=frozenset({"x"}))),
@@ -69,7 +59,6 @@ PRESS_RULES = {
     ),
     "position_std_mm": ColumnRule("a positive standard deviation in mm", is_positive=True),
     "force_std": ColumnRule("a positive share of the force up to 1 (0.01 is 1 %)", maximum=1.0, is_positive=True),
-    TEMPERATURE: _TEMPERATURE_RULE,
 }
 """The columns of a file of presses that are not electrodes."""
 
@@ -97,8 +86,6 @@ class MeasuredPresses:
         lines: Number of the line of each press in a CSV file, or number of the row in a Parquet file, for messages. If
             the presses do not come from a file, they are numbered from 1.
         ignored: Names of the columns of the file that were not read.
-        temperature_C: Temperature of the ring of the film, shape (n,), degrees Celsius; NaN if unknown. If all
-            temperatures are unknown, the attribute may be None.
         row_noun: What `lines` counts, for messages: "line", "row" or "press".
 
     Raises:
@@ -113,7 +100,6 @@ class MeasuredPresses:
     electrodes: tuple[str, ...]
     lines: tuple[int, ...]
     ignored: tuple[str, ...] = ()
-    temperature_C: Array | None = None
     row_noun: str = "line"
 
     def __post_init__(self) -> None:
@@ -137,7 +123,6 @@ class MeasuredPresses:
             charge_pC=self.charge_pC[indices],
             position_std_mm=self.position_std_mm[indices],
             force_std=self.force_std[indices],
-            temperature_C=None if self.temperature_C is None else self.temperature_C[indices],
             lines=tuple(self.lines[index] for index in indices),
         )
 
@@ -145,11 +130,6 @@ class MeasuredPresses:
     def placed(self) -> Booleans:
         """Mask of the presses whose position and force are both known, shape (n,)."""
         return np.asarray(np.isfinite(self.contact).all(axis=1))
-
-    @property
-    def knows_temperature(self) -> bool:
-        """Whether the temperature of the ring is known for at least one press."""
-        return self.temperature_C is not None and not bool(np.isnan(self.temperature_C).all())
 
     def __eq__(self, other: object) -> bool:
         """Return whether the values and the names of the columns are equal. The numbers of the lines are ignored."""
@@ -184,18 +164,10 @@ class MeasuredPresses:
 
     @property
     def columns(self) -> dict[str, Array]:
-        """Columns of numbers that a file of these presses has: a dictionary from names to arrays of shape (n,).
-
-        The column of temperatures is omitted if the temperatures of all presses are unknown.
-        """
+        """Columns of numbers that a file of these presses has: a dictionary from names to arrays of shape (n,)."""
         columns = dict(zip(CONTACT, self.contact.T, strict=True))  # x_mm, y_mm and force_N
         columns |= dict(zip(self.electrodes, self.charge_pC.T, strict=True))
-        columns |= {"position_std_mm": self.position_std_mm, "force_std": self.force_std}
-
-        # The comparison with None is redundant, but type checkers need it.
-        if self.temperature_C is not None and self.knows_temperature:
-            columns[TEMPERATURE] = self.temperature_C
-        return columns
+        return columns | {"position_std_mm": self.position_std_mm, "force_std": self.force_std}
 
     def _check_shapes(self) -> None:
         """Check that all arrays have one row for each press, and that there is one charge for each electrode.
@@ -210,8 +182,6 @@ class MeasuredPresses:
             "position_std_mm": (press_count,),
             "force_std": (press_count,),
         }
-        if self.temperature_C is not None:
-            expected_shapes["temperature_C"] = (press_count,)
         for name, shape in expected_shapes.items():
             given_shape = getattr(self, name).shape
             if given_shape != shape:
@@ -315,22 +285,12 @@ def read_presses(
             electrodes=electrode_names,
             lines=tuple(columns.row_numbers.tolist()),
             ignored=ignored_names,
-            temperature_C=_none_if_unknown(values[TEMPERATURE]),
             row_noun=columns.row_noun,
         )
 
 
-def _none_if_unknown(temperature_C: Array) -> Array | None:
-    """Return a column of temperatures, or None if all temperatures are unknown.
-
-    Args:
-        temperature_C: Temperatures, shape (n,), degrees Celsius; NaN if unknown.
-    """
-    return None if np.isnan(temperature_C).all() else temperature_C
-
-
 def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
-    """Return the names of all columns that are not in `PRESS_RULES`. These columns are assumed to be electrodes.
+    """Return the names of all columns without another meaning, which are assumed to be electrodes.
 
     Args:
         table: The table with the header of the file.
@@ -339,7 +299,7 @@ def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
         PressError: If the name of a column has several characters and is similar to a name in `PRESS_RULES`. The name
             is then probably misspelt.
     """
-    electrodes = tuple(name for name in table.header if name and name not in PRESS_RULES)
+    electrodes = tuple(name for name in table.header if name and name not in {TEMPERATURE, *PRESS_RULES})
     long_names = [name for name in electrodes if len(name) > 1]  # short names such as "F" are common electrode names
     table.refuse_similar_names(long_names, PRESS_RULES)
     return electrodes

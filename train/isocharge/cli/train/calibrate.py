@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from isocharge.cli.shared.forward_maps import write_deflection
@@ -15,8 +14,6 @@ from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
-from isocharge.serve import MeasuredPresses
-from isocharge.serve.presses.measured_presses import MAX_TEMPERATURE_C, MIN_TEMPERATURE_C
 from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.simulate.solver.friction import MAX_FRICTION
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
@@ -24,7 +21,6 @@ from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.folder import (
     calibration_folder,
     read_earlier,
-    read_moved,
     result_table,
     write_calibration,
 )
@@ -76,15 +72,6 @@ def calibrate_command(
             help="Start from the calibration in this folder, allowing for drift since then. (default: the sensor file)",
         ),
     ] = None,
-    temperature_C: Annotated[
-        float | None,
-        typer.Option(
-            "--temperature",
-            metavar="C",
-            help="Temperature of the film's ring, degrees Celsius, for presses without a column temperature_C; without "
-            "presses, the film of --from is written as it is at this temperature. (default: unknown)",
-        ),
-    ] = None,
     friction: Annotated[
         float,
         typer.Option(
@@ -120,11 +107,7 @@ def calibrate_command(
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
-    # With --from and --temperature but without presses, the film of the earlier calibration is solved at the other
-    # temperature. The calibration is then said to be moved to this temperature.
-    is_moved = file is None and earlier is not None and temperature_C is not None
-    _check_usage(file, output, next_count, temperature_C, is_moved=is_moved)
-    _check_side_forces(file, friction, side_force, is_moved=is_moved)
+    _check_usage(file, output, next_count, friction, side_force)
     problem = CalibrationProblem(
         load_sensor(sensor),
         parse_probe(probe),
@@ -143,12 +126,8 @@ def calibrate_command(
         presses = None
         if file is not None:
             presses = read_press_file(file, problem.electrodes, position_std_mm, force_std)
-            presses = _with_temperature(presses, temperature_C)
-        if is_moved and earlier is not None and temperature_C is not None:  # `is_moved` implies both other conditions
-            result = read_moved(earlier, problem, temperature_C, executor)
-        elif earlier is not None:
-            knows_temperature = presses is not None and presses.knows_temperature
-            problem = replace(problem, earlier=read_earlier(earlier, problem, knows_temperature=knows_temperature))
+        if earlier is not None:
+            problem = replace(problem, earlier=read_earlier(earlier, problem))
         if presses is not None:
             say(f"fitting the film to {len(presses)} presses")
             result = calibrate(presses, problem, executor=executor)
@@ -190,13 +169,6 @@ def _print_result(result: CalibrationResult | None, proposed_presses: list[Propo
         )
 
 
-def _with_temperature(presses: MeasuredPresses, temperature_C: float | None) -> MeasuredPresses:
-    """Set the temperature of all presses, unless they have temperatures already or the given temperature is None."""
-    if temperature_C is None or presses.knows_temperature:
-        return presses
-    return replace(presses, temperature_C=np.full(len(presses), temperature_C))
-
-
 def _write(result: CalibrationResult, folder: Path, executor: Executor | None) -> None:
     """Write the model of a calibrated film, and print the name of its version folder."""
     say("training the network of this film")
@@ -206,59 +178,33 @@ def _write(result: CalibrationResult, folder: Path, executor: Executor | None) -
     say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
 
 
-def _check_usage(
-    file: Path | None, output: Path | None, next_count: int, temperature_C: float | None, *, is_moved: bool
-) -> None:
+def _check_usage(file: Path | None, output: Path | None, next_count: int, friction: float, side_force: float) -> None:
     """Raise an error if arguments of the command contradict each other.
 
     Args:
         file: File of presses.
         output: Folder to write.
         next_count: Number of presses to propose.
-        temperature_C: Temperature, degrees Celsius.
-        is_moved: Whether an earlier calibration is moved to this temperature, without presses.
+        friction: Expected coefficient of friction of the presses.
+        side_force: Largest side force of later contacts over their force.
 
     Raises:
         InputError: If the arguments contradict each other.
     """
-    is_nothing_calibrated = file is None and not is_moved
-    is_out_of_range = temperature_C is not None and not MIN_TEMPERATURE_C <= temperature_C <= MAX_TEMPERATURE_C
-    temperature_range = f"{MIN_TEMPERATURE_C:g} to {MAX_TEMPERATURE_C:g}"
+    has_no_presses = file is None
     # The first message whose condition is true becomes the error.
     refuse(
         {
-            f"--temperature: expected {temperature_range} degrees Celsius, got {temperature_C}": is_out_of_range,
-            "--temperature: expected PRESSES.csv that were made at it, or --from FOLDER for it, got neither": (
-                is_nothing_calibrated and temperature_C is not None
-            ),
-            "expected PRESSES.csv, or --next K for presses to begin with, or --from FOLDER with --temperature C, got "
-            "none of them; `isocharge train press` takes presses at a port": is_nothing_calibrated and not next_count,
+            "expected PRESSES.csv, or --next K for presses to begin with, got neither; `isocharge train press` takes "
+            "presses at a port": has_no_presses and not next_count,
             "--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out": (
-                is_nothing_calibrated and output is not None
+                has_no_presses and output is not None
             ),
-        }
-    )
-
-
-def _check_side_forces(file: Path | None, friction: float, side_force: float, *, is_moved: bool) -> None:
-    """Raise an error if an option for side forces is given without presses or a model to which it applies.
-
-    Args:
-        file: File of presses.
-        friction: Expected coefficient of friction of the presses.
-        side_force: Largest side force of later contacts over their force.
-        is_moved: Whether an earlier calibration is moved to another temperature, without presses.
-
-    Raises:
-        InputError: If the friction is given without presses, or the side force without presses and without a model.
-    """
-    # The first message whose condition is true becomes the error.
-    refuse(
-        {
             f"--friction {friction:g}: expected PRESSES.csv that were made with this friction, got none": (
-                friction > 0.0 and file is None
+                has_no_presses and friction > 0.0
             ),
-            f"--side-force {side_force:g}: expected PRESSES.csv, or --from FOLDER with --temperature C, for a model "
-            "with larger standard deviations, got neither": side_force > 0.0 and file is None and not is_moved,
+            f"--side-force {side_force:g}: expected PRESSES.csv to train a model with it, got none": (
+                has_no_presses and side_force > 0.0
+            ),
         }
     )

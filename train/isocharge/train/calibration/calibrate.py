@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
-from isocharge.train.calibration.contact_error import N_CONTACTS, ContactSensitivity, spread_contacts
+from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.diagnosis import (
     FAR_FROM_ALL_FILMS,
     MOSTLY_OUTSIDE,
@@ -22,8 +22,7 @@ from isocharge.train.calibration.diagnosis import (
 )
 from isocharge.train.calibration.estimator import BAD_PROBABILITY, Estimation, estimate, is_unexplained
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.film_estimate import FilmEstimate
-from isocharge.train.calibration.press_data import PressData, known_temperatures
+from isocharge.train.calibration.press_data import PressData
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import CalibrationResult
 
@@ -93,7 +92,6 @@ def calibrate(
             raise PressError(outside_words)
         outside_cautions.append(f"{outside_words}; left out")
         used_presses = ordered_presses[~is_outside]
-    problem = _at_temperature_of(problem, used_presses)
     with threadpool_limits(1):  # the matrices are small, so a second thread would only wait
         charges = start or solve_even(problem, executor)
         if is_outside.mean() > 0.5:
@@ -139,19 +137,6 @@ def solve_even(
         executor,
         with_side_forces=problem.friction > 0.0 or problem.side_force > 0.0,
     )
-
-
-def solve_film(problem: CalibrationProblem, film: FilmEstimate, executor: Executor | None = None) -> FilmCharges:
-    """Solve an estimated film, with its imperfections if they are visible and with its real probe.
-
-    Args:
-        problem: The calibration problem.
-        film: The estimate.
-        executor: Executor that runs the solves; None for this process.
-    """
-    charges = solve_even(problem, executor, film.film_values)
-    contact = spread_contacts(problem.domain, N_CONTACTS)
-    return charges if _is_exact(charges, film.film_values, contact) else charges.solved(film.film_values, executor)
 
 
 def _fit_even_film(
@@ -220,14 +205,6 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
     missing = np.where(charges.prior.is_imperfection, values - charges.values, 0.0)
     missing[[charges.prior.index(name) for name in ("d12", "crosstalk")]] = 0.0  # their effect is exact
     return bool(np.linalg.norm(jacobian @ missing) < VISIBLE_ASYMMETRY * np.linalg.norm(charge))
-
-
-def _at_temperature_of(problem: CalibrationProblem, presses: MeasuredPresses) -> CalibrationProblem:
-    """Convert the estimate before the presses to their mean temperature, if both temperatures are known."""
-    temperature_C = known_temperatures(presses)
-    if problem.earlier is None or temperature_C is None:
-        return problem
-    return replace(problem, earlier=problem.earlier.at_temperature(float(temperature_C.mean())))
 
 
 def _outside_words(presses: MeasuredPresses, problem: CalibrationProblem) -> str:

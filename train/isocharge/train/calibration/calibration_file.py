@@ -16,12 +16,11 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError, cut, shown
 from isocharge.common.json_values import plain_values
 from isocharge.common.structs import Text, convert, read_json
-from isocharge.serve.presses.measured_presses import MAX_TEMPERATURE_C, MIN_TEMPERATURE_C
 from isocharge.simulate import NoiseModel
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.problem import CalibrationProblem
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Version of the file format that this module writes and reads."""
 
 DIGITS = 6
@@ -33,7 +32,6 @@ EIGENVALUE_TOLERANCE = 1e-4
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Std = Annotated[float, Meta(ge=0.0, le=1e6)]
 Correlation = Annotated[float, Meta(ge=-1.0, le=1.0)]
-Temperature = Annotated[float, Meta(ge=MIN_TEMPERATURE_C, le=MAX_TEMPERATURE_C)]
 
 
 class _Unknown(Struct, frozen=True):
@@ -50,7 +48,6 @@ class _CalibrationFile(Struct, frozen=True):
     probe: Text
     radius_mm: Number
     force_range_N: tuple[Number, Number]
-    at_C: Temperature | None
     unknowns: dict[str, _Unknown]
     noise: NoiseModel
     correlations: list[list[Correlation]]
@@ -74,7 +71,6 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
         "probe": problem.probe.notation,
         "radius_mm": problem.radius,
         "force_range_N": list(problem.force_range),
-        "at_C": film.at_C,
         "noise": vars(film.noise),
         "unknowns": {
             name: {"value": value, "std": one_std, "unit": unit}
@@ -123,7 +119,7 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
                 f"{values[index]:g}; calibrate again"
             )
     covariance = _correlations(path, content.correlations, len(values)) * np.outer(std, std)
-    return FilmEstimate(layout, values, covariance, content.at_C, content.noise)
+    return FilmEstimate(layout, values, covariance, content.noise)
 
 
 def _check_same_problem(path: Path, content: _CalibrationFile, problem: CalibrationProblem) -> None:

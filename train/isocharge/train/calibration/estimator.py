@@ -150,10 +150,7 @@ class Prior:
         session = np.array(hypothesis.session_std) ** 2
         if self.earlier is not None:
             covariance = self.earlier.covariance.copy()
-            for index, one in enumerate(SESSION):
-                row = layout.index(one.name)
-                if covariance[row, row] == 0.0:
-                    covariance[row, row] = session[index]
+            covariance[layout.session, layout.session] = np.diag(session)
             covariance[layout.coefficients, layout.coefficients] += REMAINING_DISCREPANCY**2 * discrepancy
             return covariance
         covariance = np.zeros((layout.coefficients.stop,) * 2)
@@ -257,8 +254,7 @@ def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns
     metric_contact = _in_domain(contact, charges)
     film_values = unknowns[layout.film]
     charge, film_jacobian = charges.linearised(film_values, metric_contact)
-    tension_slope = film_jacobian[:, :, layout.index("pretension")]
-    session_jacobian = np.stack([one.effect(data, charge, tension_slope) for one in SESSION], axis=2)
+    session_jacobian = np.stack([one.effect(data, charge) for one in SESSION], axis=2)
 
     # The discrepancy multiplies the charge of its own electrode.
     term_values = terms(metric_contact, charges.domain)  # shape (n, n_term)
@@ -383,7 +379,7 @@ def _estimate_with_errors(
     final_residual, _ = final.eliminated()
     final_chi2 = (final_residual**2).sum(axis=1)
     best_hypothesis = all_hypotheses[int(weight.argmax())]
-    film = FilmEstimate(layout, unknowns, np.asarray(covariance), data.mean_C, best_hypothesis.errors.noise)
+    film = FilmEstimate(layout, unknowns, np.asarray(covariance), best_hypothesis.errors.noise)
     return Estimation(
         charges=charges,
         film=film,

@@ -7,17 +7,12 @@ from functools import cached_property, partial
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import PressError
 from isocharge.simulate import FilmPrior, NoiseModel, noise_model
-from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.train.calibration.discrepancy import term_names
 from isocharge.train.calibration.press_data import PressData
 
 COEFFICIENT_DRIFT = 0.002
 """Standard deviation of the change of each coefficient of the discrepancy between two calibrations."""
-
-CREEP_MPa = 0.09
-"""Standard deviation of the change of the pretension between two calibrations whose temperatures are known, MPa."""
 
 
 @dataclass(frozen=True)
@@ -29,19 +24,17 @@ class SessionProperty:
         unit: Unit of its value.
         stds: Standard deviations of the prior distribution that are considered, with their probabilities.
         effect: Function that computes the derivatives of the charges, shape (n, n_electrode). Its arguments are the
-            presses, the charges of the film, and the derivatives of the charges with respect to the pretension.
+            presses and the charges of the film.
         caution: Words about a value that is certainly not zero, with the fields `value` and `std`.
         is_possible: Function that returns whether the presses can have this unknown.
-        lasts: Whether the value remains the same in later sessions.
     """
 
     name: str
     unit: str
     stds: tuple[tuple[float, float], ...]
-    effect: Callable[[PressData, Array, Array], Array]
+    effect: Callable[[PressData, Array], Array]
     caution: str
     is_possible: Callable[[PressData], bool] = lambda _: True
-    lasts: bool = False
 
 
 SESSION = (
@@ -49,7 +42,7 @@ SESSION = (
         "offset",
         "pC",
         ((0.0, 0.9), (30.0, 0.1)),
-        lambda _, charge, __: np.ones_like(charge),
+        lambda _, charge: np.ones_like(charge),
         "all charges of all presses contain an offset of {value:.2g} +- {std:.2g} pC: is the tare right? The model "
         "expects the same offset in later contacts; after a new tare, calibrate again",
     ),
@@ -57,24 +50,15 @@ SESSION = (
         "drift",
         "1",
         ((0.0, 0.95), (0.15, 0.05)),
-        lambda data, charge, _: data.time[:, None] * charge,
+        lambda data, charge: data.time[:, None] * charge,
         "the charges change by a share of {value:.2g} +- {std:.2g} from the first press to the last: does an amplifier "
         "drift? The standard deviations of the model contain this change",
-    ),
-    SessionProperty(
-        "pretension_per_K",
-        "MPa/K",
-        ((0.4, 1.0),),
-        lambda data, _, tension_slope: data.warming_K[:, None] * tension_slope,
-        "",
-        lambda data: data.mean_C is not None,
-        lasts=True,
     ),
     SessionProperty(
         "friction",
         "1",
         ((0.3, 1.0),),
-        lambda data, *_: data.friction_charge,
+        lambda data, _: data.friction_charge,
         "",
         lambda data: bool(data.friction_charge.any()),
     ),
@@ -134,14 +118,12 @@ class FilmEstimate:
         layout: Order of the unknowns.
         values: Most probable values, shape (n_unknown,).
         covariance: Covariance, shape (n_unknown, n_unknown).
-        at_C: Temperature to which the pretension belongs, degrees Celsius; None if it is not known.
         noise: Most probable noise of the charges.
     """
 
     layout: Layout
     values: Array
     covariance: Array
-    at_C: float | None = None
     noise: NoiseModel = field(default_factory=partial(noise_model, "reference"))
 
     @property
@@ -158,49 +140,18 @@ class FilmEstimate:
         index = self.layout.index(name)
         return float(np.sqrt(self.covariance[index, index]))
 
-    def drifted(self, *, knows_temperature: bool = False) -> "FilmEstimate":
-        """Return the estimate for a later session: the film may have drifted, and the unknowns of the session are new.
-
-        Args:
-            knows_temperature: Whether the temperature of the later session is known. Only creep then changes the
-                pretension, because the effect of the temperature is computed.
-        """
+    def drifted(self) -> "FilmEstimate":
+        """Return the estimate for a later session, in which the film may have drifted, without the earlier session."""
         prior = self.layout.prior
         drift = np.zeros(len(self.values))
         drift[self.layout.film] = [one.drift for one in prior.properties]
         drift[self.layout.coefficients] = COEFFICIENT_DRIFT
-        if knows_temperature and self.at_C is not None:
-            drift[self.layout.index(PRETENSION.name)] = CREEP_MPa
         values = self.values.copy()
         covariance = self.covariance + np.diag(drift**2)
-        for name in (one.name for one in SESSION if not one.lasts):
-            index = self.layout.index(name)
-            values[index] = 0.0
-            covariance[index] = covariance[:, index] = 0.0
+        session = self.layout.session
+        values[session] = 0.0
+        covariance[session] = covariance[:, session] = 0.0
         return replace(self, values=values, covariance=covariance)
-
-    def at_temperature(self, at_C: float) -> "FilmEstimate":
-        """Return the estimate of the film at another temperature. Only the pretension changes.
-
-        Args:
-            at_C: The other temperature, degrees Celsius.
-
-        Raises:
-            PressError: If the pretension would be outside its bounds.
-        """
-        if self.at_C is None:
-            return self
-        tension, per_K = self.layout.index(PRETENSION.name), self.layout.index("pretension_per_K")
-        change = np.eye(len(self.values))
-        change[tension, per_K] = at_C - self.at_C
-        values = change @ self.values
-        low, high = PRETENSION.limits
-        if not low <= values[tension] <= high:
-            raise PressError(
-                f"at {at_C:g} C the pretension would be {values[tension]:.2f} MPa; expected {low:g} to {high:g} MPa: a "
-                "temperature nearer to that of the presses"
-            )
-        return replace(self, values=values, covariance=change @ self.covariance @ change.T, at_C=at_C)
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
         """Draw values of all unknowns, shape (count, n_unknown). The properties of the film stay in their bounds."""

@@ -4,7 +4,7 @@
     FOLDER/<version>/model.onnx    the model of this film, with golden.json and card.md as in every model
     FOLDER/<version>/sensor.toml   the calibrated sensor
     FOLDER/<version>/calibration.json    the estimate of the film, and the errors that its uncertainty causes
-    FOLDER/<version>/presses.csv   the presses; missing if the calibration was only moved to another temperature
+    FOLDER/<version>/presses.csv   the presses
     FOLDER/<version>/charges.npz   compact charge map of the film, for `serve stream --follow`
     FOLDER/<version>/calibration.png     picture of the calibration
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the files of the last version
@@ -23,10 +23,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from msgspec.structs import replace as replace_setting
 
-from isocharge.common.errors import ModelError, PressError
+from isocharge.common.errors import ModelError
 from isocharge.common.files import as_output_errors, locked, remove_empty, write_whole
 from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
@@ -35,15 +34,11 @@ from isocharge.serve.model.model_folder import check_target
 from isocharge.serve.model.model_search import version_folders
 from isocharge.serve.presses.measured_presses import presses_text
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
-from isocharge.train.calibration.calibrate import solve_film
 from isocharge.train.calibration.calibration_file import film_table, json_text, read_film
-from isocharge.train.calibration.contact_error import PLANNED, ContactSensitivity
-from isocharge.train.calibration.estimator import Estimation
-from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate
+from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.film_network import compact_charges, training_data
-from isocharge.train.calibration.press_data import no_presses
 from isocharge.train.calibration.problem import CalibrationProblem
-from isocharge.train.calibration.result import IDENTIFIED_RATIO, CalibrationResult
+from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.model_release.release import release
 from isocharge.train.training.config import FitConfig
 from isocharge.train.training.fit import fit
@@ -62,13 +57,6 @@ PICTURE = "calibration.png"
 
 CARD = "card.md"
 """File with a description of the calibrated model."""
-
-
-WARMING = "pretension_per_K"
-"""Unknown of a session that states how the pretension changes with temperature."""
-
-UNKNOWN_WARMING_STD = next(one for one in SESSION if one.name == WARMING).stds[-1][0]
-"""Standard deviation of this unknown before any presses, MPa/K."""
 
 
 def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
@@ -197,9 +185,8 @@ def write_calibration(
         RESULT: json_text(result_table(result)).encode(),
         SENSOR: sensor_to_toml(sensor).encode(),
         PICTURE: picture_bytes(calibration_picture(result)),
+        PRESSES: presses_text(result.presses).encode(),
     }
-    if not result.move_text:
-        files[PRESSES] = presses_text(result.presses).encode()
     provenance = replace(fitted.provenance, files={**fitted.provenance.files, **files})
     released_model = release(
         replace(fitted, provenance=provenance),
@@ -217,70 +204,19 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
     return result.to_dict() | film_table(result.problem, result.film)
 
 
-def read_earlier(folder: Path, problem: CalibrationProblem, *, knows_temperature: bool = False) -> FilmEstimate:
+def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
     """Read the film of an earlier calibration, and add the possible drift since then to its uncertainty.
 
     Args:
         folder: Folder that `write_calibration` wrote, or one of its version folders.
         problem: Problem of the new calibration.
-        knows_temperature: Whether the temperatures of the new presses are known.
 
     Raises:
         PressError: If the folder contains no calibration, or a calibration of another problem.
     """
-    return read_film(_last_file(folder), problem).drifted(knows_temperature=knows_temperature)
-
-
-def read_moved(
-    folder: Path, problem: CalibrationProblem, to_C: float, executor: Executor | None = None
-) -> CalibrationResult:
-    """Read an earlier calibration, and solve its film at another temperature without new presses.
-
-    The uncertainty is not increased by a possible drift of the film.
-
-    Args:
-        folder: Folder that `write_calibration` wrote, or one of its version folders.
-        problem: The calibration problem.
-        to_C: The other temperature, degrees Celsius.
-        executor: Executor that runs the solves; None for this process.
-
-    Raises:
-        PressError: If the folder contains no calibration or a calibration of another problem, or if the earlier presses
-            did not determine how the film changes with temperature.
-    """
-    path = _last_file(folder)
-    film = read_film(path, problem)
-    if film.at_C is None or not 0.0 < film.std(WARMING) <= IDENTIFIED_RATIO * UNKNOWN_WARMING_STD:
-        raise PressError(
-            f"{path}: expected a calibration that contains the change of the film with temperature, got one without; "
-            "calibrate with presses that have a column temperature_C and cover a few degrees"
-        )
-    moved = film.at_temperature(to_C)
-    problem = replace(problem, earlier=film, noise=film.noise)
-    charges = solve_film(problem, moved, executor)
-    version = "/".join(path.parent.parts[-2:])
-    return CalibrationResult(
-        problem=problem,
-        presses=no_presses(problem.electrodes),
-        estimation=Estimation(
-            charges=charges,
-            film=moved,
-            contact=np.empty((0, 3)),
-            is_bad=np.empty(0, dtype=bool),
-            press_chi2=np.empty(0),
-            chi2=0.0,
-            redundancy=0.0,
-            hypothesis=PLANNED,
-        ),
-        sensitivity=ContactSensitivity.of(problem, charges, moved.values),
-        move_text=f"moved from {film.at_C:.1f} C, {version}, to {to_C:.1f} C by the change in its calibration",
-    )
-
-
-def _last_file(folder: Path) -> Path:
-    """Return the path of calibration.json in the last version folder, or in the folder itself if it has no versions."""
     versions = _calibrated_versions(folder)
-    return (versions[-1] if versions else folder) / RESULT
+    path = (versions[-1] if versions else folder) / RESULT
+    return read_film(path, problem).drifted()
 
 
 def _card(result: CalibrationResult, about: ModelMetadata, radius: float) -> str:
@@ -291,8 +227,8 @@ def _card(result: CalibrationResult, about: ModelMetadata, radius: float) -> str
         about: Metadata of the model.
         radius: Radius of the working area of the network, mm.
     """
+    problem = result.problem
     min_force, max_force = about.force_range_N
-    origin = result.move_text or f"calibrated on {len(result.presses)} presses"
     sentences = (*result.summary, *(f"Caution: {caution}." for caution in result.cautions))
     summary_list = "\n".join(f"- {sentence}" for sentence in sentences)
     property_rows = "\n".join(
@@ -302,7 +238,8 @@ def _card(result: CalibrationResult, about: ModelMetadata, radius: float) -> str
     )
     return f"""# {about.name}, version {about.version}: a calibrated film
 
-The sensor `{result.problem.sensor.name}`, {origin}, with `{result.problem.probe.notation}` (radius as found).
+The sensor `{problem.sensor.name}`, calibrated on {len(result.presses)} presses, with `{problem.probe.notation}`
+(radius as found).
 The model answers within {radius:g} mm of the centre, {min_force:g} to {max_force:g} N.
 
 {summary_list}

@@ -43,22 +43,10 @@ def calibration_picture(result: CalibrationResult) -> Figure:
     """
     figure = new_figure(11.0, 8.8)
     (before_axes, after_axes), (property_axes, residual_axes) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
-    is_moved = bool(result.move_text)
     before = result.problem.prior.covariance(PLANNED)
-    _draw_error(
-        before_axes,
-        result,
-        before,
-        result.film_error_before,
-        "before it was moved" if is_moved else "before the presses",
-    )
-    error_areas = _draw_error(
-        after_axes,
-        result,
-        result.film.covariance,
-        result.film_error,
-        "moved to another temperature" if is_moved else f"after {len(result.presses)} presses",
-    )
+    _draw_error(before_axes, result, before, result.film_error_before, "before the presses")
+    after_title = f"after {len(result.presses)} presses"
+    error_areas = _draw_error(after_axes, result, result.film.covariance, result.film_error, after_title)
     _draw_presses(after_axes, result)
     label = "position error by the film (rms), mm"
     figure.colorbar(
@@ -83,8 +71,7 @@ def _draw_presses(axes: Any, result: CalibrationResult) -> None:
     axes.plot(x[~is_bad], y[~is_bad], "o", color="white", mec=INK, ms=6, label="presses")
     if is_bad.any():
         axes.plot(x[is_bad], y[is_bad], "X", color=FELT, mec=INK, ms=9, label="left out")
-    if x.size:
-        axes.legend(loc="upper right", fontsize=8)
+    axes.legend(loc="upper right", fontsize=8)
 
 
 def _draw_error(axes: Any, result: CalibrationResult, covariance: Array, error: ContactError, title: str) -> Any:

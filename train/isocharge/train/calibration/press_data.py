@@ -38,10 +38,8 @@ class PressData:
         contact: Measured contacts (x, y, ln F), shape (n, 3); the middle of the domain if unknown.
         contact_std: Standard deviations of the contacts, shape (n, 3); infinite if unknown.
         time: Time of each press in the session, from -0.5 to 0.5, shape (n,).
-        warming_K: Temperature of each press minus the mean temperature, shape (n,), K.
         friction_charge: Charge that a coefficient of friction of 1 would add, shape (n, n_electrode), pC; zero if the
             presses have no friction.
-        mean_C: Mean temperature, degrees Celsius; None if the temperatures are not known.
     """
 
     charge: Array
@@ -50,9 +48,7 @@ class PressData:
     contact: Array
     contact_std: Array
     time: Array
-    warming_K: Array
     friction_charge: Array
-    mean_C: float | None
 
     @classmethod
     def of(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
@@ -69,7 +65,6 @@ class PressData:
         log_contact[:, 2] = np.log(log_contact[:, 2])
         is_contact_known = np.isfinite(log_contact)
         measured_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
-        temperature_C = known_temperatures(presses)
         count = len(presses)
         return cls(
             charge=charge,
@@ -78,17 +73,15 @@ class PressData:
             contact=np.where(is_contact_known, log_contact, domain.centre),
             contact_std=np.where(is_contact_known, measured_std, UNKNOWN_STD),
             time=np.arange(count) / max(count - 1, 1) - 0.5,
-            warming_K=np.zeros(count) if temperature_C is None else temperature_C - temperature_C.mean(),
             friction_charge=np.zeros_like(charge),
-            mean_C=None if temperature_C is None else float(temperature_C.mean()),
         )
 
     def __len__(self) -> int:
         return len(self.charge)
 
     def __getitem__(self, rows: Booleans) -> "PressData":
-        """Return some of the presses. Their times and temperatures keep their reference."""
-        names = ("charge", "charge_std", "contact", "contact_std", "time", "warming_K", "friction_charge")
+        """Return some of the presses. Their times keep their reference."""
+        names = ("charge", "charge_std", "contact", "contact_std", "time", "friction_charge")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def with_errors(self, errors: PressErrors) -> "PressData":
@@ -98,18 +91,6 @@ class PressData:
         force_std = np.hypot(self.contact_std[:, 2], force_scatter)
         contact_std = np.column_stack([position_ratio * self.contact_std[:, :2], force_std])
         return replace(self, charge_std=charge_std, noise=noise, contact_std=contact_std)
-
-
-def known_temperatures(presses: MeasuredPresses) -> Array | None:
-    """Return the temperature of each press, shape (n,), degrees Celsius; None if no temperature was measured.
-
-    A missing temperature is interpolated between those of the previous and the next press.
-    """
-    if presses.temperature_C is None or not presses.knows_temperature:
-        return None
-    index = np.arange(len(presses))
-    is_measured = np.isfinite(presses.temperature_C)
-    return np.interp(index, index[is_measured], presses.temperature_C[is_measured])
 
 
 def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:

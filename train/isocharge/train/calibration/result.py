@@ -52,7 +52,6 @@ class CalibrationResult:
         estimation: Result of the estimator.
         sensitivity: Effects of noise and of errors of the film on contacts.
         cautions: Warnings for the user.
-        move_text: Description of the change of temperature, if an earlier calibration was moved without presses.
     """
 
     problem: CalibrationProblem
@@ -60,7 +59,6 @@ class CalibrationResult:
     estimation: Estimation
     sensitivity: ContactSensitivity
     cautions: tuple[str, ...] = ()
-    move_text: str = ""
 
     @property
     def charges(self) -> FilmCharges:
@@ -109,13 +107,6 @@ class CalibrationResult:
     def summary(self) -> tuple[str, ...]:
         """Sentences about the errors, the properties that the presses determine, and the presses."""
         after, before, noise = self.film_error, self.film_error_before, self.sensitivity.noise_error
-        if self.move_text:
-            return (
-                f"{self.move_text}.",
-                f"The uncertainty of the film causes errors of {after.position_mm:.2g} mm and "
-                f"{after.force_percent:.2g} %; noise alone causes {noise.position_mm:.2g} mm and "
-                f"{noise.force_percent:.2g} %.",
-            )
         sentences = [
             f"The uncertainty of the film causes errors of {after.position_mm:.2g} mm and {after.force_percent:.2g} % "
             f"(before the presses {before.position_mm:.2g} mm and {before.force_percent:.2g} %); noise alone causes "

@@ -106,20 +106,6 @@ def _typed_contact(text: str) -> Array:
     return np.array([_cell_value(cell.strip()) for cell in cells])
 
 
-def _with_unknown_temperature(temperatures_C: Array | None) -> Array | None:
-    """Append the unknown temperature of a new press to the temperatures of earlier presses.
-
-    Args:
-        temperatures_C: Temperatures, shape (n,), degrees Celsius; None if no temperatures are measured.
-
-    Returns:
-        Temperatures, shape (n + 1,), degrees Celsius, of which the last is NaN. None if no temperatures are measured.
-    """
-    if temperatures_C is None:
-        return None
-    return np.append(temperatures_C, np.nan)
-
-
 def _cell_value(cell: str) -> float:
     """Convert the text of one value into a number. The number is NaN if the value is unknown.
 
@@ -242,7 +228,6 @@ class PressSession:
             charge_pC=np.vstack([presses.charge_pC, charge]),
             position_std_mm=np.append(presses.position_std_mm, self._stds["position_std_mm"]),
             force_std=np.append(presses.force_std, self._stds["force_std"]),
-            temperature_C=_with_unknown_temperature(presses.temperature_C),
             lines=(*presses.lines, len(presses) + 1),
         )
         self._change(extended_presses)
