@@ -59,7 +59,7 @@ def changed(key, value):
 
 FAULTS = {
     "older": (changed("format_version", 3), "format_version: expected 4, got 3: .* calibrate again with its presses"),
-    "no version": (lambda table: table.pop("format_version"), "format_version: expected 3, got None"),
+    "no version": (lambda table: table.pop("format_version"), "format_version: expected 4, got None"),
     "sensor": (changed("sensor", "mine"), "sensor: expected four-25um-biaxial, as in this calibration, got mine"),
     "probe": (changed("probe", "circle:2"), "probe: expected circle:1"),
     "radius": (changed("radius_mm", 10.0), "radius_mm: expected 8"),
