@@ -78,7 +78,7 @@ FAULTS = {
     "text": (changed("radius_mm", "wide"), "radius_mm: expected"),
     "rows": (changed("correlations", [[], [0.1, 0.2]]), "correlations: expected 148 rows of 0 to 147 numbers"),
     "large": (
-        lambda table: changed("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(149)])(table),
+        lambda table: changed("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(148)])(table),
         "positive semidefinite",
     ),
     "beyond": (lambda table: table["correlations"][1].__setitem__(0, 1.5), r"correlations\[1\]\[0\]: expected"),
