@@ -14,26 +14,34 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from isocharge.simulate import ForwardMap, Polygon, load_sensor
-from isocharge.simulate.contours.charge_curves import Curves, Mapping
 
 # The piezoelectric coefficients do not change the stress, so both sensors use the same solved presses.
 biaxial_map = ForwardMap.build(
     load_sensor("three-25um-biaxial"), Polygon.triangle(4.0), radius=12.0, force_range=(0.9, 1.1)
 )
+
+# Presses of 1 N at three distances from the centre of A, in seven directions
+angles = np.array([35.0, 45.0, 55.0, 65.0, 75.0, 85.0, 90.0])  # degrees from x
+distances = np.array([4.0, 8.0, 12.0])  # mm
+angle, distance = np.meshgrid(np.deg2rad(angles), distances, indexing="ij")
+x_of_a, y_of_a = biaxial_map.sensor.electrodes[0].centre
+x = x_of_a + distance * np.cos(angle)
+y = y_of_a + distance * np.sin(angle)
+presses = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)])
+
 figure, pair = plt.subplots(1, 2, figsize=(11.0, 4.4), layout="constrained", sharey=True)
 for axes, kind in zip(pair, ("biaxial", "uniaxial"), strict=True):
     sensor = load_sensor(f"three-25um-{kind}")
     forward_map = replace(biaxial_map, sensor=sensor)
-    lines = Mapping.lines(sensor, "A", angles=np.deg2rad((35.0, 90.0)), length=12.0)
-    curves = Curves.of(forward_map, lines, force=1.0)
+    charge_of_a = forward_map.charges(presses)[:, 0].reshape(len(angles), len(distances))
     # Difference between the directions at each distance, relative to the mean charge at this distance
-    difference = np.ptp(curves.own_charge, axis=0) / curves.own_charge.mean(axis=0)
+    difference = np.ptp(charge_of_a, axis=0) / charge_of_a.mean(axis=0)
     print(
         f"{kind}: the charges of different directions differ by {100 * difference.min():.0f} to "
         f"{100 * difference.max():.0f} % of their mean"
     )
-    for angle, charge in zip(lines.angle, curves.own_charge, strict=True):
-        axes.plot(lines.distance, charge, "o-", label=f"{np.rad2deg(angle):.0f}°")
+    for angle, charge in zip(angles, charge_of_a, strict=True):
+        axes.plot(distances, charge, "o-", label=f"{angle:.0f}°")
     axes.set(title=f"{kind} film, triangle, 1 N", xlabel="distance from the centre of A, mm")
 pair[0].set_ylabel("charge of A, pC")
 pair[1].legend(title="direction from x")

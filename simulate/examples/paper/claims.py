@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 from choices import LINEAR_MPA
 from figure_layouts import TOUCHED, contact_charges
+from mapping import Mapping
 from page import Entry, Row
 from solves import FORCE, Solves
 from triangulation_errors import Accuracy
 
 from isocharge.simulate import press
-from isocharge.simulate.contours.charge_curves import Mapping
 from isocharge.simulate.forward.readout import thermal_charge
 from isocharge.simulate.solver.equilibrium import principal_stress
 
@@ -82,7 +82,7 @@ def _d33(solves: Solves) -> tuple[Row, dict[str, object]]:
     """Compute the charges of the contact pressure where the probe covers a part of an electrode."""
     sensor = solves.choices.sensor("three")
     whole = -0.5 * D33 * FORCE
-    points = Mapping.lines(sensor, "A", length=solves.choices.length).points.reshape(-1, 2)
+    points = Mapping.lines(sensor, "A", solves.choices.length).points.reshape(-1, 2)
     extra = contact_charges(solves, sensor, points, D33)
     share = extra / solves.charges("triangle", sensor, points)
     row = Row(

@@ -1,21 +1,19 @@
 """Fig. 9 to 11 of the paper: triangulation and isocharge contours."""
 
-from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 from choices import ERROR_MM, Choices
+from drawing import DrawnContour, DrawnTriangulation
 from matplotlib.figure import Figure
 from page import Entry, Row
 from solves import FORCE, Solves
 from triangulation_errors import BEYOND, Accuracy
 
 from isocharge.common.arrays import Array
-from isocharge.simulate import ChargeSpline, Sensor
-from isocharge.simulate.contours.field_contours import ContourField
-from isocharge.simulate.contours.fix import Meeting
-from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTriangulation
+from isocharge.simulate import ChargeMap, ChargeSpline, Sensor
+from isocharge.simulate.numerics.disk import INNER_RADIUS
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, finish_axes, new_axes
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 
@@ -35,10 +33,11 @@ def fig_9(solves: Solves, accuracy: Accuracy) -> Entry:
     reach = BEYOND * solves.choices.radius
     charges = solves.charges("triangle", sensor, np.array([at]))[0]
     spline = ChargeSpline.of(solves.forward_map("triangle", sensor), reach, solves.choices.spacing)
-    field = ContourField(spline, FORCE)
+    x, y, field = charge_field(spline)
     figure, axes = new_axes(6.6, 7.0)
-    for name, charge, colour in zip(sensor.electrode_names, charges, COLOURS, strict=False):
-        draw_contours(axes, field.contours(name, float(charge)), colour, f"{name}, {charge:.0f} pC")
+    for name, charge, values, colour in zip(sensor.electrode_names, charges, field, COLOURS, strict=False):
+        axes.contour(x, y, values, [charge], colors=colour, linewidths=1.2)
+        axes.plot([], [], color=colour, label=f"{name}, {charge:.0f} pC")
     draw_electrodes(axes, sensor)
     draw_probe(axes, solves.choices.triangle, at, "probe")
     draw_working_area(axes, solves.choices.radius, "working area")
@@ -46,12 +45,11 @@ def fig_9(solves: Solves, accuracy: Accuracy) -> Entry:
     figure.legend(fontsize=8, loc="outside lower center", ncols=5)
     errors = accuracy.field["three"]
     row = Row(
-        "distance from the press to the mean of the intersections, from the field",
+        "distance from the press to the point nearest to the contours, from the field",
         "not done",
         f"median {errors.percentile(50):.1g} mm, 95 % {errors.percentile(95):.1g} mm; contours met for "
         f"{errors.fix.found.sum()} of {len(errors.at)} presses",
-        "without the error of the drawing the contours meet; where two of them only touch, on the line between "
-        "their electrodes, they may miss",
+        "without the error of the drawing the contours meet",
     )
     caption = f"Isocharge contours of a press at ({at[0]:g}, {at[1]:g}) mm, 1 N, from the field."
     return Entry("Fig. 9", caption, figure, [row], errors.numbers())
@@ -87,7 +85,7 @@ def fig_10(solves: Solves, accuracy: Accuracy) -> Entry:
         Row(
             "the shown press, distance from the mean of the crossings",
             "0.122 mm (place not given)",
-            f"{error_mm:.3f} mm" if fix.found[0] else Meeting(int(fix.status[0])).summary,
+            f"{error_mm:.3f} mm" if fix.found[0] else "the contours do not meet",
             "the place of the paper's press is not given",
         ),
         _row_of_percentile(accuracy, solves.choices.degree),
@@ -170,8 +168,12 @@ def _distributions(axes: Any, accuracy: Accuracy, degree: int) -> None:
 def fig_11(solves: Solves) -> Entry:
     """Return the entry of Fig. 11: contours of all four electrodes under a circle."""
     sensor = solves.choices.sensor("four")
-    field = ContourField(ChargeSpline.of(solves.forward_map("circle", sensor), AREA, solves.choices.spacing), FORCE)
-    reached_pC = {name: list(field.charge_range(name)) for name in sensor.electrode_names}
+    spline = ChargeSpline.of(solves.forward_map("circle", sensor), AREA, solves.choices.spacing)
+    x, y, field = charge_field(spline)
+    reached_pC = {
+        name: [float(values.min()), float(values.max())]
+        for name, values in zip(sensor.electrode_names, field, strict=True)
+    }
     circle, triangle = (solves.charges(probe, sensor, solves.places) for probe in ("circle", "triangle"))
     change = np.abs(triangle / circle - 1.0)
     rows = [
@@ -195,22 +197,21 @@ def fig_11(solves: Solves) -> Entry:
         "triangle_against_circle_worst": change.max(),
     }
     caption = "Isocharge contours of all four electrodes; on the right those of A with their charges."
-    return Entry("Fig. 11", caption, _draw_fig_11(solves.choices, sensor, field), rows, numbers)
+    return Entry("Fig. 11", caption, _draw_fig_11(solves.choices, sensor, (x, y, field)), rows, numbers)
 
 
-def _draw_fig_11(choices: Choices, sensor: Sensor, field: ContourField) -> Figure:
+def _draw_fig_11(choices: Choices, sensor: Sensor, charge_field: tuple[Array, Array, Array]) -> Figure:
     """Draw the contours of all electrodes on the left, and those of the first electrode with their charges on the
     right."""
+    x, y, field = charge_field
     figure, (left, right) = new_axes(12.6, 6.6, columns=2)
-    for name, colour in zip(sensor.electrode_names, COLOURS, strict=False):
-        levels = field.even_charges(name, LEVELS)
-        pieces = [piece for charge in levels for piece in field.contours(name, charge)]
-        draw_contours(left, pieces, colour, f"{name}, {min(levels):.0f} to {max(levels):.0f} pC", 0.9)
-    name = sensor.electrode_names[0]
-    for charge in field.even_charges(name, LEVELS):
-        pieces = field.contours(name, charge)
-        draw_contours(right, pieces, COLOURS[0])
-        _label_end(right, pieces[0], f"{charge:.0f}")
+    for name, values, colour in zip(sensor.electrode_names, field, COLOURS, strict=False):
+        levels = np.geomspace(values.min(), values.max(), LEVELS + 2)[1:-1]
+        left.contour(x, y, values, levels, colors=colour, linewidths=0.9)
+        left.plot([], [], color=colour, label=f"{name}, {levels[0]:.0f} to {levels[-1]:.0f} pC")
+        if name == sensor.electrode_names[0]:
+            lines = right.contour(x, y, values, levels, colors=colour, linewidths=1.2)
+            right.clabel(lines, fmt="%.0f", fontsize=7, colors=INK)
     for axes, title in ((left, "Fig. 11: all four electrodes, circle of 1 mm, 1 N"), (right, "electrode A alone, pC")):
         draw_electrodes(axes, sensor)
         draw_working_area(axes, choices.radius, "working area")
@@ -221,22 +222,16 @@ def _draw_fig_11(choices: Choices, sensor: Sensor, field: ContourField) -> Figur
     return figure
 
 
-def _label_end(axes: Any, points: Array, text: str) -> None:
-    """Write a text beyond the upper end of a contour."""
-    end = points[-1 if points[-1, 1] > points[0, 1] else 0]
-    beyond = tuple(9.0 * end / np.linalg.norm(end))
-    axes.annotate(text, end, xytext=beyond, textcoords="offset points", fontsize=7, ha="center", va="center")
-
-
-def draw_contours(axes: Any, contours: Sequence[Array], colour: str, label: str = "", width: float = 1.2) -> None:
-    """Draw pieces of contours. Only the first piece gets a label, so that the legend has one entry.
+def charge_field(charge_map: ChargeMap) -> tuple[Array, Array, Array]:
+    """Compute the charges of presses on rings.
 
     Args:
-        axes: Axes of matplotlib.
-        contours: Points (x, y) of the pieces, each of shape (n, 2), mm.
-        colour: Colour of the lines.
-        label: Label in the legend.
-        width: Width of the lines, points.
+        charge_map: Map with a single force.
+
+    Returns:
+        Coordinates x and y, each of shape (n_ring, n_angle), mm, and charges, shape (n_electrode, n_ring, n_angle), pC.
     """
-    for number, points in enumerate(contours):
-        axes.plot(*points.T, color=colour, lw=width, label=label if number == 0 else None)
+    distance = np.linspace(0.0, INNER_RADIUS * charge_map.domain.radius, 121)
+    z = np.outer(distance, np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 361)))
+    charge = charge_map.charges(np.column_stack([z.real.ravel(), z.imag.ravel(), np.full(z.size, FORCE)]))
+    return z.real, z.imag, charge.T.reshape(-1, *z.shape)

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 from choices import CONTOUR_PC, FIG_8_DEG
+from drawing import draw_contour
+from mapping import Curves, Mapping
 from matplotlib.figure import Figure
 from page import Entry, Row
 from solves import FORCE, Solves
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Piezo, Sensor
-from isocharge.simulate.contours.charge_curves import Curves, Mapping
-from isocharge.simulate.contours.graphical_method import draw_contour
 from isocharge.simulate.plots.figure import COLOURS, PRESSED, finish_axes, new_axes, shades
 
 FROM_A_DEG = {"three": (35.0, 90.0), "four": (110.0, 250.0)}
@@ -42,8 +42,7 @@ def curves_of(
         degrees: First and last angle of the lines, degrees.
         length: Length of the lines, mm; None for our choice.
     """
-    first, last = np.deg2rad(degrees)
-    mapping = Mapping.lines(sensor, name, (first, last), length=length or solves.choices.length)
+    mapping = Mapping.lines(sensor, name, length or solves.choices.length, degrees)
     forward_map = solves.forward_map(probe, sensor)
     return Curves.of(forward_map, mapping, FORCE), Curves.of(forward_map, mapping.finer(FINE), FORCE)
 
@@ -53,7 +52,7 @@ def curve_numbers(curves: Curves) -> dict[str, object]:
     return {
         "angle_deg": np.rad2deg(curves.mapping.angle).tolist(),
         "distance_mm": curves.mapping.distance.tolist(),
-        "charge_pC": curves.own_charge.tolist(),
+        "charge_pC": curves.charge.tolist(),
     }
 
 
@@ -72,7 +71,7 @@ def fig_6(solves: Solves) -> Entry:
     area, _ = curves_of(solves, "triangle", whole, "A", FROM_A_DEG["three"])
     example, distance = _example(solves, at, smooth)
     apart = 100.0 * _spread(at)
-    change = 100.0 * np.abs(at.own_charge / area.own_charge - 1.0).max(axis=0)
+    change = 100.0 * np.abs(at.charge / area.charge - 1.0).max(axis=0)
     rows = [
         example,
         Row(
@@ -103,7 +102,7 @@ def _example(solves: Solves, at: Curves, smooth: Curves) -> tuple[Row, Array]:
     contour = draw_contour(at, CONTOUR_PC, solves.choices.degree)
     knots = np.empty((0, 2)) if contour is None else contour.knots
     distance = np.linalg.norm(knots - at.mapping.origin, axis=1)
-    exact = np.array([np.interp(-CONTOUR_PC, -q, smooth.mapping.distance) for q in smooth.own_charge])
+    exact = np.array([np.interp(-CONTOUR_PC, -q, smooth.mapping.distance) for q in smooth.charge])
     row = Row(
         f"{CONTOUR_PC:g} pC, distance from A on lines of 35° to 90°",
         "x1 to x7, in the figure",
@@ -119,7 +118,7 @@ def _at_distances(curves: Curves, percent: Array) -> str:
 
 def _spread(curves: Curves) -> Array:
     """Return the difference of the largest and the smallest charge of the lines over their mean, at each distance."""
-    return np.ptp(curves.own_charge, axis=0) / curves.own_charge.mean(axis=0)
+    return np.ptp(curves.charge, axis=0) / curves.charge.mean(axis=0)
 
 
 def fig_8(solves: Solves) -> Entry:
@@ -179,12 +178,12 @@ def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
     draw_curves(left, curves, smooth)
     left.set_title("Fig. 8: rectangular probe, biaxial film, 1 N")
     others = {"color": PRESSED, "lw": 0.7}
-    mean = smooth.own_charge.mean(axis=0)
+    mean = smooth.charge.mean(axis=0)
     styles = {190.0: others | {"label": "the others"}} | {
         named: {"color": colour, "lw": 2.4, "label": f"{named:.0f}°"}
         for named, colour in zip(FIG_8_DEG, COLOURS, strict=False)
     }
-    for angle, charge in zip(np.rad2deg(curves.mapping.angle).round(6).tolist(), smooth.own_charge, strict=True):
+    for angle, charge in zip(np.rad2deg(curves.mapping.angle).round(6).tolist(), smooth.charge, strict=True):
         right.plot(smooth.mapping.distance, 100.0 * (charge / mean - 1.0), **styles.get(angle, others))
     ratio = "charge over the mean of the lines, %"
     title = "the same, against the mean of the lines"
@@ -194,7 +193,7 @@ def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
 
 def _angles(curves: Curves, extreme: Extreme) -> list[float]:
     """Angle of the line with the largest or smallest charge at each distance, degrees."""
-    index = extreme(curves.own_charge, axis=0)
+    index = extreme(curves.charge, axis=0)
     return [round(float(angle), 6) for angle in np.rad2deg(curves.mapping.angle[index])]
 
 
@@ -210,7 +209,7 @@ def _best_ratio(solves: Solves) -> tuple[float, float]:
     """Return the ratio d32 / d31 with which the order of Fig. 8 holds at most distances, and the share of them."""
     sensor = solves.choices.sensor("three")
     by_d31, by_d32 = (
-        curves_of(solves, "rectangle", replace(sensor, piezo=piezo), "B", FIG_8_DEG)[0].own_charge
+        curves_of(solves, "rectangle", replace(sensor, piezo=piezo), "B", FIG_8_DEG)[0].charge
         for piezo in (Piezo(d31=1.0, d32=0.0), Piezo(d31=0.0, d32=1.0))
     )
     best = (0.0, 0.0)
@@ -255,9 +254,7 @@ def draw_curves(axes: Any, points: Curves, lines: Curves) -> None:
         lines: Charges at many presses along the same lines, which are drawn as lines.
     """
     colours = shades(points.mapping.angle.size)
-    for angle, colour, marks, line in zip(
-        points.mapping.angle, colours, points.own_charge, lines.own_charge, strict=True
-    ):
+    for angle, colour, marks, line in zip(points.mapping.angle, colours, points.charge, lines.charge, strict=True):
         axes.plot(points.mapping.distance, marks, "o", color=colour, ms=3.5)
         axes.plot(lines.mapping.distance, line, "-", color=colour, lw=1.1, label=f"{np.rad2deg(angle):.0f}°")
     name = points.mapping.electrode

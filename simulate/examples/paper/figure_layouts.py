@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 from choices import ELEMENTS
+from mapping import Mapping
 from matplotlib.collections import LineCollection
 from page import Entry, Row
 from solves import FINEST, FORCE, MESHES, Solves
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Equilibrium, Sensor
-from isocharge.simulate.contours.charge_curves import Mapping
 from isocharge.simulate.forward.readout import contact_charge
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, PRESSED, finish_axes, new_axes
@@ -77,7 +77,7 @@ def trilaterate(centres: Array, distance: Array) -> Array:
 def fig_2(solves: Solves) -> Entry:
     """Return the entry of Fig. 2: the mapping scheme about one electrode."""
     sensor = solves.choices.sensor("three")
-    mapping = Mapping.lines(sensor, "A", (0.0, 2.0 * np.pi - np.deg2rad(10.0)), length=solves.choices.length)
+    mapping = Mapping.lines(sensor, "A", solves.choices.length, (0.0, 350.0))
     figure, axes = new_axes(6.4, 6.2)
     draw_mapping(axes, mapping)
     draw_electrodes(axes, sensor, highlight="A")
@@ -147,8 +147,7 @@ def scheme(solves: Solves, heading: str, electrode: str, degrees: tuple[float, f
         degrees: First and last angle of the lines, degrees.
     """
     sensor = solves.choices.sensor("three")
-    first, last = np.deg2rad(degrees)
-    mapping = Mapping.lines(sensor, electrode, (first, last), length=solves.choices.length)
+    mapping = Mapping.lines(sensor, electrode, solves.choices.length, degrees)
     figure, axes = new_axes(6.8, 6.8)
     draw_mapping(axes, mapping)
     draw_electrodes(axes, sensor, highlight=electrode)
@@ -267,6 +266,6 @@ def draw_mapping(axes: Any, mapping: Mapping) -> None:
         )  # fmt: skip
     for number, distance in enumerate(mapping.distance):
         arc = np.linspace(mapping.angle[0], mapping.angle[-1], 90)
-        circle = np.array(mapping.origin) + distance * np.stack([np.cos(arc), np.sin(arc)], axis=1)
+        circle = mapping.origin + distance * np.stack([np.cos(arc), np.sin(arc)], axis=1)
         axes.plot(*circle.T, color=PRESSED, lw=0.6, ls="--", label="circles, every step" if number == 0 else None)
     axes.plot(*points[:, 1:].reshape(-1, 2).T, ".", color=FELT, ms=4, label="presses")

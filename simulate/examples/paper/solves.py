@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from choices import CUBICS, FIG_8_DEG, Choices
+from mapping import Curves, Mapping
 from scipy.optimize import least_squares
 
 from isocharge.common.arrays import Array
@@ -26,7 +27,6 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.numerics.disk import lattice
 
@@ -137,7 +137,7 @@ class Solves:
     def scheme(self, probe: str, sensor: Sensor) -> tuple[Curves, ...]:
         """Return the charge curves along the lines from every electrode; see `forward_map` for the arguments."""
         forward_map = self.forward_map(probe, sensor)
-        lines = (Mapping.lines(sensor, name, length=self.choices.length) for name in sensor.electrode_names)
+        lines = (Mapping.lines(sensor, name, self.choices.length) for name in sensor.electrode_names)
         return tuple(Curves.of(forward_map, mapping, FORCE) for mapping in lines)
 
     def charges(self, probe: str, sensor: Sensor, at: Array) -> Array:
@@ -212,13 +212,12 @@ def _map_jobs(choices: Choices) -> dict[str, Job]:
     """Return the jobs that solve the forward map of each probe, up to the outermost press of the mapping schemes."""
     sensor = choices.sensor("three")
     lines = [
-        Mapping.lines(layout, name, length=choices.length)
+        Mapping.lines(layout, name, choices.length)
         for layout in (sensor, choices.sensor("four"))
         for name in layout.electrode_names
     ]
     reach = max(mapping.radius for mapping in lines)
-    first, last = np.deg2rad(FIG_8_DEG)
-    printed = Mapping.lines(choices.as_printed(), "B", (first, last), length=choices.printed_length).radius
+    printed = Mapping.lines(choices.as_printed(), "B", choices.printed_length, FIG_8_DEG).radius
     return {
         name: partial(ForwardMap.build, sensor, probe, SLACK * radius, (FORCE, FORCE))
         for name, probe, radius in (

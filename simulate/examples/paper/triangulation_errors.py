@@ -7,12 +7,12 @@ from functools import partial
 
 import numpy as np
 from choices import ERROR_MM
-from solves import FORCE, Solves, run_all, sample
+from drawing import DrawnTriangulation
+from solves import Solves, run_all, sample
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import ChargeSpline, Triangulation, noise_model
-from isocharge.simulate.contours.fix import Fix, Meeting
-from isocharge.simulate.contours.graphical_method import DrawnTriangulation
+from isocharge.simulate.identifiability.triangulation import Fix
 
 LAYOUTS = ("three", "four")
 
@@ -60,7 +60,7 @@ class Errors:
         """Return the statistics of the errors for programs."""
         return {
             "presses": len(self.at),
-            **{meeting.name: int(np.sum(self.fix.status == meeting)) for meeting in Meeting},
+            "found": int(self.fix.found.sum()),
             **{f"p{share}_mm": self.percentile(share) for share in (25, 50, 75, 95)},
             "percent_of_all_presses_below_0.122_mm": self.share_below(ERROR_MM),
         }
@@ -116,11 +116,8 @@ class Accuracy:
         }
         return cls(
             {(layout, degree): errors for (layout, degree, _), errors in zip(drawings[:-2], drawn, strict=False)},
-            {layout: Errors(fields[layout].locate(clean[layout], FORCE), places) for layout in LAYOUTS},
-            {layout: Errors(fields[layout].locate(noisy[layout], FORCE), places) for layout in LAYOUTS},
+            {layout: Errors(fields[layout].locate(clean[layout]), places) for layout in LAYOUTS},
+            {layout: Errors(fields[layout].locate(noisy[layout]), places) for layout in LAYOUTS},
             dict(zip(LAYOUTS, drawn[-2:], strict=True)),
-            {
-                name: Errors(fields["three"].locate(charge, FORCE), sample(choices))
-                for name, charge in solves.variants.items()
-            },
+            {name: Errors(fields["three"].locate(charge), sample(choices)) for name, charge in solves.variants.items()},
         )

@@ -21,7 +21,6 @@ with require("simulate"):
 
 if TYPE_CHECKING:
     from isocharge.common.contact_domain import Domain
-    from isocharge.simulate.contours.triangulation import Triangulation
     from isocharge.simulate.dataset.sampling import Sweep
     from isocharge.simulate.dataset.shards import Dataset, Samples, read_dataset, write_dataset
     from isocharge.simulate.dataset.sweep import run_sweep
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from isocharge.simulate.forward.readout import touch_charge
     from isocharge.simulate.identifiability.cramer_rao import limits_at
     from isocharge.simulate.identifiability.identification import identify
+    from isocharge.simulate.identifiability.triangulation import Triangulation
     from isocharge.simulate.identifiability.working_area import working_area
     from isocharge.simulate.layout.case import DesignCase
     from isocharge.simulate.layout.design import design

@@ -77,7 +77,7 @@ def triangulation(task: FittingTask) -> Method | None:
     if task.charge_map is None:
         return None
     contours = Triangulation(task.charge_map)
-    return Method("triangulation", "NumPy", lambda charge: contours.locate_with_force(charge).contact)
+    return Method("triangulation", "NumPy", lambda charge: contours.locate(charge).contact)
 
 
 def least_squares(task: FittingTask) -> Method:

@@ -1,1 +1,0 @@
-"""Isocharge contours, and triangulation of presses from these contours."""

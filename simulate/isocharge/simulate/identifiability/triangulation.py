@@ -1,0 +1,131 @@
+"""Triangulation of presses. The position of a press is the point at which its contours meet (Mirbagheri et al. 2007).
+
+The charge of an electrode restricts a press to an isocharge contour (figures 9 and 10 of the paper). The contours of
+three or more electrodes rarely meet exactly in one point. `Triangulation` therefore estimates the contact for which the
+mean square distance of the position from the contours is smallest. To first order, the distance from a contour is the
+difference of the charges divided by the length of the gradient of the charge. The estimate is therefore the nearest
+contact with these lengths as standard deviations of the charges.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Booleans
+from isocharge.common.errors import SceneError
+from isocharge.simulate.forward.charge_map import ChargeMap, as_charges, check_electrode_count, linearised
+from isocharge.simulate.forward.charge_spline import with_fast_derivatives
+from isocharge.simulate.identifiability.nearest_contact import explain, starting_contacts
+
+ROUNDS = 3
+"""Number of searches, each of which uses the gradients of the charges at the result of the previous search."""
+
+STARTS = 4
+"""Number of searches for each press, which start at different contacts."""
+
+MIN_RELATIVE_SLOPE = 0.02
+"""Lower bound of the gradient of a charge, relative to the largest gradient of the charges of a press."""
+
+AMBIGUOUS_RATIO = 2.0
+"""Ratio of the spreads at a second contact and at the best contact up to which the second is as good as the best."""
+
+AMBIGUOUS_SPREAD = 0.01
+"""Spread up to which a second contact is always as good as the best contact, mm."""
+
+
+@dataclass(frozen=True)
+class Fix:
+    """Result of a triangulation.
+
+    Attributes:
+        contact: Contact (x, y, F) of each press, shape (n, 3), mm and N; NaN if the contours do not meet within the
+            tolerance, or if they meet at two positions.
+        spread: Root mean square distance of the contours from the position at which it is smallest, shape (n,), mm. If
+            the spread is at most the tolerance, and the contact is NaN, the contours meet at two positions.
+    """
+
+    contact: Array
+    spread: Array
+
+    @property
+    def found(self) -> Booleans:
+        """Whether each press has a contact, shape (n,)."""
+        return np.isfinite(self.contact[:, 0])
+
+
+@dataclass(frozen=True)
+class Triangulation:
+    """Estimator that determines a contact as the point at which its contours meet.
+
+    Attributes:
+        charge_map: Map that computes the charges of contacts. A forward map is replaced by splines, whose fit takes a
+            few seconds. If the force of the presses is known, the map has this single force.
+        tolerance: Largest spread at which contours meet, mm. Contours that meet at two positions that are not farther
+            apart than the tolerance meet at one position.
+
+    Raises:
+        SceneError: If there are fewer than three electrodes, or if the tolerance is not positive.
+    """
+
+    charge_map: ChargeMap
+    tolerance: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_electrode_count(len(self.charge_map.electrodes))
+        if not 0.0 < self.tolerance < np.inf:
+            raise SceneError(f"tolerance: expected a positive length, got {self.tolerance} mm")
+
+    @cached_property
+    def _charges(self) -> ChargeMap:
+        """Charge map that computes derivatives fast."""
+        return with_fast_derivatives(self.charge_map)
+
+    def locate(self, charge: Array) -> Fix:
+        """Estimate the contacts of presses.
+
+        Args:
+            charge: Touch charges, shape (n, n_electrode), pC.
+
+        Raises:
+            ChargeError: If there is not one finite charge for each electrode.
+        """
+        charge = as_charges(charge, self.charge_map.electrodes)
+
+        # Search from several starting points for each press, which do not lie close together.
+        largest_charge = np.abs(charge).max(axis=1, keepdims=True, initial=1.0)
+        equal_sigma = np.broadcast_to(largest_charge, charge.shape)
+        starts = starting_contacts(self._charges, charge, equal_sigma, starts=STARTS)
+        contacts, spreads = self._descend(np.repeat(charge, STARTS, axis=0), starts.reshape(-1, 3))
+        contacts = contacts.reshape(starts.shape)
+        spreads = spreads.reshape(starts.shape[:2])
+
+        # Choose the best contact of each press, unless another contact is as good and lies elsewhere.
+        row = np.arange(len(charge))
+        best = spreads.argmin(axis=1)
+        contact = contacts[row, best]
+        spread = spreads[row, best]
+        is_elsewhere = np.linalg.norm((contacts - contact[:, None])[..., :2], axis=2) > self.tolerance
+        other_spread = spreads.min(axis=1, where=is_elsewhere, initial=np.inf)
+        is_ambiguous = other_spread <= np.maximum(AMBIGUOUS_RATIO * spread, AMBIGUOUS_SPREAD)
+        contact[(spread > self.tolerance) | is_ambiguous] = np.nan
+        return Fix(contact, spread)
+
+    def _descend(self, charge: Array, contact: Array) -> tuple[Array, Array]:
+        """Find the contacts near starting points for which the mean square distance from the contours is smallest.
+
+        Args:
+            charge: Touch charges, shape (n, n_electrode), pC.
+            contact: Starting points (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Contacts (x, y, F), shape (n, 3), mm and N, and their spreads, shape (n,), mm.
+        """
+        distance = np.empty_like(charge)
+        for _ in range(ROUNDS):
+            _, derivatives = linearised(self._charges, contact)
+            gradient_length = np.linalg.norm(derivatives[..., :2], axis=2)
+            # The lower bound keeps the distance finite where a charge has an extremum.
+            slope = np.maximum(gradient_length, MIN_RELATIVE_SLOPE * gradient_length.max(axis=1, keepdims=True))
+            contact, distance = explain(self._charges, charge, slope, contact)
+        return contact, np.sqrt(np.mean(distance**2, axis=1))
