@@ -42,15 +42,11 @@ EXPORTS = {
     "line with the separator": "sep=;\r\nx_mm;A;B;C\r\n2;502.3;244.8;215.8\r\n2;423.2;695.6;507.8\r\n",
     "line with the separator, BOM": "\ufeffsep=\t\r\nA\tB\tC\r\n502,3\t244,8\t215,8\r\n423,2\t695,6\t507,8\r\n",
     "tabs": "x_mm\tforce_N\tA\tB\tC\n2\t0.2\t502.3\t244.8\t215.8\n2\t0.5\t423.2\t695.6\t507.8\n",
-    "row of units": "\ufeffx_mm,A,B,C\r\nmm,pC,pC,pC\r\n2,502.3,244.8,215.8\r\n2,423.2,695.6,507.8\r\n",
-    "row of units in German": "x_mm;A;B;C\n[mm];[pC];[pC];\n2;502,3;244,8;215,8\n2;423,2;695,6;507,8\n",
-    "LibreOffice in German, quoted": '"A","B","C"\n"502,3","244,8","215,8"\n"423,2","695,6","507,8"\n',
     "MATLAB writetable": "x_mm|A|B|C\n2|502.3|244.8|215.8\n2|423.2|695.6|507.8\n",
     "LabVIEW with three decimals": "t\tA\tB\tC\n0,000\t502,300\t244,800\t215,800\n1,000\t423,200\t695,600\t507,800\n",
     "LabVIEW measurement": "LabVIEW Measurement\t\nWriter_Version\t2\nDecimal_Separator\t,\n***End_of_Header***\t\n\t\n"
     "Channels\t3\t\t\t\nSamples\t2\t2\t2\t\n***End_of_Header***\t\t\t\t\nX_Value\tA\tB\tC\tComment\n"
     "0,000000\t502,300000\t244,800000\t215,800000\t\n0,001000\t423,200000\t695,600000\t507,800000\t\n",
-    "Origin": "x\tA\tB\tC\nmm\tpC\tpC\tpC\n\t\t\t\n2\t502.3\t244.8\t215.8\n2\t423.2\t695.6\t507.8\n",
     "pandas": ",x_mm,A,B,C\n0,2,502.3,244.8,215.8\n1,2,423.2,695.6,507.8\n",
     "pandas in German": ";A;B;C\n0;5,023e+02;2,448e+02;2,158e+02\n1;4,232e+02;6,956e+02;5,078e+02\n",
     "lines above the header": "Date: 2026-11-25, 10:00\n\nt;A;B;C\n10:00;502,3;244,8;215,8\n10:01;423,2;695,6;507,8\n",
@@ -64,7 +60,7 @@ def test_charges_are_the_same_from_the_exports_of_other_programs(export):
 
 
 def test_header_is_above_the_first_numbers():
-    with pytest.raises(ChargeError, match="missing: 'C'; column 'c' differs"):
+    with pytest.raises(ChargeError, match="rename 'c' to 'C'"):
         read("A,B,c\n1,2,3\nA,B,C\n4,5,6\n")
     with pytest.raises(ChargeError, match=r"got the header \['time', 'channel', 'value'\]"):
         read("time,channel,value\n0,A,1\n0,B,2\n")
@@ -82,7 +78,7 @@ def test_further_columns_are_ignored_with_a_message():
     [
         (",".join(f"column {i}" for i in range(2000)), "expected at most 1,000 columns, got 2,000"),
         ("A" * 200_000, "line 1: not CSV text .field larger"),
-        ("A,B," + "x" * 90_000, "missing: 'C'"),
+        ("A,B," + "x" * 90_000, r"missing: \['C'\]"),
         ("A,B,C\n" + ",".join("1" * 20_000), "line 2: expected 3 cells"),
     ],
 )
@@ -101,28 +97,22 @@ def test_table_with_only_a_header_has_no_presses():
     [
         ("", r"presses.csv: empty; expected a header with one column for each of the electrodes \('A', 'B', 'C'\)"),
         ("\n\n", "empty"),
-        ("A,B\n1,2\n", "missing: 'C'"),
-        ("A,B,C,C\n1,2,3,4\n", "repeated: 'C'"),
-        ("1,2,3\n4,5,6\n", "missing: 'A', 'B', 'C'"),
-        ("x_mm A B C\n1 2 3 4\n", r"missing: 'A', 'B', 'C'; if blanks separate .* with: tr -s ' ' ';' < FILE"),
-        ("A\tB\tC\n1,064\t832\t629\n", r"line 2, column 'A': '1,064' has .* with: tr ',\\t' '\.,' < FILE > NEW\.csv"),
-        ("A;B;C\n1.064;832;629\n", r"line 2, column 'A': '1\.064' has .*separator of thousands"),
-        ('A,B,C\n"1,064",832,629\n', "line 2, column 'A': '1,064' has a decimal mark or a separator of thousands"),
-        ("A;B;C\n1.064,5;832,7;1\n", r"column 'A': .* got '1\.064,5'; write a decimal comma, as in .*'832,7'"),
-        ("A;B;C\n2,5;2.5;1\n", r"line 2, column 'B': .* got '2\.5'; write a decimal comma, as in .*'A': '2,5'"),
-        ("A;B;C\npC;nC;pC\n1;2;3\n", "line 2, column 'B': expected the unit pC, got 'nC'; convert the column"),
-        ("pC;nC;pC\nA;B;C\n1;2;3\n", "line 1, column 'B': expected the unit pC, got 'nC'; convert the column"),
-        ("A;B;C\nA;B;C\n1;2;3\n", "line 2, column 'A': expected a charge in pC, got 'A'"),
-        ("A;B;C\n1;2;3\npC;pC;pC\n", "line 3, column 'A': expected a charge in pC, got 'pC'"),
-        ("A,B,C\n1,2,3\n\n4,,6\n", "presses.csv, line 4, column 'B': expected a charge in pC, got an empty cell"),
-        ("A,B,C\n1,2 pC,3\n", "expected a charge in pC, got '2 pC'; write the number without 'pC'"),
-        ("A,B,C\n1,2,x\n", "line 2, column 'C': expected a charge in pC, got 'x'"),
+        ("A,B\n1,2\n", r"missing: \['C'\]"),
+        ("A,B,C,C\n1,2,3,4\n", r"repeated: \['C'\]"),
+        ("1,2,3\n4,5,6\n", r"missing: \['A', 'B', 'C'\]"),
+        ("A\tB\tC\n1,064\t832\t629\n", "every number with the mark ',' may have .*separator of thousands"),
+        ("A;B;C\n1.064;832;629\n", "every number with the mark '.' may have"),
+        ('A,B,C\n"1,064",832,629\n', "line 2, column 'A': .*got '1,064'; the decimal mark is '.'"),
+        ("A;B;C\n832,7;1.064;1\n", r"column 'B': .*got '1\.064'; the decimal mark is ','"),
+        ("A;B;C\n1.064,5;832,7;1\n", r"column 'A': .* got '1\.064,5'"),
+        ("pC;nC;pC\nA;B;C\nA;B;C\n1;2;3\n", "line 3, column 'A': expected a charge in pC, got 'A'"),
+        ("A;B;C\npC;nC;pC\n1;2;3\n", "line 2, column 'A': expected a charge in pC, got 'pC'"),
+        ("A,B,C\n1,2,3\n\n4,,6\n", "presses.csv, line 4, column 'B': expected a charge in pC.*got an empty cell"),
+        ("A,B,C\n1,2 pC,3\n", "line 2, column 'B': expected a charge in pC.*, got '2 pC'"),
         ("C,B,A\n1,nan,3\n", "line 2, column 'B': .* got 'nan'"),
         ("A,B,C\n1,2,-inf\n", "line 2, column 'C': .* got '-inf'"),
         ("A,B,C\n1,2,1e39\n", "line 2, column 'C': .* got 1e.39$"),
         ("A,B,C\n1,1_0,3\n", "line 2, column 'B': .* got '1_0'"),
-        ('A,B,C\n1.5,"2,5",3\n', "line 2, column 'B': .* got '2,5'; write a decimal point"),
-        ('A,B,C\n1,"x,y",3\n', "line 2, column 'B': .* got 'x,y'$"),
         ("A,B,C\n1,2\n", "line 2: expected 3 cells as in the header, got 2"),
         ("A,B,C\n1,2,3,4\n", "line 2: expected 3 cells as in the header, got 4"),
     ],

@@ -24,8 +24,7 @@ from itertools import zip_longest
 from operator import xor
 from typing import Any, NamedTuple
 
-from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame
-from isocharge.serve.presses.header_advice import OTHER_UNITS
+from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US, Frame
 
 _WORD = r"(?>\w+(?:[./-]\w+)*(?:\[\w*\])*)"
 
@@ -66,7 +65,7 @@ _NUMBER_KINDS = ("time", "uptime", "hexadecimal", "number")
 _NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
 """Names of a time of day, in seconds since midnight, and of the time in a log prefix such as `I (1234)`."""
 
-_CHARGE_UNITS = {unit for unit in OTHER_UNITS["pC"] if unit != "C"}  # C may be the name of an electrode
+_CHARGE_UNITS = {unit for unit in OTHER_CHARGE_UNITS if unit != "C"}  # C may be the name of an electrode
 
 
 def _token_pattern(number: str) -> re.Pattern[str]:

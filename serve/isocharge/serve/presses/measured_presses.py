@@ -12,7 +12,7 @@ If the names of the electrodes are given, all other columns are ignored. If no n
 another meaning are assumed to be electrodes. `isocharge serve predict` also reads files of presses.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +21,6 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError, error_prefix, shown
 from isocharge.serve.presses.csv_table import csv_text
-from isocharge.serve.presses.header_advice import ColumnMeaning
 from isocharge.serve.presses.number_table import (
     CHARGE_RULE,
     MAX_COLUMNS,
@@ -47,16 +46,11 @@ TEMPERATURE = "temperature_C"
 """Name of a column that is neither used nor taken for an electrode."""
 
 _POSITION = "a position in mm, or an empty cell if it is unknown"
-_FORCE_WORDS = frozenset({"force", "kraft", "fuerza", "forza", "f", "load", "last"})
 
 PRESS_RULES = {
-    "x_mm": ColumnRule(_POSITION, meaning=ColumnMeaning(unit="mm", words=frozenset({"x"}))),
-    "y_mm": ColumnRule(_POSITION, meaning=ColumnMeaning(unit="mm", words=frozenset({"y"}))),
-    "force_N": ColumnRule(
-        "a positive force in N, or an empty cell if it is unknown",
-        is_positive=True,
-        meaning=ColumnMeaning(unit="N", words=_FORCE_WORDS, is_known_by_unit=True),
-    ),
+    "x_mm": ColumnRule(_POSITION),
+    "y_mm": ColumnRule(_POSITION),
+    "force_N": ColumnRule("a positive force in N, or an empty cell if it is unknown", is_positive=True),
     "position_std_mm": ColumnRule("a positive standard deviation in mm", is_positive=True),
     "force_std": ColumnRule("a positive share of the force up to 1 (0.01 is 1 %)", maximum=1.0, is_positive=True),
 }
@@ -201,30 +195,32 @@ class MeasuredPresses:
         columns = NumberColumns(self.columns, np.array(self.lines, dtype=np.intp), self.row_noun)
         columns.check(rules, where="", error_class=PressError)  # the caller knows the file, if there is one
 
-        x_is_unknown = np.isnan(self.contact[:, CONTACT.index("x_mm")])
-        y_is_unknown = np.isnan(self.contact[:, CONTACT.index("y_mm")])
-        self._refuse_first(
-            x_is_unknown != y_is_unknown,
-            "expected both x_mm and y_mm, or two empty cells, got one of them; give the other",
+        _refuse_half_positions(self.contact, self.lines, self.row_noun)
+        has_no_charge = np.isnan(self.charge_pC).all(axis=1)
+        if has_no_charge.any():
+            raise PressError(
+                f"{self.row_noun} {self.lines[has_no_charge.argmax()]}: expected a charge of one electrode or more, "
+                f"got none; fill it in or remove the {self.row_noun}"
+            )
+
+
+def _refuse_half_positions(contact: Array, lines: Sequence[int], row_noun: str) -> None:
+    """Raise an error for the first press of which only one of x and y is known.
+
+    Args:
+        contact: Position and force of each press, shape (n, 3); NaN if unknown.
+        lines: Number of the line of each press, for the error message.
+        row_noun: What `lines` counts.
+
+    Raises:
+        PressError: If there is such a press.
+    """
+    is_half = np.isnan(contact[:, 0]) != np.isnan(contact[:, 1])
+    if is_half.any():
+        raise PressError(
+            f"{row_noun} {lines[is_half.argmax()]}: expected both x_mm and y_mm, or two empty cells, got one of them; "
+            "give the other"
         )
-        self._refuse_first(
-            np.asarray(np.isnan(self.charge_pC).all(axis=1)),
-            f"expected a charge of one electrode or more, got none; fill it in or remove the {self.row_noun}",
-        )
-
-    def _refuse_first(self, is_refused: Booleans, reason: str) -> None:
-        """Raise an error about the first press that is refused. If no press is refused, do nothing.
-
-        Args:
-            is_refused: Whether each press is refused, shape (n,).
-            reason: Text after the number of the press in the error message.
-
-        Raises:
-            PressError: If at least one press is refused.
-        """
-        refused_rows = np.flatnonzero(is_refused)
-        if refused_rows.size:
-            raise PressError(f"{self.row_noun} {self.lines[refused_rows[0]]}: {reason}")
 
 
 def read_presses(
@@ -259,20 +255,15 @@ def read_presses(
     # Read the columns of the file that are electrodes or have another meaning for a press (`PRESS_RULES`).
     expected_electrodes = "the electrodes' names" if electrodes is None else f"the electrodes {tuple(electrodes)}"
     expected_header = f"a header with {', '.join(CONTACT)} and {expected_electrodes} (charges in pC)"
-    names_with_meaning = (*(electrodes or ()), *PRESS_RULES)
-    with open_table(path, names_with_meaning, PressError, expected_header) as table:
+    with open_table(path, (*(electrodes or ()), *PRESS_RULES), PressError, expected_header) as table:
         electrode_names = _electrode_columns(table) if electrodes is None else tuple(electrodes)
         with error_prefix(f"{path}: ", PressError):
             _check_electrodes(electrode_names)
         chosen_rules = table.choose_columns(dict.fromkeys(electrode_names, CHARGE_RULE), optional=PRESS_RULES)
-        columns = table.read(chosen_rules, MAX_ROWS)
-        ignored_names = tuple(name for name in table.header if name not in chosen_rules)
-    press_count = len(columns.row_numbers)
-    if press_count == 0:
-        raise PressError(f"{path}: expected one press or more below the header, got none")
+        columns = _read_rows(table, chosen_rules)
 
     # Columns that the file does not have are filled with NaN. Missing standard deviations get their default values.
-    unknown_values = np.full(press_count, np.nan)
+    unknown_values = np.full(len(columns.row_numbers), np.nan)
     values = {name: columns.values.get(name, unknown_values) for name in (*electrode_names, *PRESS_RULES)}
     for name, std in default_stds.items():
         values[name] = np.where(np.isnan(values[name]), std, values[name])
@@ -284,9 +275,21 @@ def read_presses(
             force_std=values["force_std"],
             electrodes=electrode_names,
             lines=tuple(columns.row_numbers.tolist()),
-            ignored=ignored_names,
+            ignored=tuple(name for name in table.header if name not in chosen_rules),
             row_noun=columns.row_noun,
         )
+
+
+def _read_rows(table: NumberTable, rules: Mapping[str, ColumnRule]) -> NumberColumns:
+    """Read the chosen columns of a file of presses.
+
+    Raises:
+        PressError: If the file has no press, or a cell is wrong.
+    """
+    columns = table.read(rules, MAX_ROWS)
+    if len(columns.row_numbers) == 0:
+        raise table.source.error(": expected one press or more below the header, got none")
+    return columns
 
 
 def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
@@ -296,12 +299,10 @@ def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
         table: The table with the header of the file.
 
     Raises:
-        PressError: If the name of a column has several characters and is similar to a name in `PRESS_RULES`. The name
-            is then probably misspelt.
+        PressError: If the name of a column is similar to a name in `PRESS_RULES`. The name is then probably misspelt.
     """
     electrodes = tuple(name for name in table.header if name and name not in {TEMPERATURE, *PRESS_RULES})
-    long_names = [name for name in electrodes if len(name) > 1]  # short names such as "F" are common electrode names
-    table.refuse_similar_names(long_names, PRESS_RULES)
+    table.refuse_similar_names(electrodes, PRESS_RULES)
     return electrodes
 
 
@@ -321,23 +322,10 @@ def read_press_list(path: Path) -> Array:
     """
     path = Path(path)
     with open_table(path, CONTACT, PressError, f"a header with {', '.join(CONTACT)}") as table:
-        rules = table.choose_columns({name: PRESS_RULES[name] for name in CONTACT})
-        columns = table.read(rules, MAX_ROWS)
-    press_count = len(columns.row_numbers)
-    if press_count == 0:
-        raise PressError(f"{path}: expected one press or more below the header, got none")
+        columns = _read_rows(table, table.choose_columns({name: PRESS_RULES[name] for name in CONTACT}))
     contact = np.column_stack([columns.values[name] for name in CONTACT])
     with error_prefix(f"{path}, ", PressError):
-        # The object is created only because its constructor checks the contacts. Its other values are arbitrary.
-        MeasuredPresses(
-            contact=contact,
-            charge_pC=np.zeros((press_count, 1)),
-            position_std_mm=np.ones(press_count),
-            force_std=np.ones(press_count),
-            electrodes=("charge",),
-            lines=tuple(columns.row_numbers.tolist()),
-            row_noun=columns.row_noun,
-        )
+        _refuse_half_positions(contact, columns.row_numbers.tolist(), columns.row_noun)
     return contact
 
 
@@ -391,20 +379,13 @@ def _check_electrodes(electrodes: Collection[str]) -> None:
         PressError: If there are no names, if there are too many names, or if one of the names is not allowed.
     """
     are_different = len(set(electrodes)) == len(electrodes)
-    has_empty_name = any(name == "" for name in electrodes)
-    if not electrodes or not are_different or has_empty_name:
-        raise PressError(f"electrodes: expected one name or more, all different, none empty, got {shown(electrodes)}")
-    if len(electrodes) > MAX_ELECTRODES:
-        raise PressError(f"electrodes: expected at most {MAX_ELECTRODES} names, got {len(electrodes):,}")
-    for name in electrodes:
-        if name in PRESS_RULES:
-            raise PressError(
-                f"electrode {shown(name)}: expected a name that is none of {', '.join(PRESS_RULES)}, which are columns "
-                "of a file of presses; rename the electrode"
-            )
-        if not name.isprintable() or name != name.strip() or len(name) > MAX_NAME_CHARACTERS:
-            raise PressError(
-                f"electrode {shown(name)}: expected a name of at most {MAX_NAME_CHARACTERS:,} printable characters "
-                "without blanks at its ends, because the name is the header of a column of charges; rename the "
-                "electrode"
-            )
+    are_names = all(
+        name not in PRESS_RULES and name.isprintable() and name == name.strip() and 0 < len(name) <= MAX_NAME_CHARACTERS
+        for name in electrodes
+    )
+    if not (0 < len(electrodes) <= MAX_ELECTRODES and are_different and are_names):
+        raise PressError(
+            f"electrodes: expected 1 to {MAX_ELECTRODES} different names of at most {MAX_NAME_CHARACTERS:,} printable "
+            f"characters, without blanks at their ends, none of {', '.join(PRESS_RULES)}, got {shown(electrodes)}; "
+            "rename the electrodes"
+        )

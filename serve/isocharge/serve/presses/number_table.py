@@ -5,17 +5,16 @@ float64 arrays in which NaN stands for an empty cell. All other checks are in th
 therefore leads to the same message in every format.
 """
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import islice
+from dataclasses import dataclass
 from typing import ClassVar, NoReturn
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import InputError, shown
-from isocharge.serve.presses.header_advice import ColumnMeaning, header_advice
 
 MAX_COLUMNS = 1_000
 """Largest number of columns of a file."""
@@ -25,9 +24,6 @@ LARGEST = float(np.finfo(np.float32).max)
 
 It is the largest float32 number, because the tensors of the models are float32.
 """
-
-MAX_LISTED_NAMES = 10
-"""Largest number of column names that an error message lists."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +36,6 @@ class ColumnRule:
         maximum: Largest number that is accepted.
         is_positive: Whether only numbers above zero are accepted.
         may_be_empty: Whether empty cells are accepted.
-        meaning: Description by which the column is recognised under another name, for advice about a header.
     """
 
     description: str
@@ -48,7 +43,6 @@ class ColumnRule:
     maximum: float = LARGEST
     is_positive: bool = False
     may_be_empty: bool = True
-    meaning: ColumnMeaning = field(default_factory=ColumnMeaning)
 
     def violations(self, values: Array) -> Booleans:
         """Compute which values of a column violate the rule.
@@ -68,7 +62,7 @@ class ColumnRule:
         return np.asarray(is_violation)
 
 
-CHARGE_RULE = ColumnRule("a charge in pC", meaning=ColumnMeaning("electrode", "pC"))
+CHARGE_RULE = ColumnRule("a charge in pC")
 """Rule of the columns of charges."""
 
 
@@ -105,23 +99,12 @@ class NumberColumns:
             return
         row, column_index = positions[0]  # the first violation
         name = list(self.values)[column_index]
-        value = _value_text(float(self.values[name][row]))
+        value = float(self.values[name][row])
+        text = "an empty cell" if np.isnan(value) else f"{value:.15g}"
         raise error_class(
             f"{where}{self.row_noun} {self.row_numbers[row]}, column {shown(name)}: expected "
-            f"{rules[name].description}, got {value}"
+            f"{rules[name].description}, got {text}"
         )
-
-
-def _value_text(value: float) -> str:
-    """Return a number as text for an error message.
-
-    The text has six significant digits if they are exact, and otherwise all digits.
-    """
-    if np.isnan(value):
-        return "an empty cell"
-    short_text = f"{value:.6g}"
-    is_exact = float(short_text) == value
-    return short_text if is_exact else repr(value)
 
 
 @dataclass(frozen=True)
@@ -129,8 +112,7 @@ class TableSource:
     """File of a table, for its reader and for error messages.
 
     Attributes:
-        names: Names of columns that have a meaning. These names are kept unchanged. A header whose first name is one of
-            these names is not a comment, even if the name begins with #.
+        names: Names of columns that have a meaning. These names are kept unchanged.
         where: Name of the file.
         error_class: Class of the error that is raised for every mistake in the file.
         expected: Description of the expected header.
@@ -188,41 +170,34 @@ class NumberTable(ABC):
 
         Raises:
             InputError: If a required column is missing, if the file contains a chosen column twice, or if a column has
-                a similar name as an optional column that the file does not contain. The message states which column to
-                rename.
+                a similar name as a column that the file does not contain.
         """
         known_rules = {**required, **(optional or {})}
-        chosen_rules = {name: rule for name, rule in known_rules.items() if name in self.header or name in required}
-        other_columns = [name for name in self.header if name not in chosen_rules]
-
+        self.refuse_similar_names((name for name in self.header if name not in known_rules), known_rules)
         missing_names = [name for name in required if name not in self.header]
         if missing_names:
-            # The file may contain a missing column under another name. The message then contains advice. The length of
-            # the message is limited.
-            absent_columns = {name: rule.meaning for name, rule in known_rules.items() if name not in self.header}
-            advice = islice(header_advice(other_columns, absent_columns), MAX_LISTED_NAMES)
-            self._refuse_header("; ".join([f"missing: {_listed(missing_names)}", *advice]))
-
+            self._refuse_header("missing", missing_names)
+        chosen_rules = {name: rule for name, rule in known_rules.items() if name in self.header}
         repeated_names = [name for name in chosen_rules if self.header.count(name) > 1]
         if repeated_names:
-            self._refuse_header(f"repeated: {_listed(repeated_names)}")
-        self.refuse_similar_names(other_columns, optional or {})
+            self._refuse_header("repeated", repeated_names)
         return chosen_rules
 
-    def refuse_similar_names(self, columns: Iterable[str], optional: Mapping[str, ColumnRule]) -> None:
-        """Refuse columns whose names are similar to the names of optional columns that the file does not contain.
+    def refuse_similar_names(self, columns: Iterable[str], names: Iterable[str]) -> None:
+        """Refuse a column whose name differs from the name of a missing column only by case, brackets or blanks.
 
         Args:
             columns: Names of the columns of the file that are checked.
-            optional: Rules of the optional columns, by the names of the columns.
+            names: Names of columns that have a meaning.
 
         Raises:
-            InputError: If a column has such a name. The column is probably an optional column whose name is misspelt.
+            InputError: If a column has such a name.
         """
-        absent_columns = {name: rule.meaning for name, rule in optional.items() if name not in self.header}
-        advice = list(islice(header_advice(columns, absent_columns), MAX_LISTED_NAMES))
-        if advice:
-            self._refuse_header(f"{'; '.join(advice)}; or remove the column")
+        absent_names = {_letters_of(name): name for name in names if name not in self.header}
+        for column in columns:
+            if _letters_of(column) in absent_names:
+                name = absent_names[_letters_of(column)]
+                self._refuse_header(f"rename {shown(column)} to {shown(name)}, or remove the column; missing", [name])
 
     def read(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Read the chosen columns, and check their values.
@@ -244,17 +219,18 @@ class NumberTable(ABC):
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Convert the requested columns to arrays, without checking the values. `read` describes the arguments."""
 
-    def _refuse_header(self, reason: str) -> NoReturn:
+    def _refuse_header(self, reason: str, names: Sequence[str]) -> NoReturn:
         """Raise the error for a wrong header.
 
         Args:
-            reason: What is wrong with the header, for the error message.
+            reason: What is wrong with some names, for the error message.
+            names: These names.
 
         Raises:
             InputError: Always.
         """
         raise self.source.error(
-            f": expected {self.source.expected}, got the header {shown(list(self.header))}; {reason}"
+            f": expected {self.source.expected}, got the header {shown(list(self.header))}; {reason}: {shown(names)}"
         )
 
     def _refuse_row_count(self, max_rows: int) -> NoReturn:
@@ -266,12 +242,9 @@ class NumberTable(ABC):
         raise self.source.error(f": expected at most {max_rows:,} presses, got more; split the file")
 
 
-def _listed(names: Sequence[str]) -> str:
-    """List the first `MAX_LISTED_NAMES` names for a message, and state the number of the other names."""
-    listed = ", ".join(map(shown, names[:MAX_LISTED_NAMES]))
-    if len(names) <= MAX_LISTED_NAMES:
-        return listed
-    return f"{listed} and {len(names) - MAX_LISTED_NAMES} more"
+def _letters_of(name: str) -> str:
+    """Return the letters and digits of a name in lower case."""
+    return re.sub(r"[\W_]+", "", name.casefold())
 
 
 def ignored_columns_message(where: str, names: Sequence[str]) -> str:

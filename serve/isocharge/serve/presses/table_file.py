@@ -41,16 +41,21 @@ def open_table(
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     source = TableSource(names, str(path), error_class, expected)
-    if is_parquet(path):
-        require_pyarrow()
-        with _os_errors_converted(path, error_class, "a Parquet file of presses"), open_regular(path) as file:
-            yield ParquetTable(file, source)
-    else:
-        with (
-            _os_errors_converted(path, error_class, "a CSV file of presses"),
-            path.open(encoding="utf-8-sig", newline="") as text,  # `newline=""`: the CSV reader handles the line ends
-        ):
-            yield CsvTable(bounded_lines(text), source)
+    kind = "Parquet" if is_parquet(path) else "CSV"
+    try:
+        if is_parquet(path):
+            require_pyarrow()
+            with open_regular(path) as file:
+                yield ParquetTable(file, source)
+        else:
+            with path.open(encoding="utf-8-sig", newline="") as text:  # the CSV reader handles the line ends
+                yield CsvTable(bounded_lines(text), source)
+    except IsochargeError:  # some errors of isocharge, such as OutputError, inherit from OSError
+        raise
+    except OSError as cause:
+        raise error_class(
+            f"{path}: cannot be read ({cause.strerror or cause}); expected a {kind} file of presses"
+        ) from cause
 
 
 def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
@@ -67,23 +72,3 @@ def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
     data = parquet_bytes(columns) if is_parquet(path) else csv_text(columns).encode()
     with as_output_errors(path):
         write_whole(path, data)
-
-
-@contextmanager
-def _os_errors_converted(path: Path, error_class: type[InputError], expected: str) -> Iterator[None]:
-    """If the `with` block raises an OSError, raise an error of a given class instead.
-
-    Args:
-        path: The file, for the error message.
-        error_class: Class of the error that is raised.
-        expected: Description of the expected file, for the error message.
-
-    Raises:
-        error_class: If the block raises an OSError that is not an error of isocharge.
-    """
-    try:
-        yield
-    except OSError as cause:
-        if isinstance(cause, IsochargeError):  # some errors of isocharge, such as OutputError, inherit from OSError
-            raise
-        raise error_class(f"{path}: cannot be read ({cause.strerror or cause}); expected {expected}") from cause

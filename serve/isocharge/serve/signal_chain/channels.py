@@ -8,16 +8,14 @@ from operator import itemgetter
 import numpy as np
 
 from isocharge.common.errors import ChargeError, cut, shown
-from isocharge.serve.frames.frame import Frame
-from isocharge.serve.presses.header_advice import OTHER_UNITS, header_advice, words_of
-from isocharge.serve.presses.number_table import CHARGE_RULE
+from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, Frame
 from isocharge.serve.signal_chain.gain import GainRule
 from isocharge.serve.signal_chain.stage import Setup, Stage
 
 MAX_CHANNEL_DIGITS = 4
 """Largest number of digits in a text that is recognised as the number of a channel."""
 
-_UNITS = "|".join(["pC", *OTHER_UNITS["pC"]])
+_UNITS = "|".join(["pC", *OTHER_CHARGE_UNITS])
 
 _UNIT = re.compile(rf"(?:[_\s]({_UNITS})|\s*[\[(]\s*({_UNITS})\s*[\])])$")
 """Unit at the end of the name of a channel, such as `_nC` or `[nC]`."""
@@ -110,9 +108,6 @@ class Channels(Stage):
             return tuple(indices_of_electrode[0] for indices_of_electrode in indices)
 
         # Names of which some are those of electrodes, or nearly so, must not be assigned by their order.
-        absent = [name for name, found in zip(self._electrodes, indices, strict=True) if len(found) != 1]
-        unused = [name for index, name in enumerate(names) if [index] not in indices]
-        advice = advice or list(header_advice(unused, dict.fromkeys(absent, CHARGE_RULE.meaning)))
         if any(indices) or advice:
             raise self._assignment_error(frame, advice)
         return None
@@ -202,10 +197,15 @@ def _channels_of_electrode(electrode: str, names: tuple[str, ...]) -> list[int]:
     electrodes = [electrode_of(name) for name in names]
     equal = [index for index, name in enumerate(electrodes) if name == electrode]
     equal = equal or [index for index, name in enumerate(electrodes) if name.casefold() == electrode.casefold()]
-    required_words = words_of(electrode)
+    required_words = _words_of(electrode)
     if equal or not required_words:
         return equal
-    return [index for index, name in enumerate(names) if required_words <= words_of(name)]
+    return [index for index, name in enumerate(names) if required_words <= _words_of(name)]
+
+
+def _words_of(text: str) -> set[str]:
+    """Return the words of a text in lower case. All characters except letters and digits separate words."""
+    return {word for word in re.split(r"[\W_]+", text.casefold()) if word}
 
 
 def _order_of_channels(names: tuple[str, ...]) -> tuple[int, ...]:
