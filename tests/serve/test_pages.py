@@ -131,9 +131,6 @@ REQUIRED = {
 }
 
 
-CRC = {"width": 8, "polynomial": "07"}
-
-
 def known_keys(table):
     """The keys that the reader of a device file knows beside an unknown one, in its own words."""
     with pytest.raises(DeviceError, match="unknown key") as refused:
@@ -151,19 +148,14 @@ def documented(begin, end):
 def test_every_key_of_the_device_file_is_explained_and_exists():
     """Both ways, by what the reader itself says that it knows."""
     described = REQUIRED["frames"]
-    common = {"format", "request", "request_Hz", "echo"}
+    common = {"format", "request", "request_Hz"}
     assert documented("`[frames]`:", "More keys of described") == known_keys({"frames": {"zz": 1}})
     assert (
         documented("More keys of described", "The keys of a field")
         == known_keys({"frames": described | {"zz": 1}}) - common
     )
     field = described["fields"][0] | {"zz": 1}
-    assert documented("The keys of a field", "key of a checksum") == known_keys(
-        {"frames": described | {"fields": [field]}}
-    )
-    assert documented("key of a checksum", "`[channels]`") == known_keys(
-        {"frames": described | {"length": 3, "checksum": CRC | {"zz": 1}}}
-    )
+    assert documented("The keys of a field", "`[channels]`") == known_keys({"frames": described | {"fields": [field]}})
     assert documented("`[gain]`", "The stages") == known_keys({"gain": {"zz": 1}})
     stages = known_keys({"zz": {}}) - {"name", "front_end", "frames", "channels", "gain"}
     keys = {f"{stage}.{key}" for stage in stages for key in known_keys({stage: {"zz": 1}}) - {"on"}}

@@ -1,4 +1,4 @@
-"""Listening to a port at several baud rates, and detection of the echo of requests."""
+"""Listening to a port at several baud rates, and with requests."""
 
 import os
 import socket
@@ -50,7 +50,6 @@ def run(pty):  # noqa: ARG001 - the threads end before the pseudo-terminal does
 class PortOfOneSpeed:
     """A serial port that returns lines at 57600 bit/s, and other bytes at other speeds. A read advances its clock."""
 
-    echo_share = 0.0
     start_up_s = 10.0
     opened: ClassVar[list] = []
     now_s = 0.0
@@ -119,7 +118,7 @@ def test_board_that_restarts_when_the_port_is_opened_is_heard_at_its_baud_rate(m
 
 
 @pytest.mark.parametrize("echo", [True, False])
-def test_echo_of_a_request_is_detected(run, pty, echo):
+def test_echo_of_a_request_is_removed(run, pty, echo):
     board, url = pty
 
     def answer():
@@ -129,10 +128,8 @@ def test_echo_of_a_request_is_detected(run, pty, echo):
 
     run(answer, 0.001)
     received = listen(url, (115200,), 0.3, Request(b"?\n", 100.0), lambda _: True)
-    assert received.request == Request(b"?\n", 100.0, echo=echo)
     lines = b"".join(received.data).split(b"\n")
-    assert set(lines) <= {b"1,2", b"", b"?"}
-    assert lines.count(b"?") < lines.count(b"1,2")  # on a busy machine, an echo may arrive late
+    assert set(lines) == {b"1,2", b""}
 
 
 def test_each_datagram_is_a_chunk(run):

@@ -206,7 +206,7 @@ def test_datagrams_contain_whole_frames():
     assert [frame.values for frame in parser.feed(first + second)] == [(0.5,), (1.0,)]
     assert parser.feed(first[:3]) == []
     assert [frame.values for frame in parser.feed(first_with_another_sync + second)] == [(1.0,)]
-    assert (parser.counts.malformed, parser.counts.bytes_dropped) == (2, 9)
+    assert (parser.counts.malformed, parser.counts.bytes_dropped) == (1, 9)
 
 
 def test_constant_bytes_are_checked():
@@ -264,16 +264,6 @@ WRONG = [
         r"checksum_from: expected less than 14, inside the frame, got 14",
     ),
     ("length = 16", "length = 16\nchecksum_from = -1", r"checksum_from: expected a whole number from 0, got -1"),
-    *(
-        ('"crc-16/modbus"', f"{{{check}}}", message)
-        for check, message in [
-            ('width = 12, polynomial = "1021"', r"checksum\.width: expected one of 8, 16, 24, 32"),
-            ('width = 16, polynomial = "11021"', r"checksum\.polynomial: expected a number of 16 bits in hexadecimal"),
-            ('width = 16, polynomial = "x"', r"checksum\.polynomial: expected a number in hexadecimal"),
-            ('width = 16, poly = "1021"', r"checksum\.poly'"),
-            ('width = 16, polynomial = "1021", reflected = 1', r"checksum\.reflected: expected true or false"),
-        ]
-    ),
 ]
 
 

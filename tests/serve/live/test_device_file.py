@@ -121,8 +121,8 @@ def test_volts_on_a_feedback_capacitance(device):
 
 def test_device_file_with_a_request(device):
     assert device("[frames]\n").request is None
-    request = device('[frames]\nrequest = "3F 0A"\nrequest_Hz = 50\necho = true\n').request
-    assert (request.data, request.rate_Hz, request.echo) == (b"?\n", 50.0, True)
+    request = device('[frames]\nrequest = "3F 0A"\nrequest_Hz = 50\n').request
+    assert (request.data, request.rate_Hz) == (b"?\n", 50.0)
     described = 'sync = "55"\nlength = 5\nfields = [{name = "A", type = "f32"}]'
     assert device(f'[frames]\nformat = "described"\nrequest = "01"\n{described}').request.data == b"\x01"
 

@@ -180,8 +180,9 @@ def test_unplugged_port_raises_port_lost():
 
 
 def test_port_without_a_descriptor_is_read_by_pyserial():
-    """The port `loop://` of pyserial returns the bytes of each request."""
-    with Port("loop://", request=Request(b"1,2\n", 100.0)) as port:
+    """The port `loop://` of pyserial returns the bytes that are written to it."""
+    with Port("loop://") as port:
+        port._line.write(b"1,2\n")
         assert next(iter(port)).data == b"1,2\n"
 
 
@@ -360,24 +361,19 @@ def test_a_request_without_an_answer_is_repeated():
 @settings(derandomize=True)
 @given(st.binary(min_size=1, max_size=8), st.binary(max_size=20), st.lists(st.integers(0, 28), max_size=5))
 def test_echo_is_removed_however_it_is_split(request_bytes, answer, cuts):
-    requester = Requester(Request(request_bytes, echo=True))
+    requester = Requester(Request(request_bytes))
     requester.next_request()
     stream = request_bytes + answer
     edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
     pieces = [requester.remove_echo(stream[start:stop]) for start, stop in pairwise(edges)]
     assert b"".join(pieces) == answer
-    assert requester.echo_share == 1.0
 
 
-@pytest.mark.parametrize(
-    ("request_bytes", "echo", "answer", "share"),
-    [(b"\x01\x04\x00", True, b"\x02\x04\x00\x10", 0.0), (b"?", False, b"?1\n", 1.0)],
-)
-def test_unexpected_echo_is_counted_and_not_removed(request_bytes, echo, answer, share):
-    requester = Requester(Request(request_bytes, echo=echo))
+def test_answer_with_the_first_bytes_of_the_request_is_no_echo():
+    requester = Requester(Request(b"\x01\x04\x00"))
     requester.next_request()
-    assert requester.remove_echo(answer) == answer
-    assert requester.echo_share == share
+    pieces = [requester.remove_echo(bytes([byte])) for byte in b"\x01\x04\x02\x10"]
+    assert pieces == [b"", b"", b"\x01\x04\x02", b"\x10"]
 
 
 def test_request_is_sent_for_each_frame():
@@ -392,12 +388,11 @@ def test_request_is_sent_for_each_frame():
 
     answering = threading.Thread(target=answer)
     answering.start()
-    with Port(os.ttyname(reader), request=Request(b"?", 200.0, echo=True), silence_s=5.0) as port:
+    with Port(os.ttyname(reader), request=Request(b"?", 200.0), silence_s=5.0) as port:
         received_bytes = b""
         chunks = iter(port)
         while received_bytes.count(b"\n") < 10:
             received_bytes += next(chunks).data
-        assert port.echo_share == 1.0
     answering.join()
     os.close(board)
     os.close(reader)

@@ -171,19 +171,6 @@ def test_datagrams_of_plain_structs_are_recognised(per_datagram):
     assert [(entry["name"], entry["type"]) for entry in table["fields"][:2]] == [("seq", "u32"), ("ch1", "f32")]
 
 
-def test_unnamed_crc_is_recognised_by_its_polynomial():
-    """The CRC-16 has an unusual initial and final value, and does not cover the sync."""
-    crc = crcmod.mkCrcFun(0x11021, initCrc=0x1234, rev=False, xorOut=0x4321)
-    rows = np.random.default_rng(2).normal([100, 200, -300], 20, (200, 3)).round().astype(int)
-    bodies = [struct.pack(">H3h", seq, *row) for seq, row in enumerate(rows.tolist())]
-    stream = b"".join(b"\xaa\x55" + body + struct.pack(">H", crc(body)) for body in bodies)
-    table = recognise([stream], 1.0)
-    assert table["checksum"]["polynomial"] == "1021"
-    parser = device_from_table({"frames": table}, "test").parser()
-    assert [frame.values for frame in parser.feed(stream)] == [tuple(map(float, row)) for row in rows.tolist()]
-    assert parser.counts.crc_errors == 0
-
-
 @pytest.mark.parametrize("tick_rate_Hz", [31250.0, 32768.0])
 def test_clock_has_the_nearest_usual_tick_rate(tick_rate_Hz):
     ticks = np.round(np.arange(FRAMES) * tick_rate_Hz / RATE_HZ).astype(int)

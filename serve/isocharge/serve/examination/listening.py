@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,12 +22,6 @@ BAUDS = (115200, 921600, 1000000, 2000000, 460800, 230400, 57600, 38400, 19200, 
 TRY_S = 1.0
 """Time of listening at a baud rate before the next one is tried, s."""
 
-ECHO_S = 0.3
-"""Time of listening for an echo of the requests, s."""
-
-ECHO_SHARE = 0.7
-"""Smallest share of returned requests on a line with an echo, dimensionless."""
-
 MIN_SPAN_S = 1e-3
 """Smallest time span of received bytes, s. It keeps rates finite."""
 
@@ -42,7 +36,6 @@ class ReceivedData:
         request: Request that was sent to the board; None if the board sends frames by itself.
         chunks: The bytes with the times of their arrival.
         seconds: Time of listening, s.
-        echo_share: Share of the requests that the line returned as an echo, dimensionless.
     """
 
     url: str
@@ -50,7 +43,6 @@ class ReceivedData:
     request: Request | None = None
     chunks: list[Chunk] = field(default_factory=list)
     seconds: float = 0.0
-    echo_share: float = 0.0
 
     @property
     def data(self) -> list[bytes]:
@@ -99,8 +91,7 @@ def listen(
         url: The port.
         bauds: Baud rates to try, bit/s, each for `TRY_S`.
         seconds: Time of listening at the right baud rate, s.
-        request: Request that the board needs; None if the board sends frames by itself. The function measures whether
-            the line returns the request as an echo.
+        request: Request that the board needs; None if the board sends frames by itself.
         has_frames: Function that returns whether most of the bytes are frames.
         wait: Time to wait until the port can be opened, s.
 
@@ -110,13 +101,6 @@ def listen(
     Raises:
         PortError: If the port cannot be opened.
     """
-    # Listen for a short time to find out whether the line returns the requests.
-    if request is not None and not request.echo:
-        received = _listen_at_baud(url, bauds[0], ECHO_S, request, wait)
-        if not received.chunks:
-            return received
-        request = replace(request, echo=received.echo_share >= ECHO_SHARE)
-
     # Try the baud rates, unless the port has none, as a network port.
     chosen_baud = bauds[0]
     if has_speed(url) and len(bauds) > 1:
@@ -157,7 +141,6 @@ def _listen_at_baud(url: str, baud: int, seconds: float, request: Request | None
             if chunk is not None:  # otherwise no bytes have arrived in the remaining time
                 received.chunks.append(chunk)
     received.seconds = time.monotonic() - start_s
-    received.echo_share = port.echo_share
     return received
 
 

@@ -124,8 +124,6 @@ def _recognise_frames(received: ReceivedData) -> dict[str, Any] | None:
         return frames  # no format is recognised, or the board sends frames without a request
     frames["request"] = request.data.hex(" ").upper()  # bytes as hexadecimal numbers, such as "3F 0A"
     frames["request_Hz"] = request.rate_Hz
-    if request.echo:
-        frames["echo"] = True
     return frames
 
 

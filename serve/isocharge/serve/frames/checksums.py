@@ -1,10 +1,11 @@
 """Checksums of frames, under the names that catalogues and manuals use.
 
-The package `anycrc` computes the cyclic redundancy checks (CRC). If a CRC has no name in this module, a device file can
-state the parameters of the CRC, which Williams defines in "A painless guide to CRC error detection algorithms" (1993).
+The package `anycrc` computes the cyclic redundancy checks (CRC), which have the names of the catalogue of parametrised
+CRC algorithms (Cook, https://reveng.sourceforge.io/crc-catalogue/).
 """
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
@@ -25,20 +26,6 @@ class Checksum:
     size: int
 
 
-def crc_with_parameters(width: int, polynomial: int, start: int, reflected: bool, final: int) -> Checksum:
-    """Return the cyclic redundancy check with given parameters.
-
-    Args:
-        width: Number of bits: 8, 16, 24 or 32.
-        polynomial: Polynomial without its highest power. The highest bit is the coefficient of the highest power.
-        start: Initial value of the register, in the bit order of the polynomial.
-        reflected: Whether the bits of the bytes and of the register are processed from the lowest to the highest bit.
-        final: Value with which the register is combined by an exclusive or after the last byte.
-    """
-    crc = anycrc.CRC(width, polynomial, start, reflected, reflected, final)
-    return Checksum(crc.calc, width // 8)
-
-
 def _fletcher_16(data: bytes) -> int:
     """Compute Fletcher's checksum (1982), which has two bytes.
 
@@ -53,23 +40,7 @@ def _fletcher_16(data: bytes) -> int:
     return (sum_of_sums << 8) | byte_sum
 
 
-CRC_SIZES = {
-    "crc-8": 1,
-    "crc-8/maxim": 1,
-    "crc-8/sae-j1850": 1,
-    "crc-16/ccitt-false": 2,
-    "crc-16/xmodem": 2,
-    "crc-16/x-25": 2,
-    "crc-16/kermit": 2,
-    "crc-16/modbus": 2,
-    "crc-16/arc": 2,
-    "crc-32": 4,
-    "crc-32/mpeg-2": 4,
-    "crc-32/iscsi": 4,
-}
-"""Sizes of the cyclic redundancy checks with a name, in bytes."""
-
-CHECKSUMS = {
+SUMS = {
     "none": Checksum(lambda _: 0, 0),
     "sum-8": Checksum(lambda data: sum(data) & 0xFF, 1),
     "sum-8/negative": Checksum(lambda data: -sum(data) & 0xFF, 1),
@@ -77,13 +48,22 @@ CHECKSUMS = {
     "xor-8": Checksum(lambda data: reduce(xor, data, 0), 1),
     "sum-16": Checksum(lambda data: sum(data) & 0xFFFF, 2),
     "fletcher-16": Checksum(_fletcher_16, 2),
-    **{
-        name: Checksum(anycrc.Model(name.upper().replace("-", "", 1).replace("/", "-")).calc, size)
-        for name, size in CRC_SIZES.items()
-    },
 }
-"""All checksums, by name. The package `anycrc` writes the names in another way, for example CRC16-MODBUS.
+"""Checksums that are no CRC, by name.
 
 The checksum `sum-8/negative` is chosen such that the sum of all bytes, including the checksum, is zero modulo 256. The
 checksum `sum-8/inverted` is the sum of the bytes with every bit inverted.
 """
+
+
+def _crcs() -> Iterator[tuple[str, Checksum]]:
+    """Yield each CRC of one to four bytes by its names, such as `crc-16/modbus` for the `CRC16-MODBUS` of `anycrc`."""
+    for name in (*anycrc.models, *anycrc.aliases):
+        match = re.fullmatch(r"CRC(8|16|24|32)(?:-(.+))?", name)
+        if match is not None:
+            suffix = f"/{match[2].lower()}" if match[2] else ""
+            yield f"crc-{match[1]}{suffix}", Checksum(anycrc.Model(name).calc, int(match[1]) // 8)
+
+
+CHECKSUMS = {**SUMS, **dict(_crcs())}
+"""All checksums, by name."""

@@ -7,7 +7,7 @@ it never finds a frame.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -93,76 +93,6 @@ class SequenceGaps:
             return (RESTART,)
         self.lost += increase - 1
         return (GAP,)
-
-
-class CounterWrap:
-    """Estimator of the modulus of a counter that is sent as text.
-
-    The modulus is the value at which the counter wraps to 0. The modulus has to be estimated, because text does not
-    show how many bits the counter has. A decrease means that the counter has either wrapped or restarted. A wrap is
-    assumed if the decrease is consistent with one of the moduli that boards usually have.
-    """
-
-    def __init__(self, usual_moduli: Iterable[int], initial_modulus: int, max_step_ratio: int) -> None:
-        """Begin without any value.
-
-        Args:
-            usual_moduli: Moduli that boards use, in ascending order.
-            initial_modulus: Modulus to assume until the counter wraps.
-            max_step_ratio: Largest ratio of a step across a wrap to the previous step.
-        """
-        self._usual_moduli = tuple(usual_moduli)
-        self._modulus = initial_modulus
-        self._max_step_ratio = max_step_ratio
-        self._last_value: int | None = None
-        self._last_increase = 1  # latest increase from one value to the next
-        self._largest_value = 0
-
-    def update(self, value: int | None) -> int:
-        """Process the next value of the counter, and return the present estimate of the modulus.
-
-        The modulus is the value at which the counter wraps to 0.
-
-        Args:
-            value: Next value of the counter; None if a connection has ended. The value after None is not compared with
-                earlier values.
-
-        Returns:
-            The modulus that was estimated at the latest wrap, or the initial modulus before the first wrap.
-        """
-        last_value = self._last_value
-        self._last_value = value
-        if value is None or last_value is None:
-            return self._modulus
-        if value < last_value:
-            self._modulus = self._modulus_after_decrease(value - last_value)
-        elif value > last_value:
-            self._last_increase = value - last_value
-        self._largest_value = max(self._largest_value, value)
-        return self._modulus
-
-    def _modulus_after_decrease(self, step: int) -> int:
-        """Return the estimate of the modulus after the counter has decreased.
-
-        The modulus is the value at which the counter wraps to 0. The result is the smallest usual modulus that is
-        consistent with a wrap. If no usual modulus is consistent with a wrap, a restart is assumed, and the present
-        estimate of the modulus is returned.
-
-        A modulus is consistent with a wrap if the modulus is larger than all values so far, and if the step across the
-        wrap is plausible. The step across the wrap is the difference of the last two values modulo the tested modulus.
-        The step is plausible if it is at most `max_step_ratio` times the last increase and at most half of the modulus.
-        A step of more than half of the modulus is more likely to be a step back.
-
-        Args:
-            step: Present value minus previous value, which is negative.
-        """
-        max_step = self._max_step_ratio * self._last_increase
-        for modulus in self._usual_moduli:  # in ascending order
-            step_across_wrap = step % modulus  # not negative, although `step` is negative
-            is_plausible = step_across_wrap <= min(max_step, modulus // 2)
-            if self._largest_value < modulus and is_plausible:
-                return modulus
-        return self._modulus
 
 
 @dataclass(slots=True)
@@ -332,9 +262,10 @@ class Columns:
             self.clock_unit_us = TIMES_US[clock_name] * scales[self.clock_column]
 
         # All other columns are channels.
-        columns_without_channel = {self.seq_column, self.flags_column, *clock_columns}
         self.channels = [
-            (column, scale) for column, scale in enumerate(scales) if column not in columns_without_channel
+            (column, scale)
+            for column, scale in enumerate(scales)
+            if names[column] not in (SEQ, *TIMES_US) and column != flags_column
         ]
         channel_names = tuple(names[column] for column, _ in self.channels)
         self.names = channel_names if any(channel_names) else ()

@@ -9,8 +9,7 @@ the device file contains the following keys.
     sync = "20 4E"                 # hexadecimal; optional with another framing
     length = 8                     # of the whole frame, bytes, without stuffing; checked against the fields
     byte_order = "little"          # or "big"; optional
-    checksum = "crc-16/modbus"     # a name of `isocharge.serve.frames.checksums`, or the parameters of a CRC:
-                                   # {width = 16, polynomial = "1021", start = "FFFF", reflected = false, final = "0"}
+    checksum = "crc-16/modbus"     # a name of `isocharge.serve.frames.checksums`
     checksum_from = 0              # first byte that it covers; optional
     checksum_order = "little"      # optional; the default is the byte order of the fields
     fields = [                     # in their order, from after the sync to before the checksum
@@ -38,7 +37,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, field
 
 from isocharge.common.structs import Settings, WrongKey
-from isocharge.serve.frames.checksums import CHECKSUMS, Checksum, crc_with_parameters
+from isocharge.serve.frames.checksums import CHECKSUMS, SUMS, Checksum
 from isocharge.serve.frames.frame import (
     FLAGS,
     SEQ_MODULUS,
@@ -62,45 +61,6 @@ DATAGRAM = "datagram"
 """Name of the framing in which every datagram contains one or more whole frames."""
 
 Framing = Literal["sync", "cobs", "slip", "hdlc", "datagram"]
-HexadecimalNumber = Annotated[
-    str, Meta(pattern="^[0-9A-Fa-f]{1,8}$", description="a number in hexadecimal, as in '1021'")
-]
-
-
-class CrcParameters(Settings, frozen=True):
-    """Parameters of a cyclic redundancy check that has no name.
-
-    The keys have the same meanings as the parameters of `isocharge.serve.frames.checksums.crc_with_parameters`.
-    """
-
-    width: Literal[8, 16, 24, 32]
-    polynomial: HexadecimalNumber
-    start: HexadecimalNumber = "0"
-    reflected: bool = False
-    final: HexadecimalNumber = "0"
-
-    def __post_init__(self) -> None:
-        """Check that no number has more bits than the checksum.
-
-        Raises:
-            WrongKey: For the first number that has more bits.
-        """
-        for key in ("polynomial", "start", "final"):
-            text = getattr(self, key)
-            has_too_many_bits = int(text, 16).bit_length() > self.width
-            if has_too_many_bits:
-                raise WrongKey(key, f"a number of {self.width} bits in hexadecimal, as in '1021'", text)
-
-    @property
-    def checksum(self) -> Checksum:
-        """The checksum with these parameters."""
-        return crc_with_parameters(
-            width=self.width,
-            polynomial=int(self.polynomial, 16),
-            start=int(self.start, 16),
-            reflected=self.reflected,
-            final=int(self.final, 16),
-        )
 
 
 class FrameSection(Settings, frozen=True, tag_field="format"):
@@ -109,12 +69,10 @@ class FrameSection(Settings, frozen=True, tag_field="format"):
     Attributes:
         request: Bytes that request one frame, in hexadecimal; None for a board that sends frames without a request.
         request_Hz: Largest number of requests per second.
-        echo: Whether the line returns every byte that is sent. The request is then removed from the received bytes.
     """
 
     request: Hexadecimal | None = None
     request_Hz: Annotated[float, Meta(gt=0, le=MAX_REQUEST_RATE_Hz)] = 100.0
-    echo: bool = False
 
 
 class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only=True):
@@ -126,7 +84,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         framing: Method by which the beginning of each frame is found in the stream.
         sync_bytes: Bytes with which every frame begins, in hexadecimal.
         byte_order: Byte order of the fields.
-        checksum: Name of the checksum, or parameters of a CRC.
+        checksum: Name of the checksum.
         checksum_from: First byte that the checksum covers.
         checksum_order: Byte order of the checksum; None means the byte order of the fields.
     """
@@ -136,7 +94,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     framing: Framing = "sync"
     sync_bytes: Hexadecimal | None = field(name="sync", default=None)
     byte_order: ByteOrder = "little"
-    checksum: str | CrcParameters = "none"
+    checksum: str = "none"
     checksum_from: Annotated[int, Meta(ge=0)] = 0
     checksum_order: ByteOrder | None = None
 
@@ -146,9 +104,9 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         Raises:
             WrongKey: For the first key that is missing or not valid.
         """
-        if isinstance(self.checksum, str) and self.checksum not in CHECKSUMS:
-            checksum_names = ", ".join(CHECKSUMS)
-            raise WrongKey("checksum", f"one of {checksum_names}, or the parameters of a CRC", self.checksum)
+        if self.checksum not in CHECKSUMS:
+            expected = f"one of {', '.join(SUMS)}, or a CRC of the catalogue, such as crc-16/modbus"
+            raise WrongKey("checksum", expected, self.checksum)
         if self.framing == SYNC and self.sync_bytes is None:
             raise WrongKey("sync")  # the key is missing
 
@@ -190,10 +148,8 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     @cached_property
     def selected_checksum(self) -> Checksum:
-        """The checksum that the key `checksum` selects by name or describes by the parameters of a CRC."""
-        if isinstance(self.checksum, str):
-            return CHECKSUMS[self.checksum]
-        return self.checksum.checksum
+        """The checksum that the key `checksum` selects."""
+        return CHECKSUMS[self.checksum]
 
     @cached_property
     def columns(self) -> Columns:
@@ -359,25 +315,17 @@ class SyncParser(Parser):
         return frames
 
 
-class DatagramParser(Parser):
+class DatagramParser(SyncParser):
     """Parser for datagrams, each of which contains one or more whole frames."""
-
-    def __init__(self, layout: FrameLayout) -> None:
-        """Begin without stored bytes."""
-        super().__init__(*_parser_arguments(layout))
-        self.layout = layout
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that one datagram contains.
 
         If the length of the datagram is not a multiple of the length of a frame, the whole datagram is rejected.
         """
-        length = self.layout.length
-        has_only_whole_frames = len(data) % length == 0
-        if not has_only_whole_frames:
+        if len(data) % self.layout.length != 0:
             self.counts.count_rejected(len(data))
             return []
-        frames = []
-        for start in range(0, len(data), length):
-            frames += self._try_decode(self.layout.decode, data[start : start + length], dropped_size=length)
+        frames = super().feed(data)
+        self.reset()
         return frames

@@ -7,8 +7,8 @@ occurred three times in succession. Lines that resemble a message, such as `Chan
 because a board that starts often sends several similar messages. After the recognition, lines with another layout
 are dropped and counted.
 
-Reading may start in the middle of a cycle. The lines of a cycle are therefore sorted by name, with the frame counter
-and the clock before the channels. A cycle begins with the line whose name comes first in the sorted order.
+Reading may start in the middle of a cycle. A cycle therefore begins with the line whose name is that of the frame
+counter, or else comes first in the order of names.
 
 Reading may also start in the middle of a line. If the first line begins with a number, it is therefore dropped and
 counted as malformed. This also applies to files and pipes, because their bytes usually come from a port, for example
@@ -20,8 +20,8 @@ in an otherwise intact line. Lines between the frames that never change, such as
 the recognition of the layout.
 
 A column with the name `seq` is the frame counter. A column with the name `t_us`, `t_ms` or `t_s` is the clock of the
-device. All other columns are channels. At first, the values at which the counter and the clock wrap to 0 are unknown.
-The parser estimates each value when the counter or the clock wraps for the first time.
+device. All other columns are channels. A frame counter below 256 is assumed to have 8 bits, and all others to have 16
+bits or more. A clock in us or ms is assumed to have 32 bits, and a clock in s is assumed to be a time of day.
 """
 
 from collections import deque
@@ -34,7 +34,6 @@ from isocharge.serve.frames.frame import (
     T_US_MODULUS,
     TIMES_US,
     Columns,
-    CounterWrap,
     DelimitedParser,
     Frame,
 )
@@ -58,14 +57,8 @@ MAX_VALUES = 256
 MAX_HEADERS = 8
 """Number of lines without numbers that are kept, because one of them may be the header of the following lines."""
 
-SEQ_MODULI = (100, 256, 1000, 10_000, SEQ_MODULUS, 1 << 32)
-"""Values at which frame counters usually wrap to 0."""
-
-MAX_SEQ_STEP_RATIO = 2
-"""Largest ratio of the step of the frame counter across a wrap to the previous step."""
-
-MAX_CLOCK_STEP_RATIO = 16
-"""Largest ratio of the step of the clock across a wrap to the previous step."""
+SMALL_SEQ_MODULUS = 256
+"""Value at which a frame counter of 8 bits wraps to 0."""
 
 DAY_US = 86_400_000_000
 """Value at which a time of day wraps to 0, us."""
@@ -75,35 +68,24 @@ class Layout:
     """Arrangement of the values of a frame in one line, or in a cycle of several lines.
 
     Attributes:
-        example: One of the lines, with which headers are compared.
+        example: The first line, with which headers are compared.
         skeletons: Text between the numbers of each line of a frame.
         names: Names of all values; empty for a value without a name.
         unnamed: Indices of the values that have no names in the lines. A header or a device file may name them.
-        first_name: The first name that is not the name of a clock; empty without such a name.
         columns: Meanings of the values as frame counter, clock or channels.
     """
 
-    def __init__(self, cycles: Sequence[Sequence[Line]]) -> None:
-        """Determine the layout from several frames, each of which is a single line or a cycle of lines.
-
-        The names of a cycle are sorted, because the given lines may begin in the middle of a cycle.
-
-        Args:
-            cycles: Lines of each frame, shape (frames, lines).
-        """
-        self.example = cycles[0][0]
-        self.skeletons = [Skeleton(lines) for lines in zip(*cycles, strict=True)]
-        names = self.skeletons[0].names
-        if len(self.skeletons) > 1:
-            different_names = {name for skeleton in self.skeletons for name in skeleton.names}
-            names = tuple(sorted(different_names, key=_counter_and_clock_first))
+    def __init__(self, lines: Sequence[Line]) -> None:
+        """Determine the layout from the lines of one frame."""
+        self.example = lines[0]
+        self.skeletons = [Skeleton(line) for line in lines]
+        names = [name for line in lines for name in line.names]
         self.unnamed = [index for index, name in enumerate(names) if not name]
         self.set_names(names)
 
     def set_names(self, names: Sequence[str]) -> None:
         """Store the names of all values, and find the columns of the frame counter, the clock and the channels."""
         self.names = tuple(names)
-        self.first_name = next((name for name in names if name not in TIMES_US), "")
         scales = (1.0,) * len(self.names)  # values in text have no scale
         self.columns = Columns(self.names, scales)
 
@@ -136,16 +118,14 @@ class TextParser(DelimitedParser):
         self._columns = columns
         self._meanings = dict(meanings or {})
         self._headers: deque[str] = deque(maxlen=MAX_HEADERS)  # lines without numbers
-        self._seq_wrap = CounterWrap(SEQ_MODULI, SEQ_MODULUS, MAX_SEQ_STEP_RATIO)
-        self._clock_wrap = create_clock_wrap(1.0)  # until the layout states the unit of the clock
+        self.seq_modulus = SMALL_SEQ_MODULUS  # until the counter exceeds it
         self._is_first_line = True  # whether the next line is the first line of a connection
 
-        # Texts, skeletons and sizes in bytes of the lines from which the layout will be recognised
-        self._collected_lines: list[tuple[str, str, int]] = []
+        # Lines from which the layout will be recognised, and their sizes in bytes
+        self._collected_lines: list[tuple[Line, int]] = []
 
-        # Values (by name) and number of bytes of the present cycle of lines, which together contain one frame
-        self._cycle_values: dict[str, float] = {}
-        self._cycle_byte_count = 0
+        # Lines, values and bytes of the present cycle of lines, which together contain one frame
+        self._clear_cycle()
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames in the lines that end within `data`. A line ends with a line feed or a carriage return."""
@@ -159,8 +139,6 @@ class TextParser(DelimitedParser):
         super().reset()
         self._drop_cycle()
         self._is_first_line = True
-        self._seq_wrap.update(None)  # None means that the connection has ended
-        self._clock_wrap.update(None)
 
     def _parse_piece(self, piece: bytes) -> list[Frame]:
         """Parse a line, and return the frames that the line completes.
@@ -174,17 +152,14 @@ class TextParser(DelimitedParser):
         size = len(piece) + 1  # with the line feed
         is_first_line = self._is_first_line
         self._is_first_line = False
-        if not piece:
-            return []
         try:
-            text = piece.decode()
+            text = clean_text(piece.decode())
+            if not text:
+                return []
             # The beginning of the first line may be missing. For example, "801.2" may have become the number "1.2".
-            if is_first_line and parse_line(clean_text(text)).starts[:1] == (0,):
+            if is_first_line and parse_line(text).starts[:1] == (0,):
                 return self._reject(size)
-            frames = None if text[0] in ">$" else self._read_line(text, size)  # these lines have to be cleaned first
-            if frames is None:
-                text = clean_text(text)
-                frames = self._read_line(text, size) if text else []
+            frames = self._read_line(text, size)
             return self._examine_line(text, size) if frames is None else frames
         except ValueError:
             return self._reject(size)
@@ -223,7 +198,8 @@ class TextParser(DelimitedParser):
 
     def _describe_layout(self, layout: Layout) -> None:
         """Describe the recognised layout in the attribute `format`."""
-        self._clock_wrap = create_clock_wrap(layout.columns.clock_unit_us)
+        unit_us = round(layout.columns.clock_unit_us)
+        self.t_us_modulus = DAY_US if unit_us == TIMES_US["t_s"] else T_US_MODULUS * unit_us
         is_unnamed = not any(layout.names)
         names = f"{len(layout.names)} columns without names" if is_unnamed else ", ".join(layout.names)
         self.format = f"text: {printable(names)}"
@@ -241,31 +217,30 @@ class TextParser(DelimitedParser):
         Returns:
             The frames of all equal cycles; an empty list if no layout is recognised yet.
         """
-        self._collected_lines.append((line.text, line.skeleton, size))
+        names = tuple(self._meanings.get(name, name) for name in line.names)
+        self._collected_lines.append((line._replace(names=names), size))
         repeats = MESSAGE_REPEATS if line.is_prose else RECOGNITION_REPEATS
         cycle_length = self._repeated_cycle_length(repeats) if len(line.numbers) <= MAX_VALUES else 0
         repeated_lines = self._collected_lines[-repeats * cycle_length :] if cycle_length > 0 else []
-        parsed_lines = [self._with_meanings(parse_line(text)) for text, _, _ in repeated_lines]
-        cycles = _frame_cycles(parsed_lines, cycle_length)
-        if not cycles:
+        frame_lines = _frame_lines([line for line, _ in repeated_lines], cycle_length)
+        if not frame_lines:
             # Keep as many lines as the longest cycles need, and reject the older lines.
             while len(self._collected_lines) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
-                _, _, oldest_size = self._collected_lines.pop(0)
-                self._reject(oldest_size)
+                self._reject(self._collected_lines.pop(0)[1])
             return []
 
-        for _, _, rejected_size in self._collected_lines[: -len(repeated_lines)]:
+        for _, rejected_size in self._collected_lines[: -len(repeated_lines)]:
             self._reject(rejected_size)
         self._collected_lines = []
-        layout = Layout(cycles)
+        layout = Layout(frame_lines)
         is_named = layout.name_unnamed(self._columns)
         while self._headers and not is_named:
             is_named = layout.name_unnamed(header_names(self._headers.pop(), layout.example))
         self.layout = layout
         self._describe_layout(layout)
         frames = []
-        for text, _, repeated_size in repeated_lines:
-            frames_of_line = self._read_line(text, repeated_size)
+        for repeated_line, repeated_size in repeated_lines:
+            frames_of_line = self._read_line(repeated_line.text, repeated_size)
             frames += self._reject(repeated_size) if frames_of_line is None else frames_of_line
         return frames
 
@@ -273,34 +248,26 @@ class TextParser(DelimitedParser):
         """Return the number of lines in a cycle, or 0 if the collected lines do not repeat regularly.
 
         A cycle is a sequence of lines that repeats. It is recognised if the last lines consist of several equal cycles.
-        Lines are equal if their skeletons are equal.
+        Lines are equal if their skeletons are equal. The length of the cycle is the distance from the last line to the
+        latest earlier line that is equal.
 
         Args:
             repeats: Number of equal cycles that are needed.
         """
-        skeletons = [skeleton for _, skeleton, _ in self._collected_lines]
+        skeletons = [line.skeleton for line, _ in self._collected_lines]
         *earlier_skeletons, last_skeleton = skeletons
         if last_skeleton not in earlier_skeletons:
             return 0
-
-        # The length of the cycle is the distance from the last line to the latest earlier line that is equal.
-        latest_skeletons_first = earlier_skeletons[::-1]
-        cycle_length = latest_skeletons_first.index(last_skeleton) + 1
-
-        # Compare the last lines with repetitions of the first cycle among them.
-        recent_skeletons = skeletons[-repeats * cycle_length :]
-        is_repeated = recent_skeletons == recent_skeletons[:cycle_length] * repeats
+        cycle_length = earlier_skeletons[::-1].index(last_skeleton) + 1
+        is_repeated = skeletons[-repeats * cycle_length :] == skeletons[-cycle_length:] * repeats
         return cycle_length if is_repeated else 0
-
-    def _with_meanings(self, line: Line) -> Line:
-        """Replace the names that the device uses for its counter and its clock by `seq`, `t_us`, `t_ms` or `t_s`."""
-        return line._replace(names=tuple(self._meanings.get(name, name) for name in line.names))
 
     def _read_line(self, text: str, size: int) -> list[Frame] | None:
         """Return a list with the frame that a line completes.
 
         The list is empty if the line completes no frame. The result is None if the line does not have the recognised
-        layout, or if no layout is recognised yet.
+        layout, or if no layout is recognised yet. If a line of a cycle is lost, the other lines of the cycle are
+        rejected.
 
         Args:
             text: The line.
@@ -309,58 +276,39 @@ class TextParser(DelimitedParser):
         layout = self.layout
         if layout is None:
             return None
-        for skeleton in layout.skeletons:
+        for position, skeleton in enumerate(layout.skeletons):
             values = skeleton.values(text)
-            if values is not None:
-                if len(layout.skeletons) == 1:
-                    return self._frame_of_values(layout, values, size)
-                return self._read_cycle_line(layout, skeleton, values, size)
+            if values is None:
+                continue
+            if position != self._cycle_position:
+                self._drop_cycle()
+                if position > 0:
+                    return self._reject(size)
+            self._cycle_position += 1
+            self._cycle_values += values
+            self._cycle_byte_count += size
+            if self._cycle_position < len(layout.skeletons):
+                return []
+            cycle_values = self._cycle_values
+            cycle_byte_count = self._cycle_byte_count
+            self._clear_cycle()
+            return self._frame_of_values(layout, cycle_values, cycle_byte_count)
         return None
-
-    def _read_cycle_line(self, layout: Layout, skeleton: Skeleton, values: tuple[float, ...], size: int) -> list[Frame]:
-        """Store the values of one line of a cycle. A cycle is a sequence of lines that together contain one frame.
-
-        A line begins a new cycle in two cases: if its name comes first in the layout, or if the present cycle already
-        contains its name. In the second case, some lines were lost.
-
-        Args:
-            layout: The recognised layout.
-            skeleton: Skeleton of the line, with the names of the values.
-            values: Values of the line.
-            size: Number of bytes of the line.
-
-        Returns:
-            A list with the frame if the line completes the cycle, otherwise an empty list.
-        """
-        line_name = skeleton.line_name
-        begins_cycle = line_name == layout.first_name or line_name in self._cycle_values
-        if begins_cycle:
-            self._drop_cycle()  # an earlier cycle, if it is unfinished
-        self._cycle_values.update(zip(skeleton.names, values, strict=True))
-        self._cycle_byte_count += size
-        is_complete = len(self._cycle_values) == len(layout.names)
-        if not is_complete:
-            return []
-
-        # The cycle is complete. Convert its values to a frame, in the order of the layout.
-        frame_values = [self._cycle_values[name] for name in layout.names]
-        cycle_byte_count = self._cycle_byte_count
-        self._clear_cycle()
-        return self._frame_of_values(layout, frame_values, cycle_byte_count)
 
     def _drop_cycle(self) -> None:
         """Drop the lines of an unfinished cycle, and count them as rejected."""
-        if self._cycle_values:
+        if self._cycle_position > 0:
             self.counts.count_rejected(self._cycle_byte_count)
         self._clear_cycle()
 
     def _clear_cycle(self) -> None:
         """Delete the stored values of the present cycle, so that a new cycle can begin."""
-        self._cycle_values = {}
+        self._cycle_position = 0
+        self._cycle_values: tuple[float, ...] = ()
         self._cycle_byte_count = 0
 
     def _frame_of_values(self, layout: Layout, values: Sequence[float], size: int) -> list[Frame]:
-        """Convert values to a frame, and update the moduli of the counter and the clock.
+        """Convert values to a frame, and update the modulus of the counter.
 
         Args:
             layout: The recognised layout.
@@ -372,37 +320,13 @@ class TextParser(DelimitedParser):
             infinite.
         """
         frames = self._try_decode(layout.columns.frame, values, dropped_size=size)
-        for frame in frames:
-            self.seq_modulus = self._seq_wrap.update(frame.seq)
-            self.t_us_modulus = self._clock_wrap.update(frame.t_us)
+        if any((frame.seq or 0) >= SMALL_SEQ_MODULUS for frame in frames):
+            self.seq_modulus = SEQ_MODULUS
         return frames
 
 
-def create_clock_wrap(unit_us: float) -> CounterWrap:
-    """Create the estimator of the time at which a clock wraps to 0.
-
-    The estimator assumes that the clock has 16, 24 or 32 bits, that the board computes the time from a 32-bit clock in
-    us or ms, or that the time is a time of day.
-
-    Args:
-        unit_us: Unit of the clock, us.
-    """
-    unit = round(unit_us)
-    usual_moduli = {T_US_MODULUS, 1000 * T_US_MODULUS, DAY_US}  # of a 32-bit clock in us or ms; all moduli are in us
-    for bits in (16, 24, 32):
-        usual_moduli.add((1 << bits) * unit)
-    initial_modulus = T_US_MODULUS * unit
-    return CounterWrap(sorted(usual_moduli), initial_modulus, MAX_CLOCK_STEP_RATIO)
-
-
-def _counter_and_clock_first(name: str) -> tuple[bool, str]:
-    """Return the sorting key of a name, which sorts the frame counter and the clock before the channels."""
-    is_channel = name != SEQ and name not in TIMES_US
-    return is_channel, name
-
-
-def _frame_cycles(lines: Sequence[Line], cycle_length: int) -> list[Sequence[Line]]:
-    """Return the lines of each frame in repeated cycles of lines; empty if it is not clear which lines are frames.
+def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:
+    """Return the lines of one frame in repeated cycles of lines; empty if it is not clear which lines are frames.
 
     If every value has a name, a frame consists of all lines of a cycle. Otherwise, a frame is a single line, and the
     other lines of the cycle never change.
@@ -411,11 +335,13 @@ def _frame_cycles(lines: Sequence[Line], cycle_length: int) -> list[Sequence[Lin
         lines: Lines of whole cycles; may be empty.
         cycle_length: Number of lines in a cycle.
     """
-    if not lines:
-        return []
-    has_line_names = all(set(line.names) - set(TIMES_US) and all(line.names) for line in lines)
-    if cycle_length == 1 or has_line_names:
-        return [lines[start : start + cycle_length] for start in range(0, len(lines), cycle_length)]
-    lines_at_position = [lines[position::cycle_length] for position in range(cycle_length)]
-    varying_lines = [lines for lines in lines_at_position if len({line.text for line in lines}) > 1]
-    return [[line] for line in varying_lines[0]] if len(varying_lines) == 1 else []
+    cycle = lines[:cycle_length]
+    if cycle_length <= 1:
+        return cycle
+    line_names = [next((name for name in line.names if name not in TIMES_US), "") for line in cycle]
+    if all(line_names) and all(all(line.names) for line in cycle):
+        first = min(range(cycle_length), key=lambda position: (line_names[position] != SEQ, line_names[position]))
+        return lines[first : first + cycle_length]
+    texts = [{line.text for line in lines[position::cycle_length]} for position in range(cycle_length)]
+    varying = [line for line, texts_of_line in zip(cycle, texts, strict=True) if len(texts_of_line) > 1]
+    return varying if len(varying) == 1 else []

@@ -9,7 +9,7 @@ skeleton. Lines with the same skeleton are frames of one layout, in whatever not
 | `A:801.2 pC, B:-799.5 pC` | A, B | 801.2, -799.5 |
 | `3,1;-2,0` | | 3.1, -2.0 |
 | `12:34:56.5 -> (0x1F, 0x2E)` | t_s | 45296.5, 31, 46 |
-| `{"charge": {"A": 801.2}, "q": [3, 4]}` | charge.A, q.0, q.1 | 801.2, 3, 4 |
+| `{"charge": {"A": 801.2, "B": 3}}` | A, B | 801.2, 3 |
 
 A word directly before a number is the name of the number. Digits in a word, as in `ch3`, are not a number. Words that
 are neither names nor followed by a colon or an equals sign may change from line to line.
@@ -18,11 +18,11 @@ are neither names nor followed by a colon or an equals sign may change from line
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from functools import reduce
 from itertools import zip_longest
 from operator import xor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US, Frame
 
@@ -46,7 +46,7 @@ def _number_pattern(decimal_marks: str) -> str:
 _PATTERNS = {
     "time": _TIME,
     "uptime": "([0-9]+)",
-    "hexadecimal": "([-+]?(?:0[xX])?[0-9A-Fa-f]++)",
+    "hexadecimal": "([-+]?0[xX][0-9A-Fa-f]{1,16})",
     "number": _number_pattern("."),
     "number with a decimal comma": _number_pattern(".,"),
     "quoted": f"(?:{_QUOTED})",
@@ -80,16 +80,14 @@ def _token_pattern(number: str) -> re.Pattern[str]:
         r"|(?P<uptime>(?<=\b[EWIDV]\s\()[0-9]+(?=\)))"
         rf"|(?P<key>(?<=^>)[^:]+(?=:)|(?<=^\$)\w+|(?:{key}|{_QUOTED})(?=\s*[:=]))"
         rf"|(?P<quoted>{_QUOTED})"
-        r"|(?P<hexadecimal>(?<![\w.])[-+]?0[xX][0-9A-Fa-f]+(?!\w))"
+        r"|(?P<hexadecimal>(?<![\w.])[-+]?0[xX][0-9A-Fa-f]{1,16}(?!\w))"
         rf"|(?P<number>(?<![\w.]){number}(?!\.[0-9])(?=[^\W\d_]*(?!\w)))"
         rf"|(?P<word>{_WORD})"
         r"|(?P<mark>\S)"
     )
 
 
-_TOKENS = {kind: _token_pattern(_PATTERNS[kind]) for kind in ("number", "number with a decimal comma")} | {
-    "hexadecimal": re.compile(r"(?P<hexadecimal>\w+)|(?P<mark>\S)")
-}
+_TOKENS = {kind: _token_pattern(_PATTERNS[kind]) for kind in ("number", "number with a decimal comma")}
 """Regular expressions of a part of a line, by the kind of the numbers in the line."""
 
 
@@ -112,7 +110,6 @@ class Line(NamedTuple):
         names: Name of each number; empty for a number without a name.
         numbers: The numbers as texts.
         starts: Position in the line at which each number begins.
-        hexadecimal: Index of each hexadecimal number.
         is_prose: Whether the line resembles a message, such as `Channel 3 is ready`, because it has at least as many
             words as numbers. Keys, and words after a comma or another mark, do not count.
     """
@@ -122,7 +119,6 @@ class Line(NamedTuple):
     names: tuple[str, ...]
     numbers: tuple[str, ...]
     starts: tuple[int, ...]
-    hexadecimal: tuple[int, ...]
     is_prose: bool
 
 
@@ -162,28 +158,18 @@ def parse_line(text: str) -> Line:
         text: The line, as `clean_text` returns it.
 
     Raises:
-        ValueError: If the line contains characters that are not printable, two numbers with the same name, or a
-            decimal number after a hexadecimal number, such as the size after the address of a part of a program.
+        ValueError: If the line contains characters that are not printable, or a decimal number after a hexadecimal
+            number, such as the size after the address of a part of a program.
     """
     if not text.replace("\t", " ").isprintable():
         raise ValueError(f"expected printable characters, got {text[:100]!r}")
-    number_kind = "number"
-    if _are_hexadecimal(text):
-        number_kind = "hexadecimal"
-    elif _has_decimal_commas(text):
-        number_kind = "number with a decimal comma"
+    number_kind = "number with a decimal comma" if _has_decimal_commas(text) else "number"
     tokens = _tokens(text.rstrip(",; \t"), number_kind)
     number_tokens = [token for token in tokens if token.kind in _NUMBER_KINDS]
     kinds = [token.kind for token in number_tokens]
-    hexadecimal = tuple(index for index, kind in enumerate(kinds) if kind == "hexadecimal")
-    if hexadecimal and "number" in kinds[hexadecimal[0] :]:
+    if "hexadecimal" in kinds and "number" in kinds[kinds.index("hexadecimal") :]:
         raise ValueError(f"expected only hexadecimal numbers after the first one, got {text[:100]!r}")
-
     word_names = _names(tokens)
-    names = _with_units(_json_names(text, word_names, number_tokens), tokens)
-    channel_names = [name for name in names if name and name not in TIMES_US]
-    if len(set(channel_names)) < len(channel_names):
-        raise ValueError(f"expected different names, got {text[:100]!r}")
 
     skeleton = ""
     word_count = 0
@@ -202,15 +188,7 @@ def parse_line(text: str) -> Line:
     numbers = tuple(token.content for token in number_tokens)
     starts = tuple(token.start for token in number_tokens)
     is_prose = word_count >= len(numbers)
-    return Line(text, skeleton + _CODES["end"], tuple(names), numbers, starts, hexadecimal, is_prose)
-
-
-def _are_hexadecimal(text: str) -> bool:
-    """Return whether a line consists of words of equal length that are hexadecimal numbers, such as `01F3 FFE2`."""
-    words = re.findall(r"\w+", text)
-    has_letters_and_digits = re.search("[A-Fa-f]", text) is not None and re.search("[0-9]", text) is not None
-    are_numbers = re.fullmatch(r"[0-9A-Fa-f]{3,8}(?:[\s,;]+[0-9A-Fa-f]{3,8})+[\s,;]*", text) is not None
-    return are_numbers and has_letters_and_digits and len(set(map(len, words))) == 1
+    return Line(text, skeleton + _CODES["end"], tuple(_with_units(word_names, tokens)), numbers, starts, is_prose)
 
 
 def _has_decimal_commas(text: str) -> bool:
@@ -259,8 +237,9 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
 def _names(tokens: list[_Token]) -> list[str]:
     """Return the name of each number, which is the word or the key directly before the number; empty without a name.
 
-    Words are units and not names if the first number follows no word but the last number precedes one. A single name
-    at the first of several numbers is a label of the line, unless it is a name of a counter or a clock.
+    Words are units and not names if the first number follows no word but the last number precedes one. A name that
+    occurs several times is no name. A single name at the first of several numbers is a label of the line, unless it is
+    a name of a counter or a clock.
 
     Args:
         tokens: Parts of the line.
@@ -280,55 +259,15 @@ def _names(tokens: list[_Token]) -> list[str]:
             candidate = ""
 
     channels = [index for index, name in enumerate(names) if name not in TIMES_US]
+    repeated = {name for name in names if names.count(name) > 1} - set(TIMES_US)
     are_units = bool(channels) and not names[channels[0]] and tokens[-1].kind == "word"
-    names = ["" if name in words and (are_units or words.count(name) > 1) else name for name in names]
+    names = ["" if (are_units and name in words) or name in repeated else name for name in names]
     named = [index for index in channels if names[index]]
     if len(channels) > 1 and named == channels[:1] and names[named[0]] != SEQ:
         names[named[0]] = ""
     if tokens and tokens[0].content == ">" and len(names) == 2:  # `>name:time:value`
         names = [_NAMES_OF_TIMES["uptime"], next((token.content for token in tokens if token.kind == "key"), "")]
     return names
-
-
-def _json_names(text: str, names: list[str], number_tokens: list[_Token]) -> list[str]:
-    """If a line ends with a JSON text, replace the names of the numbers in it by their paths, such as `charge.A`.
-
-    The numbers of a list that contains only numbers keep their names.
-
-    Args:
-        text: The line.
-        names: Name of each number.
-        number_tokens: The numbers.
-    """
-    bracket = re.search(r"[\[{]", text)
-    if bracket is None:
-        return names
-    try:
-        # Integers are parsed as floats, so that integers of hundreds of digits become infinite, as in other notations.
-        content = json.loads(text[bracket.start() :], parse_int=float)
-        paths = list(_number_paths("", content))
-    except (ValueError, RecursionError):
-        return names
-    n_before = sum(token.start < bracket.start() for token in number_tokens)
-    is_list_of_numbers = isinstance(content, list) and all(isinstance(item, float) for item in content)
-    if is_list_of_numbers or n_before + len(paths) != len(names):
-        return names
-    return names[:n_before] + paths
-
-
-def _number_paths(path: str, content: Any) -> Iterator[str]:
-    """Yield the path of each number in a JSON value, such as `charge.A` or `charge.0.re`.
-
-    Args:
-        path: Path of the value; empty for the whole text.
-        content: The value.
-    """
-    if isinstance(content, float):  # integers were read as floats
-        yield path
-        return
-    items = content.items() if isinstance(content, dict) else enumerate(content if isinstance(content, list) else ())
-    for key, value in items:
-        yield from _number_paths(f"{path}.{key}" if path else str(key), value)
 
 
 def _with_units(names: list[str], tokens: list[_Token]) -> list[str]:
@@ -354,31 +293,13 @@ class Skeleton:
 
     Attributes:
         names: Name of each number; empty for a number without a name.
-        line_name: The first name, by which a line of a cycle is identified. The names of clocks are ignored, because
-            every line of a cycle may contain the clock.
     """
 
-    def __init__(self, lines: Sequence[Line]) -> None:
-        """Prepare the reading of lines.
-
-        Hexadecimal numbers of a fixed length are signed (two's complement) if all of them are closer to zero or to the
-        end of their range than to its middle.
-
-        Args:
-            lines: Lines with the same skeleton, at least one.
-        """
-        self.names = lines[0].names
-        self.line_name = next((name for name in self.names if name not in TIMES_US), "")
-        skeleton = lines[0].skeleton
+    def __init__(self, line: Line) -> None:
+        """Prepare the reading of lines with the skeleton of a line."""
+        self.names = line.names
         patterns = {_CODES[kind]: pattern for kind, pattern in _PATTERNS.items()}
-        self._match = re.compile("".join(patterns.get(part) or re.escape(part) for part in skeleton)).fullmatch
-        self._hexadecimal = lines[0].hexadecimal
-        self._modulus = 0  # number of values of a signed hexadecimal number; 0 if the numbers are unsigned
-        digits = {line.numbers[index].lower().removeprefix("0x") for line in lines for index in self._hexadecimal}
-        are_near_zero = all(text[0] in "0123cdef" for text in digits)
-        lengths = set(map(len, digits))
-        if lengths in ({4}, {6}, {8}) and are_near_zero:
-            self._modulus = 16 ** lengths.pop()
+        self._match = re.compile("".join(patterns.get(part) or re.escape(part) for part in line.skeleton)).fullmatch
 
     def values(self, text: str) -> tuple[float, ...] | None:
         """Return the numbers in a line; None if the line has another skeleton.
@@ -389,30 +310,20 @@ class Skeleton:
         match = self._match(text)
         if match is None:
             return None
-        numbers = match.groups()
-        if self._hexadecimal:
-            return tuple(
-                self._hexadecimal_value(number) if index in self._hexadecimal else _value(number)
-                for index, number in enumerate(numbers)
-            )
         try:
-            return tuple(map(float, numbers))
-        except ValueError:  # a number is a time of day, has a decimal comma, or is `ovf`
-            return tuple(map(_value, numbers))
-
-    def _hexadecimal_value(self, number: str) -> float:
-        """Return the value of a hexadecimal number."""
-        value = int(number, 16)
-        is_negative = 2 * value >= self._modulus > 0
-        return float(value - self._modulus if is_negative else value)
+            return tuple(map(float, match.groups()))
+        except ValueError:  # a number is a time of day, is hexadecimal, has a decimal comma, or is `ovf`
+            return tuple(map(_value, match.groups()))
 
 
 def _value(number: str) -> float:
-    """Return the value of a decimal number, which is NaN for `ovf`, or the seconds since midnight of a time of day."""
+    """Return the value of a number, which is NaN for `ovf`, or the seconds since midnight of a time of day."""
     if ":" in number:
         hours, minutes, seconds = number.split(":")
         whole, _, fraction = seconds.replace(",", ".").partition(".")
         return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{whole}.{fraction.replace('.', '')}")
+    if "x" in number.lower():
+        return float(int(number, 16))
     if number[-3:].lower() == "ovf":
         return math.nan
     return float(number.replace(",", "."))

@@ -123,7 +123,7 @@ class Device(Settings, frozen=True):
         """Request that the board answers with a frame, or None if the board sends frames without requests."""
         if self.frames.request is None:
             return None
-        return Request(bytes.fromhex(self.frames.request), self.frames.request_Hz, self.frames.echo)
+        return Request(bytes.fromhex(self.frames.request), self.frames.request_Hz)
 
     def parser(self) -> Parser:
         """Return a new parser that reads the frames of the board."""

@@ -51,12 +51,10 @@ class Request:
     Attributes:
         data: The bytes of the request.
         rate_Hz: Largest number of requests per second.
-        echo: Whether the connection returns each request as an echo, which must be removed from the received bytes.
     """
 
     data: bytes
     rate_Hz: float = 100.0
-    echo: bool = False
 
 
 class Requester:
@@ -71,20 +69,14 @@ class Requester:
         """
         self._request = request
         self._now_s = now_s
-        self._request_count = 0  # number of requests that were sent
-        self._echo_count = 0  # number of complete echoes that were received
         self.reset()
-
-    @property
-    def echo_share(self) -> float:
-        """Fraction of the requests that came back as an echo, whether or not the echoes were removed."""
-        return self._echo_count / max(1, self._request_count)
 
     def reset(self) -> None:
         """Make the next request due at once, for example because the line was opened again."""
         self._requested_s = -float("inf")  # time of the latest request
         self._received_s = -float("inf")  # time of the latest received byte
-        self._expected_echo = b""  # bytes of the echo that have not been received yet
+        self._expects_echo = False  # whether the next bytes may be an echo of the request
+        self._received_start = b""  # first bytes after the request, which may be the beginning of its echo
 
     def wait_s(self) -> float:
         """Return the time until the next request is due, s, or 0 if a request is due now.
@@ -101,41 +93,31 @@ class Requester:
         return max(0.0, due_s - now_s, quiet_end_s - now_s)
 
     def next_request(self) -> bytes:
-        """Return the bytes of the next request, which the caller must send now.
-
-        The method stores the time of the request, and expects an echo of it.
-        """
+        """Return the bytes of the next request, which the caller must send now."""
         self._requested_s = self._now_s()
-        self._request_count += 1
-        self._expected_echo = self._request.data
+        self._expects_echo = True
+        self._received_start = b""
         return self._request.data
 
     def remove_echo(self, received: bytes) -> bytes:
         """Return the received bytes without the echo of the request.
 
-        The echo consists of the same bytes as the request, and may arrive in several parts. If `Request.echo` is false,
-        complete echoes are only counted, and the received bytes are returned unchanged.
+        The echo consists of the same bytes as the request, and may arrive in several parts. If the first bytes may be
+        the beginning of the echo, they are returned together with the bytes that show that they are none.
 
         Args:
             received: Bytes that arrived after the latest request; may be empty.
         """
-        if not received:
+        if received:
+            self._received_s = self._now_s()
+        if not self._expects_echo:
+            return received
+        self._received_start += received
+        request = self._request.data
+        if request != self._received_start and request.startswith(self._received_start):
             return b""
-        self._received_s = self._now_s()
-
-        # The received bytes may be shorter than the expected echo, or may continue after it. Compare their common part.
-        echo_length = min(len(received), len(self._expected_echo))  # 0 if no echo is expected
-        is_echo = echo_length > 0 and received[:echo_length] == self._expected_echo[:echo_length]
-        if not is_echo:
-            self._expected_echo = b""  # the answer has begun, so no echo can follow
-            return received
-
-        self._expected_echo = self._expected_echo[echo_length:]  # the part that has not arrived yet
-        if not self._expected_echo:
-            self._echo_count += 1
-        if not self._request.echo:  # no echo is expected, so these bytes are part of the answer
-            return received
-        return received[echo_length:]
+        self._expects_echo = False
+        return self._received_start.removeprefix(request)
 
 
 MAX_READ_BYTES = 65536

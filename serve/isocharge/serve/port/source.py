@@ -217,11 +217,6 @@ class Port:
             self._line.close()
         self._line = None
 
-    @property
-    def echo_share(self) -> float:
-        """Fraction of the requests that came back as an echo, or 0 if the board sends frames without requests."""
-        return self._requester.echo_share if self._requester else 0.0
-
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks as they arrive. If the port is lost and `reconnect` is true, open the port again.
 

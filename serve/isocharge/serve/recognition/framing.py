@@ -6,23 +6,19 @@ of one frame length. For each repeated pair of bytes, frames are assumed to begi
 chooses the pair whose frames would cover the largest part of the stream. The position of the chosen pair within a frame
 is determined later.
 
-Checksums with a name are tried for every possible position of the first byte that they cover. For cyclic redundancy
-checks without a name, only the polynomials have to be tried, because the effect of all other parameters is a constant.
-The initial value, the final value and all constant bytes change the check of every frame by the same constant if the
-frames have the same length.
+All checksums with a name are tried for every possible position of the first byte that they cover.
 """
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from itertools import chain, product
 from math import gcd
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isocharge.serve.frames.checksums import CHECKSUMS, crc_with_parameters
+from isocharge.serve.frames.checksums import CHECKSUMS
 from isocharge.serve.frames.frame_field import ByteOrder
 from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC
 from isocharge.serve.frames.stuffing import STUFFINGS, Stuffing
@@ -257,32 +253,14 @@ def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray
             yield distance, positions[code_distance_pairs == pair]
 
 
-CRC_POLYNOMIALS = {
-    4: (0x04C11DB7, 0x1EDC6F41),
-    3: (0x864CFB,),
-    2: (0x1021, 0x8005, 0x3D65, 0x8BB7),
-    1: (0x07, 0x31, 0x1D, 0x2F, 0x9B, 0x39, 0xD5),
-}
-"""Polynomials of cyclic redundancy checks that are tried without a name, by the size of the check in bytes."""
-
 MIN_CHECKED_FRAMES = 6
 """Smallest number of different frames from which a checksum is recognised."""
 
 MAX_CHECKED_FRAMES = 24
 """Largest number of different frames from which a checksum is recognised."""
 
-N_FIRST_FRAMES = 4
-"""Number of frames for which each checksum is computed first."""
-
-MIN_FITTING_FIRST_FRAMES = 2
-"""Smallest number of the `N_FIRST_FRAMES` frames that a checksum must fit before it is computed for other frames."""
-
 FITTING_SHARE = 0.75
 """Smallest share of the frames that a checksum must fit. It is less than 1, because some frames may be damaged."""
-
-MAX_FIRST_COVERED_BYTE = 16
-"""Largest position of the first byte that a checksum covers."""
-
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
 """Byte orders that are tried."""
@@ -318,10 +296,9 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     frames = [row.tobytes() for row in checked_rows]
     _usual, is_constant = usual_bytes(checked_rows)  # `is_constant` has the shape (length,)
     length = len(is_constant)
-    # Number of constant bytes at the beginning of the frames, at most `MAX_FIRST_COVERED_BYTE`. It is the position of
-    # the first False.
-    leading_constant_count = int(np.argmin([*is_constant[:MAX_FIRST_COVERED_BYTE], False]))
-    for size in CRC_POLYNOMIALS:  # in bytes, from the widest to the narrowest
+    # Number of constant bytes at the beginning of the frames. It is the position of the first False.
+    leading_constant_count = int(np.argmin([*is_constant, False]))
+    for size in (4, 3, 2, 1):  # in bytes
         is_too_wide = size + 2 > length  # at least two bytes must remain
         last_bytes_are_constant = is_constant[-size:].all()  # a checksum would differ from frame to frame
         if is_too_wide or last_bytes_are_constant:
@@ -332,9 +309,7 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
         possible_starts = range(last_possible_start + 1)
         orders = ORDERS if size > 1 else ORDERS[:1]  # a single byte has no byte order
         for order in orders:
-            named_checks = _named_checks(frames, size, order, possible_starts)
-            unnamed_checks = _unnamed_checks(frames, size, order)
-            first_check = next(chain(named_checks, unnamed_checks), None)
+            first_check = next(_fitting_checks(frames, size, order, possible_starts), None)
             if first_check is not None:
                 yield first_check
 
@@ -353,8 +328,8 @@ def _drawn_rows(rows: Bytes) -> Bytes:
     return np.asarray(different_rows[drawn_indices])
 
 
-def _named_checks(frames: list[bytes], size: int, order: ByteOrder, possible_starts: range) -> Iterator[Check]:
-    """Yield the checksums with a name that fit most of the frames.
+def _fitting_checks(frames: list[bytes], size: int, order: ByteOrder, possible_starts: range) -> Iterator[Check]:
+    """Yield the checksums that fit most of the frames.
 
     Different positions are tried for the first byte that a checksum covers. A checksum is yielded once for each
     position with which it fits.
@@ -378,8 +353,7 @@ def _named_checks(frames: list[bytes], size: int, order: ByteOrder, possible_sta
 def _fits(compute: Callable[[bytes], int], frames: list[bytes], start: int, size: int, order: ByteOrder) -> bool:
     """Return whether most frames end with the checksum of the covered bytes.
 
-    The checksum covers the bytes from a given position to the checksum. To save time, the remaining frames are not
-    examined if the checksum fits too few of the first frames.
+    The checksum covers the bytes from a given position to the checksum.
 
     Args:
         compute: Function that computes the checksum of bytes.
@@ -388,49 +362,9 @@ def _fits(compute: Callable[[bytes], int], frames: list[bytes], start: int, size
         size: Number of bytes of the checksum.
         order: Byte order of the checksum.
     """
-
-    def count_fitting(some_frames: list[bytes]) -> int:
-        """Return the number of frames that end with the computed checksum."""
-        count = 0
-        for frame in some_frames:
-            computed_checksum = compute(frame[start:-size])
-            sent_checksum = int.from_bytes(frame[-size:], order)
-            if computed_checksum == sent_checksum:
-                count += 1
-        return count
-
-    if count_fitting(frames[:N_FIRST_FRAMES]) < MIN_FITTING_FIRST_FRAMES:
-        return False
-    return count_fitting(frames) >= FITTING_SHARE * len(frames)
-
-
-def _unnamed_checks(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check]:
-    """Yield the cyclic redundancy checks without a name that fit most of the frames.
-
-    A board may use any initial value and any final value, but this function computes all checks with 0 for both values.
-    For frames of one length, other initial and final values combine every check with the same constant by an exclusive
-    or. If the polynomial is right, the computed check and the sent check therefore differ by this constant in all
-    frames. The final value of the yielded check is set to this constant.
-
-    Args:
-        frames: The frames, which are of one length.
-        size: Number of bytes of the checksum.
-        order: Byte order of the checksum.
-    """
-    digit_count = 2 * size  # hexadecimal digits of a number of this size
-    for polynomial, reflected in product(CRC_POLYNOMIALS[size], (False, True)):
-        crc = crc_with_parameters(8 * size, polynomial, start=0, reflected=reflected, final=0)
-        difference_counts: Counter[int] = Counter()  # number of frames by the difference of their two checks
-        for frame in frames:
-            computed_value = crc.compute(frame[:-size])
-            sent_value = int.from_bytes(frame[-size:], order)
-            difference_counts[computed_value ^ sent_value] += 1
-        most_frequent_difference, fitting_count = difference_counts.most_common(1)[0]
-        if fitting_count >= FITTING_SHARE * len(frames):
-            parameters = {
-                "width": 8 * size,
-                "reflected": reflected,
-                "polynomial": f"{polynomial:0{digit_count}X}",
-                "final": f"{most_frequent_difference:0{digit_count}X}",
-            }
-            yield Check(size, order, {"checksum": parameters})
+    wrong_count = 0
+    for frame in frames:
+        wrong_count += compute(frame[start:-size]) != int.from_bytes(frame[-size:], order)
+        if wrong_count > (1.0 - FITTING_SHARE) * len(frames):
+            return False
+    return True
