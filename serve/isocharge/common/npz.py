@@ -7,11 +7,8 @@ of much memory. Arrays that contain pickled Python objects are refused.
 
 import io
 import zipfile
-from collections.abc import Mapping
 
 import numpy as np
-
-from isocharge.common.arrays import Array
 
 MAX_UNPACKED_BYTES = 64 << 20
 """Largest total size of the arrays of a file, bytes."""
@@ -45,46 +42,3 @@ def npz_arrays(data: bytes) -> dict[str, np.ndarray]:
             return {name: np.asarray(content) for name, content in arrays.items()}
     except Exception as error:  # zipfile, zlib and NumPy raise many types of exceptions for damaged files
         raise ValueError(str(error) or type(error).__name__) from error
-
-
-def finite_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None, ...]) -> Array:
-    """Check the shape and the values of an array of a file, and return the array as float64.
-
-    Args:
-        arrays: Arrays of the file, by name.
-        name: Name of the array.
-        shape: Expected shape. The length None stands for any length of at least one.
-
-    Raises:
-        ValueError: If the array is missing, has another shape, or contains values that are not finite real numbers.
-    """
-    if name not in arrays:
-        raise ValueError(f"the array {name!r} is missing")
-    array = arrays[name]
-    if array.dtype.kind not in "fiu":  # floating-point numbers, signed and unsigned integers
-        raise ValueError(f"{name}: expected real numbers, got an array of {array.dtype}")
-    is_fitting = array.ndim == len(shape) and all(
-        length > 0 and expected in (None, length) for length, expected in zip(array.shape, shape, strict=True)
-    )
-    if not is_fitting:
-        lengths = ", ".join("n" if length is None else str(length) for length in shape)
-        raise ValueError(f"{name}: expected an array of shape ({lengths}), got {array.shape}")
-    values = array.astype(np.float64)
-    is_finite = np.isfinite(values)
-    if not is_finite.all():
-        first_wrong_value = values[~is_finite][0]
-        raise ValueError(f"{name}: expected finite numbers, got {first_wrong_value}")
-    return values
-
-
-def finite_number(arrays: Mapping[str, np.ndarray], name: str) -> float:
-    """Return the value of an array that contains a single number and has no dimensions.
-
-    Args:
-        arrays: Arrays of the file, by name.
-        name: Name of the array.
-
-    Raises:
-        ValueError: If the array is missing, has dimensions, or does not contain a finite real number.
-    """
-    return float(finite_array(arrays, name, ()))
