@@ -20,6 +20,7 @@ from onnx import TensorProto, helper, numpy_helper
 from boards import TcpBoard, taps
 from isocharge.serve import ModelMetadata, PredictionRecord, Predictor, write_model
 from isocharge.serve.model.metadata import ModelNoise
+from isocharge.serve.model.session import OUTPUTS
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import Application, HttpServer
 from isocharge.serve.network.model_store import open_model_store
@@ -101,8 +102,9 @@ class LinearFilm:
             "pC_per_N": [[PC_PER_N * n]],
             "std_scale": [[50.0, 50.0, 0.0]],
             "std_floor": [[0.0, 0.0, 7e-4]],
+            "no_correlation": [[0.0, 0.0, 0.0]],
         }
-        names = {name: name for name in ("charge_pC", "contact", "contact_std", "misfit")}
+        names = {name: name for name in ("charge_pC", *OUTPUTS)}
         names |= renamed or {}
         node = helper.make_node
         nodes = [
@@ -113,14 +115,14 @@ class LinearFilm:
             node("Concat", ["position", "force"], [names["contact"]], axis=1),
             node("Div", ["std_scale", "sum"], ["std_position"]),
             node("Add", ["std_position", "std_floor"], [names["contact_std"]]),
+            node("Mul", [names["contact_std"], "no_correlation"], [names["contact_correlation"]]),
             node("Neg", [names["charge_pC"]], ["negated"]),
             node("Relu", ["negated"], ["negative"]),
             node("ReduceSum", ["negative", "axes"], [names["misfit"]], keepdims=1),
         ]
         tensor_info = helper.make_tensor_value_info
-        output_widths = {"contact": 3, "contact_std": 3, "misfit": 1}
         inputs = [tensor_info(names["charge_pC"], TensorProto.FLOAT, [batch, n])]
-        outputs = [tensor_info(names[name], TensorProto.FLOAT, [batch, width]) for name, width in output_widths.items()]
+        outputs = [tensor_info(names[name], TensorProto.FLOAT, [batch, width]) for name, width in OUTPUTS.items()]
         initializers = [numpy_helper.from_array(np.array([1], dtype=np.int64), "axes")]
         for name, values in constants.items():
             initializers.append(numpy_helper.from_array(np.array(values, dtype=np.float32), name))

@@ -7,7 +7,7 @@ import numpy as np
 
 from isocharge.train.training.activations import TANH
 from isocharge.train.training.features import logarithmic_features
-from isocharge.train.training.folded_network import N_CONTACT_ANSWERS, FoldedNetwork
+from isocharge.train.training.folded_network import COSINES_TO_CORRELATIONS, N_CONTACT_ANSWERS, FoldedNetwork
 from isocharge.train.training.folding import fold
 from isocharge.train.training.network import LARGEST_INT8
 from isocharge.train.training.perceptron import Layer, Perceptron
@@ -38,11 +38,12 @@ def random_network(n_electrode, hidden, misfit_hidden, *, is_int8=False, activat
         activation: Activation of the hidden layers.
     """
     rng = np.random.default_rng(0)
+    n_contact = N_CONTACT_ANSWERS + len(COSINES_TO_CORRELATIONS)
     perceptrons = [
-        random_perceptron(rng, (n_electrode, *hidden, N_CONTACT_ANSWERS), activation),
+        random_perceptron(rng, (n_electrode, *hidden, n_contact), activation),
         random_perceptron(rng, (n_electrode, *misfit_hidden, n_electrode), activation),
     ]
-    n_answer = N_CONTACT_ANSWERS + n_electrode
+    n_answer = n_contact + n_electrode
     units = Layer(np.diag([8.0, 8.0, *np.ones(n_answer - 2)]), np.zeros(n_answer))
     layers = fold(perceptrons, np.zeros(n_electrode), np.eye(n_electrode), units)
     if is_int8:

@@ -25,11 +25,9 @@ if TYPE_CHECKING:
     from isocharge.serve.model.metadata import ModelMetadata
     from isocharge.serve.model.model_folder import (
         Model,
-        ModelCheck,
         check_golden,
         load_checked_model,
         load_model,
-        verify_model,
         write_model,
     )
     from isocharge.serve.model.model_search import find_labelled_model, find_model
@@ -58,7 +56,6 @@ __all__ = [
     "Frame",
     "MeasuredPresses",
     "Model",
-    "ModelCheck",
     "ModelMetadata",
     "Policy",
     "Port",
@@ -91,7 +88,6 @@ __all__ = [
     "read_presses",
     "stream",
     "table_records",
-    "verify_model",
     "wander",
     "write_contacts",
     "write_model",

@@ -18,8 +18,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.progress import track
+from isocharge.serve.model.contact import Contact
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 
 Clock = Callable[[], int]
 """Function that returns the time, ns."""
@@ -164,7 +164,7 @@ def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Cont
     # These functions return the charges of the next press, and begin again with the first press after the last one.
     next_array = partial(next, cycle(charge_pC))
     next_list = partial(next, cycle(charge_pC.tolist()))
-    out = np.zeros(N_WITHOUT_CORRELATION, np.float32)  # receives the results of `predict_into`
+    out = np.zeros(len(Contact._fields), np.float32)  # receives the results of `predict_into`
     contenders = [
         Contender("predict_into, float32 array", 1, lambda: predictor.predict_into(next_array(), out)),
         Contender("predict, list of numbers", 1, lambda: predictor.predict(next_list())),

@@ -36,7 +36,7 @@ from isocharge.serve.export.record_messages import (
     WRENCH,
     WRENCH_DEFINITION,
 )
-from isocharge.serve.model.contact import NO_CORRELATION
+from isocharge.serve.model.contact import Contact
 from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.targets import Outputs
 from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking, field_names
@@ -57,14 +57,11 @@ def numbers(low=-1e4, high=1e4):
 def records(draw):
     """Records as a stream writes them: pressed, at rest, or of a reading that was no number."""
     kind = draw(st.sampled_from(["contact", "rest", "invalid"]))
-    contact = dict.fromkeys(("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit"))
-    contact |= dict.fromkeys(NO_CORRELATION)
+    contact = dict.fromkeys(Contact._fields)
     if kind == "rest":
         contact["force_N"] = 0.0
     if kind == "contact":
         contact = {name: draw(numbers()) for name in contact}
-        if draw(st.booleans()):
-            contact |= NO_CORRELATION
     charges = st.none() | st.fixed_dictionaries(dict.fromkeys(ELECTRODES, st.none() | numbers()))
     return PredictionRecord(
         timestamp=draw(TIMES),

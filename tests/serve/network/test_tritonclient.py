@@ -109,7 +109,12 @@ def test_tritonclient_model_config(client):
     config = response.get("config", response)
     assert config.get("max_batch_size", config.get("maxBatchSize")) == 4096
     assert config["input"][0]["name"] == "charge_pC"
-    assert [output["name"] for output in config["output"]] == ["contact", "contact_std", "misfit"]
+    assert [output["name"] for output in config["output"]] == [
+        "contact",
+        "contact_std",
+        "contact_correlation",
+        "misfit",
+    ]
 
 
 def test_tritonclient_statistics(client, module, film):

@@ -53,7 +53,7 @@ def test_onnx_and_c_give_the_network(name, build, tmp_path):
 
     expected = np.concatenate(network.predict(charge_pC.astype(float)), axis=1)
     check_close(np.stack(Predictor(folder).predict_batch(charge_pC), axis=1)[:, :7], expected)
-    check_close(build(folder).predict(charge_pC), expected)
+    check_close(build(folder).predict(charge_pC)[:, :7], expected)
 
     read_network = read_graph(graph, "graph")
     assert read_network.layers.activation.name == name

@@ -9,7 +9,7 @@ from msgspec import structs
 from tests.train.random_networks import random_network
 
 from isocharge.serve import find_model, load_model, write_model
-from isocharge.serve.model.session import output_widths
+from isocharge.serve.model.session import COLUMNS
 from isocharge.simulate import load_sensor, noise_model
 from isocharge.train.data.presses import draw_contacts
 from isocharge.train.model_release.onnx_graph import write_graph
@@ -22,16 +22,16 @@ MODELS = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial", "four
 
 
 def onnxruntime_answers(model, charge_pC):
-    """Run a model one press at a time, as a host program does; shape (n, 10), or (n, 7) without correlations."""
+    """Run a model one press at a time, as a host program does; shape (n, 10)."""
     session = load_model(find_model(model)).session
-    names = sorted(output_widths(session), key="contact_correlation".__eq__)
-    rows = [np.concatenate(session.run(names, {"charge_pC": charge[None]}), axis=1)[0] for charge in charge_pC]
+    rows = [np.concatenate(session.run([*COLUMNS], {"charge_pC": charge[None]}), axis=1)[0] for charge in charge_pC]
     return np.array(rows)
 
 
 def double_precision_answers(network, charge_pC):
-    """Return contact, standard deviations and misfit of a network, shape (n, 7)."""
-    return np.concatenate(network.predict(charge_pC.astype(float)), axis=1)
+    """Return contact, standard deviations, misfit and correlations of a network, shape (n, 10)."""
+    contact, std, correlation, misfit = network.outputs(charge_pC.astype(float))
+    return np.concatenate([contact, std, misfit, correlation], axis=1)
 
 
 def check_agreement(given, expected, tolerance=1e-5):
@@ -78,7 +78,7 @@ def write_random_model(folder, network):
         (3, (32, 32), (24, 24), False, ["float layer_1_weights_0[1024]", "float layer_1_weights_1[576]"]),
         (4, (5, 7), (9, 3), True, ["signed char layer_1_weights_0[35]", "signed char layer_1_weights_1[27]"]),
         (5, (48, 48, 48), (33, 17, 8), False, ["float layer_2_weights_1[136]", "float last_weights_1[40]"]),
-        (8, (24,), (16,), False, ["float layer_0_weights_0[320]", "float last_weights_0[144]"]),
+        (8, (24,), (16,), False, ["float layer_0_weights_0[320]", "float last_weights_0[336]"]),
     ],
 )
 def test_any_width_and_number_of_electrodes(electrodes, hidden, misfit_hidden, is_int8, arrays, build, tmp_path):

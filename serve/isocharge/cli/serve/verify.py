@@ -1,30 +1,27 @@
 """`isocharge verify`: check whether a model folder is complete, unchanged, and correct on this machine."""
 
-from dataclasses import asdict
-
-import typer
-
 from isocharge.cli.shared.options import JsonOption, ModelArgument, ModelsOption
-from isocharge.cli.shared.terminal import show, show_json
-from isocharge.serve.model.model_folder import verify_model
+from isocharge.cli.shared.terminal import show_result
+from isocharge.serve.model.model_folder import load_checked_model
 from isocharge.serve.model.model_search import find_model
 
 
 def verify_command(model: ModelArgument, json: JsonOption = False, models: ModelsOption = None) -> None:
     """Check that a model folder is what was exported, and that this machine computes its golden vectors.
 
-    The commands of `isocharge serve` make the same checks when they load a model. The exit code is 0 if everything
-    fits, 1 if something does not fit, and 2 if there is no such model.
+    The commands of `isocharge serve` make the same checks when they load a model. The command fails with the reason if
+    a file is missing, is changed or belongs to another model, or if an output differs.
 
     Example: isocharge verify three-25um-biaxial
     """
-    folder = find_model(model, models)
-    checks = verify_model(folder)
-    fits = all(check.fits for check in checks)
-    if json:
-        show_json({"folder": str(folder), "fits": fits, "checks": [asdict(check) for check in checks]})
-    else:
-        for check in checks:
-            verdict = "" if check.fits else " does not fit"
-            show(f"{check.name}{verdict}: {check.message}")
-    raise typer.Exit(0 if fits else 1)
+    checked = load_checked_model(find_model(model, models))
+    golden = checked.golden
+    facts = {
+        "model": checked.metadata.label,
+        "folder": str(checked.folder),
+        "sha256": {"model.onnx": golden.sha256} | dict(golden.companion_sha256),
+        "golden_presses": len(golden.charge_pC),
+        "dataset_sha256": checked.metadata.dataset_sha256,
+        "made_with": checked.metadata.made_with,
+    }
+    show_result(facts, json=json)

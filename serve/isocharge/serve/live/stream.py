@@ -390,7 +390,7 @@ class TouchStream(ReadingStream):
         for stage in self._contact_stages:
             stage.step(frame)
         if frame.contact is not None:
-            contact_fields = frame.contact.fields()
+            contact_fields = frame.contact._asdict()
         else:
             contact_fields = NO_CONTACT if frame.is_valid else UNKNOWN_CONTACT
         flags = (*frame.flags, *frame.contact_flags)

@@ -76,49 +76,6 @@ class Series:
         return np.asarray(coefficients_by_term.reshape(len(x_degree), -1))
 
 
-@dataclass(frozen=True)
-class SeriesStack:
-    """Several series of the same degrees, each of which is evaluated at points of its own.
-
-    Attributes:
-        coefficients: Coefficients of the products, shape (n_series, degree + 1, degree + 1, force_degree + 1,
-            n_electrode). The coefficients of each series are those of `Series`.
-    """
-
-    coefficients: Array
-
-    def values_and_derivatives(self, coordinates: Array) -> Array:
-        """Evaluate each series at its points, with the derivatives with respect to the three coordinates.
-
-        Args:
-            coordinates: Scaled coordinates of the m points of each series, shape (n_series, m, 3). Coordinates outside
-                [-1, 1] are clipped.
-
-        Returns:
-            Values and derivatives, shape (n_series, m, 4, n_electrode), as `Series.values_and_derivatives` returns
-            them.
-        """
-        n_series, n_x, _n_y, n_force, n_electrode = self.coefficients.shape
-        n_point = coordinates.shape[1]
-        all_coordinates = coordinates.reshape(n_series * n_point, 3)
-        position_terms, force_terms = chebyshev_terms(all_coordinates, degree=n_x - 1, force_degree=n_force - 1)
-
-        # The two sums are those of `Series.values_and_derivatives`, for all series at the same time.
-        n_term = position_terms.shape[1]
-        position_sums = position_terms.reshape(n_series, n_point, n_term) @ self._term_coefficients
-        force_coefficients = position_sums.reshape(n_series * n_point, n_force, 4 * n_electrode)
-        values = force_terms[:, None, :] @ force_coefficients
-        return values.reshape(n_series, n_point, 4, n_electrode)
-
-    @cached_property
-    def _term_coefficients(self) -> Array:
-        """Coefficients of each series and of its three derivatives; see `Series`.
-
-        The shape is (n_series, n_term, (force_degree + 1) * 4 * n_electrode).
-        """
-        return np.stack([Series(coefficients)._term_coefficients for coefficients in self.coefficients])
-
-
 def position_degrees(degree: int) -> tuple[Integers, Integers]:
     """Return the degrees in x and in y of all products of polynomials whose total degree is at most `degree`.
 

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array, Singles
-from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 
 MAX_DECIMALS = 6
 """Largest number of decimals in the text of a contact. The last decimal is 1 nm or 1 uN."""
@@ -30,9 +29,9 @@ class Contact(NamedTuple):
         force_std_N: Standard deviation of the force, N.
         misfit: Distance between the measured charges and the nearest charges that a single contact can produce, in
             standard deviations of the noise.
-        xy_correlation: Correlation of the errors of x and y, -1 to 1; NaN if the model computes no correlations.
-        xF_correlation: Correlation of the errors of x and the force, -1 to 1; NaN without correlations.
-        yF_correlation: Correlation of the errors of y and the force, -1 to 1; NaN without correlations.
+        xy_correlation: Correlation of the errors of x and y, -1 to 1.
+        xF_correlation: Correlation of the errors of x and the force, -1 to 1.
+        yF_correlation: Correlation of the errors of y and the force, -1 to 1.
     """
 
     x_mm: float
@@ -74,16 +73,6 @@ class Contact(NamedTuple):
             yF_correlation=yF_covariance / (y_std_mm * force_std_N),
         )
 
-    def fields(self) -> dict[str, Any]:
-        """Return the values of the contact as a dictionary with the field names of a prediction record.
-
-        If the model computes no correlations, the correlations are None instead of NaN.
-        """
-        fields = self._asdict()
-        if math.isnan(self.xy_correlation):
-            fields |= NO_CORRELATION
-        return fields
-
     def __repr__(self) -> str:
         """Return a text with x, y, the force and their standard deviations, rounded to two significant digits."""
         numbers = ", ".join(f"{name}={value} +- {std}" for name, value, std in self._rounded())
@@ -105,9 +94,6 @@ class Contact(NamedTuple):
             value = getattr(self, name)
             yield name, f"{value:.{decimals}f}", f"{std:.{decimals}f}"
 
-
-NO_CORRELATION = dict.fromkeys(Contact._fields[N_WITHOUT_CORRELATION:])
-"""Correlations of a contact in a record, all None, for a model that computes no correlations."""
 
 CLOSE_DISTANCE_mm = 0.3
 """Largest difference of x or of y between two close contacts, mm."""

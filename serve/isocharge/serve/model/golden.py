@@ -11,7 +11,7 @@ where the floor is a constant for each column of the output.
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -23,9 +23,9 @@ from msgspec import Meta, Struct
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import ModelError
 from isocharge.common.files import read_needed, sha256_of
-from isocharge.common.structs import Finite, NotNegative, Text, WrongKey, read_json
+from isocharge.common.structs import Finite, NotNegative, Text, read_json
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS, run
+from isocharge.serve.model.session import CORRELATION, INPUT, run
 
 RELATIVE_TOLERANCE = 1e-5
 """Largest difference of two outputs, relative to max(|output|, floor), dimensionless."""
@@ -128,14 +128,34 @@ def make_golden(
                 f"the new model: {name}: expected finite outputs, got {rows[bad_row]} for the charges "
                 f"{charge_pC[bad_row]} pC"
             )
-    floor_of_output = FLOORS | {"contact": contact_floor, "contact_std": contact_floor}
     return Golden(
         sha256=sha256_of(onnx_model),
         charge_pC=charge_pC,
         outputs=outputs,
         relative_tolerance=RELATIVE_TOLERANCE,
-        floors={name: floor_of_output[name] for name in outputs},  # some models compute no correlations
+        floors=FLOORS | {"contact": contact_floor, "contact_std": contact_floor},
     )
+
+
+Rows = Annotated[list[list[Finite]], Meta(min_length=1)]
+"""Rows of numbers, one for each press."""
+
+
+class _Tolerance(Struct):
+    """The object `tolerance` of `golden.json`."""
+
+    relative: NotNegative
+    floor: dict[str, tuple[Finite, ...]]
+
+
+class _GoldenFile(Struct):
+    """The content of `golden.json`."""
+
+    sha256: Text
+    inputs: dict[str, Rows]
+    outputs: dict[str, Rows]
+    tolerance: _Tolerance
+    files: dict[Text, Text]
 
 
 def read_golden(path: Path) -> Golden:
@@ -148,16 +168,19 @@ def read_golden(path: Path) -> Golden:
         raise ModelError(f"{path}: missing; every model has this file: copy the whole folder of the model again")
     try:
         content = read_json(path, "golden vectors", ModelError, _GoldenFile)
-    except ModelError as error:
-        raise ModelError(f"{error}; the file is damaged: copy or export the model again") from error
-    # An output that the model does not have, such as the correlations of an older model, is None in the file.
-    present_outputs = [name for name in OUTPUTS if getattr(content.outputs, name) is not None]
+        # Numbers that are too large for float32 become infinite. They differ from every output of a model.
+        with np.errstate(over="ignore"):
+            outputs = {name: np.array(rows, np.float32) for name, rows in content.outputs.items()}
+            charge_pC = np.array(content.inputs[INPUT], np.float32)
+    except (ModelError, ValueError, KeyError) as error:  # rows of different lengths, or no charges
+        where = "" if isinstance(error, ModelError) else f"{path}: "
+        raise ModelError(f"{where}{error}; the file is damaged: copy or export the model again") from error
     return Golden(
         sha256=content.sha256,
-        charge_pC=_float32_array(content.inputs.charge_pC),
-        outputs={name: _float32_array(getattr(content.outputs, name)) for name in present_outputs},
+        charge_pC=charge_pC,
+        outputs=outputs,
         relative_tolerance=content.tolerance.relative,
-        floors={name: getattr(content.tolerance.floor, name) for name in present_outputs},
+        floors=content.tolerance.floor,
         companion_sha256=content.files,
     )
 
@@ -194,68 +217,6 @@ def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
     return data
 
 
-Triple = tuple[Finite, Finite, Finite]
-"""Three finite numbers, one for each column of an output."""
-
-
-class _Inputs(Struct):
-    """The object `inputs` of `golden.json`."""
-
-    charge_pC: Annotated[list[list[Finite]], Meta(min_length=1)]
-
-    def __post_init__(self) -> None:
-        lengths = {len(row) for row in self.charge_pC}
-        if len(lengths) > 1:
-            raise WrongKey(INPUT, "rows of one length", self.charge_pC)
-
-
-class _Outputs(Struct):
-    """The object `outputs` of `golden.json`."""
-
-    contact: list[Triple]
-    contact_std: list[Triple]
-    misfit: list[tuple[Finite]]
-    contact_correlation: list[Triple] | None = None
-
-
-class _Floors(Struct):
-    """The object `tolerance.floor` of `golden.json`."""
-
-    contact: Triple
-    contact_std: Triple
-    misfit: tuple[Finite]
-    contact_correlation: Triple = (10.0, 10.0, 10.0)
-
-
-class _Tolerance(Struct):
-    """The object `tolerance` of `golden.json`."""
-
-    relative: NotNegative
-    floor: _Floors
-
-
-class _GoldenFile(Struct):
-    """The content of `golden.json`. `load_model` checks that each output has one row for each press."""
-
-    sha256: Text
-    inputs: _Inputs
-    outputs: _Outputs
-    tolerance: _Tolerance
-    files: dict[Text, Text]
-
-
-def _float32_array(rows: Sequence[Sequence[float]]) -> Singles:
-    """Convert rows of numbers to a float32 array of shape (n, width).
-
-    Numbers that are too large for float32 become infinite. An infinite number differs from every output of a model, so
-    the comparison with the outputs fails.
-    """
-    if not rows:
-        return np.zeros((0, 0), dtype=np.float32)  # the conversion below would return an array with one axis
-    with np.errstate(over="ignore"):
-        return np.array(rows, dtype=np.float64).astype(np.float32)
-
-
 def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> None:
     """Check that the outputs that a model has computed from the golden charges agree with the stored outputs.
 
@@ -265,23 +226,25 @@ def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> No
         where: Name or file of the model, for error messages.
 
     Raises:
-        ModelError: If an output differs by more than the tolerance. The message names the largest difference of this
-            output.
+        ModelError: If an output is missing, has another shape or differs by more than the tolerance. The message names
+            the largest difference of this output.
     """
-    for name, expected in golden.outputs.items():
-        actual = outputs[name].astype(np.float64)
+    for name, rows in outputs.items():
+        expected = golden.outputs.get(name, np.zeros((0, 0), np.float32)).astype(float)
+        if rows.shape != expected.shape:
+            raise ModelError(
+                f"{where}: {name}: expected the shape {expected.shape} (golden.json), got {rows.shape}; copy or export "
+                "the model again"
+            )
         # Below its floor, a value has a constant tolerance, because a relative tolerance would approach 0.
         tolerance = golden.relative_tolerance * np.maximum(np.abs(expected), golden.floors[name])
-        with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 with a tolerance of 0 is reported as a difference
-            # Differences as multiples of the tolerance, shape (n, width)
-            tolerance_multiples = np.abs(actual - expected) / tolerance
-        if (tolerance_multiples <= 1.0).all():  # false for NaN
-            continue
-
-        # The message shows the largest difference. A value that is not a number counts as an infinite difference.
-        tolerance_multiples[np.isnan(tolerance_multiples)] = np.inf
-        row, column = np.unravel_index(np.argmax(tolerance_multiples), tolerance_multiples.shape)
-        raise ModelError(
-            f"{where}: {name}[{row}, {column}]: expected {expected[row, column]:.9g} +- {tolerance[row, column]:.1g} "
-            f"(golden.json), got {actual[row, column]:.9g}; copy or export the model again"
-        )
+        with np.errstate(invalid="ignore"):
+            excess = np.abs(rows - expected) - tolerance
+        excess[np.isnan(excess)] = np.inf  # a value that is not a number counts as an infinite difference
+        row, column = np.unravel_index(np.argmax(excess), excess.shape)
+        if excess[row, column] > 0.0:
+            raise ModelError(
+                f"{where}: {name}[{row}, {column}]: expected {expected[row, column]:.9g} +- "
+                f"{tolerance[row, column]:.1g} (golden.json), got {rows[row, column]:.9g}; copy or export the model "
+                "again"
+            )

@@ -10,8 +10,7 @@ A version is written under a temporary name, read back with all checks of a read
 therefore never see an incomplete version.
 """
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -22,7 +21,6 @@ from numpy.typing import ArrayLike
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ModelError, OutputExists, error_prefix
 from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
-from isocharge.common.versions import package_version
 from isocharge.serve.model.golden import (
     Golden,
     check_outputs,
@@ -33,17 +31,7 @@ from isocharge.serve.model.golden import (
 )
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_labels import NAME
-from isocharge.serve.model.session import (
-    CORRELATION,
-    INPUT,
-    OUTPUTS,
-    as_batch,
-    check_interface,
-    check_output_shapes,
-    open_session,
-    output_widths,
-    run,
-)
+from isocharge.serve.model.session import INPUT, OUTPUTS, as_batch, check_interface, open_session, run
 
 
 @dataclass(frozen=True)
@@ -55,14 +43,12 @@ class Model:
         metadata: Metadata of the model.
         golden: Golden vectors.
         session: Session of onnxruntime.
-        graph: Content of `model.onnx`.
     """
 
     folder: Path
     metadata: ModelMetadata
     golden: Golden
     session: ort.InferenceSession
-    graph: bytes
 
 
 def load_model(folder: Path) -> Model:
@@ -77,172 +63,58 @@ def load_model(folder: Path) -> Model:
     path = folder / "model.onnx"
     onnx_model = read_needed(path, ModelError, "copy or export the model again")
     golden = read_golden(folder / "golden.json")
-    _check_checksum(onnx_model, golden, path)
-    session = open_session(onnx_model, str(path))
-    metadata = ModelMetadata.from_props(session.get_modelmeta().custom_metadata_map, str(path))
-    check_interface(session, len(metadata.electrodes), str(path))
-    _check_golden_shapes(golden, metadata, folder / "golden.json")
-    return Model(folder, metadata, golden, session, graph=onnx_model)
-
-
-def _check_checksum(onnx_model: bytes, golden: Golden, path: Path) -> None:
-    """Check that the checksum of `model.onnx` is equal to the checksum in `golden.json`.
-
-    Args:
-        onnx_model: Content of `model.onnx`.
-        golden: Golden vectors, which contain the expected checksum.
-        path: Path of `model.onnx`, for the error message.
-
-    Raises:
-        ModelError: If the checksums differ.
-    """
     actual_sha256 = sha256_of(onnx_model)
     if actual_sha256 != golden.sha256:
         raise ModelError(
             f"{path}: expected sha256 {golden.sha256} (golden.json), got {actual_sha256} over {len(onnx_model)} bytes; "
             "the file is damaged or changed: copy or export it again"
         )
-
-
-def _check_golden_shapes(golden: Golden, metadata: ModelMetadata, path: Path) -> None:
-    """Check that golden vectors have one charge for each electrode, and that each output has one row for each press.
-
-    Args:
-        golden: Golden vectors.
-        metadata: Metadata of the model.
-        path: File of the golden vectors, for the error message.
-
-    Raises:
-        ModelError: If a shape is wrong.
-    """
-    shape = golden.charge_pC.shape
+    session = open_session(onnx_model, str(path))
+    metadata = ModelMetadata.from_props(session.get_modelmeta().custom_metadata_map, str(path))
     n_electrode = len(metadata.electrodes)
-    if len(shape) != 2 or shape[0] == 0 or shape[1] != n_electrode:
+    check_interface(session, n_electrode, str(path))
+    if golden.charge_pC.shape[1] != n_electrode:
         raise ModelError(
-            f"{path}: expected charges of shape (n, {n_electrode}) with n > 0, got {shape}; "
+            f"{folder / 'golden.json'}: expected charges of shape (n, {n_electrode}), got {golden.charge_pC.shape}; "
             "copy or export the model again"
         )
-    check_output_shapes(golden.outputs, len(golden.charge_pC), str(path))
+    return Model(folder, metadata, golden, session)
 
 
-def check_golden(model: Model) -> str:
+def check_golden(model: Model) -> None:
     """Check that this machine computes the outputs that are stored in the golden vectors of a model.
-
-    Returns:
-        Sentence that states how many presses agree.
 
     Raises:
         ModelError: If an output differs from the output in `golden.json` by more than the tolerance.
     """
     where = str(model.folder / "model.onnx")
-    charge_pC = model.golden.charge_pC
     with error_prefix(f"{where}: ", ModelError):
-        outputs = run(model.session, charge_pC)
-    check_output_shapes(outputs, len(charge_pC), where)
+        outputs = run(model.session, model.golden.charge_pC)
     check_outputs(model.golden, outputs, where)
-    return f"this machine computes the outputs in golden.json for {len(charge_pC)} presses"
 
 
-def _check_version(model: Model) -> str:
-    """Check that a version folder has the version number in the metadata, and return a sentence that states it.
+def load_checked_model(folder: Path) -> Model:
+    """Read a version of a model, and make all checks that do not depend on the use of the model.
+
+    Args:
+        folder: The version folder, as `find_model` returns it.
 
     Raises:
-        ModelError: If the name of the folder is another version number.
+        ModelError: If a file is missing, is damaged or belongs to another model, if a computed output differs from the
+            golden vectors, or if the name of the folder is another version number than the number in the metadata.
     """
-    folder = model.folder
+    model = load_model(folder)
     is_version_folder = folder.name.isdecimal()
     if is_version_folder and folder.name != str(model.metadata.version):
         raise ModelError(
             f"{folder}: expected version {folder.name}, got {model.metadata.label}; "
             "move it into a folder of that version, or export it again"
         )
-    return f"the metadata name the model {model.metadata.label}"
-
-
-def _check_companion_files(model: Model) -> str:
-    """Check that the files beside `model.onnx`, such as the charge map, have the checksums in `golden.json`.
-
-    Returns:
-        Sentence that names the files.
-
-    Raises:
-        ModelError: If a file is missing, is changed, or belongs to another model.
-    """
-    existing_names = {path.name for path in model.folder.glob("*.npz")}
-    names = sorted(existing_names | model.golden.companion_sha256.keys())
-    for name in names:
-        read_companion_file(model.folder, name, "make the model again")
-    if not names:
-        return "the model has no charge map"
-    return f"{', '.join(names)}: the checksum is that in golden.json"
-
-
-MODEL_CHECKS: Mapping[str, Callable[[Model], str]] = MappingProxyType(
-    {"version": _check_version, "charge map": _check_companion_files, "golden vectors": check_golden}
-)
-"""Checks of a model that was read, by the name of what is checked.
-
-A check returns a sentence that states what it found, or raises a ModelError.
-"""
-
-
-def load_checked_model(folder: Path) -> Model:
-    """Read a version of a model, and make all checks of `MODEL_CHECKS`.
-
-    Args:
-        folder: The version folder, as `find_model` returns it.
-
-    Raises:
-        ModelError: If a file is missing or damaged, if a computed output differs from the golden vectors, or if the
-            name of the folder is another version number than the number in the metadata.
-    """
-    model = load_model(folder)
-    for check in MODEL_CHECKS.values():
-        check(model)
+    existing_names = {path.name for path in folder.glob("*.npz")}
+    for name in sorted(existing_names | model.golden.companion_sha256.keys()):
+        read_companion_file(folder, name, "make the model again")
+    check_golden(model)
     return model
-
-
-@dataclass(frozen=True)
-class ModelCheck:
-    """Result of one check of a model folder.
-
-    Attributes:
-        name: What was checked: "graph", "origin" or a key of `MODEL_CHECKS`.
-        fits: Whether the check succeeded.
-        message: Sentence that states what the check found, or what is wrong and how to correct it.
-    """
-
-    name: str
-    fits: bool
-    message: str
-
-
-def verify_model(folder: Path) -> list[ModelCheck]:
-    """Make the checks of `load_checked_model`, and return the result of each check.
-
-    If the graph cannot be read, its check is the only one.
-
-    Args:
-        folder: The version folder, as `find_model` returns it.
-    """
-    try:
-        model = load_model(folder)
-    except ModelError as error:
-        return [ModelCheck("graph", False, str(error))]
-    graph = f"model.onnx has the sha256 {model.golden.sha256} that golden.json states"
-    made_with = model.metadata.made_with
-    origin = (
-        f"isocharge {made_with.get('isocharge', 'of an unknown version')} made the model with the command "
-        f"{made_with.get('command', 'unknown')!r}, from the dataset with the sha256 {model.metadata.dataset_sha256}; "
-        f"this is isocharge {package_version()}"
-    )
-    checks = [ModelCheck("graph", True, graph), ModelCheck("origin", True, origin)]
-    for name, check in MODEL_CHECKS.items():
-        try:
-            checks.append(ModelCheck(name, True, check(model)))
-        except ModelError as error:
-            checks.append(ModelCheck(name, False, str(error)))
-    return checks
 
 
 def write_model(
@@ -296,27 +168,8 @@ def write_model(
         for name, content in companion_files.items():
             write_whole(draft / name, content)
         _check_draft(draft, metadata)
-    _write_triton_config(folder / "config.pbtxt", metadata, has_correlation=CORRELATION in output_widths(session))
+    write_whole(folder / "config.pbtxt", triton_config(metadata.name, len(metadata.electrodes)).encode())
     return target
-
-
-def _write_triton_config(path: Path, metadata: ModelMetadata, *, has_correlation: bool) -> None:
-    """Write the file `config.pbtxt`, with which Triton can serve all versions of a model.
-
-    The file may list only outputs that every version computes. If an existing file does not list the correlations, an
-    older version of the model does not compute them. In this case, the new file does not list the correlations either.
-
-    Args:
-        path: The file, which may exist already.
-        metadata: Metadata of the new version.
-        has_correlation: Whether the new version computes correlations.
-    """
-    n_electrode = len(metadata.electrodes)
-    config_without_correlation = triton_config(metadata.name, n_electrode, correlation=False)
-    is_older_without_correlation = path.exists() and path.read_text(encoding="utf-8") == config_without_correlation
-    lists_correlation = has_correlation and not is_older_without_correlation
-    config = triton_config(metadata.name, n_electrode, correlation=lists_correlation)
-    write_whole(path, config.encode())
 
 
 def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Path:
@@ -341,37 +194,13 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
     name = folder.resolve().name
     if not NAME.fullmatch(name):
         raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; rename the folder")
-    _check_triton_config(folder / "config.pbtxt", name, electrodes)
-    return target
-
-
-def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> None:
-    """Check that an existing `config.pbtxt` describes a model with this name and these electrodes.
-
-    Args:
-        path: The file, which need not exist.
-        name: Name of the model.
-        electrodes: Names of the electrodes.
-
-    Raises:
-        ModelError: If the file exists and describes another model.
-    """
-    if not path.exists():
-        return
-    # The text of the file is determined by the name, the number of electrodes, and whether there are correlations.
-    text = path.read_text(encoding="utf-8")
-    valid_texts = [triton_config(name, len(electrodes), correlation=correlation) for correlation in (False, True)]
-    if text in valid_texts:
-        return
-    first_line = re.match('name: "(.*)"', text)  # contains the name of the model
-    if first_line and first_line[1] != name:
+    config_path = folder / "config.pbtxt"
+    if config_path.exists() and config_path.read_text(encoding="utf-8") != triton_config(name, len(electrodes)):
         raise ModelError(
-            f"{path}: names the model {first_line[1]!r}, its folder is {name!r}: was it copied or renamed? Give it "
-            "its old name, or choose another output"
+            f"{config_path}: describes a model other than {name!r} with the electrodes {electrodes}; use another model "
+            "name or, if the folder was copied or renamed, its old name"
         )
-    raise ModelError(
-        f"{path}: describes a model other than one with the electrodes {electrodes}; use another model name"
-    )
+    return target
 
 
 def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
@@ -395,18 +224,15 @@ def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
     check_golden(model)
 
 
-def triton_config(name: str, n_electrode: int, *, correlation: bool = True) -> str:
+def triton_config(name: str, n_electrode: int) -> str:
     """Return the text of the file `config.pbtxt`, which describes the inputs and outputs of a model for Triton.
 
     Args:
         name: Name of the model.
         n_electrode: Number of electrodes.
-        correlation: Whether the output with the correlations is listed. If it is not listed, Triton can also serve
-            older versions, which do not have this output.
     """
-    outputs = {tensor: width for tensor, width in OUTPUTS.items() if correlation or tensor != CORRELATION}
     head = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
-    return head + _tensor_list("input", {INPUT: n_electrode}) + _tensor_list("output", outputs)
+    return head + _tensor_list("input", {INPUT: n_electrode}) + _tensor_list("output", OUTPUTS)
 
 
 def _tensor_list(list_name: str, widths: dict[str, int]) -> str:

@@ -10,29 +10,20 @@ and writes the contact into an existing array, which is faster in a loop.
 
 import logging
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Singles
-from isocharge.common.errors import ChargeError, ModelError
+from isocharge.common.errors import ChargeError
 from isocharge.serve.model.contact import Contact, Contacts
 from isocharge.serve.model.metadata import ModelNoise
-from isocharge.serve.model.model_folder import Model, load_model
+from isocharge.serve.model.model_folder import load_model
 from isocharge.serve.model.model_search import find_model
-from isocharge.serve.model.session import (
-    N_WITHOUT_CORRELATION,
-    BoundPress,
-    as_batch,
-    as_press,
-    open_session,
-    run,
-    write_finite,
-)
+from isocharge.serve.model.session import COLUMNS, BoundPress, as_batch, as_press, run, write_finite
 from isocharge.serve.model.validity import Validity
 
 log = logging.getLogger(__name__)
@@ -75,7 +66,6 @@ class Predictor:
         self.folder = loaded.folder
         self.metadata = loaded.metadata
         self.validity = Validity.of(loaded.metadata)
-        self._graph = loaded.graph
         self._session = loaded.session
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
         self._press_lock = threading.Lock()  # held while a method uses the memory of `_press`
@@ -83,28 +73,7 @@ class Predictor:
         self._centre_x_mm, self._centre_y_mm = self.validity.centre_mm
         self._max_distance_squared_mm2, self._max_force_N = self.validity.implausible_limits
         self._has_warned = False
-        self._constants: Mapping[str, Singles] = {}
         self._stated_noise: ModelNoise | None = None
-        _check_bound_memory(self._press, loaded)
-
-    def with_constants(self, constants: Mapping[str, Singles]) -> "Predictor":
-        """Return a predictor with the same ONNX graph, but with new values of some constants.
-
-        The call takes about a millisecond.
-
-        Args:
-            constants: New values by the names of the constants in the graph.
-
-        Raises:
-            ModelError: If the graph contains no constant with one of the names, or a new value has another shape.
-        """
-        new_predictor = object.__new__(type(self))
-        new_predictor.__dict__.update(self.__dict__)
-        new_predictor._constants = constants  # keeps the arrays alive, because onnxruntime uses their memory
-        new_predictor._session = open_session(self._graph, self.metadata.label, constants)
-        new_predictor._press = BoundPress(new_predictor._session, len(self.metadata.electrodes))
-        new_predictor._press_lock = threading.Lock()
-        return new_predictor
 
     def with_noise(self, white_pC: float, gain: float) -> "Predictor":
         """Return a predictor of the same model whose standard deviations are those for another noise of the charges.
@@ -125,7 +94,7 @@ class Predictor:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how `copy` and `pickle` create the predictor again, because the onnxruntime session has no copy."""
-        return _load_again, (type(self), self.folder.resolve(), dict(self._constants), self._stated_noise)
+        return _load_again, (type(self), self.folder.resolve(), self._stated_noise)
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
         """Compute the contact of one press. Call `flags` to find out whether the contact is valid.
@@ -184,15 +153,14 @@ class Predictor:
         Args:
             charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. If a
                 charge is NaN, the result is NaN.
-            out: Array of float32 for the values of the contact in the order of the attributes of `Contact`. An array of
-                shape (10,) receives all values. An array of shape (7,) receives the values without correlations. If the
-                model computes no correlations, the shape must be (7,).
+            out: Array of float32 for the values of the contact in the order of the attributes of `Contact`, shape
+                (10,).
 
         Raises:
             ChargeError: If an array is not float32 or has another shape. Nothing is written in this case.
 
         Example:
-            >>> charges, contact = np.zeros(3, np.float32), np.zeros(7, np.float32)
+            >>> charges, contact = np.zeros(3, np.float32), np.zeros(10, np.float32)
             >>> touch.predict_into(charges, contact)  # doctest: +SKIP
         """
         try:
@@ -200,9 +168,8 @@ class Predictor:
                 self._press.run_into(charge_pC, out)
         except (AttributeError, NotImplementedError, TypeError, ValueError) as error:
             raise ChargeError(
-                f"expected charges {self.metadata.electrodes} and a writable `out` of the {self._press.size} numbers "
-                f"of a Contact that the model gives, or of the first {N_WITHOUT_CORRELATION}, both float32 arrays, got "
-                f"{_describe(charge_pC)} and {_describe(out)} ({error})"
+                f"expected charges {self.metadata.electrodes} and a writable `out` for the {len(Contact._fields)} "
+                f"numbers of a Contact, both float32 arrays, got {_describe(charge_pC)} and {_describe(out)} ({error})"
             ) from error
 
     def predict_batch(self, charge_pC: ArrayLike) -> Contacts:
@@ -250,16 +217,8 @@ class Predictor:
         Args:
             charges: Touch charges, shape (n, electrodes), pC.
         """
-        # For each output of the graph, the columns in the table below that this output fills
-        columns_by_output = self._press.columns
-        outputs = run(self._session, charges, tuple(columns_by_output))
-
-        # Table with one row for each press and one column for each attribute of `Contact`. The columns of the
-        # correlations remain NaN if the model computes no correlations.
-        contact_table = np.full((len(charges), len(Contact._fields)), np.nan, np.float32)
-        for output_name, columns in columns_by_output.items():
-            contact_table[:, columns] = outputs[output_name]
-        return Contacts(*contact_table.T)
+        outputs = run(self._session, charges)
+        return Contacts(*np.concatenate([outputs[name] for name in COLUMNS], axis=1).T)
 
     def __repr__(self) -> str:
         """Return a text with the label, the sensor, the electrodes and the valid domain of the model."""
@@ -295,17 +254,13 @@ class Predictor:
         )
 
 
-def _load_again(
-    predictor_class: type[Predictor], folder: Path, constants: Mapping[str, Singles], noise: ModelNoise | None
-) -> Predictor:
-    """Load a predictor from its folder, with the constants of `with_constants` and the noise of `with_noise`.
+def _load_again(predictor_class: type[Predictor], folder: Path, noise: ModelNoise | None) -> Predictor:
+    """Load a predictor from its folder, with the noise of `with_noise`.
 
     Raises:
         ModelError: If the model is no longer in the folder, or is damaged.
     """
     predictor = predictor_class(folder)
-    if constants:
-        predictor = predictor.with_constants(constants)
     predictor._stated_noise = noise
     return predictor
 
@@ -315,30 +270,3 @@ def _describe(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"{value.dtype} of shape {value.shape}"
     return type(value).__name__
-
-
-def _check_bound_memory(press: BoundPress, model: Model) -> None:
-    """Check that this version of onnxruntime reads and writes the bound memory itself, and not a copy of the memory.
-
-    Bound memory is memory that onnxruntime uses for the inputs and outputs of all calls. The contact of one press is
-    computed in the bound memory, and again with `session.run`, which copies the arrays. The results must agree within a
-    small tolerance.
-
-    Args:
-        press: Bound memory for one press of the model.
-        model: The model. The check uses the charges of the first press in its golden vectors.
-
-    Raises:
-        ModelError: If the results in the bound memory and with `session.run` differ.
-    """
-    charges = model.golden.charge_pC[:1]  # shape (1, electrodes)
-    press.write(*charges[0])
-    press.run()
-    actual = press.read()  # contains the outputs in the order of `press.columns`
-    outputs = run(model.session, charges, tuple(press.columns))
-    expected = np.concatenate([rows[0] for rows in outputs.values()])
-    if not np.allclose(actual, expected, rtol=1e-4, atol=1e-4):
-        raise ModelError(
-            f"{model.folder}: onnxruntime {ort.__version__} computes {actual} in bound memory and "
-            f"{tuple(expected.tolist())} without it; report this with the version and the machine"
-        )

@@ -21,7 +21,7 @@ from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import Model, load_checked_model
 from isocharge.serve.model.model_search import model_names, repositories, version_folders
-from isocharge.serve.model.session import BoundPress, output_widths
+from isocharge.serve.model.session import BoundPress
 from isocharge.serve.model.validity import Validity
 from isocharge.serve.network.metrics import ModelMetrics, Statistics
 
@@ -52,11 +52,6 @@ class LoadedVersion:
     def validity(self) -> Validity:
         """Limits within which the contacts that the model estimates are valid."""
         return Validity.of(self.metadata)
-
-    @cached_property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs of the model."""
-        return tuple(output_widths(self.model.session))
 
     def press_of_thread(self) -> BoundPress:
         """Return an object that runs the model for single presses and reuses the memory of earlier presses.

@@ -210,7 +210,7 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
             if is_touch:
                 # `contacts` contains one array over the rows for each attribute of `Contact`.
                 contact = Contact(*(float(column[row]) for column in contacts))
-                contact_fields = contact.fields()
+                contact_fields = contact._asdict()
             yield PredictionRecord(
                 timestamp=None,
                 t_device_us=None,

@@ -124,9 +124,7 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     ]
     xy_correlation: Annotated[
         float | None,
-        Meaning(
-            "Correlation of the errors of x and y, -1 to 1; null from a model that gives none.", is_shown_live=True
-        ),
+        Meaning("Correlation of the errors of x and y, -1 to 1.", is_shown_live=True),
     ]
     xF_correlation: Annotated[float | None, Meaning("Correlation of the errors of x and the force.")]
     yF_correlation: Annotated[float | None, Meaning("Correlation of the errors of y and the force.")]

@@ -18,6 +18,7 @@ import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from isocharge.common.errors import InputError
+from isocharge.serve.model.session import OUTPUTS
 from isocharge.serve.network.address import ServerLimits, Tls, Token
 from isocharge.serve.network.grpc import grpc_server, server
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE
@@ -63,12 +64,12 @@ def tensor(charges, datatype="FP32", **fields):
 @pytest.mark.parametrize("datatype", ["FP32", "FP64"])
 def test_charges_as_fp32_contents(serve, film, predictor, datatype):
     answer = call(serve()(), "ModelInfer", model_name="linear", id="7", inputs=[tensor(film.golden_pC(), datatype)])
-    contact, std, misfit = answer.outputs
+    contact, std, correlation, misfit = answer.outputs
     assert answer.id == "7"
     assert list(answer.raw_output_contents) == []
-    assert [output.name for output in answer.outputs] == ["contact", "contact_std", "misfit"]
+    assert [output.name for output in answer.outputs] == [*OUTPUTS]
     expected = np.column_stack(predictor.predict_batch(film.golden_pC()))
-    for output, columns in ((contact, slice(0, 3)), (std, slice(3, 6)), (misfit, slice(6, 7))):
+    for output, columns in zip((contact, std, misfit, correlation), np.split(np.arange(10), (3, 6, 7)), strict=True):
         rows = np.float32(output.contents.fp32_contents).reshape(output.shape)
         np.testing.assert_array_equal(rows, expected[:, columns])
 
@@ -102,11 +103,6 @@ def test_flags_as_bytes_contents(serve):
             {"inputs": [tensor([[1.0] * 3])], "outputs": [{"name": "z"}]},
             "INVALID_ARGUMENT",
             "one of contact, contact_std, contact_correlation, misfit",
-        ),
-        (
-            {"inputs": [tensor([[1.0] * 3])], "outputs": [{"name": "contact_correlation"}]},
-            "INVALID_ARGUMENT",
-            "expected one of contact, contact_std, misfit, got 'contact_correlation', which linear/2 does not have",
         ),
         ({"inputs": [tensor([[1.0] * 3], shape=[5000, 3])]}, "RESOURCE_EXHAUSTED", "at most 4096 presses"),
         ({"model_name": "cubic"}, "NOT_FOUND", "'cubic' is not found; serving: linear/1, linear/2"),

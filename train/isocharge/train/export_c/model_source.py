@@ -24,7 +24,7 @@ from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
 from isocharge.serve.model.contact import Contact, Contacts
 from isocharge.serve.model.golden import Golden
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.session import CORRELATION, N_WITHOUT_CORRELATION
+from isocharge.serve.model.session import COLUMNS
 from isocharge.serve.model.validity import Validity
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
 from isocharge.train.export_c.layer_source import LayerSource, find_blocks
@@ -50,7 +50,6 @@ def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     """
     features = network.features
     is_logarithmic = features.mean is None
-    n_number = _contact_size(network)
     return source_text(
         "isocharge_model.h",
         label=c_comment(metadata.label),
@@ -58,9 +57,9 @@ def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         sensor=c_string(metadata.frame_id),
         electrodes=len(metadata.electrodes),
         names=", ".join(map(c_string, metadata.electrodes)),
-        fields=", ".join(f'"{name}"' for name in Contact._fields[:n_number]),
-        numbers=n_number,
-        all=source_text("isocharge_all.h") if network.n_angle else "",
+        fields=", ".join(f'"{name}"' for name in Contact._fields),
+        numbers=len(Contact._fields),
+        all=source_text("isocharge_all.h"),
         **_validity_literals(Validity.of(metadata)),
         low=f"{features.low_pC:g}" if is_logarithmic else "LOW",
         high=f"{features.high_pC:g}" if is_logarithmic else "HIGH (isocharge_model.c)",
@@ -140,7 +139,7 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         log_std=log_std,
         known=network.angle_columns.stop,
         answers=last.weight.shape[1],
-        all=_correlations_source(network) if network.n_angle else "",
+        all=_correlations_source(network),
         misfit_unit=c_float(MISFIT_UNIT),
     )
 
@@ -183,11 +182,6 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
     return hidden, skip, last
 
 
-def _contact_size(network: FoldedNetwork) -> int:
-    """Return how many fields of a `Contact` a network computes. Without correlations, the number is smaller."""
-    return len(Contact._fields) if network.n_angle else N_WITHOUT_CORRELATION
-
-
 def _correlations_source(network: FoldedNetwork) -> str:
     """Return the text of the C function that computes the correlations in addition to the other outputs."""
     text = source_text(
@@ -207,19 +201,15 @@ def self_test(golden: Golden, metadata: ModelMetadata) -> str:
         golden: Golden vectors of the model.
         metadata: Metadata of the model.
     """
-    # The correlations are sorted to the end, as in a `Contact`, because False comes before True. The sort is stable, so
-    # the other names keep their order.
-    names = sorted(golden.outputs, key=lambda name: name == CORRELATION)
-    answers = np.concatenate([golden.outputs[name] for name in names], axis=1)
-    no_correlations = np.zeros((len(answers), len(Contact._fields) - N_WITHOUT_CORRELATION))
-    contacts = Contacts(*np.hstack([answers[:, :N_WITHOUT_CORRELATION], no_correlations]).T)
+    answers = np.concatenate([golden.outputs[name] for name in COLUMNS], axis=1)
+    contacts = Contacts(*answers.T)
     flags = [sum(FLAG_BITS[flag] for flag in words) for words in Validity.of(metadata).batch_flags(contacts)]
-    floors = np.array([floor for name in names for floor in golden.floors[name]], np.float32)
+    floors = np.array([floor for name in COLUMNS for floor in golden.floors[name]], np.float32)
     return source_text(
         "self_test.c",
         vectors=len(answers),
         numbers=answers.shape[1],
-        function="isocharge_predict_all" if CORRELATION in names else "isocharge_predict",
+        function="isocharge_predict_all",
         relative=c_float(golden.relative_tolerance),
         floors=c_array("FLOOR", floors),
         charges=c_array("CHARGE_PC", golden.charge_pC),

@@ -193,8 +193,7 @@ def _interface_section(metadata: ModelMetadata, fitted: Fitted) -> str:
     domain_text = ""
     if requested != fitted.domain:
         domain_text = f" ({requested.radius:g} mm were requested; farther out two contacts can have the same charges)"
-    has_correlations = fitted.network.n_angle > 0
-    correlations = ", `contact_correlation` (xy, xF, yF)" if has_correlations else ""
+    correlations = ", `contact_correlation` (xy, xF, yF)"
     probe_text = "; the model does not distinguish them" if len(metadata.probes) > 1 else ""
     return f"""# {metadata.name}, version {metadata.version}
 

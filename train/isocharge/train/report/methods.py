@@ -12,8 +12,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, TrainingError
+from isocharge.serve.model.contact import Contact
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.simulate import ChargeMap, Domain, NoiseModel, Triangulation
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.report.gauss_newton import GaussNewton
@@ -142,7 +142,7 @@ def model_method(folder: Path) -> Method:
 
     def single_call(charge: Array) -> Callable[[], object]:
         """Return a function that computes the complete answer to one press."""
-        answer = np.zeros(N_WITHOUT_CORRELATION, np.float32)  # overwritten by every call
+        answer = np.zeros(len(Contact._fields), np.float32)  # overwritten by every call
         return partial(predictor.predict_into, charge.astype(np.float32), answer)
 
     return Method(f"network `{predictor.metadata.label}`", "Predictor", estimate, single_call)

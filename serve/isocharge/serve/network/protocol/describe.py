@@ -41,7 +41,7 @@ def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:
         "versions": [other.version for other in store.versions_of(metadata.name)],
         "platform": PLATFORM,
         "inputs": [_tensor(INPUT, len(metadata.electrodes))],
-        "outputs": [_tensor(name, OUTPUTS[name]) for name in loaded.outputs],
+        "outputs": [_tensor(name, width) for name, width in OUTPUTS.items()],
         "properties": metadata.to_props(),
     }
 
@@ -60,7 +60,7 @@ def model_config(loaded: LoadedVersion, limits: ServerLimits) -> dict[str, Any]:
         "version_policy": {"all": {}},
         "max_batch_size": limits.batch,
         "input": [{"name": INPUT, "data_type": "TYPE_FP32", "dims": [len(loaded.metadata.electrodes)]}],
-        "output": [{"name": name, "data_type": "TYPE_FP32", "dims": [OUTPUTS[name]]} for name in loaded.outputs],
+        "output": [{"name": name, "data_type": "TYPE_FP32", "dims": [OUTPUTS[name]]} for name in OUTPUTS],
     }
 
 

@@ -17,7 +17,7 @@ from isocharge.common.arrays import Singles
 from isocharge.common.errors import RequestError, TooLarge
 from isocharge.common.structs import parse_json
 from isocharge.serve.model.contact import Contacts
-from isocharge.serve.model.session import CORRELATION, INPUT, as_float32, check_output_shapes, run, run_error
+from isocharge.serve.model.session import COLUMNS, INPUT, OUTPUTS, as_float32, run, run_error
 from isocharge.serve.network.model_store import LoadedVersion
 from isocharge.serve.network.protocol.bodies import InferBody, InputTensor, Parameters
 
@@ -103,7 +103,7 @@ def check_request(body: InferBody, binary: bytes, loaded: LoadedVersion, max_pre
         TooLarge: If the request contains more than `max_presses` presses.
     """
     default_is_binary = bool(body.parameters and body.parameters.binary_data_output)
-    outputs = dict.fromkeys(loaded.outputs, default_is_binary)
+    outputs = dict.fromkeys(OUTPUTS, default_is_binary)
     if body.outputs:
         outputs = {}
         for output in body.outputs:
@@ -111,11 +111,6 @@ def check_request(body: InferBody, binary: bytes, loaded: LoadedVersion, max_pre
             outputs[output.name] = default_is_binary if stated_choice is None else stated_choice
         if len(outputs) < len(body.outputs):
             raise RequestError("outputs: expected each name once")
-        if CORRELATION in outputs and CORRELATION not in loaded.outputs:  # older models do not compute it
-            raise RequestError(
-                f"outputs: expected one of {', '.join(loaded.outputs)}, got {CORRELATION!r}, which "
-                f"{loaded.metadata.label} does not have"
-            )
     charges = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, max_presses)
     return InferRequest(body.id or "", charges, outputs)
 
@@ -198,9 +193,7 @@ def infer(loaded: LoadedVersion, charge_pC: Singles) -> dict[str, Rows]:
         ModelError: If onnxruntime fails to run the graph.
     """
     if len(charge_pC) > 1:
-        outputs = run(loaded.model.session, charge_pC, loaded.outputs)
-        check_output_shapes(outputs, len(charge_pC), loaded.metadata.label)
-        return dict[str, Rows](outputs)
+        return dict[str, Rows](run(loaded.model.session, charge_pC))
     press = loaded.press_of_thread()
     press.write(*charge_pC[0].tolist())
     try:
@@ -217,11 +210,7 @@ def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
         loaded: Version of the model that was run.
         outputs: Outputs of the model for the presses by name, each of shape (n, width).
     """
-    correlations = np.zeros_like(outputs["contact"])  # the flags do not depend on the correlations
-    # `Contacts` has ten attributes, which are arrays of the shape (n,): three values of the contact, three standard
-    # deviations, the misfit and three correlations. The columns of the four outputs have the same order.
-    outputs_in_order = [outputs["contact"], outputs["contact_std"], outputs["misfit"], correlations]
-    contacts = Contacts(*np.concatenate(outputs_in_order, axis=1).T)
+    contacts = Contacts(*np.concatenate([outputs[name] for name in COLUMNS], axis=1).T)
     texts = [",".join(flags) for flags in loaded.validity.batch_flags(contacts)]
     return np.array(texts, dtype=object)[:, np.newaxis]
 
