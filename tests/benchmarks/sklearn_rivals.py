@@ -9,14 +9,16 @@ from warnings import catch_warnings, simplefilter
 import numpy as np
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.compose import TransformedTargetRegressor
+from sklearn.decomposition import PCA
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.pipeline import Pipeline
+from sklearn.preprocessing import FunctionTransformer
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
-from isocharge.train.report.gauss_newton import whitening
+from isocharge.train.data.presses import LOWEST_CHARGE
 
 BATCH = 256
 """Number of presses for which a Gaussian process computes the kernel at a time."""
@@ -31,7 +33,8 @@ def log_charge_regressor(domain: Domain, **steps: Any) -> TransformedTargetRegre
         domain: Contacts that can occur.
         steps: Steps of the pipeline by name: transformers of the whitened logarithms, then the regressor.
     """
-    pipeline = Pipeline([*whitening().steps, *steps.items()])
+    logarithms = FunctionTransformer(lambda charge: np.log(np.maximum(charge, LOWEST_CHARGE)))
+    pipeline = Pipeline([("logarithms", logarithms), ("whitening", PCA(whiten=True)), *steps.items()])
     return TransformedTargetRegressor(
         pipeline, func=domain.to_unit, inverse_func=domain.to_contact, check_inverse=False
     )

@@ -60,7 +60,7 @@ def test_errors_equal_those_of_serve_check_on_the_held_out_presses(section, pres
     released = section["methods"][0]["errors"]
     assert section["test_presses"] == len(held_out_presses)
     assert section["limits"] == {}
-    assert {method["library"] for method in section["methods"]} == {"Predictor", "NumPy"}
+    assert "expected at least 448 presses" in section["left_out"][0]  # too few for least squares
     assert released["position_rms_mm"] == pytest.approx(position_rms_mm, rel=1e-3)
     assert released["force_rms_percent"] == pytest.approx(force_rms_percent, rel=1e-3)
     assert released["position_median_mm"] > 0.3  # it is 0.07 mm on simulated presses of the described film
@@ -84,6 +84,6 @@ def test_too_few_presses_within_the_forces_of_the_model_are_refused(uniform_pres
 
 def test_model_with_other_electrodes_is_refused(uniform_presses, tmp_path):
     dataset = dataset_of(uniform_presses, load_sensor(NAME), PROBE)
-    with pytest.raises(ModelError, match=r"expected the electrodes \('A', 'B', 'C'\) of the presses"):
+    with pytest.raises(ModelError, match="with the electrodes A, B, C, got a model with another"):
         write_report(tmp_path / "out", [(dataset, find_model("four-25um-biaxial"))], QUICK)
     assert not list(tmp_path.iterdir())

@@ -12,6 +12,6 @@ from isocharge.common.extras import require
 
 with require("train"):
     from isocharge.train.report.build import write_report
-    from isocharge.train.report.case import QUICK, Settings
+    from isocharge.train.report.evaluation import QUICK, Settings
 
 __all__ = ["QUICK", "Settings", "write_report"]

@@ -11,12 +11,11 @@ from isocharge.common.progress import track
 from isocharge.serve.benchmark import machine
 from isocharge.simulate import Dataset
 from isocharge.simulate.plots.figure import save_picture
-from isocharge.train.report.case import Settings
-from isocharge.train.report.evaluation import DatasetEvaluation
+from isocharge.train.report.evaluation import DatasetEvaluation, Settings
 from isocharge.train.report.page import PICTURE, draw_speed, report_page
 from isocharge.train.training.fit import threads_and_seed
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Version of the format of `report.json`."""
 
 RECORDED_PACKAGES = ("isocharge", "numpy", "scipy", "onnxruntime")
@@ -49,7 +48,7 @@ def write_report(
     Raises:
         OutputExists: If the folder exists.
         DatasetError: If the methods cannot be fitted to a dataset.
-        ModelError: If a model is for another sensor or for a smaller range of forces than its dataset.
+        ModelError: If a model is for another sensor than its dataset.
         PressError: If there are too few measured presses.
     """
     refuse_existing(folder)

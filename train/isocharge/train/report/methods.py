@@ -15,8 +15,15 @@ from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.model.predictor import Predictor
 from isocharge.simulate import ChargeMap, Domain, NoiseModel, Triangulation
-from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.report.gauss_newton import GaussNewton
+from isocharge.simulate.identifiability.nearest_contact import search
+from isocharge.train.data.charge_fit import fit_charge_series
+from isocharge.train.data.presses import LabelledPresses, split_by_position
+
+VALIDATION_FRACTION = 0.1
+"""Fraction of the positions whose presses are used to choose the degree of a charge series."""
+
+N_CANDIDATES = 512
+"""Number of contacts among which least squares chooses the starting points of its descents."""
 
 
 @dataclass(frozen=True)
@@ -83,16 +90,26 @@ def triangulation(task: FittingTask) -> Method | None:
 def least_squares(task: FittingTask) -> Method:
     """Return the search for the contact with the smallest squared residuals of the charges.
 
+    The residuals are divided by the standard deviation of the noise. The contact is restricted to the domain.
+
     Args:
         task: Presses and conditions. Without a charge map, a series is fitted to the presses.
 
     Raises:
-        DatasetError: If the series cannot be fitted to the presses.
         TrainingError: If there are too few presses.
     """
-    search = GaussNewton(task.domain, task.noise, task.charge_map, task.seed)
-    search.fit(task.presses.charge, task.presses.contact)
-    return Method("least squares, Gauss-Newton", "NumPy", search.predict)
+    charge_map = task.charge_map
+    if charge_map is None:
+        train, validation = split_by_position(task.presses, VALIDATION_FRACTION, task.seed)
+        names = tuple(map(str, range(train.charge.shape[1])))
+        charge_map = fit_charge_series(task.domain, names, train, validation)
+
+    def estimate(charge: Array) -> Array:
+        """Estimate contacts (x, y, F), shape (n, 3), mm and N."""
+        contact, _ = search(charge_map, charge, task.noise.sigma(charge), candidates=N_CANDIDATES)
+        return contact
+
+    return Method("least squares, Gauss-Newton", "NumPy", estimate)
 
 
 METHOD_BUILDERS: tuple[Callable[[FittingTask], Method | None], ...] = (triangulation, least_squares)

@@ -7,9 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
-from isocharge.train.report.case import Settings
-from isocharge.train.report.evaluation import Section
-from isocharge.train.report.measures import MethodRecord
+from isocharge.train.report.evaluation import MethodRecord, Section, Settings
 
 PICTURE = "speed.png"
 """Name of the file of the picture."""
@@ -23,7 +21,6 @@ HEADER = (
     "95 %, mm",
     "force rms, %",
     "one press, us",
-    "presses per second",
 )
 """Headers of the columns of the table."""
 
@@ -58,9 +55,8 @@ def report_page(sections: Sequence[Section], settings: Settings, machine: Mappin
         blocks.append(_conditions(section))
         blocks += [f"Left out: {reason}." for reason in section.left_out]
     blocks.append(
-        "All methods run in one process with one thread, and take turns. The times are medians for one press. The last "
-        f"column states the speed for batches of up to {settings.batch} presses. The seed determines the presses and "
-        "the noise."
+        "All methods run in one process with one thread, and take turns. The times are medians for one press. The seed "
+        f"({settings.seed}) determines the presses and the noise."
     )
     blocks.append(f"Machine: {', '.join(f'{name} {value}' for name, value in machine.items())}.")
     if command:
@@ -96,13 +92,13 @@ def _table_lines(sections: Sequence[Section]) -> Iterator[str]:
     for section in sections:
         if section.limits:
             limit_cells = _error_cells(section.limits)
-            yield _table_line([section.sensor, "*Cramér-Rao limit, unbiased*", "", *limit_cells, "", ""])
+            yield _table_line([section.sensor, "*Cramér-Rao limit, unbiased*", "", *limit_cells, ""])
         for record in sorted(section.methods, key=_position_error):
             name = record.name
             if record.answered < 1.0:
                 name += f" ({100 * record.answered:.3g} % answered)"
-            times = [f"{record.single_press_us:,.3g}", f"{record.presses_per_s:,.0f}"]
-            yield _table_line([section.sensor, name, record.library, *_error_cells(record.errors), *times])
+            time = f"{record.single_press_us:,.3g}"
+            yield _table_line([section.sensor, name, record.library, *_error_cells(record.errors), time])
 
 
 def _table_line(cells: Sequence[str]) -> str:
