@@ -9,7 +9,7 @@ from dataclasses import asdict
 
 import pytest
 
-from isocharge.cli.serve.doctor import brief_report
+from isocharge.cli.serve.doctor import brief_report, device_text
 from isocharge.cli.shared.terminal import say, show, show_json, show_result, warnings_to_stderr
 from isocharge.common.errors import IsochargeError
 from isocharge.serve import (
@@ -22,7 +22,6 @@ from isocharge.serve import (
     load_model,
     read_charges,
 )
-from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.model.metadata import ModelMetadata

@@ -18,8 +18,8 @@ import crcmod.predefined
 import numpy as np
 import pytest
 
+from isocharge.cli.serve.doctor import device_text
 from isocharge.serve import Chunk, Predictor, TouchStream, load_device
-from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.port.serial_line import Request
@@ -216,10 +216,9 @@ def test_a_board_that_is_plugged_in(command, tmp_path):
         doctor = ("serve", "doctor", "--port", port.url, "--seconds", "0.8")
         code, out, err = command(*doctor, "--model", FOUR)
         assert code == 0
-        assert "3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')" in out
-        assert f"models of 3 electrodes: {THREE}" in err
+        assert "3 of 3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')" in out
         code, _, err = command(*doctor, "--model", THREE, "--write", path)
-        assert (code, "models of" in err) == (0, False)
+        assert code == 0
         code, _, err = command(*doctor, "--model", THREE, "--write", path)
         assert (code, "not overwritten" in err) == (1, True)
         rest = sent + 600  # of which the port may hold two hundred that nobody reads

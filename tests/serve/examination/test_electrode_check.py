@@ -137,7 +137,7 @@ def test_presses_that_do_not_distinguish_the_channels_raise_an_error():
 
 def test_missing_press_raises_an_error_after_the_timeout(film, check):
     sensor = sensor_with_wiring(film.charges, film.directions[:2], (0, 1, 2))
-    with pytest.raises(PressCheckError, match=r"electrode C: no press came within 1\.8 s"):
+    with pytest.raises(PressCheckError, match=r"electrode C: no press began and ended within 1\.8 s"):
         check(sensor, "ABC", timeout_s=1.8)
 
 
@@ -154,19 +154,6 @@ def test_press_right_after_the_request_is_accepted(film, check, delay_s):
     """The pause between two presses is shorter than the time in which the rest level is measured."""
     result = check(sensor_with_wiring(film.charges, film.directions, (1, 0, 2), rest_s=delay_s), "ABC")
     assert result.found == {"A": "2", "B": "1", "C": "3"}
-
-
-def test_check_goes_on_with_the_same_electrode_after_an_unclear_press(film, check):
-    """The first press near B is in the middle, where it changes all channels equally."""
-    directions = np.insert(film.directions, 1, 0.0, axis=0)[[0, 1, 3, 2]]
-    result = check(sensor_with_wiring(film.charges, directions, (0, 1, 2)), "ABC")
-    assert result.found == {"A": "1", "B": "2", "C": "3"}
-
-
-def test_check_goes_on_with_the_same_electrode_after_a_late_press(film, check):
-    """The press near A begins while the rest level is measured, and lasts longer than the check waits."""
-    sensor = sensor_with_wiring(film.charges, film.directions, (0, 1, 2), first_rest_s=2.2, rest_s=1.2)
-    assert check(sensor, "ABC", timeout_s=1.6).found == {"A": "1", "B": "2", "C": "3"}
 
 
 def test_settings_of_single_electrodes_move_with_their_channels():

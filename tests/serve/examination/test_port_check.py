@@ -1,7 +1,6 @@
 """Port check of simulated boards with known faults, and health of channels with known noise, drift and hum."""
 
 import json
-import re
 import struct
 from dataclasses import asdict, replace
 from functools import partial
@@ -13,7 +12,6 @@ from isocharge.cli.serve.doctor import brief_report
 from isocharge.common.errors import DeviceError, NoFramesError
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text
 from isocharge.serve.examination.channel_health import measure_channel_health
-from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.live.device import ANY_BOARD
@@ -82,17 +80,19 @@ def test_check_of_a_channel_without_a_number():
 @pytest.mark.parametrize(
     ("board", "message"),
     [
-        (charges(), "3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')"),
-        (charges(hum=9.0), "channel 1 has a hum of 9 pC: put [hum] frequency_Hz = 50 into a device file"),
+        (charges(), "3 of 3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')"),
+        (charges(hum=9.0), "channel 1 has a hum of 9 pC: set [hum] frequency_Hz = 50"),
         (charges(drift=-4.0), "channel 1 drifts by -4 pC/s"),
-        (charges(drift=4.0), "the charges drift by 12 pC/s in total, which the tare cannot follow"),
         (charges(offset=(0.0, 120.0, 0.0)), "channel 2 has 120 pC at rest, but a tare accepts at most 100 pC"),
         (charges(noise=8.0), "channel 1 has a noise of "),
         (lambda k: charges()(3 * k), "798 frames were lost"),
         (lambda k: charges()(k) + b"\x07\0" * (k % 4 == 0), "2.0% of the bytes do not belong to good frames"),
         (lambda _: b"", "no bytes were received"),
         (lambda _: b"\xf8\x80\xfe\xff" * 5, "no frames were recognised: try another baud rate"),
-        (lambda k: f"{1e-3 * (k % 7):.4f};{1.65 + 1e-3 * (k % 5):.4f}\n".encode(), "feedback capacitance"),
+        (
+            lambda k: f"{1e-3 * (k % 7):.4f};{1.65 + 1e-3 * (k % 5):.4f}\n".encode(),
+            "seem to be in V: state the charge",
+        ),
     ],
 )
 def test_check_reports_missing_settings(board, message):
@@ -122,11 +122,11 @@ def test_unused_inputs_are_ignored():
 
 def test_too_few_used_channels_for_the_model():
     report = examine_received(received(row), electrodes=("A", "B", "C", "D", "E"))
-    assert "6 channels, but the model has the electrodes" in missing(report)
+    assert "of 6 channels, but the model has the electrodes" in missing(report)
     assert "channels" not in report.device
 
 
-def test_channels_of_most_similar_noise_are_proposed():
+def test_channel_with_much_less_noise_is_not_proposed():
     """The first input is a temperature, whose noise is much smaller than that of the film."""
     rng = np.random.default_rng(0)
     board = lambda _: ",".join(f"{x:.3f}" for x in rng.normal(0.0, [0.05, 3.0, 3.0, 3.0])).encode() + b"\n"  # noqa: E731
@@ -155,12 +155,11 @@ def test_proposed_device_file_reads_the_same_charges():
     [
         ({}, (32768 + 400, 32768 - 90), {"A": 33168, "B": 32678}),
         ({"pC_per_unit": 0.01}, (32768 + 400, 32768 - 90), {"A": 33168, "B": 32678}),
-        ({"pC_per_unit": 1.0}, (10, -10), None),
+        ({"pC_per_unit": 1.0}, (10, -10), {"A": 10, "B": -10}),
         ({}, (0, 0), None),
-        ({"V_per_unit": 0.1, "feedback_pF": 100.0}, (700, 700), {"A": 700, "B": 700}),
     ],
 )
-def test_offset_is_proposed_if_the_rest_is_too_large_for_a_tare(gain, rests, offset):
+def test_level_at_rest_is_proposed_as_offset(gain, rests, offset):
     board = lambda k: b"%d,%d\n" % tuple(rest + (k * 7) % 5 - 2 for rest in rests)  # noqa: E731
     proposed = examine_received(received(board), electrodes=("A", "B"), gain=gain).device["gain"]
     assert proposed == gain | ({} if offset is None else {"offset": offset})
@@ -172,8 +171,6 @@ def test_proposed_file_of_a_board_far_from_zero_works():
     report = examine_received(received(board))
     assert report.device["gain"]["offset"] == pytest.approx({"A": 312.0, "B": -128.0, "C": 3.0}, abs=0.3)
     assert "channel 1 has 311.9 pC at rest" in missing(report)
-    assert report.works
-    assert not examine_received(received(row)).works  # counts of which nobody has said what they are
 
 
 @pytest.mark.parametrize("number", [b"nan", b"ovf", b"1e30"])
@@ -194,7 +191,11 @@ def test_line_that_is_not_read_is_shown():
 @pytest.mark.parametrize(
     ("names", "channels", "message"),
     [
-        ("A_nC B_nC C_nC", {"A": "A_nC", "B": "B_nC", "C": "C_nC"}, "state the charge of one nC in pC"),
+        (
+            "A_nC B_nC C_nC",
+            {"A": "A_nC", "B": "B_nC", "C": "C_nC"},
+            "the channels seem to be in nC",
+        ),
         ("c b a", {"A": "a", "B": "b", "C": "c"}, ""),
         ("A B z", None, "('A', 'B', 'z')"),
         ("x y z", {"A": "x", "B": "y", "C": "z"}, ""),
@@ -207,7 +208,7 @@ def test_channels_are_proposed_by_their_names(names, channels, message):
         return ",".join(f"{name}:{rng.normal():.3f}" for name in names.split()).encode() + b"\n"
 
     report = examine_received(received(board), electrodes=("A", "B", "C"))
-    assert (report.device.get("channels"), report.works) == (channels, not message)
+    assert (report.device.get("channels"), not report.missing) == (channels, not message)
     assert message in missing(report)
 
 
@@ -242,15 +243,6 @@ def test_stream_states_that_a_serial_server_uses_the_telnet_protocol():
     stream = ReadingStream(("A", "B", "C"), device_from_table({"frames": {"format": "binary"}}, "test"))
     with pytest.raises(NoFramesError, match="raw TCP"):
         [list(stream.frames(Chunk(frame.replace(b"\xff", b"\xff\xff"), 0.0, 0))) for frame in frames * 2]
-
-
-@pytest.mark.parametrize("gain", [{}, {"pC_per_unit": 0.5}])
-def test_device_text_describes_the_board(gain):
-    board = lambda k: b"%d,%d,0\n" % (303 + k % 5, 307 - k % 5)  # noqa: E731
-    text = device_text(examine_received(received(board), electrodes=("A", "B"), gain=gain))
-    assert ("\npC_per_unit = 0.5" in text) == bool(gain)
-    assert re.search(r"\n# text: 3 columns without names; 20[01] frames per second\n", text)
-    assert "channels that no electrode uses: 3" in text
 
 
 def test_offset_drift_hum_and_noise_of_a_channel():

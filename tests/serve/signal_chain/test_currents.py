@@ -1,4 +1,4 @@
-"""Boards that send currents: integral, leak, detection of touches, and the estimate of the leak by the doctor.
+"""Boards that send currents: integral, leak, and detection of touches.
 
 The charges are stated first, and the currents are their differences. The integral must return the charges.
 """
@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import DeviceError
-from isocharge.serve import Chunk, Frame, device_from_table, encode_frame
-from isocharge.serve.examination.current_press import find_current_press
-from isocharge.serve.examination.listening import ReceivedData
-from isocharge.serve.examination.port_check import examine_received
-from isocharge.serve.signal_chain.inflow import LeakSection
+from isocharge.serve import device_from_table
 from isocharge.train.export_c.folder import device_header
 from stage_runner import StageRunner
 
@@ -60,40 +56,6 @@ def test_integral_of_currents_is_the_charge_and_detects_touches(tau_s):
 def test_noise_of_currents_gives_no_touch():
     values = currents(np.zeros((len(T_S), 3)))
     assert not any(frame.is_contact for frame in run(values))
-
-
-@pytest.mark.parametrize("tau_s", [3.0, 10.0, 30.0])
-def test_doctor_estimates_the_leak_from_a_press_and_its_release(tau_s):
-    is_first_press = T_S < 10.5
-    charge_pC = 1000.0 * FORCE[is_first_press, None] * RATIOS
-    press = find_current_press(currents(charge_pC, tau_s, noise_pC=0.05), T_S[is_first_press])
-    assert press.begin_s == pytest.approx(3.0, abs=0.11)
-    assert press.sections["leak"]["tau_s"] == pytest.approx(tau_s, rel=0.1)
-
-
-def test_doctor_proposes_no_leak_without_a_leak_or_without_a_press():
-    charge_pC = 1000.0 * FORCE[:, None] * RATIOS
-    is_first_press = T_S < 10.5
-    press = find_current_press(currents(charge_pC, noise_pC=0.0)[is_first_press], T_S[is_first_press])
-    assert press.sections == {}
-    assert find_current_press(currents(0.0 * charge_pC), T_S) is None
-    held = T_S < 7.0  # not released
-    assert find_current_press(currents(charge_pC)[held], T_S[held]) is None
-
-
-def test_doctor_writes_the_leak_of_a_current_board():
-    charge_pC = 1000.0 * FORCE[T_S < 10.5, None] * RATIOS
-    rows = currents(charge_pC, 4.0, noise_pC=0.05)
-    data = [encode_frame(Frame(n, round(1e3 * n), tuple(row))) for n, row in enumerate(rows.tolist())]
-    chunks = [Chunk(piece, n / RATE_HZ, round(1e9 * n / RATE_HZ)) for n, piece in enumerate(data)]
-    device = device_from_table({"front_end": "current", "frames": {"format": "binary"}}, "b")
-    received = ReceivedData("tcp://board:1", 115200, chunks=chunks, seconds=len(rows) / RATE_HZ)
-    examination = examine_received(received, device=device)
-    assert examination.works
-    assert examination.touch == ""
-    completed = device_from_table(examination.device, "b")
-    assert completed.front_end == "current"
-    assert completed.rule(LeakSection).tau_s == pytest.approx(4.0, rel=0.1)
 
 
 def test_currents_are_refused_in_c_and_beside_a_memory():

@@ -1,7 +1,6 @@
 """`isocharge serve doctor`: examine what a port sends, and write the device file of the board."""
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from shlex import join
@@ -15,18 +14,19 @@ from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption
 from isocharge.cli.shared.terminal import say, show, show_json, show_result
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.files import refuse_existing, write_whole
+from isocharge.common.printable_text import printable
+from isocharge.common.toml_text import to_toml
 from isocharge.serve import Examination, Port, Predictor, device_from_table, examine, load_device
-from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.electrode_check import ElectrodeCheck, check_electrodes, corrected_table
 from isocharge.serve.examination.listening import BAUDS
-from isocharge.serve.model.model_search import model_names, repositories
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.presses.number_text import parse_number
 
+HEAD = "Written by `isocharge serve doctor` from what came through a port; the keys are in serve/docs/device_file.md."
+"""First line of a device file."""
+
 SHOWN = ("name", "offset_pC", "noise_pC", "drift_pC_per_s", "hum_pC")
 """Values of a channel in the table."""
-
-GAIN_METAVAR = "NUMBER|A=..,B=.."
 
 
 def doctor_command(
@@ -63,20 +63,8 @@ def doctor_command(
         str | None,
         typer.Option(
             "--pc-per-unit",
-            metavar=GAIN_METAVAR,
+            metavar="NUMBER|A=..,B=..",
             help="Charge of one unit that the board sends, pC; for the device file. (default: asked for)",
-        ),
-    ] = None,
-    V_per_unit: Annotated[
-        str | None,
-        typer.Option(
-            "--v-per-unit", metavar=GAIN_METAVAR, help="Voltage of one unit, V; with --feedback-pf. (default: none)"
-        ),
-    ] = None,
-    feedback_pF: Annotated[
-        str | None,
-        typer.Option(
-            "--feedback-pf", metavar=GAIN_METAVAR, help="Feedback capacitance of the amplifiers, pF. (default: none)"
         ),
     ] = None,
     request: Annotated[
@@ -116,12 +104,11 @@ def doctor_command(
     metadata = Predictor(model, models=models).metadata if model else None
     electrodes = metadata.electrodes if metadata else ()  # empty for any model
     unnoticed = metadata.unnoticed if metadata else None  # presses outside the working area that the model misses
-    settings = {"pC_per_unit": pC_per_unit, "V_per_unit": V_per_unit, "feedback_pF": feedback_pF}
-    gain = {key: _parse_gain_setting(key, text) for key, text in settings.items() if text is not None}
-    if gain and device is not None:
+    gain = None if pC_per_unit is None else {"pC_per_unit": _parse_gain(pC_per_unit)}
+    if gain is not None and device is not None:
         raise InputError(
-            f"{_gain_option(next(iter(gain)))}: expected no gain beside --device, because the device file states it; "
-            f"leave the option out, or write the gain into the section [gain] of {device}"
+            "--pc-per-unit: expected no gain beside --device, because the device file states it; leave the option out, "
+            f"or write the gain into the section [gain] of {device}"
         )
     say(f"listening for {seconds:g} s; leave the film alone")
     examination = examine(
@@ -149,10 +136,6 @@ def doctor_command(
     if json:
         unnoticed_share = unnoticed.total_share if unnoticed else None
         show_json(asdict(examination) | {"found_channels": found_channels, "unnoticed_share": unnoticed_share})
-    channel_count = len(examination.channels)
-    if examination.good and len(electrodes) > channel_count:
-        suitable_models = ", ".join(_models_with_electrode_count(channel_count, models)) or "none"
-        say(f"models of {channel_count} electrodes: {suitable_models}; choose one with --model")
     if not examination.good:
         raise typer.Exit(1)
     if examination.touch:
@@ -214,27 +197,10 @@ def port_lines() -> Iterator[str]:
         yield f"{port.device} ({port.description}): {received}"
 
 
-def _models_with_electrode_count(electrode_count: int, models: Path | None) -> Iterator[str]:
-    """Yield the names of the models with a given number of electrodes. Models that cannot be read are omitted.
+def _parse_gain(text: str) -> Any:
+    """Parse `--pc-per-unit`, and return one number or a number for each electrode.
 
     Args:
-        electrode_count: The number of electrodes.
-        models: Value of `--models`; None if the option is not given.
-    """
-    names = [name for root in repositories(models) for name in model_names(root)]
-    unique_names = dict.fromkeys(names)  # several repositories may contain a model with the same name
-    for name in unique_names:
-        with suppress(IsochargeError):
-            if len(Predictor(name, models=models).metadata.electrodes) == electrode_count:
-                yield name
-
-
-def _parse_gain_setting(key: str, text: str) -> Any:
-    """Parse an option that describes the gain, and return one number or a number for each electrode.
-
-    Args:
-        key: Key of the setting in a device file, such as `pC_per_unit`. The error message contains the option with the
-            corresponding name, such as `--pc-per-unit`.
         text: Value of the option, such as `0.1` or `A=0.1,B=-0.1`.
 
     Raises:
@@ -247,13 +213,8 @@ def _parse_gain_setting(key: str, text: str) -> Any:
         return {electrode.strip(): parse_number(number.strip()) for electrode, _equals_sign, number in pairs}
     except ValueError as error:  # from `parse_number`
         raise InputError(
-            f"{_gain_option(key)}: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}"
+            f"--pc-per-unit: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}"
         ) from error
-
-
-def _gain_option(key: str) -> str:
-    """Return the option that states a key of the section `[gain]`, such as `--pc-per-unit` for `pC_per_unit`."""
-    return f"--{key.replace('_', '-').lower()}"
 
 
 def _parse_request(text: str | None, rate_Hz: float) -> Request | None:
@@ -272,14 +233,12 @@ def _parse_request(text: str | None, rate_Hz: float) -> Request | None:
     try:
         # The codec `unicode_escape` decodes escape sequences in bytes of Latin-1. Other characters first become escape
         # sequences themselves. The last step refuses them, because they do not fit into one byte.
-        escaped_text = text.encode("latin-1", "backslashreplace")
-        unescaped_text = escaped_text.decode("unicode_escape")
-        data = unescaped_text.encode("latin-1")
-    except (UnicodeDecodeError, UnicodeEncodeError) as error:
-        raise InputError(rf"--request: expected a text like '?\n' or '\x01\x04', got {text!r}") from error
-    if not data:
-        raise InputError("--request: expected at least one byte, got an empty text")
-    return Request(data, rate_Hz)
+        data = text.encode("latin-1", "backslashreplace").decode("unicode_escape").encode("latin-1")
+        if data:
+            return Request(data, rate_Hz)
+    except (UnicodeDecodeError, UnicodeEncodeError):
+        pass
+    raise InputError(rf"--request: expected a text like '?\n' or '\x01\x04', got {text!r}")
 
 
 def _write_device_file(path: Path, examination: Examination, model: str) -> None:
@@ -297,14 +256,24 @@ def _write_device_file(path: Path, examination: Examination, model: str) -> None
         write_whole(path, device_text(examination).encode())
     except OSError as error:
         raise InputError(f"--write {path}: cannot be written ({error.strerror}); choose another path") from error
-    if not examination.works:  # settings are missing without which touches are not detected
-        say(f"{path} written; it gives no touches yet: put in what is missing above")
-        return
-    has_measured_offsets = "offset" in examination.device.get("gain", {})  # the charges of the film at rest
-    if has_measured_offsets:
+    if examination.missing:
+        say("put the settings that are missing above into the file")
+    if "offset" in examination.device.get("gain", {}):  # the charges of the film at rest
         say("the offsets are right only if nothing lay on the film; a steady weight cannot be noticed")
     command = join(["isocharge", "serve", "stream", model, "--port", examination.url, "--device", str(path)])
     say(f"{path} written; use it with: {command}")
+
+
+def device_text(examination: Examination) -> str:
+    """Return the device file of a board as TOML text, which begins with comments that describe the board.
+
+    Args:
+        examination: Result of the port check, with the content of the device file.
+    """
+    comments = [HEAD, f"{examination.format}; {examination.rate_Hz:.4g} frames per second"]
+    if examination.unused:
+        comments.append(f"channels that no electrode uses: {printable(', '.join(examination.unused))}")
+    return to_toml(examination.device, comments)
 
 
 def brief_report(examination: Examination) -> dict[str, Any]:

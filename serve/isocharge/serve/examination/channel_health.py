@@ -1,9 +1,7 @@
 """Health of one channel of a board while the film is at rest: offset, noise, drift and hum."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -73,70 +71,25 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
     usable_pC = charge_pC[is_usable]
     usable_times_s = times_s[is_usable]
 
-    # In a short time, a hum cannot be distinguished from a drift. At a low frame rate, it cannot be sampled.
-    hum_frequencies_Hz: list[float] = []
-    if usable_times_s[-1] > MIN_HUM_TIME_S:
-        hum_frequencies_Hz = [hum_Hz for hum_Hz in MAINS_HZ if rate_Hz > MIN_SAMPLES_PER_PERIOD * hum_Hz]
-    fit = _fit_drift_and_hum(usable_pC, usable_times_s, hum_frequencies_Hz)
-    hum_50_Hz_pC = fit.hum_amplitudes_pC.get(50.0)  # None if the hum of this frequency was not fitted
-    hum_60_Hz_pC = fit.hum_amplitudes_pC.get(60.0)
+    # The columns of the design matrix are a constant, the time, and the cosine and the sine of each hum. In a short
+    # time, a hum cannot be distinguished from a drift. At a low frame rate, it cannot be sampled.
+    columns = [np.ones_like(usable_times_s), usable_times_s]
+    hum_columns: dict[float, int] = {}  # first column of each hum
+    for hum_Hz in MAINS_HZ:
+        if usable_times_s[-1] > MIN_HUM_TIME_S and rate_Hz > MIN_SAMPLES_PER_PERIOD * hum_Hz:
+            hum_columns[hum_Hz] = len(columns)
+            phase = 2.0 * np.pi * hum_Hz * usable_times_s
+            columns += [np.cos(phase), np.sin(phase)]
+    design_matrix = np.column_stack(columns)
+    coefficients = np.linalg.lstsq(design_matrix, usable_pC, rcond=None)[0]
+    hum_pC = {hum_Hz: math.hypot(*coefficients[column : column + 2]) for hum_Hz, column in hum_columns.items()}
     return ChannelHealth(
         name,
         offset_pC=float(usable_pC.mean()),
-        noise_pC=float(fit.residual_pC.std()),
-        drift_pC_per_s=fit.slope_pC_per_s,
-        hum_pC=(hum_50_Hz_pC, hum_60_Hz_pC),
+        noise_pC=float((usable_pC - design_matrix @ coefficients).std()),
+        drift_pC_per_s=float(coefficients[1]),
+        hum_pC=(hum_pC.get(50.0), hum_pC.get(60.0)),  # None if the hum was not fitted
         span_pC=float(np.ptp(usable_pC)),  # largest minus smallest value
         unusable=unusable_count,
         unusable_value=unusable_value,
     )
-
-
-class _DriftAndHum(NamedTuple):
-    """Straight line and sinusoidal hum that were fitted to the values of a channel.
-
-    Attributes:
-        slope_pC_per_s: Slope of the line.
-        hum_amplitudes_pC: Amplitude of the hum at each frequency, Hz.
-        residual_pC: Values minus the fit, shape (n,).
-    """
-
-    slope_pC_per_s: float
-    hum_amplitudes_pC: dict[float, float]
-    residual_pC: Array
-
-
-def _fit_drift_and_hum(charge_pC: Array, times_s: Array, hum_frequencies_Hz: Sequence[float]) -> _DriftAndHum:
-    """Fit a straight line and a hum at each frequency to the values of a channel, by linear least squares.
-
-    The fitted function of the time t is
-
-        constant + slope * t + sum over the frequencies f of (cosine * cos(2 pi f t) + sine * sin(2 pi f t)).
-
-    The amplitude of the hum at a frequency is sqrt(cosine^2 + sine^2).
-
-    Args:
-        charge_pC: Values, shape (n,), pC.
-        times_s: Times of the values, shape (n,), s.
-        hum_frequencies_Hz: Frequencies of the hum, Hz; empty if only the line is fitted.
-
-    Returns:
-        Slope of the line, amplitude of the hum at each frequency, and residuals.
-    """
-    # Each column contains the values of one function of time, which is multiplied by its coefficient.
-    columns = [np.ones_like(times_s), times_s]
-    for hum_Hz in hum_frequencies_Hz:
-        phase = 2.0 * np.pi * hum_Hz * times_s
-        columns += [np.cos(phase), np.sin(phase)]
-    design_matrix = np.column_stack(columns)
-    coefficients = np.linalg.lstsq(design_matrix, charge_pC, rcond=None)[0]
-
-    # The coefficients have the order of the columns, so those of the hum alternate between cosine and sine.
-    _constant, slope_pC_per_s, *hum_coefficients = coefficients.tolist()
-    cosines_pC = hum_coefficients[0::2]
-    sines_pC = hum_coefficients[1::2]
-    amplitudes_pC = {}
-    for hum_Hz, cosine_pC, sine_pC in zip(hum_frequencies_Hz, cosines_pC, sines_pC, strict=True):
-        amplitudes_pC[hum_Hz] = math.hypot(cosine_pC, sine_pC)
-    residual_pC = charge_pC - design_matrix @ coefficients
-    return _DriftAndHum(slope_pC_per_s, amplitudes_pC, residual_pC)

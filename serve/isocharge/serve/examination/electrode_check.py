@@ -29,9 +29,6 @@ MIN_ADVANTAGE = 1.1
 PRESS_TIMEOUT_S = 60.0
 """Time to wait for each press, s."""
 
-PRESS_ATTEMPTS = 3
-"""Number of times that a press near the same electrode is asked for, if the press is late or unclear."""
-
 
 @dataclass(frozen=True)
 class ElectrodeCheck:
@@ -66,19 +63,6 @@ class ElectrodeCheck:
             yield f"channel {names} falls under a press and the others rise: check the signs of the gain"
 
 
-class UnclearPressError(PressCheckError):
-    """Presses do not distinguish the channels.
-
-    Attributes:
-        rows: Indices of the electrodes near which the film must be pressed again.
-    """
-
-    def __init__(self, message: str, rows: tuple[int, ...]) -> None:
-        """Store the message and the indices of the electrodes."""
-        super().__init__(message)
-        self.rows = rows
-
-
 def check_electrodes(
     port: Port,
     device: Device,
@@ -87,8 +71,6 @@ def check_electrodes(
     timeout_s: float = PRESS_TIMEOUT_S,
 ) -> ElectrodeCheck:
     """For each electrode, ask the user for a press near it, and find the channel that changes most under this press.
-
-    A press that is late or unclear is asked for again.
 
     Args:
         port: The open port.
@@ -107,26 +89,8 @@ def check_electrodes(
     electrodes = list(channels)
     channel_names = list(channels.values())
     presses = _PressReader(port, device, channel_names, ask, timeout_s)
-    changes = np.zeros((len(electrodes), len(channel_names)))  # of each channel under the press near each electrode
-    awaited = list(range(len(electrodes)))  # rows of the presses that are missing or unclear
-    columns: list[int] = []  # column of the channel that belongs to each electrode
-    errors: dict[int, list[PressCheckError]] = {row: [] for row in awaited}
-    while not columns:
-        try:
-            while awaited:
-                changes[awaited[0]] = presses.press_near(electrodes[awaited[0]])
-                awaited.pop(0)
-            columns = assign_channels(changes, electrodes)
-        except PressCheckError as error:
-            if isinstance(error, UnclearPressError):
-                awaited += error.rows
-            errors_of_press = errors[awaited[0]]
-            errors_of_press.append(error)
-            if len(errors_of_press) == PRESS_ATTEMPTS:
-                raise errors_of_press[0] from None
-            if len(errors_of_press) == PRESS_ATTEMPTS - 1:
-                presses.detector.forget_rest()  # a press may have been taken for the rest
-            ask(str(error))
+    changes = np.array([presses.press_near(electrode) for electrode in electrodes])
+    columns = assign_channels(changes, electrodes)
 
     # A channel is inverted if its value falls under the press near its own electrode.
     found_channels = {}
@@ -155,7 +119,7 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
         Column of the channel for each electrode.
 
     Raises:
-        UnclearPressError: If two presses change the same channel most, or a press changes two channels almost equally.
+        PressCheckError: If two presses change the same channel most, or a press changes two channels almost equally.
     """
     normalised = np.abs(changes) + 1e-30  # a channel that never changes must not cause a division by zero
     for _ in range(NORMALISATION_STEPS):
@@ -167,17 +131,14 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
     for row, column in enumerate(columns):
         other_changes = np.delete(normalised[row], column)  # empty if there is only one channel
         if other_changes.size and normalised[row, column] < MIN_ADVANTAGE * other_changes.max():
-            raise UnclearPressError(
+            raise PressCheckError(
                 f"the press near electrode {electrodes[row]} changes two channels by almost the same amount; press "
-                "closer to the electrode, with a thinner probe, and try again",
-                (row,),
+                "closer to the electrode, with a thinner probe, and try again"
             )
         if column in columns[:row]:
-            earlier_row = columns.index(column)
-            raise UnclearPressError(
-                f"the presses near electrodes {electrodes[earlier_row]} and {electrodes[row]} change the same channel "
-                "most; press closer to each electrode, and try again",
-                (earlier_row, row),
+            raise PressCheckError(
+                f"the presses near electrodes {electrodes[columns.index(column)]} and {electrodes[row]} change the "
+                "same channel most; press closer to each electrode, and try again"
             )
     return columns
 
@@ -195,39 +156,22 @@ def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str
     # Each electrode receives the settings of the electrode to which its channel was assumed to belong.
     expected_electrode = {channel: electrode for electrode, channel in check.expected.items()}
     source_electrode = {electrode: expected_electrode[channel] for electrode, channel in check.found.items()}
-    corrected_sections = {name: _reassigned_settings(section, source_electrode) for name, section in table.items()}
-    corrected_sections["channels"] = dict(check.found)
-    return corrected_sections
 
+    def moved(setting: Any) -> Any:
+        """Return a setting of a section, with the values of single electrodes moved to other electrodes."""
+        if not isinstance(setting, Mapping) or set(setting) != set(source_electrode):
+            return setting
+        return {electrode: setting[source] for electrode, source in source_electrode.items()}
 
-def _reassigned_settings(section: Any, source_electrode: Mapping[str, str]) -> Any:
-    """Move settings between electrodes in a section of a device file, and return the new section.
-
-    A setting with one value for each electrode is a table, such as `offset = {A = 1.0, B = 2.0}`. All other settings
-    are returned unchanged.
-
-    Args:
-        section: A table of settings by name, or a single value, which is returned unchanged.
-        source_electrode: For each electrode, the electrode whose settings it receives.
-    """
-    if not isinstance(section, Mapping):
-        return section
-    reassigned_section = {}
-    for key, setting in section.items():
-        is_for_each_electrode = isinstance(setting, Mapping) and set(setting) == set(source_electrode)
-        if is_for_each_electrode:
-            reassigned_section[key] = {electrode: setting[source] for electrode, source in source_electrode.items()}
-        else:
-            reassigned_section[key] = setting
-    return reassigned_section
+    sections = {name: section for name, section in table.items() if isinstance(section, Mapping)}
+    moved_sections = {
+        name: {key: moved(setting) for key, setting in section.items()} for name, section in sections.items()
+    }
+    return {**table, **moved_sections, "channels": dict(check.found)}
 
 
 class _PressReader:
-    """Reader of presses, each of which the user is asked for.
-
-    Attributes:
-        detector: Detector of the presses.
-    """
+    """Reader of presses, each of which the user is asked for."""
 
     def __init__(
         self, port: Port, device: Device, channels: list[str], ask: Callable[[str], None], timeout_s: float
@@ -241,7 +185,7 @@ class _PressReader:
             ask: Function that is called with a sentence that asks the user to wait or to press.
             timeout_s: Longest time to wait for the rest or for a press, s.
         """
-        self.detector = PressDetector()
+        self._detector = PressDetector()
         self._port = port
         self._parser = device.parser()
         self._channels = channels
@@ -261,28 +205,22 @@ class _PressReader:
         Raises:
             PressCheckError: If the rest, or the begin or the end of the press, does not come in time.
         """
-        detector = self.detector
-        has_block = False
+        detector = self._detector
         if detector.rest is None:
             self._ask("wait, and do not touch the film, until the rest level is known")
-            deadline_s = time.monotonic() + self._timeout_s
-            while detector.rest is None and (block := self._next_block(deadline_s)) is not None:
-                has_block = True
-                detector.feed(*block)
+        deadline_s = time.monotonic() + self._timeout_s
+        while detector.rest is None and (block := self._next_block(deadline_s)) is not None:
+            detector.feed(*block)
         if detector.rest is not None:
             self._ask(f"press near electrode {electrode}, as close to it as you can, and let go")
             deadline_s = time.monotonic() + self._timeout_s
             while (block := self._next_block(deadline_s)) is not None:
                 if detector.feed(*block):
                     return detector.change
-            has_block = detector.is_pressed
-            detector.is_pressed = False
-        if has_block:
-            raise PressCheckError(
-                f"electrode {electrode}: the charges did not come to rest within {self._timeout_s:g} s; take the "
-                "finger away after each press, and try again"
-            )
-        raise PressCheckError(f"electrode {electrode}: no press came within {self._timeout_s:g} s; try again")
+        raise PressCheckError(
+            f"electrode {electrode}: no press began and ended within {self._timeout_s:g} s; take the finger away after "
+            "each press, and try again"
+        )
 
     def _next_block(self, deadline_s: float) -> tuple[Array, Array] | None:
         """Collect the frames of one block of time, and return the median and the noise of each channel.

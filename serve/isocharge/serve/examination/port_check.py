@@ -5,31 +5,32 @@ the settings that are still missing.
 """
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from isocharge.common.arrays import Array
-from isocharge.common.errors import IsochargeError
 from isocharge.common.printable_text import printable
 from isocharge.serve.examination.channel_health import ChannelHealth, measure_channel_health
-from isocharge.serve.examination.current_press import find_current_press
-from isocharge.serve.examination.held_press import HeldPress, find_held_press
+from isocharge.serve.examination.held_press import find_held_press
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
-from isocharge.serve.examination.missing import CLEAN_SHARE, held_press_sentences, missing_sentences
+from isocharge.serve.examination.missing import (
+    CLEAN_SHARE,
+    channel_count_sentences,
+    channel_sentences,
+    held_press_sentences,
+    transmission_sentences,
+    unit_sentences,
+)
 from isocharge.serve.examination.press_detector import find_touch
-from isocharge.serve.examination.proposal import Proposal, propose, unit_of
-from isocharge.serve.frames.frame import Frame
+from isocharge.serve.examination.proposal import propose, unit_of
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
-from isocharge.serve.live.stream import ReadingStream
 from isocharge.serve.port.serial_line import Request, without_telnet
 from isocharge.serve.port.source import has_speed
 from isocharge.serve.recognition.recognise import recognise
 from isocharge.serve.signal_chain.channels import channel_index
 from isocharge.serve.signal_chain.gain import Gain, GainRule
-from isocharge.serve.signal_chain.tare import TareRule
 
 RIGHT_BAUD_SHARE = 0.5
 """Smallest share of bytes in good frames at the right baud rate, dimensionless."""
@@ -63,9 +64,7 @@ class Examination:
         missing: One sentence for each setting or property that is missing before contacts can be computed.
         missing_for_held_presses: One sentence for each setting or property without which the force of a held press
             seems to change. Touches are computed without them.
-        works: Whether a film at rest can be tared with this device file. It is false after a touch.
-        device: Content of the given device file, or of a proposed device file. It is empty without frames, and has no
-            offsets after a touch.
+        device: Content of the given device file, or of a proposed device file. It is empty without frames.
     """
 
     url: str
@@ -76,18 +75,17 @@ class Examination:
     rate_Hz: float
     good: int
     bad: int
-    lost: int | None
-    repeated: int | None
-    device_clock: bool
-    unit: str
-    channels: tuple[ChannelHealth, ...]
-    unused: tuple[str, ...]
-    held: str
-    touch: str
-    missing: tuple[str, ...]
-    missing_for_held_presses: tuple[str, ...]
-    works: bool
-    device: Mapping[str, Any]
+    lost: int | None = None
+    repeated: int | None = None
+    device_clock: bool = False
+    unit: str = "pC"
+    channels: tuple[ChannelHealth, ...] = ()
+    unused: tuple[str, ...] = ()
+    held: str = ""
+    touch: str = ""
+    missing: tuple[str, ...] = ()
+    missing_for_held_presses: tuple[str, ...] = ()
+    device: Mapping[str, Any] = field(default_factory=dict)
 
 
 def examine(
@@ -160,23 +158,6 @@ def _uses_telnet(received: ReceivedData, device: Device, intact_share: float) ->
     return _intact_share(replace(received, chunks=chunks), device) > intact_share
 
 
-def _proposed_device(proposal: Proposal, *, is_gain_stated: bool) -> Device:
-    """Return the settings of a proposed device file.
-
-    Args:
-        proposal: The content of the file, and the names of the electrodes.
-        is_gain_stated: Whether the user has stated the gain. Otherwise the settings leave out the proposed section
-            `[gain]`, so that the values remain as the board sends them.
-
-    Raises:
-        DeviceError: If the gain is not valid, or is stated for other electrodes.
-    """
-    table = {key: value for key, value in proposal.table.items() if is_gain_stated or key != "gain"}
-    device = device_from_table(table, "board")
-    Gain(device.setup(proposal.electrodes))  # raises an error for the numbers of other electrodes
-    return device
-
-
 def examine_received(
     received: ReceivedData,
     *,
@@ -200,39 +181,17 @@ def examine_received(
     Raises:
         DeviceError: If the gain is not valid, or is stated for other electrodes.
     """
-    # Without a device file (`ANY_BOARD`), the format of the frames and the settings are proposed from the bytes.
-    is_proposed = device is ANY_BOARD
+    # Without a device file (`ANY_BOARD`), the format of the frames and the settings are proposed from the bytes. If no
+    # gain is stated, the values remain as the board sends them.
     given_device = device
-    if is_proposed:
-        proposal = propose(received, electrodes, gain or {})
-        device = _proposed_device(proposal, is_gain_stated=bool(gain))
-    else:
-        proposal = Proposal(dict(device.table), electrodes)
-
-    # Read the frames, and examine the channels in the time before a held press. With a gain, all values are converted
-    # to pC.
+    table = dict(device.table)
+    if device is ANY_BOARD:
+        table, electrodes = propose(received, electrodes, gain or {})
+        device = device_from_table({key: value for key, value in table.items() if gain or key != "gain"}, "board")
+        Gain(device.setup(electrodes))  # raises an error for the numbers of other electrodes
     capture = read_frames(received, device)
-    unit = "pC" if device.rule(GainRule) is not None else unit_of(capture)
-    electrode_at_position = electrodes_by_position(capture, device)
-    unused_channels = tuple(
-        name for position, name in enumerate(capture.names) if position not in electrode_at_position
-    )
-    find_press = find_current_press if device.front_end == "current" else find_held_press
-    held_press = find_press(*capture.values()) if capture.frames else None
-    rest_end_s = math.inf if held_press is None else held_press.begin_s  # the film is at rest until a held press begins
-    channels = tuple(_measure_channels(capture, device, electrode_at_position, rest_end_s))
-    touch_sentence = _touch_sentence(capture, device, electrode_at_position, held_press, unit)
-
-    # Complete the device file, and test whether the film can be tared with its settings. Proposed offsets that were
-    # measured on a touched film are wrong.
-    table = _completed_table(proposal.table, held_press, without_offsets=is_proposed and bool(touch_sentence))
-    electrode_names = proposal.electrodes or tuple(electrode_at_position.values())
-    is_at_rest = bool(electrode_at_position) and not touch_sentence
-    can_be_tared = is_at_rest and _can_be_tared(received, table, electrode_names)
-
-    # The first frame shows whether the frames have a number and a time. Without frames, both are None.
-    first_frame = capture.frames[0] if capture.frames else Frame(None, None, ())
-    is_numbered = first_frame.seq is not None
+    uses_telnet = _uses_telnet(received, given_device, capture.intact_share)
+    missing = list(transmission_sentences(capture, uses_telnet=uses_telnet))
     counts = capture.parser.counts
     examination = Examination(
         url=received.url,
@@ -243,117 +202,61 @@ def examine_received(
         rate_Hz=capture.rate_Hz,
         good=len(capture.frames),
         bad=counts.crc_errors + counts.malformed,
+        missing=tuple(missing),
+        device=table,
+    )
+    if not capture.frames or uses_telnet:
+        return examination
+
+    # Examine the electrodes' channels in the time before a held press. With a gain, all values are converted to pC.
+    electrode_at_position = electrodes_by_position(capture, device)
+    unit = "pC" if device.rule(GainRule) is not None else unit_of(capture)
+    values, times_s = capture.values()
+    held_press = find_held_press(values, times_s)
+    # The last moments before a held press do not count as rest, because the force is already rising.
+    rest_end_s = math.inf if held_press is None else held_press.begin_s - PRESS_MARGIN_S
+    is_rest = times_s < rest_end_s
+    charges = values[is_rest][:, list(electrode_at_position)]  # shape (n, n_electrode)
+    gain_rule = device.rule(GainRule)
+    if gain_rule is not None:
+        for column, electrode in enumerate(electrode_at_position.values()):
+            with np.errstate(over="ignore"):  # an unusable value may become infinite, and is ignored later
+                charges[:, column] = gain_rule.charge_pC(electrode, charges[:, column])
+    channels = tuple(
+        measure_channel_health(capture.names[position], charge, times_s[is_rest], capture.rate_Hz)
+        for position, charge in zip(electrode_at_position, charges.T, strict=True)
+    )
+
+    touch = ""
+    found = find_touch(charges, times_s[is_rest], unit_is_pC=unit == "pC") if channels else None
+    if found is not None:
+        touch = (
+            f"an untouched film: channel {printable(channels[found.column].name)} changes by {found.total_change:.4g} "
+            f"{unit} about {found.time_s:.1f} s after the first frame, as under a touch; take the finger away, and try "
+            "again"
+        )
+        missing.insert(0, touch)
+    if held_press is not None:
+        table = held_press.sections | table  # keeps a section that the device file already has
+    missing += channel_count_sentences(capture, device, len(channels), electrodes)
+    missing += unit_sentences(unit)
+    missing += channel_sentences(channels, unit, device)
+    first_frame = capture.frames[0]
+    is_numbered = first_frame.seq is not None
+    return replace(
+        examination,
         lost=capture.gaps.lost if is_numbered else None,
         repeated=capture.gaps.repeated if is_numbered else None,
         device_clock=first_frame.t_us is not None,
         unit=unit,
         channels=channels,
-        unused=unused_channels,
+        unused=tuple(name for position, name in enumerate(capture.names) if position not in electrode_at_position),
         held="" if held_press is None else held_press.description,
-        touch=touch_sentence,
-        missing=(),
+        touch=touch,
+        missing=tuple(missing),
         missing_for_held_presses=tuple(held_press_sentences(capture, device, held_press)),
-        works=can_be_tared,
         device=table,
     )
-    uses_telnet = _uses_telnet(received, given_device, capture.intact_share)
-    missing = missing_sentences(examination, capture, device, proposal.electrodes, uses_telnet=uses_telnet)
-    return replace(examination, missing=tuple(missing))
-
-
-def _completed_table(
-    table: Mapping[str, Any], held_press: HeldPress | None, *, without_offsets: bool
-) -> dict[str, Any]:
-    """Return the content of a device file, completed with the sections that follow from a held press.
-
-    Args:
-        table: Sections of the device file by name. They take precedence over the sections of the press.
-        held_press: The press, with sections that correct the change of its charge; None if no press was held.
-        without_offsets: Whether the key `offset` of the section `[gain]` is removed. Offsets that were measured on a
-            touched film are wrong.
-
-    Returns:
-        The completed sections by name. The given table is not changed.
-    """
-    completed_table = dict(table)
-    if held_press is not None:
-        for name, section in held_press.sections.items():
-            completed_table.setdefault(name, section)  # keeps a section that the device file already has
-    if without_offsets and "gain" in completed_table:
-        gain = completed_table.pop("gain")
-        remaining_gain = {key: value for key, value in gain.items() if key != "offset"}
-        if remaining_gain:  # an empty section is not valid
-            completed_table["gain"] = remaining_gain
-    return completed_table
-
-
-def _touch_sentence(
-    capture: Capture, device: Device, electrode_at_position: Mapping[int, str], held_press: HeldPress | None, unit: str
-) -> str:
-    """Return a sentence if the film was touched before any held press; otherwise, return an empty text.
-
-    The film should be at rest before a held press.
-
-    Args:
-        capture: The frames.
-        device: Settings of the board, with its gain.
-        electrode_at_position: Name of the electrode by the position of its channel in the frame.
-        held_press: The held press; None if there was none.
-        unit: Unit of the channels: "pC", "counts", "V", or a unit in their names, such as "nC".
-    """
-    if not capture.frames or not electrode_at_position:
-        return ""
-    # The last moments before a held press do not count as rest, because the force is already rising.
-    rest_end_s = math.inf if held_press is None else held_press.begin_s - PRESS_MARGIN_S
-    charges, times_s = _rest_charges(capture, device, electrode_at_position, rest_end_s)
-    touch = find_touch(charges, times_s, unit_is_pC=unit == "pC")
-    if touch is None:
-        return ""
-
-    # The charges have one column for each electrode. Find the channel of the column that was touched.
-    positions_in_frame = list(electrode_at_position)
-    position_in_frame = positions_in_frame[touch.column]
-    name = printable(capture.names[position_in_frame])
-    return (
-        f"an untouched film: channel {name} changes by {touch.total_change:.4g} {unit} about {touch.time_s:.1f} s "
-        "after the first frame, as under a touch; take the finger away, and try again"
-    )
-
-
-def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
-    """Return whether a tare succeeds with a device file. A tare is a measurement of the charges at rest.
-
-    There are four other cases.
-
-    - If there are no frames, the result is false.
-    - If reading the frames raises an error, the result is false.
-    - If the device file switches the tare off, the result is true.
-    - If there are fewer than twice as many frames as a tare needs, the result is true. The frames then do not show
-      that a tare would fail.
-
-    Args:
-        received: Bytes that the board sent while the film was at rest.
-        table: Content of the device file.
-        electrodes: Electrodes of the model.
-    """
-    frame_count = 0
-    try:
-        # Process the bytes again as a reader of the board does, until a frame has a tare.
-        device = device_from_table(table, "board")
-        tare_rule = device.rule(TareRule)
-        stream = ReadingStream(electrodes, device)
-        for chunk in received.chunks:
-            for frame in stream.frames(chunk):
-                frame_count += 1
-                if frame.tare_pC is not None or tare_rule is None:
-                    return True
-    except IsochargeError:
-        return False
-
-    if tare_rule is None or frame_count == 0:  # without a tare rule, the first frame has ended the loop
-        return False
-    # No frame has a tare. If there were few frames, this does not show that a tare fails.
-    return frame_count < 2 * tare_rule.frames
 
 
 def electrodes_by_position(capture: Capture, device: Device) -> dict[int, str]:
@@ -374,49 +277,3 @@ def electrodes_by_position(capture: Capture, device: Device) -> dict[int, str]:
         if position is not None:
             electrode_at_position[position] = electrode
     return electrode_at_position
-
-
-def _measure_channels(
-    capture: Capture, device: Device, electrode_at_position: Mapping[int, str], rest_end_s: float
-) -> Iterator[ChannelHealth]:
-    """Yield the health (offset, noise, drift and hum) of each channel that belongs to an electrode.
-
-    Args:
-        capture: The frames.
-        device: Settings of the board, with its gain.
-        electrode_at_position: Name of the electrode by the position of its channel in the frame.
-        rest_end_s: Time until which the film is at rest, s from the first frame. Later frames are left out.
-    """
-    if not capture.frames:
-        return
-    charges_pC, times_s = _rest_charges(capture, device, electrode_at_position, rest_end_s)
-    for position, charge_pC in zip(electrode_at_position, charges_pC.T, strict=True):
-        yield measure_channel_health(capture.names[position], charge_pC, times_s, capture.rate_Hz)
-
-
-def _rest_charges(
-    capture: Capture, device: Device, electrode_at_position: Mapping[int, str], rest_end_s: float
-) -> tuple[Array, Array]:
-    """Return the charges of the frames in which the film is at rest, and the times of these frames.
-
-    Args:
-        capture: The frames.
-        device: Settings of the board, with its gain.
-        electrode_at_position: Name of the electrode by the position of its channel in the frame.
-        rest_end_s: Time until which the film is at rest, s from the first frame. Later frames are left out.
-
-    Returns:
-        Two arrays. The first array contains the charges, shape (n, n_electrode), with the columns in the order of
-        `electrode_at_position`. Their unit is pC if the gain is known, and the unit of the board otherwise. The second
-        array contains the times since the first frame, shape (n,), s.
-    """
-    values, times_s = capture.values()  # shape (frames, channels) and shape (frames,)
-    is_rest = times_s < rest_end_s
-    positions_in_frame = list(electrode_at_position)
-    charges = values[is_rest][:, positions_in_frame]
-    gain = device.rule(GainRule)
-    if gain is not None:
-        for column, electrode in enumerate(electrode_at_position.values()):
-            with np.errstate(over="ignore"):  # an unusable value may become infinite, and is ignored later
-                charges[:, column] = gain.charge_pC(electrode, charges[:, column])
-    return charges, times_s[is_rest]

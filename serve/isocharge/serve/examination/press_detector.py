@@ -114,10 +114,6 @@ class PressDetector:
         self._count = 0  # number of blocks
         self.begin_block: int | None = None
         self.change = np.zeros(0)
-        self.forget_rest()
-
-    def forget_rest(self) -> None:
-        """Measure the rest level again from the next quiet blocks."""
         self.rest: Array | None = None
         self.is_pressed = False
         self._min_change = np.zeros(0)  # smallest change of each channel that begins a press
