@@ -40,7 +40,7 @@ def _row(charges: ChargeSpline, radius: float, force: float) -> str:
     rings = Rings.spread(radius)
     limits = rings.per_ring(limits_at(charges, rings.contacts(force), NOISE).position)
     rms = np.sqrt(np.average((limits**2).mean(axis=1), weights=rings.distance))
-    folds = len(find_folds(charges, rings, force, NOISE).points)
+    folds = len(find_folds(charges, rings, force, NOISE))
     pairs = len(find_ambiguous_pairs(charges, NOISE, force))
     return f"{limits.max():9.3f} {rms:8.3f} {folds:5d} {pairs:5d}"
 

@@ -30,7 +30,6 @@ from isocharge.common.progress import track
 from isocharge.simulate import ChargeSpline, NoiseModel
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import check_radius
-from isocharge.simulate.identifiability.folds import singular_values
 from isocharge.simulate.numerics.disk import onto_disk
 
 CHUNK = 64
@@ -457,8 +456,12 @@ class Posterior:
         force_jacobian = self._profile.slope(log_force, expected)[..., None]
         jacobian = np.concatenate([position_jacobian, force_jacobian], axis=2)
         whitened_jacobian = jacobian / self.noise.sigma(expected)[..., None]
-        # `singular_values` removes the part by the force. Shape (n, 2), in descending order
-        inverse_stds = singular_values(whitened_jacobian)
+        # Remove the component along the derivative with respect to the force, because the force is not known.
+        along_force = whitened_jacobian[..., 2:]
+        force_direction = along_force / np.maximum(np.linalg.norm(along_force, axis=1, keepdims=True), 1e-300)
+        position_jacobian = whitened_jacobian[..., :2]
+        component = np.einsum("nej,nei->nji", force_direction, position_jacobian)
+        inverse_stds = np.linalg.svd(position_jacobian - force_direction @ component, compute_uv=False)
         return np.asarray(inverse_stds[:, 0])
 
     def _integrate_force(self, position: Array, charge: Array) -> tuple[Array, Array]:

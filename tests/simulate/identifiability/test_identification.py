@@ -64,12 +64,6 @@ def test_determined_share_agrees_with_random_positions(film, identification):
     np.testing.assert_allclose(medians, expected, rtol=0.05)
 
 
-def test_condition_is_the_ratio_of_the_standard_deviations_of_the_position(identification):
-    limits = identification.maps[1]
-    covariance = limits_at(identification.charges, limits.rings.contacts(limits.force), REFERENCE).covariance
-    np.testing.assert_allclose(limits.condition.ravel(), np.sqrt(np.linalg.cond(covariance[:, :2, :2])), rtol=0.02)
-
-
 def test_working_area_with_an_electrode_at_the_centre_is_small(film):
     """The area is smaller than the spacing of the rings on the whole film."""
     places = ((0.0, 0.0), (8.66, 5.0), (-8.66, 5.0))

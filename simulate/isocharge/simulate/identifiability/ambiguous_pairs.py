@@ -27,6 +27,9 @@ MIN_DISTANCE_SIGMAS = 6.0
 If the distance is smaller, the two contacts count as a single contact with a large uncertainty.
 """
 
+STARTS = 3
+"""Number of searches for a second contact of each first contact. Most often, one of them finds the first contact."""
+
 
 @dataclass(frozen=True)
 class AmbiguousPairs:
@@ -109,10 +112,10 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     position_std = limits_at(charge_map, contact, noise).position
     min_distance = np.maximum(MIN_DISTANCE, MIN_DISTANCE_SIGMAS * position_std)
     sigma = noise.sigma(charge)
-    start = starting_contacts(charge_map, charge, sigma, excluded=(position, min_distance))
+    start = starting_contacts(charge_map, charge, sigma, starts=STARTS)
 
-    # Search for the second contacts. Then select the pairs whose contacts are still distant, and whose charges agree
-    # within the noise.
+    # Search for the second contacts. A search that finds the first contact again is discarded below. Then select the
+    # pairs whose contacts are still distant, and whose charges agree within the noise.
     first_index = np.repeat(np.arange(len(charge)), start.shape[1])
     first_contact = contact[first_index]
     second_contact, residual = explain(

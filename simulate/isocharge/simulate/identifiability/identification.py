@@ -14,13 +14,7 @@ from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_cou
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
-from isocharge.simulate.identifiability.folds import scaled_derivatives, singular_values
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion, mirror_region
-from isocharge.simulate.identifiability.side_force_limits import (
-    MAX_SIDE_FORCE_ERROR,
-    SideForceLimits,
-    side_force_limits,
-)
 from isocharge.simulate.identifiability.working_area import (
     DEFAULT_ERROR,
     Bound,
@@ -68,15 +62,12 @@ class LimitMap:
         position: Smallest root mean square error of the position, shape (n_ring, n_angle), mm.
         relative_force: Smallest standard deviation of the force divided by the force, shape (n_ring, n_angle),
             dimensionless.
-        condition: Ratio of the standard deviations of the position in the worst and in the best direction, shape
-            (n_ring, n_angle), dimensionless.
     """
 
     force: float
     rings: Rings
     position: Array
     relative_force: Array
-    condition: Array
 
     @classmethod
     def of(cls, charge_map: ChargeMap, noise: NoiseModel, force: float, rings: Rings) -> "LimitMap":
@@ -88,26 +79,13 @@ class LimitMap:
             force: Force of the contacts, N.
             rings: Positions of the contacts.
         """
-        contact = rings.contacts(force)
-        limits = limits_at(charge_map, contact, noise)
-
-        # The two singular values are the inverse standard deviations of the position in the best and in the worst
-        # direction. The smaller singular value is zero at a fold, so the ratio is limited to 1e12.
-        largest, smallest = singular_values(scaled_derivatives(charge_map, contact, noise)).T
-        condition = largest / np.maximum(smallest, 1e-12 * largest)
-        return cls(
-            force,
-            rings,
-            position=rings.per_ring(limits.position),
-            relative_force=rings.per_ring(limits.force),
-            condition=rings.per_ring(condition),
-        )
+        limits = limits_at(charge_map, rings.contacts(force), noise)
+        return cls(force, rings, rings.per_ring(limits.position), rings.per_ring(limits.force))
 
     def statistics(self) -> dict[str, float]:
         """Return a dictionary for JSON with the median, the root mean square and the maximum of the errors.
 
-        The weight of a position is the area that it represents. Errors of the force are in percent of the force. The
-        dictionary also contains the force and the largest condition number.
+        The weight of a position is the area that it represents. Errors of the force are in percent of the force.
         """
         # The area that a position represents is proportional to its distance from the centre.
         n_angle = self.position.shape[1]
@@ -122,7 +100,6 @@ class LimitMap:
             "force_median_percent": _median(force_error_percent, area),
             "force_rms_percent": float(np.sqrt(np.average(force_error_percent**2, weights=area))),
             "force_worst_percent": float(force_error_percent.max()),
-            "condition_worst": float(self.condition.max()),
         }
 
 
@@ -140,8 +117,6 @@ class Identification:
             for the largest force.
         inner_maps: Error limits within the working area for the same forces; empty if the working area has the
             radius 0.
-        side_force: Error limits for the same forces if the side force of the probe is unknown. Empty with fewer than
-            six electrodes, for a probe that is not circular, or if the working area has the radius 0.
         mirror: Share of the presses outside the working area that have the charges of a press inside the working area.
             None if the share was not computed, if there is no working area, or if the working area reaches the clamp.
     """
@@ -153,7 +128,6 @@ class Identification:
     area: WorkingArea
     maps: tuple[LimitMap, ...] = field(repr=False)
     inner_maps: tuple[LimitMap, ...] = field(repr=False)
-    side_force: tuple[SideForceLimits, ...] = field(repr=False, default=())
     mirror: MirrorRegion | None = field(default=None, repr=False)
 
     @classmethod
@@ -163,7 +137,6 @@ class Identification:
         noise: NoiseModel,
         *,
         error: float = DEFAULT_ERROR,
-        executor: Executor | None = None,
     ) -> "Identification":
         """Compute how well the charges of a sensor determine the contacts in the domain of a forward map.
 
@@ -173,7 +146,6 @@ class Identification:
             forward_map: Forward map of the sensor.
             noise: Noise of the readings. The white noise must be positive.
             error: Largest Cramer-Rao position error that is allowed in the working area, mm.
-            executor: Executor that runs the solves of the side forces; None for this process.
         """
         check_electrode_count(len(forward_map.electrodes))
         charges = with_fast_derivatives(forward_map)
@@ -187,8 +159,7 @@ class Identification:
         area = working_area(charges, noise, error=error)
         maps = _limit_maps(charges, noise, forces, charges.domain.radius)
         inner_maps = _limit_maps(charges, noise, forces, area.radius)
-        side_force = side_force_limits(forward_map, charges, noise, forces, area.radius, executor)
-        return cls(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inner_maps, side_force)
+        return cls(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inner_maps)
 
     @property
     def determined_share(self) -> float:
@@ -202,13 +173,6 @@ class Identification:
 
     @property
     def summary(self) -> str:
-        """Sentences that describe the working area, and also the error of the side force if it was computed."""
-        if not self.side_force:
-            return self._area_summary
-        return f"{self._area_summary} {self._side_force_summary}"
-
-    @property
-    def _area_summary(self) -> str:
         """Sentences about the working area, and about the larger area in which preceding frames are needed."""
         area = self.area
         if not (len(area.folds) or len(area.pairs)):
@@ -219,21 +183,6 @@ class Identification:
             f"{area.search_radius:.3g} mm that was searched. The working area is "
             f"{100.0 * (area.radius / area.search_radius) ** 2:.0f} % of this disk."
         )
-
-    @property
-    def _side_force_summary(self) -> str:
-        """Sentence that lists the forces at which the side force can be estimated, with the error at each force."""
-        estimable = [limits for limits in self.side_force if limits.is_estimable]
-        if not estimable:
-            return (
-                f"The side force of the probe cannot be estimated to {100.0 * MAX_SIDE_FORCE_ERROR:g} % of the force "
-                "at any of these forces."
-            )
-        errors = []
-        for limits in estimable:
-            median_percent = limits.statistics()["side_force_median_percent"]
-            errors.append(f"to {median_percent:.2g} % of the force at {limits.force:g} N")
-        return f"The side force of the probe can be estimated {', '.join(errors)} (median)."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the results as a dictionary for JSON, in which an infinite radius is None."""
@@ -257,7 +206,6 @@ class Identification:
             },
             "mirror_region": None if self.mirror is None else self.mirror.to_dict(),
             "limits_in_working_area": [limits.statistics() for limits in self.inner_maps],
-            "limits_with_side_force": [limits.statistics() for limits in self.side_force],
             "by_distance": self._errors_by_distance(),
             "folds_mm": area.folds.round(3).tolist(),
             "twins": self._listed_pairs(),
@@ -327,7 +275,7 @@ def identify(
     else:
         forward_map = ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
 
-    identification = Identification.of(forward_map, noise, error=error, executor=executor)
+    identification = Identification.of(forward_map, noise, error=error)
     area_radius = identification.area.radius
     mirror = mirror_region(sensor, probe, identification.charges, area_radius, noise, executor=executor)
     return replace(identification, mirror=mirror)

@@ -48,21 +48,16 @@ def explain(
         Contacts (x, y, F) within the domain of the map, shape (n, 3), mm and N. Residuals, which are the given charges
         minus the charges of the contacts, divided by `sigma`, shape (n, n_electrode), dimensionless.
     """
-
-    # Compute the centre and the half width of the domain along x, y and ln F. Unit coordinates are relative to them.
-    radius = INNER_RADIUS * charge_map.domain.radius
     force_range = charge_map.domain.force_range
-    min_log_force, max_log_force = np.log(force_range)
-    centre = charge_map.domain.centre
-    half_width = np.array([radius, radius, 0.5 * (max_log_force - min_log_force)])
-    # The half width of ln F is zero if there is a single force. A division by the half width uses 1 instead.
-    nonzero_half_width = np.where(half_width > 0.0, half_width, 1.0)
+    domain = charge_map.domain.within(INNER_RADIUS * charge_map.domain.radius)
+    # With a single force, the charges do not depend on the third unit coordinate.
+    half_width = domain.scale * [1.0, 1.0, force_range[1] > force_range[0]]
 
     def to_contact(unit_coordinates: Array) -> Array:
         """Convert unit coordinates, shape (k, 3), into contacts (x, y, F), shape (k, 3), mm and N."""
-        log_contact = unit_coordinates * half_width + centre  # (x, y, ln F)
-        force = np.clip(np.exp(log_contact[:, 2]), *force_range)  # rounding must not move it out of the range
-        return np.column_stack([log_contact[:, :2], force])
+        contact = domain.to_contact(unit_coordinates)
+        contact[:, 2] = np.clip(contact[:, 2], *force_range)  # rounding must not move it out of the range
+        return contact
 
     def residuals(rows: Integers, unit_coordinates: Array) -> tuple[Array, Array]:
         """Compute the residuals (Q - Q(c)) / sigma for selected rows of charges, and the derivatives of the residuals.
@@ -75,15 +70,11 @@ def explain(
             Residuals, shape (k, n_electrode). Their derivatives with respect to the unit coordinates, shape (k, 3,
             n_electrode).
         """
-        # The slopes are the derivatives of the charges with respect to x, y and ln F, shape (k, n_electrode, 3).
         predicted, slopes = linearised(charge_map, to_contact(unit_coordinates))
         derivatives = -slopes * half_width / sigma[rows][..., None]
         return (charge[rows] - predicted) / sigma[rows], derivatives.swapaxes(1, 2)
 
-    # Convert the starting points into unit coordinates, minimise, and convert the solution back.
-    log_start = np.column_stack([start[:, :2], np.log(start[:, 2])])  # (x, y, ln F)
-    unit_start = (log_start - centre) / nonzero_half_width
-    unit_solution, residual = minimise(residuals, unit_start, min_change=min_change)
+    unit_solution, residual = minimise(residuals, domain.to_unit(start), min_change=min_change)
     return to_contact(unit_solution), residual
 
 
@@ -137,7 +128,6 @@ def starting_contacts(
     *,
     starts: int = 2,
     candidates: int = CANDIDATES,
-    excluded: tuple[Array, Array] | None = None,
 ) -> Array:
     """Find starting points of descents for given charges.
 
@@ -150,8 +140,6 @@ def starting_contacts(
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
         starts: Number of starting points for each row of charges.
         candidates: Number of candidates.
-        excluded: Disk for each row of charges in which no starting point lies: centres, shape (n, 2), mm, and radii,
-            shape (n,), mm. None to exclude no disk.
 
     Returns:
         For each row of charges, the contacts (x, y, F) with the nearest charges, in ascending order of the distance of
@@ -165,19 +153,11 @@ def starting_contacts(
     positions = unit_candidates[:, :2]
     is_neighbour = scipy.spatial.distance.cdist(positions, positions) < START_SEPARATION
 
-    # Find the candidates with the nearest charges for each row of charges. If there are no charges, the loop processes
-    # one empty chunk, because at least one array is needed for the concatenation.
-    nearest_candidates = []
-    for chunk_start in range(0, max(len(charge), 1), CHUNK):
-        chunk = slice(chunk_start, chunk_start + CHUNK)
-        is_excluded = None
-        if excluded is not None:
-            centre, radius = excluded
-            is_excluded = scipy.spatial.distance.cdist(centre[chunk], contact[:, :2]) <= radius[chunk, None]
-        nearest_candidates.append(
-            _nearest_rows(charge[chunk], sigma[chunk], candidate_charges, is_neighbour, starts, is_excluded)
-        )
-    return np.asarray(contact[np.concatenate(nearest_candidates)])
+    start = np.empty((len(charge), starts, 3))
+    for first_row in range(0, len(charge), CHUNK):
+        chunk = slice(first_row, first_row + CHUNK)
+        start[chunk] = contact[_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, is_neighbour, starts)]
+    return start
 
 
 def _unit_candidates(count: int) -> Array:
@@ -201,12 +181,7 @@ def _unit_candidates(count: int) -> Array:
 
 
 def _nearest_rows(
-    charge: Array,
-    sigma: Array,
-    candidate_charges: Array,
-    is_neighbour: Booleans,
-    count: int,
-    is_excluded: Booleans | None = None,
+    charge: Array, sigma: Array, candidate_charges: Array, is_neighbour: Booleans, count: int
 ) -> Integers:
     """For each row of charges, find the candidates whose charges are nearest to this row.
 
@@ -219,7 +194,6 @@ def _nearest_rows(
         candidate_charges: Charges of the candidates, shape (n_candidate, n_electrode), pC.
         is_neighbour: Whether each pair of candidates lies close together, shape (n_candidate, n_candidate).
         count: Number of candidates to find for each row of charges.
-        is_excluded: Whether a candidate must not be found for a row, shape (n, n_candidate); None to allow all.
 
     Returns:
         Indices of the candidates in ascending order of the distance of their charges, shape (n, count).
@@ -231,8 +205,6 @@ def _nearest_rows(
     weights = np.hstack([inverse_variance, -2.0 * charge * inverse_variance])
     charge_powers = np.hstack([candidate_charges**2, candidate_charges])
     squared_distance = weights @ charge_powers.T  # shape (n, n_candidate)
-    if is_excluded is not None:
-        squared_distance[is_excluded] = np.inf
     nearest = np.empty((len(charge), count), dtype=np.intp)
     for rank in range(count):
         nearest_candidate = squared_distance.argmin(axis=1)

@@ -22,11 +22,8 @@ This value is the radius of the default probe.
 RADIUS_STEP = 0.1
 """The radius of a working area is rounded down to a multiple of this step, mm."""
 
-MAX_CONFIRMATIONS = 4
-"""Largest number of times that the error is evaluated again on finer rings within the area.
-
-Near an electrode, the error may exceed its limit between two neighbouring rings of the first evaluation.
-"""
+MAX_RINGS = 200
+"""Largest number of rings on which the position error is evaluated. Larger disks have a multiple of `RADIUS_STEP`."""
 
 Bound = Literal["fold", "ambiguous pair", "error", "search"]
 """Reason for the radius of a working area. "search" means that only the radius of the search bounds the area.
@@ -131,22 +128,20 @@ def search_working_area(
     min_force, max_force = charge_map.domain.force_range
     middle_force = float(np.sqrt(min_force * max_force))
     forces = sorted({min_force, middle_force, max_force})
-    rings = Rings.spread(search_radius)
 
-    # Find the distance of the nearest fold among the folds for all forces.
-    folds_of_forces = [find_folds(charge_map, rings, force, noise) for force in forces]
-    folds = np.concatenate([folds_of_force.points for folds_of_force in folds_of_forces])
-    fold_x, fold_y = folds.T
-    fold_radius = float(np.hypot(fold_x, fold_y).min(initial=np.inf))
+    # The distances of the rings are multiples of the step to which the radius of the working area is rounded.
+    step = RADIUS_STEP * np.ceil(search_radius / (MAX_RINGS * RADIUS_STEP))
+    n_rings = max(1, int(_round_down(search_radius, step) / step + 0.5))
+    rings = Rings.spread(min(n_rings * step, search_radius), n_rings)
 
-    # Find the distance at which the error first exceeds its limit, on the rings or at the positions between the rings
-    # where the error has a local maximum.
-    error_radius = np.inf
-    for force, folds_of_force in zip(forces, folds_of_forces, strict=True):
-        ring_radius = _error_radius(charge_map, rings, force, noise, error)
-        weakest_radius = _nearest_exceeding_distance(charge_map, folds_of_force.weakest, force, noise, error)
-        error_radius = min(error_radius, ring_radius, weakest_radius)
-    error_radius = _confirm_error_radius(charge_map, error_radius, forces, noise, error)
+    # Find the folds, and the last ring before the error first exceeds its limit. An error that is NaN exceeds it.
+    folds = np.concatenate([find_folds(charge_map, rings, force, noise) for force in forces])
+    fold_radius = float(np.hypot(*folds.T).min(initial=np.inf))
+    errors = [rings.per_ring(limits_at(charge_map, rings.contacts(force), noise).position) for force in forces]
+    is_within_limit = (np.array(errors) <= error).all(axis=(0, 2))
+    error_radius = search_radius
+    if not is_within_limit.all():
+        error_radius = float(np.append(0.0, rings.distance)[is_within_limit.argmin()])
     pairs = find_ambiguous_pairs(charge_map, noise, min_force) if search_pairs else AmbiguousPairs.none()
 
     # The smallest of the following radii bounds the working area. If the error never exceeds its limit, `error_radius`
@@ -172,93 +167,9 @@ def search_working_area(
     )
 
 
-def _confirm_error_radius(
-    charge_map: ChargeMap, radius: float, forces: list[float], noise: NoiseModel, error: float
-) -> float:
-    """Evaluate the position error on finer rings within a radius, and reduce the radius if the error exceeds its limit.
-
-    After a reduction, the evaluation is repeated within the smaller radius, on still finer rings.
-
-    Args:
-        charge_map: Map that computes the charges of contacts.
-        radius: Radius within which the error does not exceed its limit on coarser rings, mm.
-        forces: Forces of the contacts, N.
-        noise: Noise of the readings.
-        error: Largest allowed position error, mm.
-
-    Returns:
-        Radius within which the error does not exceed its limit on the finer rings either, mm. There are at most
-        `MAX_CONFIRMATIONS` evaluations.
-    """
-    # If the given radius is that of the domain, the rings within it are those that were evaluated before. A second
-    # evaluation would not change the result.
-    if radius >= charge_map.domain.radius:
-        return radius
-    for _ in range(MAX_CONFIRMATIONS):
-        # The finer rings extend to the rounded radius, because the radius of the working area is rounded, too.
-        outermost_ring = _round_down(radius)
-        if outermost_ring <= 0.0:
-            break
-        finer_rings = Rings.spread(outermost_ring)
-
-        # If the error exceeds its limit on none of the finer rings, the distance is that of the outermost ring.
-        exceeding_distance = min(_error_radius(charge_map, finer_rings, force, noise, error) for force in forces)
-        is_confirmed = exceeding_distance >= outermost_ring * (1.0 - 1e-9)  # allows for rounding errors
-        if is_confirmed:
-            break
-        radius = exceeding_distance
-    return radius
-
-
-def _error_radius(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel, error: float) -> float:
-    """Return the distance from the centre at which the position error first exceeds its limit, mm.
-
-    The logarithm of the largest error on each ring is interpolated linearly between the rings. If no error exceeds the
-    limit, the distance of the outermost ring is returned.
-
-    Args:
-        charge_map: Map that computes the charges of contacts.
-        rings: Positions at which the error is evaluated.
-        force: Force of the contacts, N.
-        noise: Noise of the readings.
-        error: Largest allowed position error, mm.
-    """
-    position_error = rings.per_ring(limits_at(charge_map, rings.contacts(force), noise).position)
-    largest_error = position_error.max(axis=1)  # shape (n_ring,)
-    exceeding_rings = np.flatnonzero(~(largest_error <= error))  # an error that is NaN exceeds the limit
-    if not exceeding_rings.size:
-        outermost_distance = rings.distance[-1]
-        return float(outermost_distance)
-    first_exceeding = int(exceeding_rings[0])
-    if first_exceeding == 0:  # even the innermost ring has too large errors
-        return 0.0
-    rings_around_limit = [first_exceeding - 1, first_exceeding]
-    log_errors = np.log(largest_error[rings_around_limit])
-    return float(np.interp(np.log(error), log_errors, rings.distance[rings_around_limit]))
-
-
-def _nearest_exceeding_distance(
-    charge_map: ChargeMap, position: Array, force: float, noise: NoiseModel, error: float
-) -> float:
-    """Return the distance (mm) from the centre to the nearest given position with an error above its limit.
-
-    The distance is infinite if the error does not exceed its limit at any of the given positions.
-
-    Args:
-        charge_map: Map that computes the charges of contacts.
-        position: Positions (x, y), shape (n, 2), mm.
-        force: Force of the contacts at these positions, N.
-        noise: Noise of the readings.
-        error: Largest allowed position error, mm.
-    """
-    contact = np.column_stack([position, np.full(len(position), force)])
-    is_exceeding = ~(limits_at(charge_map, contact, noise).position <= error)  # an error that is NaN exceeds the limit
-    return float(np.hypot(*position.T).min(initial=np.inf, where=is_exceeding))
-
-
-def _round_down(radius: float) -> float:
-    """Round a radius (mm) down to a multiple of `RADIUS_STEP`."""
+def _round_down(radius: float, step: float = RADIUS_STEP) -> float:
+    """Round a radius down to a multiple of a step, mm."""
     # The factor compensates the rounding error of the quotient. The conversion into decimal digits removes the rounding
     # error of the product.
-    steps = np.floor(radius / RADIUS_STEP * (1.0 + 1e-9))
-    return float(f"{steps * RADIUS_STEP:.12g}")
+    steps = np.floor(radius / step * (1.0 + 1e-9))
+    return float(f"{steps * step:.12g}")

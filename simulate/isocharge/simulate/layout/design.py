@@ -220,7 +220,7 @@ def describe_ambiguities(case: DesignCase, charges: ChargeMap) -> str:
     min_force, max_force = charges.domain.force_range
     forces = sorted({min_force, case.force, max_force})
     rings = Rings.spread(case.radius)
-    fold_points = np.concatenate([find_folds(charges, rings, force, case.noise).points for force in forces])
+    fold_points = np.concatenate([find_folds(charges, rings, force, case.noise) for force in forces])
     pair_count = sum(len(find_ambiguous_pairs(charges, case.noise, force)) for force in forces)
 
     findings = []
