@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.model.metadata import ModelMetadata
@@ -26,9 +27,6 @@ from isocharge.serve.model.validity import Validity
 from isocharge.serve.network.metrics import ModelMetrics, Statistics
 
 log = logging.getLogger(__name__)
-
-UNLOADED = "unloaded"
-"""Reason in the index if a client has unloaded the model."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +63,23 @@ class LoadedVersion:
         return press
 
 
+class _Versions(NamedTuple):
+    """Versions of one model. The object is never changed, so that other threads can use it without a lock.
+
+    Attributes:
+        loaded: Loaded versions by number, in ascending order of their numbers.
+        refused: Reasons why versions were refused or unloaded, by number.
+    """
+
+    loaded: Mapping[int, LoadedVersion] = MappingProxyType({})
+    refused: Mapping[int, str] = MappingProxyType({})
+
+    def find(self, version: str) -> LoadedVersion | None:
+        """Return the loaded version with a number, or the highest loaded version if the number is empty."""
+        numbers = [number for number in self.loaded if version in ("", str(number))]
+        return self.loaded[numbers[-1]] if numbers else None
+
+
 class ModelStore:
     """Loaded models by name and version.
 
@@ -88,66 +103,47 @@ class ModelStore:
         self._change_lock = threading.Lock()
         self.metrics = ModelMetrics()
         self._statistics: dict[tuple[str, int], Statistics] = {}
-        # Loaded versions by name and version. The empty version in a key stands for the highest loaded version.
-        self._loaded: dict[tuple[str, str], LoadedVersion] = {}
-        self._refused: dict[tuple[str, int], str] = {}  # reasons why versions were refused, by name and version
+        self._models: dict[str, _Versions] = {}  # is replaced as a whole, so that no thread reads half of a change
         for name, folder in folders().items():
             self._load_versions(name, folder)
-        if not self._loaded:
+        if not self.loaded_versions():
             raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'no model was found'}")
 
-    def get(self, name: str, version: str = "") -> LoadedVersion:
-        """Return a loaded version of a model.
+    def find(self, name: str, version: str = "") -> LoadedVersion | None:
+        """Return a loaded version of a model, or None if the version is not loaded.
 
         Args:
             name: Name of the model.
             version: Number of the version as a text. An empty text means the highest loaded version.
+        """
+        return self._models.get(name, _Versions()).find(version)
+
+    def get(self, name: str, version: str = "") -> LoadedVersion:
+        """Return a loaded version of a model, as `find` does.
 
         Raises:
             ModelNotFound: If the version is not loaded. The message lists the loaded versions, and states why the
                 version was refused or unloaded.
         """
-        loaded = self._loaded.get((name, version))
-        if loaded is None:
-            raise ModelNotFound(self._not_found_message(name, version))
-        return loaded
-
-    def _not_found_message(self, name: str, version: str) -> str:
-        """Return the error message for a model or a version that is not loaded.
-
-        The message lists all loaded versions. If the requested version was refused or unloaded, the message also
-        contains the reason.
-
-        Args:
-            name: Name of the model.
-            version: Number of the requested version as a text. An empty text means that any version was requested. The
-                message then contains the reasons for all versions of the model.
-        """
+        loaded = self.find(name, version)
+        if loaded is not None:
+            return loaded
         label = f"{name}/{version}" if version else name
-        loaded_labels = sorted(loaded.metadata.label for loaded in self.loaded_versions())
-        available = ", ".join(loaded_labels) or "no model"
-        reasons: list[str] = []
-        for (refused_name, refused_version), reason in sorted(self._refused.items()):
-            is_requested_version = version in ("", str(refused_version))
-            is_requested = refused_name == name and is_requested_version
-            if is_requested and reason not in reasons:
-                reasons.append(reason)
-        return "; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *reasons])
+        available = ", ".join(sorted(loaded.metadata.label for loaded in self.loaded_versions())) or "no model"
+        refused = self._models.get(name, _Versions()).refused
+        reasons = [reason for number, reason in refused.items() if version in ("", str(number))]
+        raise ModelNotFound(
+            "; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *dict.fromkeys(reasons)])
+        )
 
     def label(self, name: str, version: str = "") -> str | None:
-        """Return the label `name/version` of a version, or None if the version is not loaded.
-
-        Args:
-            name: Name of the model.
-            version: Number of the version as a text. An empty text means the highest loaded version.
-        """
-        loaded = self._loaded.get((name, version))
+        """Return the label `name/version` of the version that `find` returns, or None if the version is not loaded."""
+        loaded = self.find(name, version)
         return None if loaded is None else loaded.metadata.label
 
     def loaded_versions(self) -> list[LoadedVersion]:
         """Return all loaded versions of all models, sorted by name and version."""
-        versions = [loaded for (_, version), loaded in self._loaded.items() if version]
-        return sorted(versions, key=lambda loaded: (loaded.metadata.name, loaded.metadata.version))
+        return [loaded for _, versions in sorted(self._models.items()) for loaded in versions.loaded.values()]
 
     def versions_of(self, name: str) -> list[LoadedVersion]:
         """Return the loaded versions of one model, in ascending order of their numbers.
@@ -156,11 +152,11 @@ class ModelStore:
             ModelNotFound: If no version of the model is loaded.
         """
         self.get(name)  # raises ModelNotFound
-        return [loaded for loaded in self.loaded_versions() if loaded.metadata.name == name]
+        return list(self._models[name].loaded.values())
 
     def refusals(self) -> list[str]:
         """Return the reasons why versions were refused or unloaded, sorted by name and version."""
-        return [reason for _, reason in sorted(self._refused.items())]
+        return [row["reason"] for row in self.index() if row["reason"]]
 
     def check_ready(self) -> None:
         """Check that at least one version of a model is loaded.
@@ -170,40 +166,24 @@ class ModelStore:
         Raises:
             ModelError: If no version is loaded.
         """
-        if self._loaded:
-            return
-        unloaded_count = list(self._refused.values()).count(UNLOADED)
-        refused_count = len(self._refused) - unloaded_count
-        raise ModelError(
-            f"not ready: no model is loaded (versions refused: {refused_count}, unloaded: {unloaded_count}); "
-            "the repository's index has the reasons"
-        )
-
-    def version_states(self) -> list[dict[str, str]]:
-        """Return one row for every version that is loaded, was refused or was unloaded.
-
-        A row contains the name of the model, and the number and the state of the version. If the version was refused or
-        unloaded, the row also contains the reason.
-        """
-        reasons = self._refused
-        loaded_keys = {(loaded.metadata.name, loaded.metadata.version) for loaded in self.loaded_versions()}
-        all_keys = loaded_keys | set(reasons)  # a loaded version whose new files were refused is in both sets
-        return [
-            {
-                "name": name,
-                "version": str(version),
-                "state": "READY" if (name, version) in loaded_keys else "UNAVAILABLE",
-                "reason": reasons.get((name, version), ""),
-            }
-            for name, version in sorted(all_keys)
-        ]
+        if not self.loaded_versions():
+            raise ModelError("not ready: no model is loaded; the repository's index has the reasons")
 
     def index(self) -> list[dict[str, str]]:
-        """Return the rows of `version_states`, followed by one row for each model that has no version among them."""
-        rows = self.version_states()
-        listed_names = {row["name"] for row in rows}
-        for name in self._folders():
-            if name not in listed_names:
+        """Return one row for every version that is loaded, was refused or was unloaded, and for every other model.
+
+        A row contains the name of the model, and the number and the state of the version. If the version was refused or
+        unloaded, the row also contains the reason. The number is empty if no version of a model was found.
+        """
+        rows = []
+        models = self._models
+        for name in sorted(models.keys() | self._folders().keys()):
+            loaded, refused = models.get(name, _Versions())
+            for version in sorted(loaded.keys() | refused.keys()):  # new files of a loaded version may be refused
+                state = "READY" if version in loaded else "UNAVAILABLE"
+                reason = refused.get(version, "")
+                rows.append({"name": name, "version": str(version), "state": state, "reason": reason})
+            if not (loaded or refused):
                 rows.append({"name": name, "version": "", "state": "UNAVAILABLE", "reason": ""})
         return rows
 
@@ -242,10 +222,10 @@ class ModelStore:
             ModelNotFound: If no version of the model is loaded.
         """
         with self._change_lock:
-            reasons = {(name, loaded.metadata.version): UNLOADED for loaded in self.versions_of(name)}
-            self._replace(name, [], reasons)
+            unloaded = {loaded.metadata.version: "unloaded" for loaded in self.versions_of(name)}
+            self._replace(name, _Versions(refused=unloaded))
 
-    def _load_versions(self, name: str, folder: Path) -> dict[tuple[str, int], str]:
+    def _load_versions(self, name: str, folder: Path) -> Mapping[int, str]:
         """Load every version in the folder of a model, and replace the versions that were loaded before.
 
         If a version is refused, or if no version is found, every earlier version that was not replaced remains loaded.
@@ -255,60 +235,30 @@ class ModelStore:
             folder: Folder of the model.
 
         Returns:
-            Reasons why versions were refused, by name and version.
+            Reasons why versions were refused, by number.
         """
-        new_versions: dict[int, LoadedVersion] = {}
-        refused: dict[tuple[str, int], str] = {}
+        loaded: dict[int, LoadedVersion] = {}
+        refused: dict[int, str] = {}
         for version, version_folder in version_folders(folder).items():
             # The counters continue when files are loaded again, because a Prometheus counter must never decrease.
             if (name, version) not in self._statistics:
                 self._statistics[name, version] = Statistics(self.metrics, name, version)
             statistics = self._statistics[name, version]
             try:
-                new_versions[version] = _load_version(name, version, version_folder, statistics)
+                loaded[version] = _load_version(name, version, version_folder, statistics)
             except Exception as error:  # any error in one folder must not affect the other models
-                refused[name, version] = _refusal_reason(version_folder, error)
-        available_versions = new_versions
-        if refused or not new_versions:  # keep the versions that were loaded before, unless new files replace them
-            available_versions = self._loaded_by_version(name) | new_versions
-        ascending_versions = [available_versions[version] for version in sorted(available_versions)]
-        self._replace(name, ascending_versions, refused)
+                refused[version] = _refusal_reason(version_folder, error)
+        if refused or not loaded:  # keep the versions that were loaded before, unless new files replace them
+            loaded = {**self._models.get(name, _Versions()).loaded, **loaded}
+        self._replace(name, _Versions(dict(sorted(loaded.items())), refused))
         return refused
 
-    def _loaded_by_version(self, name: str) -> dict[int, LoadedVersion]:
-        """Return the loaded versions of a model by the number of the version."""
-        return {loaded.metadata.version: loaded for loaded in self.loaded_versions() if loaded.metadata.name == name}
-
-    def _replace(self, name: str, versions: list[LoadedVersion], refused: dict[tuple[str, int], str]) -> None:
-        """Replace the loaded versions of a model, and the reasons why its versions were refused or unloaded.
-
-        Each dictionary is replaced by a new dictionary in a single assignment. Other threads can therefore read the
-        dictionaries without a lock.
-
-        Args:
-            name: Name of the model.
-            versions: New loaded versions of the model, in ascending order. If the list is empty, the model is removed.
-            refused: Reasons why versions were refused or unloaded, by name and version.
-        """
-        loaded = {
-            (other_name, version): other_loaded
-            for (other_name, version), other_loaded in self._loaded.items()
-            if other_name != name
-        }
-        for new_version in versions:
-            loaded[name, new_version.version] = new_version
-        if versions:
-            loaded[name, ""] = versions[-1]  # the empty version stands for the highest version
-
-        other_refused = {
-            (other_name, version): reason
-            for (other_name, version), reason in self._refused.items()
-            if other_name != name
-        }
-        self._refused = other_refused | refused
-        self._loaded = loaded
+    def _replace(self, name: str, versions: _Versions) -> None:
+        """Replace the versions of a model."""
+        self._models = self._models | {name: versions}
         for (known_name, version), statistics in self._statistics.items():
-            statistics.ready.set((known_name, str(version)) in loaded)
+            if known_name == name:
+                statistics.ready.set(version in versions.loaded)
 
 
 def open_model_store(models: Path | None = None) -> ModelStore:

@@ -29,6 +29,7 @@ from schemathesis.specs.openapi.checks import (
 from headless_chromium import start_chromium
 from isocharge.common.errors import InputError
 from isocharge.serve.network.address import ServerLimits, Token
+from isocharge.serve.network.model_store import _Versions
 from isocharge.serve.network.protocol import Handler, routes
 from isocharge.serve.network.protocol.response import compress, decompress
 
@@ -401,7 +402,7 @@ def chromium():
 def test_start_page_lists_the_models_and_an_example_that_runs(chromium, store, start_http, ask):
     """The texts of the models come from files. They are shown as text, even if they look like HTML."""
     name = "<svg onload=alert(1)>"
-    store._refused[name, 1] = f"{name}/1 is refused"
+    store._models[name] = _Versions(refused={1: f"{name}/1 is refused"})
     page = chromium.new_page()
     page.goto(start_http(Handler(store)).url)
     page.wait_for_selector("td a")

@@ -94,14 +94,26 @@ async def _start(handler: Handler, address: str, tls: Tls | None) -> tuple[grpc.
         handler: Handler of the HTTP server. The gRPC server uses its models, limits and token.
         address: Address `host:port` on which to listen. The port 0 selects a free port.
         tls: Certificate and private key for TLS, or None for a server without TLS.
+
+    Raises:
+        ListenError: If the address is in use or cannot be used.
+        InputError: If a TLS file cannot be used.
     """
     limits = handler.limits
     # The service limits the number of open calls to `connections`. If a new call exceeds this limit, the service ends a
     # waiting call instead of refusing the new call. grpcio would refuse the new call, so its own limit must be higher.
-    max_calls = 2 * limits.connections
-    server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=max_calls)
+    server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=2 * limits.connections)
     server.add_generic_rpc_handlers((Service(handler).handlers(),))
-    port = _listen(server, address, tls)
+    try:
+        if tls is None:
+            port = server.add_insecure_port(address)
+        else:
+            credentials = grpc.ssl_server_credentials([tls.key_and_certificate()])
+            port = server.add_secure_port(address, credentials)
+    except RuntimeError as error:
+        raise ListenError(
+            f"cannot listen on {address} for gRPC: {error}; choose another --grpc-port or --host"
+        ) from error
     await server.start()
     return server, port
 
@@ -120,26 +132,3 @@ def _options(limits: ServerLimits) -> list[tuple[str, int]]:
         ("grpc.keepalive_permit_without_calls", 1),  # the client may also ping while it has no open call
         ("grpc.so_reuseport", 0),
     ]
-
-
-def _listen(server: grpc.aio.Server, address: str, tls: Tls | None) -> int:
-    """Bind a server to an address, and return the port on which the server listens.
-
-    Args:
-        server: The server, which has not been started yet.
-        address: Address `host:port` on which to listen. The port 0 selects a free port.
-        tls: Certificate and private key for TLS, or None for a server without TLS.
-
-    Raises:
-        ListenError: If the address is in use or cannot be used.
-        InputError: If a TLS file cannot be used.
-    """
-    try:
-        if tls is None:
-            return int(server.add_insecure_port(address))
-        credentials = grpc.ssl_server_credentials([tls.key_and_certificate()])
-        return int(server.add_secure_port(address, credentials))
-    except RuntimeError as error:
-        raise ListenError(
-            f"cannot listen on {address} for gRPC: {error}; choose another --grpc-port or --host"
-        ) from error

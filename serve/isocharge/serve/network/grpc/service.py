@@ -98,30 +98,27 @@ class Service:
 
     def handlers(self) -> grpc.GenericRpcHandler:
         """Return the handlers of all methods in the form that grpcio requires."""
-        methods = {name: grpc.stream_unary_rpc_method_handler(partial(self._handle, name)) for name in METHODS}
-        methods[STREAM] = grpc.stream_stream_rpc_method_handler(partial(self._handle, STREAM))
+        methods = {name: grpc.stream_stream_rpc_method_handler(partial(self._handle, name)) for name in METHODS}
         return grpc.method_handlers_generic_handler(SERVICE, methods)
 
-    async def _handle(self, name: str, _messages: object, context: grpc.aio.ServicerContext) -> Any:
+    async def _handle(self, name: str, _messages: object, context: grpc.aio.ServicerContext) -> None:
         """Answer a call. Then count the call by its status, and log the call if there is a log.
+
+        If an error has occurred, the call is ended with the status and the message of the error.
 
         Args:
             name: Name of the method.
             _messages: Iterator over the messages. It is not used, because the messages are read from the context.
-            context: Context of the call, from which messages are read.
-
-        Returns:
-            The serialized response, or None if the method is `STREAM`, because its responses were already sent. If an
-            error has occurred, the call is ended with the status and the message of the error, and nothing is returned.
+            context: Context of the call, from which messages are read and to which responses are written.
         """
         call = _Call()
         start_ns = time.perf_counter_ns()
         status = "CANCELLED"  # if the client disconnects, this coroutine is cancelled, and the status is not changed
+        message = ""
         error_type = None
         try:
-            response = await self._answer_call(name, context, call)
+            await self._answer(name, context, call)
             status = "OK"
-            return response
         except grpc.aio.InternalError as error:  # no message can be sent or read, as the client has ended the call
             raise asyncio.CancelledError from error
         except Exception as error:  # every error is sent to the client
@@ -141,65 +138,41 @@ class Service:
                     client=context.peer() if self._traffic.log else None,  # only the log needs the client
                 )
             )
-        # This line is reached only after an error. The call is ended with the status and the message of the error.
-        return await context.abort(grpc.StatusCode[status], message)
+        if message:
+            await context.abort(grpc.StatusCode[status], message)
 
-    async def _answer_call(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes | None:
+    async def _answer(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> None:
         """Check the number of open calls and the token, and answer the messages of a call.
 
-        Args:
-            name: Name of the method.
-            context: Context of the call.
-            call: Properties of the call for the counters and the log, which are updated.
-
-        Returns:
-            The serialized response, or None if the method is `STREAM`, because its responses were already sent.
-        """
-        with self._count_open_call():
-            if self._token is not None and name not in METHODS_WITHOUT_TOKEN:
-                self._token.check(_authorization(context))
-            if name == STREAM:
-                await self._answer_stream(context, call)
-                return None
-            return await self._answer_message(name, context, call)
-
-    async def _answer_message(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes:
-        """Wait for the only message of a call, and return the serialized response.
-
-        Args:
-            name: Name of the method.
-            context: Context of the call, from which the message is read.
-            call: Properties of the call for the counters and the log, which are updated.
-
-        Raises:
-            RequestError: If the call ends without a message, or if the message is not valid.
-            TimeoutError: If the message does not arrive in time.
-        """
-        data = await self._next_message(context, self._limits.header_seconds)
-        if data is grpc.aio.EOF:
-            raise RequestError(f"{name}: expected a message, got none")
-        if name in SLOW_METHODS:
-            return await asyncio.to_thread(self._respond, name, data, call)
-        return self._respond(name, data, call)
-
-    async def _answer_stream(self, context: grpc.aio.ServicerContext, call: _Call) -> None:
-        """Send a response to each message of a stream until the client ends the stream.
-
-        The first message must arrive within `header_seconds`, and each later message within `idle_seconds` after the
+        A call of the method `STREAM` may contain any number of messages, and every other call contains one message. The
+        first message must arrive within `header_seconds`, and each later message within `idle_seconds` after the
         previous response. The client must read each response within `body_seconds`.
 
         Args:
+            name: Name of the method.
             context: Context of the call, from which messages are read and to which responses are written.
             call: Properties of the call for the counters and the log, which are updated.
 
         Raises:
             TimeoutError: If the client does not send a message or does not read a response in time.
+            IsochargeError: If the call is refused.
         """
-        data = await self._next_message(context, self._limits.header_seconds)
-        while data is not grpc.aio.EOF:
-            async with asyncio.timeout(self._limits.body_seconds):
-                await context.write(self._respond(STREAM, data, call))
-            data = await self._next_message(context, self._limits.idle_seconds)
+        with self._count_open_call():
+            if self._token is not None and name not in METHODS_WITHOUT_TOKEN:
+                self._token.check(_authorization(context))
+            timeout_s = self._limits.header_seconds
+            while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
+                if name in SLOW_METHODS:
+                    response = await asyncio.to_thread(self._respond, name, data, call)
+                else:
+                    response = self._respond(name, data, call)
+                async with asyncio.timeout(self._limits.body_seconds):
+                    await context.write(response)
+                if name != STREAM:
+                    return
+                timeout_s = self._limits.idle_seconds
+            if name != STREAM:
+                raise RequestError(f"{name}: expected a message, got none")
 
     def _respond(self, name: str, data: bytes, call: _Call) -> bytes:
         """Answer one message, and return the serialized response.
