@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError
+from isocharge.serve.flags import BEYOND
 from isocharge.serve.model.contact import Contact, Contacts
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.model_folder import load_model
@@ -69,9 +70,6 @@ class Predictor:
         self._session = loaded.session
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
         self._press_lock = threading.Lock()  # held while a method uses the memory of `_press`
-        # The limits of implausible contacts are stored here, because `predict` compares them with every contact.
-        self._centre_x_mm, self._centre_y_mm = self.validity.centre_mm
-        self._max_distance_squared_mm2, self._max_force_N = self.validity.implausible_limits
         self._has_warned = False
         self._stated_noise: ModelNoise | None = None
 
@@ -121,13 +119,9 @@ class Predictor:
             contacts = self._with_stated_noise(self._stated_noise, as_batch([values], self.metadata.electrodes))
             contact = Contact(*np.asarray(contacts, float)[0].tolist())
 
-        # These lines repeat `Validity.is_beyond`, because a call would slow down the prediction.
-        x_from_centre_mm = contact.x_mm - self._centre_x_mm
-        y_from_centre_mm = contact.y_mm - self._centre_y_mm
-        distance_squared_mm2 = x_from_centre_mm * x_from_centre_mm + y_from_centre_mm * y_from_centre_mm
-        is_implausible = contact.force_N > self._max_force_N or distance_squared_mm2 > self._max_distance_squared_mm2
-        if is_implausible:
-            self._warn_once(charge_pC, contact)
+        if not self._has_warned and BEYOND in self.flags(contact):
+            self._has_warned = True
+            self._warn(charge_pC, contact)
         return contact
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
@@ -229,16 +223,13 @@ class Predictor:
             f"positions {self.validity.area_text}, forces {low_N:.3g} to {high_N:.3g} N)"
         )
 
-    def _warn_once(self, charge_pC: object, contact: Contact) -> None:
-        """Log a warning for a contact that cannot be a measurement, unless a warning was logged before.
+    def _warn(self, charge_pC: object, contact: Contact) -> None:
+        """Log a warning for a contact that cannot be a measurement.
 
         Args:
             charge_pC: Charges of the press, as they were passed to `predict`.
             contact: Contact that the model computed from the charges.
         """
-        if self._has_warned:
-            return
-        self._has_warned = True
         charges = np.ravel(np.asarray(charge_pC, float))
         pairs = zip(self.metadata.electrodes, charges, strict=True)
         log.warning(
