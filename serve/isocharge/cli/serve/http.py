@@ -69,8 +69,8 @@ def http_command(
     """Serve models over HTTP and, with --grpc-port, over gRPC. The protocol is the Open Inference Protocol v2.
 
     Charges are in pC, positions in mm, and forces in N. Prints the address as soon as the server answers requests. The
-    server has a page for people at `/`, a description for programs at `/openapi.json`, and metrics for Prometheus at
-    `/metrics`. SIGHUP loads all models again. After Ctrl-C, the server answers all requests that have begun, and stops.
+    server has a description for programs at `/openapi.json`, and metrics for Prometheus at `/metrics`. SIGHUP loads
+    all models again. After Ctrl-C, the server answers all requests that have begun, and stops.
 
     Example: isocharge serve http --port 8000
     """

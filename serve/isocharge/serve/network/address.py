@@ -19,13 +19,6 @@ from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import InputError, ListenError, TokenError, TooLarge
 from isocharge.common.files import read_whole
 
-LISTEN_ERRORS = {
-    errno.EADDRINUSE: "another program listens there; stop it or choose another port",
-    errno.EADDRNOTAVAIL: "this machine has no such address; choose one that it has",
-    errno.EACCES: "this user may not listen there; choose another place, or a port above 1023",
-}
-"""Cause and advice by the error number of the operating system, if a server cannot listen."""
-
 
 @dataclass(frozen=True)
 class Address:
@@ -71,11 +64,8 @@ class Address:
         except ListenError:  # _listen_unix has raised this error, whose message already states what to do
             raise
         except (OSError, UnicodeError) as error:  # a host name that cannot be encoded causes a UnicodeError
-            reason = str(error)
-            if isinstance(error, OSError) and error.errno in LISTEN_ERRORS:
-                reason = LISTEN_ERRORS[error.errno]
             place = self.uds or f"{self.host}:{self.port}"
-            raise ListenError(f"cannot listen on {place}: {reason}") from error
+            raise ListenError(f"cannot listen on {place}: {error}; choose another address or port") from error
 
     def release(self) -> None:
         """Remove the file of the closed Unix socket, unless another server listens on the same path.

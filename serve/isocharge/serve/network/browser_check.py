@@ -25,14 +25,6 @@ from urllib.parse import urlsplit
 from isocharge.common.errors import InputError, OriginError, RequestError
 from isocharge.serve.network.address import ip_address
 
-CACHED_REQUESTS = 256
-"""Number of combinations of headers for which the result of the check is cached.
-
-Clients send the same headers again and again.
-"""
-
-LOCALHOST = "localhost"
-
 TRUSTED_FETCH_SITES = (b"same-origin", b"none")
 """Values of the header `Sec-Fetch-Site` that are accepted.
 
@@ -52,11 +44,10 @@ class BrowserCheck:
             on a Unix socket.
     """
 
-    def __init__(self, host: str = LOCALHOST, allowed_hosts: Iterable[str] = (), *, any_host: bool = False) -> None:
+    def __init__(self, host: str = "localhost", allowed_hosts: Iterable[str] = (), *, any_host: bool = False) -> None:
         self._allowed_names = frozenset(map(host_name, allowed_hosts))
-        self._host_names = self._allowed_names | {LOCALHOST, host.lower()}
+        self._host_names = self._allowed_names | {"localhost", host.lower()}
         self._any_host = any_host
-        self._cached_reason = lru_cache(CACHED_REQUESTS)(self._refusal_reason)
 
     def check(self, method: str, headers: Mapping[bytes, bytes]) -> None:
         """Check the headers of a request, and raise an error if the request is refused.
@@ -68,66 +59,30 @@ class BrowserCheck:
         Raises:
             OriginError: If a page of another site has sent the request, or if `Host` is not a name of this server.
         """
-        get = headers.get
-        reason = self._cached_reason(
-            method,
-            get(b"host", b""),
-            get(b"origin"),
-            get(b"sec-fetch-site"),
-            get(b"sec-fetch-mode"),
-            get(b"sec-fetch-dest"),
-        )
-        if reason is not None:
-            raise OriginError(reason)
-
-    def _refusal_reason(
-        self,
-        method: str,
-        host: bytes,
-        origin: bytes | None,
-        fetch_site: bytes | None,
-        fetch_mode: bytes | None,
-        fetch_dest: bytes | None,
-    ) -> str | None:
-        """Return the reason why a request is refused, or None if the request is accepted.
-
-        First, the header `Host` must contain a name or an address of this server, unless every host is accepted.
-        Second, if the request has a header `Origin`, it must contain the origin of a page of this server. Third, if the
-        request has no header `Origin`, the header `Sec-Fetch-Site` must not state that another site has sent the
-        request. As an exception, the user may follow a link on another site to a page of this server.
-
-        Args:
-            method: Method in capitals.
-            host: Value of the header `Host`. It is empty if the request has no such header.
-            origin: Value of the header `Origin`, or None if the request has no such header.
-            fetch_site: Value of the header `Sec-Fetch-Site`, or None if the request has no such header.
-            fetch_mode: Value of the header `Sec-Fetch-Mode`, or None if the request has no such header.
-            fetch_dest: Value of the header `Sec-Fetch-Dest`, or None if the request has no such header.
-        """
-        is_accepted_host = self._any_host or self._is_served(host)
-        if not is_accepted_host:
-            return (
-                f"Host: expected an IP address or one of {self._served_names()}, got {_quoted(host)}; use the server's "
-                "address, or name the host by --allow-host"
+        host = headers.get(b"host", b"")
+        if not (self._any_host or self._is_served(host)):
+            raise OriginError(
+                f"Host: expected an IP address or one of {', '.join(sorted(self._host_names))}, got {_quoted(host)}; "
+                "use the server's address, or name the host by --allow-host"
             )
+        origin = headers.get(b"origin")
         if origin is not None:
-            if self._is_own_page(origin, host):
-                return None
-            return (
-                f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
-                "itself, or name the page's host by --allow-host"
+            if not self._is_own_page(origin, host):
+                raise OriginError(
+                    f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
+                    "itself, or name the page's host by --allow-host"
+                )
+            return
+        # Programs other than browsers do not send the header Sec-Fetch-Site. A link on another site may open a page of
+        # this server, because the other site cannot read the response.
+        fetch_site = headers.get(b"sec-fetch-site", b"none")
+        is_navigation = headers.get(b"sec-fetch-mode") == b"navigate" and headers.get(b"sec-fetch-dest") == b"document"
+        is_link = is_navigation and method in ("GET", "HEAD")
+        if fetch_site.lower() not in TRUSTED_FETCH_SITES and not is_link:
+            raise OriginError(
+                f"Sec-Fetch-Site: expected a request by a page of this server, got {_quoted(fetch_site)}; open the "
+                f"page of {_quoted(host)}"
             )
-        # Programs other than browsers do not send the header Sec-Fetch-Site.
-        if fetch_site is None or fetch_site.lower() in TRUSTED_FETCH_SITES:
-            return None
-        # A link on another site may open a page of this server, because the other site cannot read the response.
-        is_link = method in ("GET", "HEAD") and fetch_mode == b"navigate" and fetch_dest == b"document"
-        if is_link:
-            return None
-        return (
-            f"Sec-Fetch-Site: expected a request by a page of this server, got {_quoted(fetch_site)}; open the page of "
-            f"{_quoted(host)}"
-        )
 
     def _is_served(self, host: bytes) -> bool:
         """Return whether the header `Host` contains an IP address or a name of this server.
@@ -163,10 +118,6 @@ class BrowserCheck:
         page_name = _name_in(f"//{page_host}")
         requested_name = _name_in(f"//{requested_host}")
         return page_name in self._allowed_names and page_name != requested_name
-
-    def _served_names(self) -> str:
-        """Return the host names of this server in alphabetical order, separated by commas."""
-        return ", ".join(sorted(self._host_names))
 
 
 def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
@@ -216,6 +167,7 @@ def host_name(text: str) -> str:
     return name.removesuffix(".")  # "example.org." is the same host as "example.org"
 
 
+@lru_cache
 def _name_in(url: str) -> str:
     """Return the host name in a URL in lower case, or "?" if the URL contains no host name."""
     try:

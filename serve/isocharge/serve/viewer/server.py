@@ -27,8 +27,7 @@ from isocharge.serve.network.address import Token
 from isocharge.serve.network.browser_check import BrowserCheck, header_values
 from isocharge.serve.network.http.application import Message, Receive, Send
 from isocharge.serve.network.protocol import Response
-from isocharge.serve.network.protocol.page import PAGE_HEADERS
-from isocharge.serve.network.protocol.response import error_response, json_response, response_of
+from isocharge.serve.network.protocol.response import PAGE_HEADERS, error_response, json_response, response_of
 from isocharge.serve.viewer.hub import Hub, Viewer
 from isocharge.serve.viewer.messages import FLAG_BITS, confirmed_number
 

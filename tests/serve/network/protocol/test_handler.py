@@ -3,9 +3,7 @@
 schemathesis creates valid and invalid requests from the OpenAPI document, and compares the answers with the document.
 """
 
-import base64
 import gzip
-import hashlib
 import re
 import tracemalloc
 import zlib
@@ -26,10 +24,8 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from headless_chromium import start_chromium
 from isocharge.common.errors import InputError
-from isocharge.serve.network.address import ServerLimits, Token
-from isocharge.serve.network.model_store import _Versions
+from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.protocol import Handler, routes
 from isocharge.serve.network.protocol.response import compress, decompress
 
@@ -311,7 +307,7 @@ def test_openapi_describes_request_and_response_of_each_route(ask):
     document = orjson.loads(ask("GET", "/openapi.json")[2])
     described = {(next(iter(item.keys() - {"parameters"})).upper(), path) for path, item in document["paths"].items()}
     existing = {(route.method, path) for route in routes.ROUTES for path in route.paths}
-    assert existing - described == {("GET", "/"), ("GET", "/openapi.json")}
+    assert existing - described == {("GET", "/openapi.json")}
     assert described <= existing
     for path, item in sorted(document["paths"].items(), key=lambda row: row[0].endswith("unload")):
         (method,) = item.keys() - {"parameters"}
@@ -370,75 +366,6 @@ def test_model_metadata_equal_those_of_the_file(ask, store):
     assert properties == store.get("linear").metadata.to_props()
 
 
-def test_card_of_a_model(ask, store):
-    status, headers, body = ask("GET", "/v2/models/linear/card")
-    assert (status, headers["content-type"]) == (200, "text/plain; charset=utf-8")
-    assert body.startswith(b"# The linear film")
-    (store.get("linear").model.folder / "card.md").unlink()
-    assert refusal(ask("GET", "/v2/models/linear/card"))[1].startswith("linear/2: this model has no card")
-
-
-def test_start_page_allows_only_its_own_script_and_style(ask):
-    """The only script and the only style sheet of the page are allowed by their hashes."""
-    _, headers, page = ask("GET", "/")
-    policy = dict(part.strip().split(" ", 1) for part in headers["content-security-policy"].split(";"))
-    for name in ("script", "style"):
-        text = page.decode().split(f"<{name}>")[1].split(f"</{name}>")[0]
-        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-        assert policy.pop(f"{name}-src") == f"'sha256-{digest}'"
-        assert page.count(f"<{name}".encode()) == 1
-    assert policy.pop("connect-src") == "'self'"
-    assert policy == dict.fromkeys(("default-src", "base-uri", "form-action", "frame-ancestors"), "'none'")
-    assert (headers["x-content-type-options"], headers["x-frame-options"]) == ("nosniff", "DENY")
-    assert b" style=" not in page
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with start_chromium() as browser:
-        yield browser
-
-
-def test_start_page_lists_the_models_and_an_example_that_runs(chromium, store, start_http, ask):
-    """The texts of the models come from files. They are shown as text, even if they look like HTML."""
-    name = "<svg onload=alert(1)>"
-    store._models[name] = _Versions(refused={1: f"{name}/1 is refused"})
-    page = chromium.new_page()
-    page.goto(start_http(Handler(store)).url)
-    page.wait_for_selector("td a")
-    assert page.locator("td a").all_inner_texts() == ["linear/1", "linear/2"]
-    assert page.locator(".refused").inner_text() == f"Refused: {name}/1 is refused"
-    assert page.locator("svg").count() == 0
-    example = page.locator("#example").inner_text()
-    assert example.startswith("curl 'http://127.0.0.1:")
-    assert ask("POST", INFER, example.split("-d '")[1].split("'")[0].encode())[0] == 200
-    page.locator("td a").first.click()
-    page.wait_for_selector("#text:visible")
-    assert page.locator("#text").inner_text().startswith("# The linear film")
-    for width in (1280, 390):
-        page.set_viewport_size({"width": width, "height": 844})
-        boxes = [cell.bounding_box() for cell in page.locator("td, dd").all()]
-        assert all(box["x"] + box["width"] <= width for box in boxes)
-    page.close()
-
-
-def test_start_page_asks_for_the_token(chromium, store, start_http):
-    page = chromium.new_page()
-    url = start_http(Handler(store, token=Token("sesame"))).url
-    page.goto(url)
-    page.wait_for_selector("form:visible")
-    assert page.locator("td a").count() == 0
-    page.fill("input", "other")
-    page.click("button")
-    page.wait_for_function("document.querySelector('output').textContent.includes('another token')")
-    page.fill("input", "sesame")
-    page.click("button")
-    page.wait_for_selector("td a")
-    assert 'Bearer $ISOCHARGE_TOKEN"' in page.locator("#example").inner_text()
-    assert "sesame" not in page.content()
-    page.close()
-
-
 CHECKS = [
     not_a_server_error,
     content_type_conformance,
@@ -458,7 +385,7 @@ def operations(handler, start_http):
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", GenerationMode, ids=lambda mode: mode.value)
 def test_server_conforms_to_its_openapi_document(operations, mode):
-    listed = {path for route in routes.ROUTES for path in route.paths} - {"/", "/openapi.json"}
+    listed = {path for route in routes.ROUTES for path in route.paths} - {"/openapi.json"}
     assert {operation.path for operation in operations} == {path for path in listed if "unload" not in path}
     answered = set()
     for operation in operations:

@@ -11,40 +11,17 @@ import re
 import time
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import NamedTuple
 
 from isocharge.common.errors import UnknownPath, WrongMethod
 from isocharge.serve.network.address import ServerLimits, Token
 from isocharge.serve.network.browser_check import BrowserCheck, header_values
 from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.response import Response, decompress, error_response
-from isocharge.serve.network.protocol.routes import ROUTES, Request, Route, Service
+from isocharge.serve.network.protocol.routes import ROUTES, Request, Route
 from isocharge.serve.network.traffic import Client, Exchange, Traffic
 
 Headers = Iterable[tuple[bytes, bytes]]
 """Headers of a request. The names are in lower case, and the values are unchanged."""
-
-MAX_REMEMBERED_PATHS = 64
-"""Number of recently requested paths whose routes are cached."""
-
-
-class Match(NamedTuple):
-    """The route of a path.
-
-    Attributes:
-        route: The route, or None if the server has no route for the path.
-        label: First template of the route, under which requests are counted and logged.
-        model: Name of the model in the path. It is empty if the path contains no name.
-        version: Version of the model in the path. It is empty if the path contains no version.
-    """
-
-    route: Route | None
-    label: str
-    model: str = ""
-    version: str = ""
-
-
-NO_ROUTE = Match(None, "unknown")
 
 _PARAMETERS = {"{model}": "(?P<model>[^/]*)", "{version}": "(?P<version>[^/]+)"}
 """Regular expression for each placeholder that a template of a path may contain."""
@@ -61,20 +38,19 @@ def _pattern(template: str) -> re.Pattern[str]:
 _PATTERNS = [(_pattern(template), route) for route in ROUTES for template in route.paths]
 
 
-@lru_cache(MAX_REMEMBERED_PATHS)
-def match_path(path: str) -> Match:
+@lru_cache
+def match_path(path: str) -> tuple[Route | None, str, str]:
     """Return the route of a path, and the name and the version of the model in the path.
 
     If the path contains no name or no version, the name or the version in the result is empty. If the server has no
-    route for the path, the result is `NO_ROUTE`.
+    route for the path, the route is None.
     """
     for pattern, route in _PATTERNS:
         path_match = pattern.fullmatch(path)
         if path_match is not None:
             parameters = path_match.groupdict()
-            label = route.paths[0]  # requests for the other paths of the route are counted under the first path
-            return Match(route, label, parameters.get("model", ""), parameters.get("version", ""))
-    return NO_ROUTE
+            return route, parameters.get("model", ""), parameters.get("version", "")
+    return None, "", ""
 
 
 class Handler:
@@ -106,14 +82,13 @@ class Handler:
         has_token = token is not None
         self._browser_check = browser_check or BrowserCheck(any_host=has_token)
         self.traffic = traffic or Traffic()
-        self._service = Service(store, self.limits, self.traffic)
 
     def may_block(self, path: str) -> bool:
         """Return whether computing the response for a path may take a long time.
 
         The server should then compute the response in another thread, so that other requests are not delayed.
         """
-        route = match_path(path).route
+        route, _, _ = match_path(path)
         return route is not None and route.may_block
 
     def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
@@ -130,19 +105,21 @@ class Handler:
             The response. If an error occurs, it is not raised, but the response contains its status and its message.
         """
         start_ns = time.perf_counter_ns()
-        match = match_path(path)
+        route, model, version = match_path(path)
+        label = "unknown" if route is None else route.paths[0]  # all paths of a route are counted under the first path
         try:
-            response = self._check_and_answer(method, path, match, header_values(headers), body)
+            request = Request(self.store, self.limits, self.traffic, header_values(headers), body, model, version)
+            response = self._check_and_answer(method, path, route, request)
         except Exception as error:  # every error is sent to the client
             response = error_response(error)
-        self.traffic.count("http", match.label, response.status)
+        self.traffic.count("http", label, response.status)
         log = self.traffic.log
         if log is not None:  # the properties of the exchange are only determined for the log
             exchange = Exchange(
                 transport="http",
-                route=match.label,
+                route=label,
                 status=response.status,
-                model=self.store.label(match.model, match.version),
+                model=self.store.label(model, version),
                 error=response.error,
                 ns=time.perf_counter_ns() - start_ns,
                 bytes_in=len(body),
@@ -152,23 +129,20 @@ class Handler:
             log.write_exchange(exchange)
         return response
 
-    def _check_and_answer(
-        self, method: str, path: str, match: Match, headers: dict[bytes, bytes], body: bytes
-    ) -> Response:
+    def _check_and_answer(self, method: str, path: str, route: Route | None, request: Request) -> Response:
         """Check whether a request is allowed, answer the request, and return the response.
 
         Args:
             method: Method in capitals.
             path: Path without the query, for error messages.
-            match: Route of the path.
-            headers: Value of each header by the name of the header in lower case.
-            body: Body of the request, which may be compressed.
+            route: Route of the path, or None if the server has no route for the path.
+            request: The request, whose body may be compressed.
 
         Raises:
             IsochargeError: If the request is refused.
         """
+        headers = request.headers
         self._browser_check.check(method, headers)
-        route = match.route
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
         # which paths exist.
         if self.token is not None and (route is None or route.needs_token):
@@ -179,8 +153,9 @@ class Handler:
         is_head_of_get = method == "HEAD" and route.method == "GET"
         if method != route.method and not is_head_of_get:
             raise WrongMethod(f"{path}: expected the method {route.method}, got {method[:20]}", route.method)
-        self.limits.check_body(len(body))
+        self.limits.check_body(len(request.body))
         encoding = headers.get(b"content-encoding")
         if encoding is not None:
-            body = decompress(body, encoding.lower(), self.limits.body_bytes)
-        return route.respond(Request(self._service, headers, body, match.model, match.version))
+            plain_body = decompress(request.body, encoding.lower(), self.limits.body_bytes)
+            request = request._replace(body=plain_body)
+        return route.respond(request)

@@ -109,6 +109,14 @@ def error_response(error: Exception) -> Response:
     return response
 
 
+PAGE_HEADERS = [
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+]
+"""Headers of every page, in addition to its content security policy."""
+
 MIN_COMPRESSED_BYTES = 1024
 """Smallest size of a body that is compressed, bytes. Shorter bodies are sent faster without compression."""
 

@@ -18,37 +18,26 @@ from isocharge.serve.network.protocol import describe
 from isocharge.serve.network.protocol.bodies import IndexBody
 from isocharge.serve.network.protocol.inference import answer_inference, read_infer, write_answer
 from isocharge.serve.network.protocol.openapi import openapi_document
-from isocharge.serve.network.protocol.page import PAGE_HEADERS, START_PAGE, START_PAGE_POLICY, card
 from isocharge.serve.network.protocol.response import Response, compress, json_response, response_of
 from isocharge.serve.network.traffic import Traffic
-
-
-class Service(NamedTuple):
-    """Objects of the server that the functions of the routes need.
-
-    Attributes:
-        store: Store of the models that the server uses.
-        limits: Limits of the size of a body and of a batch.
-        traffic: Counters of the requests to the server.
-    """
-
-    store: ModelStore
-    limits: ServerLimits
-    traffic: Traffic
 
 
 class Request(NamedTuple):
     """Request that is passed to the function of its route. Its body is already decompressed.
 
     Attributes:
-        service: Objects of the server.
+        store: Store of the models that the server uses.
+        limits: Limits of the size of a body and of a batch.
+        traffic: Counters of the requests to the server.
         headers: Value of each header by the name of the header in lower case.
         body: Body of the request.
         model: Name of the model in the path. It is empty if the path contains no name.
         version: Version of the model in the path. It is empty if the path contains no version.
     """
 
-    service: Service
+    store: ModelStore
+    limits: ServerLimits
+    traffic: Traffic
     headers: Mapping[bytes, bytes]
     body: bytes
     model: str = ""
@@ -57,7 +46,7 @@ class Request(NamedTuple):
     @property
     def loaded(self) -> LoadedVersion:
         """Loaded version of the model in the path. ModelNotFound is raised if the version is not loaded."""
-        return self.service.store.get(self.model, self.version)
+        return self.store.get(self.model, self.version)
 
     def object(self) -> dict[str, Any]:
         """Return the JSON object in the body, which is empty if there is no body."""
@@ -72,7 +61,7 @@ class Route(NamedTuple):
         paths: Templates of the paths. Requests are logged and counted under the first template.
         respond: Function that answers a request.
         needs_token: Whether requests must contain the token of the server. Health checks need no token, because the
-            programs that start and monitor servers do not have it. The start page asks for the token itself.
+            programs that start and monitor servers do not have it.
         may_block: Whether an answer may take a long time. The server then computes the answer in another thread.
     """
 
@@ -86,25 +75,12 @@ class Route(NamedTuple):
 # The functions below answer the requests of the routes. A parameter `_` is a request whose content is not needed.
 
 
-def _show_page(_: Request) -> Response:
-    response = response_of(200, b"text/html; charset=utf-8", START_PAGE)
-    response.headers.extend([*PAGE_HEADERS, (b"content-security-policy", START_PAGE_POLICY)])
-    return response
-
-
-def _show_card(request: Request) -> Response:
-    response = response_of(200, b"text/plain; charset=utf-8", card(request.loaded.model))
-    response.headers.extend(PAGE_HEADERS)
-    return response
-
-
 def _show_openapi(request: Request) -> Response:
-    return json_response(openapi_document(request.service.store))
+    return json_response(openapi_document(request.store))
 
 
 def _show_metrics(request: Request) -> Response:
-    service = request.service
-    texts = [generate_latest(registry) for registry in (service.store.metrics.registry, service.traffic.registry)]
+    texts = [generate_latest(registry) for registry in (request.store.metrics.registry, request.traffic.registry)]
     return response_of(200, CONTENT_TYPE, b"".join(texts))
 
 
@@ -117,12 +93,12 @@ def _is_live(_: Request) -> Response:
 
 
 def _is_ready(request: Request) -> Response:
-    request.service.store.check_ready()
+    request.store.check_ready()
     return json_response({"ready": True})
 
 
 def _show_statistics(request: Request) -> Response:
-    return json_response(describe.statistics_of(request.service.store, request.model, request.version))
+    return json_response(describe.statistics_of(request.store, request.model, request.version))
 
 
 def _show_index(request: Request) -> Response:
@@ -131,25 +107,25 @@ def _show_index(request: Request) -> Response:
     If the body contains `ready: true`, the index contains only the loaded versions.
     """
     body = parse_json(request.body or b"{}", "", RequestError, IndexBody)
-    return json_response(describe.repository_index(request.service.store, ready=body.ready is True))
+    return json_response(describe.repository_index(request.store, ready=body.ready is True))
 
 
 def _load(request: Request) -> Response:
     """Read the files of a model again, and return an empty object."""
     if request.object().get("parameters") not in (None, {}):
         raise RequestError(describe.NO_LOAD_PARAMETERS)
-    request.service.store.load(request.model)
+    request.store.load(request.model)
     return json_response({})
 
 
 def _unload(request: Request) -> Response:
     request.object()  # refuses a body that is not an object
-    request.service.store.unload(request.model)
+    request.store.unload(request.model)
     return json_response({})
 
 
 def _show_model(request: Request) -> Response:
-    return json_response(describe.model_metadata(request.loaded, request.service.store))
+    return json_response(describe.model_metadata(request.loaded, request.store))
 
 
 def _is_model_ready(request: Request) -> Response:
@@ -157,7 +133,7 @@ def _is_model_ready(request: Request) -> Response:
 
 
 def _show_config(request: Request) -> Response:
-    return json_response(describe.model_config(request.loaded, request.service.limits))
+    return json_response(describe.model_config(request.loaded, request.limits))
 
 
 def _infer(request: Request) -> Response:
@@ -171,7 +147,7 @@ def _infer(request: Request) -> Response:
         raise RequestError("Upgrade: this server reads no body after this header; set the client to HTTP/1.1")
     header_length = request.headers.get(b"inference-header-content-length")
     # `answer_inference` calls `read` and `write_answer`, because it measures the duration of these steps.
-    read = partial(read_infer, request.body, header_length, loaded, request.service.limits.batch)
+    read = partial(read_infer, request.body, header_length, loaded, request.limits.batch)
     plain_body, json_length = answer_inference(loaded, read, write_answer)
 
     accepted_encodings = request.headers.get(b"accept-encoding", b"")
@@ -199,7 +175,6 @@ def _model_paths(ending: str = "") -> tuple[str, str]:
 
 
 ROUTES = (
-    Route("GET", ("/",), _show_page, needs_token=False),
     Route("GET", ("/openapi.json",), _show_openapi),
     Route("GET", ("/v2/health/live",), _is_live, needs_token=False),
     Route("GET", ("/v2/health/ready",), _is_ready, needs_token=False),
@@ -211,7 +186,6 @@ ROUTES = (
     Route("POST", ("/v2/repository/models/{model}/unload",), _unload, may_block=True),
     Route("GET", _model_paths(), _show_model),
     Route("GET", _model_paths("/ready"), _is_model_ready),
-    Route("GET", _model_paths("/card"), _show_card),
     Route("GET", _model_paths("/config"), _show_config),
     Route("GET", _model_paths("/stats"), _show_statistics),
     Route("POST", _model_paths("/infer"), _infer),
