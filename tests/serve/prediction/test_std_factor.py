@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.stats import binom, chi2
+from scipy.stats import chi2
 
-from isocharge.serve.prediction.std_factor import REGION_QUANTILES, StdFactor, _smallest_rank
+from isocharge.serve.prediction.std_factor import REGION_QUANTILES, StdFactor
 
 
 def draw(rng, count, scale, degrees_of_freedom):
@@ -28,15 +28,7 @@ def test_regions_hold_for_at_least_ninety_percent_of_contacts_on_ninety_percent_
     assert 0.88 < np.mean(holds) < 0.98
 
 
-@pytest.mark.parametrize("count", [22, 23, 30, 38, 100, 1000])
-def test_rank_is_that_of_the_binomial_distribution(count):
-    rank = _smallest_rank(count)
-    assert binom.cdf(rank - 1, count, 0.9) >= 0.9
-    assert binom.cdf(rank - 2, count, 0.9) < 0.9
-
-
 def test_too_few_presses_have_no_guarantee():
-    assert _smallest_rank(21) is None
     assert StdFactor.from_errors(*draw(np.random.default_rng(0), 21, 1.0, 30)) is None
     assert StdFactor.from_errors(np.full((30, 3), np.nan), np.ones((30, 3))) is None
 

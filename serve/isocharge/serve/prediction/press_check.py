@@ -12,25 +12,23 @@ first appears as a common scale factor of all forces and as a common shift of al
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 
-from isocharge.common.arrays import Booleans
+from isocharge.common.arrays import Array, Booleans
 from isocharge.common.json_values import plain_values
-from isocharge.serve.flags import MISFIT
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.validity import Validity
+from isocharge.serve.prediction.agreement import Agreement, binomial_distribution, chi_squared_deviate
 from isocharge.serve.prediction.press_errors import (
     FORCE,
     NOT_TRAINED,
-    Agreement,
-    ErrorSummary,
     PressErrors,
     X,
     Y,
-    chi_squared_survival,
     misfit_limit,
     press_errors,
 )
@@ -46,9 +44,6 @@ BAD_PRESS_PROBABILITY = 1e-3
 MAX_BAD_FRACTION = 0.1
 """Largest fraction of bad presses for which a model may still fit. A single bad press is always allowed."""
 
-BAD_PRESS_MIN_CHI_SQUARED = 9.0
-"""Sum of the squared errors of a press, relative to their variances, below which the press is certainly not bad."""
-
 MISFIT_FRACTION = 0.01
 """Fraction of good presses whose misfit is above the limit `misfit_p99` of the model."""
 
@@ -63,6 +58,63 @@ MAX_LISTED_PRESSES = 5
 
 MIN_FIT_PRESSES = 500
 """Smallest number of presses from which `isocharge train fit` trains a model."""
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """Summary of the errors of the positions in mm, or of the forces in %.
+
+    Attributes:
+        presses: Number of presses.
+        rms: Root mean square of the errors.
+        median: Median of the absolute errors.
+        max: Largest absolute error.
+        noise: Expected root mean square of the errors that the noise of the charges causes.
+        rig: Expected root mean square of the errors that the uncertainty of the rig causes.
+        explained: Expected root mean square of the errors that noise and rig cause together.
+        beyond: Square root of rms^2 - explained^2, which is the part that noise and rig do not explain; 0 if this
+            difference is negative.
+    """
+
+    presses: int
+    rms: float
+    median: float
+    max: float
+    noise: float
+    rig: float
+    explained: float
+    beyond: float
+
+    @classmethod
+    def from_errors(cls, error: Array, noise_std: Array, rig_std: Array) -> "ErrorSummary | None":
+        """Summarise errors, and compare the mean square error with the variances that noise and rig cause.
+
+        Args:
+            error: Components of the error of each press, shape (n, components); NaN where unknown.
+            noise_std: Standard deviations of the components that the noise of the charges causes.
+            rig_std: Standard deviations of the components that the uncertainty of the rig causes.
+
+        Returns:
+            The summary; None if there are no presses with known errors.
+        """
+        is_known = ~np.isnan(error).any(axis=1)
+        if not is_known.any():
+            return None
+        size = np.linalg.norm(error[is_known], axis=1)
+        rms, noise, rig = (
+            float(np.sqrt(np.mean(np.sum(part[is_known] ** 2, axis=1)))) for part in (error, noise_std, rig_std)
+        )
+        explained = math.hypot(noise, rig)
+        return cls(
+            presses=size.size,
+            rms=rms,
+            median=float(np.median(size)),
+            max=float(size.max()),
+            noise=noise,
+            rig=rig,
+            explained=explained,
+            beyond=math.sqrt(max(rms**2 - explained**2, 0.0)),  # the errors may happen to be smaller than expected
+        )
 
 
 @dataclass(frozen=True)
@@ -102,6 +154,7 @@ class PressCheck:
         """
         agreement = self.agreement
         degrees = agreement.degrees
+        common = agreement.common
         values = {
             "each": [self.errors.row(press) for press in range(self.presses)],
             "model": self.model,
@@ -113,10 +166,10 @@ class PressCheck:
             "degrees_of_freedom": degrees,
             "chi_squared_per_degree": agreement.chi_squared / degrees if degrees else None,
             "p_value": agreement.p_value,
-            "shift_mm": [agreement.shift_x.mean, agreement.shift_y.mean],
-            "shift_std_mm": [agreement.shift_x.std, agreement.shift_y.std],
-            "force_scale": 1.0 + agreement.force.mean,
-            "force_scale_std": agreement.force.std,
+            "shift_mm": common.mean[:FORCE],
+            "shift_std_mm": common.std[:FORCE],
+            "force_scale": 1.0 + common.mean[FORCE],
+            "force_scale_std": common.std[FORCE],
             "common_p_value": agreement.common_p_value,
             "std_factor": None if self.std_factor is None else self.std_factor.factor,
             "fits": self.fits,
@@ -147,8 +200,9 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     is_selected = errors.is_compared & ~is_bad
     selected_count = int(is_selected.sum())
     agreement = Agreement.from_errors(errors, is_selected)
-    position = _position_summary(errors, is_selected)
-    force = _force_summary(errors, is_selected)
+    parts = (errors.error[is_selected], errors.noise_std[is_selected], errors.rig_std[is_selected])
+    position = ErrorSummary.from_errors(*(part[:, :FORCE] for part in parts))
+    force = ErrorSummary.from_errors(*(100.0 * part[:, FORCE:] for part in parts))
     misfit_text = _misfit_statement(errors, is_selected, metadata)  # empty unless too many presses have a large misfit
 
     fits = None  # remains None if there are too few presses for a verdict
@@ -160,8 +214,9 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     if fits is False:
         notes += _remedies(metadata, position, force)
     notes += _exclusion_notes(errors, metadata)
-    notes += _bad_press_notes(errors, is_bad)
-    notes += _misfit_notes(errors, metadata)
+    if is_bad.any():
+        bad_lines = row_words(np.array(errors.lines)[is_bad].tolist(), errors.row_noun, MAX_LISTED_PRESSES)
+        notes.append(f"{bad_lines}: nothing like the other presses, left out; look at it")
     notes += _common_notes(agreement)
     return PressCheck(
         model=metadata.label,
@@ -197,86 +252,29 @@ def _bad_presses(errors: PressErrors) -> Booleans:
     if Agreement.from_errors(errors, is_compared).acceptable:
         return no_bad_press
 
-    is_improbable = _improbable_presses(errors, is_compared)
+    # The probability of such large errors is below a limit, which is divided by the number of compared presses
+    # (Bonferroni correction). If all presses are good, the probability that one of them is found is therefore at most
+    # `BAD_PRESS_PROBABILITY`.
     compared_count = int(is_compared.sum())
+    degrees = np.maximum(np.count_nonzero(~np.isnan(errors.error), axis=1), 1)
+    deviate = chi_squared_deviate(np.nansum(errors.squared_ratio, axis=1), degrees)
+    limit = NormalDist().inv_cdf(1.0 - BAD_PRESS_PROBABILITY / max(1, compared_count))
+    is_improbable = is_compared & (deviate > limit)
     improbable_count = int(is_improbable.sum())
-    max_bad_count = max(1.0, MAX_BAD_FRACTION * compared_count)
-    few_are_improbable = 0 < improbable_count <= max_bad_count
+    few_are_improbable = 0 < improbable_count <= max(1.0, MAX_BAD_FRACTION * compared_count)
     enough_others_remain = compared_count - improbable_count >= MIN_PRESSES
     if not (few_are_improbable and enough_others_remain):
         return no_bad_press
-
     others_agree = Agreement.from_errors(errors, is_compared & ~is_improbable).acceptable
     return is_improbable if others_agree else no_bad_press
-
-
-def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
-    """Find the compared presses whose errors are very unlikely to be caused by noise and rig.
-
-    A press has improbable errors if the probability of such large errors is below a limit. The limit is divided by the
-    number of compared presses (Bonferroni correction). If all presses are good, the probability that at least one press
-    has improbable errors is therefore at most `BAD_PRESS_PROBABILITY`.
-
-    Args:
-        errors: Errors of all presses.
-        is_compared: Whether each press is compared, shape (n,).
-
-    Returns:
-        Whether each press has improbable errors, shape (n,).
-    """
-    probability_limit = BAD_PRESS_PROBABILITY / max(1, int(is_compared.sum()))
-    # Squared errors of x, y and the force, relative to their expected variances, shape (n, 3); NaN where unknown. The
-    # sum over one press has a chi-squared distribution. Its probability is only computed if the sum is large, to save
-    # time.
-    squared_ratio = errors.squared_ratio
-    is_candidate = is_compared & (np.nansum(squared_ratio, axis=1) > BAD_PRESS_MIN_CHI_SQUARED)
-    is_improbable = np.zeros_like(is_compared)
-    for press_index in np.flatnonzero(is_candidate):
-        press_ratios = squared_ratio[press_index]
-        known_ratios = press_ratios[~np.isnan(press_ratios)]
-        probability = chi_squared_survival(float(known_ratios.sum()), known_ratios.size)
-        is_improbable[press_index] = probability < probability_limit
-    return is_improbable
-
-
-def _position_summary(errors: PressErrors, is_selected: Booleans) -> ErrorSummary | None:
-    """Summarise the position errors of the selected presses, mm.
-
-    Args:
-        errors: Errors of all presses.
-        is_selected: Whether each press is selected, shape (n,).
-
-    Returns:
-        The summary; None if no selected press has a known position.
-    """
-    is_known = is_selected & ~np.isnan(errors.position_error_mm)
-    noise_variance = errors.noise_std[is_known, X] ** 2 + errors.noise_std[is_known, Y] ** 2
-    rig_variance = errors.rig_std[is_known, X] ** 2 + errors.rig_std[is_known, Y] ** 2
-    return ErrorSummary.from_errors(errors.position_error_mm[is_known], noise_variance, rig_variance)
-
-
-def _force_summary(errors: PressErrors, is_selected: Booleans) -> ErrorSummary | None:
-    """Summarise the relative force errors of the selected presses, %.
-
-    Args:
-        errors: Errors of all presses. The errors of the force are relative to the measured force.
-        is_selected: Whether each press is selected, shape (n,).
-
-    Returns:
-        The summary; None if no selected press has a known force.
-    """
-    error_percent = 100.0 * np.abs(errors.error[:, FORCE])
-    is_known = is_selected & ~np.isnan(error_percent)
-    noise_variance = (100.0 * errors.noise_std[is_known, FORCE]) ** 2
-    rig_variance = (100.0 * errors.rig_std[is_known, FORCE]) ** 2
-    return ErrorSummary.from_errors(error_percent[is_known], noise_variance, rig_variance)
 
 
 def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: ModelMetadata) -> str:
     """Return a statement for the user if more presses have a large misfit than chance can explain.
 
     The misfit is the distance between the measured charges and the nearest charges of a single contact. A misfit is
-    large if it is above the limit of the model, which 1 % of good presses exceed.
+    large if it is above the limit of the model, which 1 % of good presses exceed. The number of such presses has a
+    binomial distribution.
 
     Args:
         errors: Errors of all presses.
@@ -286,36 +284,15 @@ def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: Mode
     Returns:
         The statement; empty if chance can explain the number of presses with a large misfit.
     """
-    has_large_misfit = np.array([MISFIT in flags for flags in errors.flags], dtype=np.bool_)
     selected_count = int(is_selected.sum())
-    misfit_count = int((has_large_misfit & is_selected).sum())
-    probability_of_as_many = 1.0 - _probability_of_fewer(misfit_count, selected_count)  # as many, or more
-    if probability_of_as_many >= MISFIT_PROBABILITY:
+    misfit_count = int((errors.has_misfit & is_selected).sum())
+    probability_of_at_most = binomial_distribution(selected_count, MISFIT_FRACTION)
+    if misfit_count == 0 or 1.0 - probability_of_at_most[misfit_count - 1] >= MISFIT_PROBABILITY:
         return ""
-    limit = misfit_limit(metadata)
-    return f"{misfit_count} of {selected_count} presses have a misfit above {limit:.3g}, which 1 % of good ones have"
-
-
-def _probability_of_fewer(misfit_count: int, press_count: int) -> float:
-    """Compute the probability that fewer than `misfit_count` of `press_count` good presses have a large misfit.
-
-    Each good press has a large misfit with the probability p = `MISFIT_FRACTION`. The number of such presses has a
-    binomial distribution. With n = `press_count`, the result is the sum of binomial(n, k) (p / (1 - p))^k (1 - p)^n
-    over k from 0 to `misfit_count` - 1. The terms are computed from their logarithms, because the binomial coefficients
-    would overflow.
-
-    Args:
-        misfit_count: Number of presses with a large misfit.
-        press_count: Number of all presses.
-    """
-    log_odds = math.log(MISFIT_FRACTION / (1.0 - MISFIT_FRACTION))
-    log_probability_of_none = press_count * math.log1p(-MISFIT_FRACTION)
-    probability = 0.0
-    for k in range(misfit_count):
-        # lgamma(m + 1) is the logarithm of the factorial of m
-        log_binomial = math.lgamma(press_count + 1) - math.lgamma(k + 1) - math.lgamma(press_count - k + 1)
-        probability += math.exp(log_binomial + k * log_odds + log_probability_of_none)
-    return probability
+    return (
+        f"{misfit_count} of {selected_count} presses have a misfit above {misfit_limit(metadata):.3g}, which 1 % of "
+        "good ones have: no single press on the model's film gives such charges (gain, tare, swapped or dead electrode)"
+    )
 
 
 def _verdict(
@@ -359,11 +336,16 @@ def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: Err
         position: Errors of the positions; None if no position is known.
         force: Errors of the forces; None if no force is known.
     """
+
+    def rig_std(errors: ErrorSummary) -> float:
+        """Return how uncertain the rig would have to be to explain the errors, in their unit."""
+        return math.sqrt(max(errors.rms**2 - errors.noise**2, 0.0))
+
     options = []
     if position is not None:  # the option is the standard deviation of x and of y, not of the distance
-        options.append(f"--position-std {_explaining_rig_std(position) / math.sqrt(2.0):.2g}")
+        options.append(f"--position-std {rig_std(position) / math.sqrt(2.0):.2g}")
     if force is not None:  # the option is relative to the force, not in percent
-        options.append(f"--force-std {0.01 * _explaining_rig_std(force):.2g}")
+        options.append(f"--force-std {0.01 * rig_std(force):.2g}")
     yield f"the errors would be the rig's if that were as uncertain as {' '.join(options)}"
 
     # A sensor that was never calibrated may also have the section `calibration`, but without gains and rotation.
@@ -378,18 +360,6 @@ def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: Err
         "this film is calibrated already: do so again only if it has changed since (isocharge train calibrate --from); "
         f"what no film explains, `isocharge train fit PRESSES.csv` learns from {MIN_FIT_PRESSES} presses on"
     )
-
-
-def _explaining_rig_std(errors: ErrorSummary) -> float:
-    """Return how uncertain the rig would have to be to explain the errors, as a standard deviation.
-
-    Args:
-        errors: Errors of the positions or of the forces.
-
-    Returns:
-        Standard deviation of the rig, in the unit of the errors.
-    """
-    return math.sqrt(max(errors.rms**2 - errors.noise**2, 0.0))
 
 
 def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
@@ -434,37 +404,6 @@ def _explain_exclusion(reason: str, metadata: ModelMetadata) -> str:
     )
 
 
-def _bad_press_notes(errors: PressErrors, is_bad: Booleans) -> Iterator[str]:
-    """If there are bad presses, yield a note that lists these presses.
-
-    Args:
-        errors: Errors of all presses.
-        is_bad: Whether each press is bad, shape (n,).
-    """
-    if is_bad.any():
-        bad_lines = np.array(errors.lines)[is_bad].tolist()
-        list_of_lines = row_words(bad_lines, errors.row_noun, MAX_LISTED_PRESSES)  # such as "lines 2, 5 and 4 more"
-        yield f"{list_of_lines}: nothing like the other presses, left out; look at it"
-
-
-def _misfit_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
-    """If too many presses have a misfit above the limit of the model, yield a note.
-
-    Presses that are excluded from the comparison are also counted.
-
-    Args:
-        errors: Errors of all presses.
-        metadata: Metadata of the model.
-    """
-    all_presses = np.ones(len(errors.lines), dtype=np.bool_)
-    misfit_text = _misfit_statement(errors, all_presses, metadata)
-    if misfit_text:
-        yield (
-            f"{misfit_text}: no single press on the model's film gives such charges (gain, tare, swapped or dead "
-            "electrode)"
-        )
-
-
 def _common_notes(agreement: Agreement) -> Iterator[str]:
     """Yield a note about a common shift of all positions, and a note about a common scale factor of all forces.
 
@@ -473,18 +412,14 @@ def _common_notes(agreement: Agreement) -> Iterator[str]:
     Args:
         agreement: Tests of the errors, which contain the common errors of x, y and the force.
     """
-    shift_x = agreement.shift_x
-    shift_y = agreement.shift_y
-    relative_force = agreement.force
-    if max(abs(shift_x.significance), abs(shift_y.significance)) > MIN_COMMON_SIGNIFICANCE:
-        shift_std_mm = max(shift_x.std, shift_y.std)
+    mean, std, significance = agreement.common
+    if np.nanmax(np.abs(significance[:FORCE]), initial=0.0) > MIN_COMMON_SIGNIFICANCE:
         yield (
-            f"positions are off by ({shift_x.mean:.2g}, {shift_y.mean:.2g}) +- {shift_std_mm:.2g} mm on the average: "
+            f"positions are off by ({mean[X]:.2g}, {mean[Y]:.2g}) +- {std[:FORCE].max():.2g} mm on the average: "
             "electrodes or rig are shifted"
         )
-    if abs(relative_force.significance) > MIN_COMMON_SIGNIFICANCE:
-        force_scale = 1.0 + relative_force.mean
+    if abs(significance[FORCE]) > MIN_COMMON_SIGNIFICANCE:
         yield (
-            f"forces are {force_scale:.4g} +- {relative_force.std:.2g} times the measured ones on the average, as "
-            "after a change of pretension, d31 or gains"
+            f"forces are {1.0 + mean[FORCE]:.4g} +- {std[FORCE]:.2g} times the measured ones on the average, as after "
+            "a change of pretension, d31 or gains"
         )

@@ -5,12 +5,12 @@ that were not used for the training or the calibration, the share of contacts th
 the distribution Beta(k, n + 1 - k), whatever the distribution of the errors.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.serve.prediction.agreement import binomial_distribution
 
 COVERAGE = 0.9
 """Share of contacts that the 95 % regions contain at least, after the factor is applied."""
@@ -59,22 +59,7 @@ class StdFactor(NamedTuple):
         degrees = is_known.sum(axis=1)
         squared_size = np.sum(np.where(is_known, error / std, 0.0) ** 2, axis=1)[degrees > 0]
         scores = np.sort(np.sqrt(squared_size / np.take(REGION_QUANTILES, degrees[degrees > 0] - 1)))
-        rank = _smallest_rank(len(scores))
-        return None if rank is None else cls(float(scores[rank - 1]), len(scores))
-
-
-def _smallest_rank(count: int) -> int | None:
-    """Return the smallest rank k of n scores for which the statement is true; None if there is no such rank.
-
-    The k-th smallest score covers at least the share p of all contacts if at most k - 1 of n independent scores lie
-    below the quantile p, whose probability is that of a binomial distribution.
-    """
-    probability = 0.0
-    for rank in range(1, count + 1):
-        below = rank - 1
-        log_term = below * math.log(COVERAGE) + (count - below) * math.log1p(-COVERAGE)
-        log_count = math.lgamma(count + 1) - math.lgamma(below + 1) - math.lgamma(count - below + 1)
-        probability += math.exp(log_count + log_term)
-        if probability >= CONFIDENCE:
-            return rank
-    return None
+        # The k-th smallest score covers at least the share p of all contacts if at most k - 1 of n independent scores
+        # lie below the quantile p.
+        ranks = np.flatnonzero(binomial_distribution(len(scores), COVERAGE)[:-1] >= CONFIDENCE)
+        return cls(float(scores[ranks[0]]), len(scores)) if ranks.size else None
