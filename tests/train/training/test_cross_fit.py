@@ -163,11 +163,12 @@ def test_card_of_a_model_of_measured_presses_states_noise_and_coverage(fitted_pa
     metadata = Predictor(released_pad).metadata
     card = (released_pad / "card.md").read_text()
     assert f"```bash\n{metadata.made_with['command']}\n```" in card
-    assert "\n| fitted to | 1200 presses at 1200 places, in `presses.csv` |\n" in card
+    assert "1200 measured presses at 1200 places, which are in `presses.csv`" in card
     assert "\n| probes | unknown |\n" in card
-    percentages = re.findall(r"(?:\| \S+ and|intervals \|) (\S+) %", card)
+    percentages = re.findall(r"pC and (\S+) %|intervals \| (\S+)%", card)
     expected = [*fitted_pad.noise.gain, metadata.errors["coverage_68"], metadata.errors["coverage_95"]]
-    np.testing.assert_allclose(np.array(percentages, float), 100.0 * np.array(expected), rtol=1e-2)
+    stated = np.array([float(gain or coverage) for gain, coverage in percentages])
+    np.testing.assert_allclose(stated, 100.0 * np.array(expected), rtol=1e-2)
 
 
 LONG_PAD_CENTRE_mm = (30.0, 0.0)

@@ -1,15 +1,11 @@
 """Measurement of the share of wrong answers without a flag, for presses outside the working area of a model."""
 
-import math
-from collections.abc import Iterator
-from textwrap import fill
-
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.flags import STRESS
 from isocharge.serve.model.contact import Contacts
-from isocharge.serve.model.metadata import ModelMetadata, UnnoticedPresses, percent_text
+from isocharge.serve.model.metadata import ModelMetadata, UnnoticedPresses
 from isocharge.serve.model.validity import Validity
 from isocharge.train.training.fitted import Fitted
 
@@ -18,15 +14,6 @@ WRONG_STDS = 4.0
 
 NOISE_SEED = 11
 """Seed of the noise of the presses."""
-
-MAX_CARD_ROWS = 8
-"""Largest number of rows of the table in a card."""
-
-CARD_WIDTH = 120
-"""Largest length of a line of text in a card, characters."""
-
-MIN_NAMED_SHARE = 0.005
-"""Smallest total share of wrong answers without a flag for which a card contains a table."""
 
 
 def unnoticed_presses(fitted: Fitted, metadata: ModelMetadata) -> UnnoticedPresses | None:
@@ -71,47 +58,3 @@ def is_flagged(metadata: ModelMetadata, contact: Array, std: Array, misfit: Arra
     fields = np.concatenate([contact, std, misfit, correlation], axis=1).T  # one row for each field of `Contacts`
     flags = Validity.of(metadata).batch_flags(Contacts(*fields))
     return np.array([any(flag != STRESS for flag in answer_flags) for answer_flags in flags])
-
-
-def unnoticed_section(unnoticed: UnnoticedPresses | None) -> str:
-    """Return the section of a card about presses outside the working area.
-
-    The shares of wrong answers without a flag are listed by the distance from the centre, unless the total share is
-    very small. Neighbouring rings are joined, so that the table has at most `MAX_CARD_ROWS` rows. The section is empty
-    if the shares were not measured.
-
-    Args:
-        unnoticed: Shares of the presses to which the model gives a wrong answer without a flag; None if the shares were
-            not measured.
-    """
-    if unnoticed is None:
-        return ""
-    sentence = fill(f"{unnoticed.summary}.", CARD_WIDTH)
-    heading_and_sentence = f"## Presses outside the working area\n\n{sentence}\n"
-    if unnoticed.total_share < MIN_NAMED_SHARE:
-        return heading_and_sentence + "\n"
-
-    table_rows = "".join(_ring_rows(unnoticed))
-    return f"{heading_and_sentence}\n| distance from the centre | wrong without a flag |\n|---|---|\n{table_rows}\n"
-
-
-def _ring_rows(unnoticed: UnnoticedPresses) -> Iterator[str]:
-    """Yield the rows of the table in a card.
-
-    Each row states a range of distances from the centre, and the share of wrong answers without a flag in this range. A
-    row combines several neighbouring rings.
-
-    Args:
-        unnoticed: Shares of the presses to which the model gives a wrong answer without a flag.
-    """
-    edges = unnoticed.ring_edges_mm
-    ring_areas = np.diff(edges**2)  # divided by pi, in mm^2
-    ring_count = len(ring_areas)
-    rings_per_row = math.ceil(ring_count / MAX_CARD_ROWS)
-    for first_ring in range(0, ring_count, rings_per_row):
-        end_ring = min(first_ring + rings_per_row, ring_count)
-        rings = slice(first_ring, end_ring)
-        # The share of each ring is weighted by the area of the ring.
-        row_share = np.average(unnoticed.ring_shares[rings], weights=ring_areas[rings])
-        distances = f"{edges[first_ring]:.3g} to {edges[end_ring]:.3g} mm"
-        yield f"| {distances} | {percent_text(float(row_share))} |\n"

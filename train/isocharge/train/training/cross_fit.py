@@ -455,8 +455,7 @@ def _misfit_examples(
 
     # Draw charges, which are made from the charges of randomly chosen presses.
     n_electrode = presses.charge.shape[1]
-    chosen_rows = rng.integers(len(presses), size=config.sizes(n_electrode).misfit_charges)
-    _, charge = draw_charges(rng, presses.charge[chosen_rows], presses.charge, noise)
+    charge = draw_charges(rng, presses.charge, noise, config.sizes(n_electrode).misfit_charges)
     residual = planes.residuals(noise.level(charge))
     return np.stack([charge, residual])
 

@@ -21,12 +21,10 @@ class Provenance:
     The release of a model writes this information in addition to the information that is written for every model.
 
     Attributes:
-        card: Additional section of the model card, in Markdown.
         made_with: Additional entries of the metadata.
         files: Contents of additional files in the version folder, by file name.
     """
 
-    card: str = ""
     made_with: Mapping[str, object] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
 

@@ -4,21 +4,14 @@ An example consists of a set of charges and the residuals of these charges with 
 nearest contact is found by a search.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from isocharge.common.arrays import Array
-from isocharge.common.defaults import FEW_ELECTRODES
-from isocharge.train.data.channel_noise import ChannelNoise, Noise
-from isocharge.train.data.misfit_charges import (
-    ExampleOptions,
-    draw_misfit_examples,
-    draw_outside_examples,
-    misfit_noise,
-)
+from isocharge.simulate.identifiability.nearest_contact import search
+from isocharge.train.data.channel_noise import ChannelNoise
+from isocharge.train.data.misfit_charges import draw_charges, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.training.config import TrainingConfig
 from isocharge.train.training.descent import TrainingStage
@@ -32,26 +25,17 @@ MISFIT_RATE_FACTOR = 1.5
 """Learning rate of the misfit network, relative to the learning rate of the contact network. It can be larger, because
 the targets of the misfit network have no noise."""
 
-OUTSIDE_SHARE = 0.15
+OUTSIDE_SHARE = 0.25
 """Share of the examples of the misfit network that are presses outside the working area, dimensionless.
 
 If the dataset has no such presses, there are no such examples.
 """
 
-MANY_OUTSIDE_SHARE = 0.3
-"""Share of presses outside the working area for sensors with more than `FEW_ELECTRODES` electrodes, dimensionless.
+MIN_CHANGE = 1e-4
+"""Change of |residual|^2 below which a search for the nearest contact ends, relative to 1 + |residual|^2."""
 
-It is larger, because the misfit of these sensors can reveal nearly all presses outside the working area.
-"""
-
-SEARCH_STARTS = 2
+SEARCH_STARTS = 3
 """Number of starts of a search for the nearest contact."""
-
-MANY_SEARCH_STARTS = 4
-"""Number of starts of a search for sensors with more than `FEW_ELECTRODES` electrodes.
-
-It is larger, because the misfit of these sensors has more local minima.
-"""
 
 FOCUS_MISFIT = 10.0
 """Misfit at which the weight of an example is half of the largest weight, in standard deviations of the noise.
@@ -67,7 +51,7 @@ def misfit_examples(
 
     Args:
         split: Presses for training, and the charge field in which the search finds the nearest contacts.
-        features: Input features of the network. Their limits are also the limits of the charges of both signs.
+        features: Input features of the network, whose limits are also the limits of the charges.
         outside: Presses outside the working area, from which a share of the examples is drawn; None if there are none.
         config: Noise, number of examples and seed.
 
@@ -75,26 +59,18 @@ def misfit_examples(
         Array of shape (2, n, n_electrode): first the charges, pC, and then their residuals with respect to the nearest
         contact, in standard deviations of the noise.
     """
-    charge_features = features.charge_features
-    n_electrode = charge_features.n_electrode
-    has_many_electrodes = n_electrode > FEW_ELECTRODES
-    noise: Noise = misfit_noise(config.noise_model)
-    options = ExampleOptions(starts=MANY_SEARCH_STARTS if has_many_electrodes else SEARCH_STARTS)
-    if charge_features.mean is not None:  # the charges have both signs
-        noise = ChannelNoise.alike(misfit_noise(config.noise_model), n_electrode)
-        options = replace(options, limits=(charge_features.low_pC, charge_features.high_pC))
-
-    count = config.sizes(n_electrode).misfit_charges
-    n_outside = 0
+    limits = features.charge_features
+    rng = np.random.default_rng(config.seed)
+    noise = ChannelNoise.alike(misfit_noise(config.noise_model), limits.n_electrode)
+    count = config.sizes(limits.n_electrode).misfit_charges
+    outside_charge = np.empty((0, limits.n_electrode))
     if outside is not None:
-        n_outside = round((MANY_OUTSIDE_SHARE if has_many_electrodes else OUTSIDE_SHARE) * count)
-    examples = draw_misfit_examples(split.train, split.field, noise, count - n_outside, config.seed, options=options)
-    if outside is None:
-        return examples
-    outside_examples = draw_outside_examples(
-        outside.train.charge, split.field, noise, n_outside, config.seed, options=options
-    )
-    return np.concatenate([examples, outside_examples], axis=1)
+        rows = rng.integers(len(outside.train), size=round(OUTSIDE_SHARE * count))
+        outside_charge = noise.add(outside.train.charge[rows], rng)
+    drawn_charge = draw_charges(rng, split.train.charge, noise, count - len(outside_charge))
+    charge = np.clip(np.concatenate([drawn_charge, outside_charge]), limits.low_pC, limits.high_pC)
+    _, residual = search(split.field, charge, noise.sigma(charge), starts=SEARCH_STARTS, min_change=MIN_CHANGE)
+    return np.stack([charge, residual])
 
 
 def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:

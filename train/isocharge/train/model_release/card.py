@@ -1,0 +1,181 @@
+"""Card of a model, which states what the model is for, its errors, its limits, and how to make it again."""
+
+import json
+
+import numpy as np
+
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.train.data.measured_sensor import PressedArea
+from isocharge.train.model_release.evaluate import HELD_PRESSES
+from isocharge.train.training.fitted import Fitted
+
+LISTED_ERRORS = {
+    "position_median_mm": "position, median | {:g} mm",
+    "position_rms_mm": "position, rms | {:g} mm",
+    "position_p95_mm": "position, 95 % | {:g} mm",
+    "position_p99_mm": "position, 99 % | {:g} mm",
+    "clean_position_median_mm": "position without noise, median | {:g} mm",
+    "clean_position_p95_mm": "position without noise, 95 % | {:g} mm",
+    "force_median_percent": "force, median | {:g} %",
+    "force_rms_percent": "force, rms | {:g} %",
+    "force_p99_percent": "force, 99 % | {:g} %",
+    "coverage_68": "coverage of the 68 % intervals | {:.1%}",
+    "coverage_95": "coverage of the 95 % intervals | {:.1%}",
+    "misfit_p99": "misfit that 1 % of good presses exceed | {:g}",
+    "misfit_p999": "misfit that 0.1 % of good presses exceed | {:g}",
+    "found_gain_20_percent": "detected presses of about 1 N with one gain wrong by 20 % | {:.1%}",
+    "found_dead_electrode": "detected presses of about 1 N with one dead electrode | {:.1%}",
+}
+"""Rows of the table of errors by the name of the error in the metadata. Errors that were not measured have no row."""
+
+SIMULATED_TRUTH = (
+    "These figures compare with the simulator. On a real film, unknown gains and pretension cause larger errors."
+)
+
+MEASURED_TRUTH = (
+    "The figures are those of one sensor and its rig on the day of the measurement, and include the errors of the rig. "
+    "Another sensor, or the same sensor after months, can have far larger errors. "
+    "`isocharge serve check` measures them with a few presses."
+)
+
+LIMITS = """\
+- The answer to a press outside the working area or the range of forces, or to several presses at a time, is wrong. It
+  carries a flag only if the charges differ enough from those of every press that the model covers.
+- The standard deviations are valid for the noise named above, and not for wrong gains. The answer is a posterior mean,
+  which is close to the middle of the working area where the charges carry little information.
+"""
+
+
+def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
+    """Return the text of `card.md`.
+
+    Args:
+        metadata: Metadata of the model.
+        fitted: The network, its sensor and its presses.
+    """
+    electrodes = metadata.electrodes
+    sensor_name = metadata.sensor["name"]
+    is_measured = HELD_PRESSES in metadata.errors
+    teacher = metadata.made_with.get("teacher")
+    teacher_text = f"\nThe model is a small network that learned the answers of `{teacher}`." if teacher else ""
+    correlations = ", `contact_correlation` (xy, xF, yF)" if fitted.network.n_angle > 0 else ""
+    noise = zip(electrodes, *metadata.noise.for_each_electrode(len(electrodes)), strict=True)
+    noise_text = "; ".join(f"{name} {white:g} pC and {100 * gain:.3g} %" for name, white, gain in noise)
+    error_rows = "\n".join(
+        f"| {row.format(metadata.errors[name])} |" for name, row in LISTED_ERRORS.items() if name in metadata.errors
+    )
+    unnoticed_text = f"{metadata.unnoticed.summary}.\n\n" if metadata.unnoticed is not None else ""
+    cautions_text = "".join(f"- {caution}.\n" for caution in fitted.cautions)
+    return f"""# {metadata.name}, version {metadata.version}
+
+Estimates the position and the force of one press from the charges of the sensor `{sensor_name}`.{teacher_text}
+
+| | |
+|---|---|
+| input | `charge_pC`, float32 [n, {len(electrodes)}], touch charges of {", ".join(electrodes)} in pC |
+| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlations}, `misfit` |
+| working area | {_area_text(fitted)} |
+| forces | {_forces_text(metadata)} |
+| probes | {", ".join(metadata.probes)} |
+| noise `{metadata.noise.name}` | {noise_text} |
+
+## Errors
+
+The errors are those on {len(fitted.test)} {_presses_text(metadata)}.
+
+| error | |
+|---|---|
+{error_rows}
+
+The misfit is the distance of the charges from those of the nearest single contact, in units of the noise. Three charges
+nearly always fit some contact.
+
+{unnoticed_text}## Limits
+
+- {MEASURED_TRUTH if is_measured else SIMULATED_TRUTH}
+{cautions_text}{LIMITS}
+## Make it again
+
+```bash
+{metadata.made_with["command"] or "(made by a program, see metadata)"}
+```
+"""
+
+
+def hub_block(metadata: ModelMetadata) -> str:
+    """Return the block at the beginning of a card with the kind of the model and its measured errors.
+
+    Model hubs read this block as YAML, of which JSON is a part (https://huggingface.co/docs/hub/model-cards). The block
+    names no licence, because the publisher of a model chooses it.
+
+    Args:
+        metadata: Metadata of the model, with its errors.
+    """
+    metrics = [
+        {"type": name, "name": row.split(" | ")[0], "value": float(f"{metadata.errors[name]:g}")}
+        for name, row in LISTED_ERRORS.items()
+        if name in metadata.errors
+    ]
+    result = {
+        "task": {"type": "tabular-regression"},
+        "dataset": {"name": str(metadata.sensor["name"]), "type": "presses"},
+        "metrics": metrics,
+    }
+    block = {
+        "library_name": "onnx",
+        "pipeline_tag": "tabular-regression",
+        "tags": ["isocharge", "tactile-sensing", "piezoelectric"],
+        "model-index": [{"name": metadata.name, "results": [result]}],
+    }
+    return f"---\n{json.dumps(block, indent=1)}\n---\n\n"
+
+
+def _area_text(fitted: Fitted) -> str:
+    """Return a text about the working area."""
+    if isinstance(fitted.domain, PressedArea):
+        width, height = np.ptp(np.array(fitted.domain.corners), axis=0)
+        return f"{width:.4g} mm x {height:.4g} mm, the outline of the presses; corners in the metadata"
+    text = f"within {fitted.domain.radius:g} mm of the centre"
+    requested = fitted.requested_domain
+    if requested != fitted.domain:
+        text += f" ({requested.radius:g} mm were requested; farther out two contacts can have the same charges)"
+    return text
+
+
+def _forces_text(metadata: ModelMetadata) -> str:
+    """Return a text about the range of forces, and about the force at which the film yields."""
+    constant_force = metadata.made_with.get("constant_force")
+    if constant_force is not None:
+        reason = "all presses had this force" if constant_force["is_known"] else "the forces were not measured"
+        return (
+            f"not estimated: every answer is {constant_force['force_N']:g} N with a standard deviation of "
+            f"{100 * constant_force['force_std']:.3g} %, because {reason}"
+        )
+    min_force, max_force = metadata.force_range_N
+    text = f"{min_force:g} to {max_force:g} N"
+    if metadata.yield_force_N is not None:
+        text += (
+            f"; beyond {metadata.yield_force_N:g} N the film is stressed to more than {DEFAULT_STRESS_LIMIT:g} MPa: "
+            "PVDF yields (flag `stress`)"
+        )
+    return text
+
+
+def _presses_text(metadata: ModelMetadata) -> str:
+    """Return a text about the presses on which the errors were measured."""
+    measured = metadata.made_with.get("measured")
+    if measured is not None:
+        factors = " for positions and ".join(f"{factor:g}" for factor in measured["std_factors"])
+        return (
+            f"measured presses at {measured['places']} places, which are in `presses.csv`. They are estimated by "
+            f"{measured['folds']} networks, each at the places on which it was not trained. The model learned the mean "
+            f"of their answers. The standard deviations were multiplied by {factors} for forces, so that the 68 % "
+            "intervals contain 68 % of these presses"
+        )
+    if HELD_PRESSES in metadata.errors:
+        return "measured presses that were not used in the training. No noise was added to these presses"
+    return (
+        "simulated presses that were not used in the training, with that noise. The forces are log-uniform, and the "
+        "positions are uniform over the working area"
+    )
