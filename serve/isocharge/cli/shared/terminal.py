@@ -17,7 +17,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from shutil import get_terminal_size
 from typing import Any, Self
 
 import typer
@@ -130,20 +129,8 @@ def show_result(result: Mapping[str, Any], *, json: bool) -> None:
 
 
 def _table_lines(rows: list[dict[str, Any]]) -> list[str]:
-    """Return the lines of a table, with one column for each key of the rows.
-
-    A table that is wider than the terminal has one column for each row instead.
-    """
+    """Return the lines of a table with one column for each key of the rows. The cells are aligned at the right."""
     table = [list(rows[0]), *([_value_text(value) for value in row.values()] for row in rows)]
-    lines = _aligned_lines(table)
-    max_characters, _lines = get_terminal_size((100, 24))  # 100 without a terminal
-    if len(lines[0]) <= max_characters:
-        return lines
-    return _aligned_lines([list(column) for column in zip(*table, strict=True)])
-
-
-def _aligned_lines(table: list[list[str]]) -> list[str]:
-    """Return the rows of a table as lines in which the cells of each column are aligned at the right."""
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     return ["  ".join(map(str.rjust, row, widths)).rstrip() for row in table]
 

@@ -4,15 +4,12 @@ A contact consists of ten numbers. Other programs rely on the order of the ten n
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Singles
-
-MAX_DECIMALS = 6
-"""Largest number of decimals in the text of a contact. The last decimal is 1 nm or 1 uN."""
 
 
 class Contact(NamedTuple):
@@ -74,25 +71,11 @@ class Contact(NamedTuple):
         )
 
     def __repr__(self) -> str:
-        """Return a text with x, y, the force and their standard deviations, rounded to two significant digits."""
-        numbers = ", ".join(f"{name}={value} +- {std}" for name, value, std in self._rounded())
-        return f"Contact({numbers}, misfit={self.misfit:.2g})"
-
-    def _rounded(self) -> Iterator[tuple[str, str, str]]:
-        """Yield the name, the rounded value and the rounded standard deviation of x, of y and of the force.
-
-        The number of decimals is chosen so that the standard deviation has two significant digits, but is at least 0
-        and at most `MAX_DECIMALS`. The value has as many decimals as its standard deviation. If the standard deviation
-        is not positive and finite, both have `MAX_DECIMALS` decimals.
-        """
-        stds = {"x_mm": self.x_std_mm, "y_mm": self.y_std_mm, "force_N": self.force_std_N}
-        for name, std in stds.items():
-            decimals = MAX_DECIMALS
-            if math.isfinite(std) and std > 0.0:
-                decimals_of_two_digits = 1 - math.floor(math.log10(std))  # for example, 3 if the std is 0.012
-                decimals = min(max(decimals_of_two_digits, 0), MAX_DECIMALS)
-            value = getattr(self, name)
-            yield name, f"{value:.{decimals}f}", f"{std:.{decimals}f}"
+        """Return a text with x, y, the force and their standard deviations, rounded to a few significant digits."""
+        return (
+            f"Contact(x_mm={self.x_mm:.4g} +- {self.x_std_mm:.2g}, y_mm={self.y_mm:.4g} +- {self.y_std_mm:.2g}, "
+            f"force_N={self.force_N:.4g} +- {self.force_std_N:.2g}, misfit={self.misfit:.2g})"
+        )
 
 
 CLOSE_DISTANCE_mm = 0.3

@@ -27,15 +27,8 @@ def find_model(model: str | Path, models: Path | None = None) -> Path:
     """
     roots = repositories(models)
     is_path = isinstance(model, Path) or model.startswith((".", "/")) or model.endswith(".onnx")
-    candidates: list[Path] = []
-    if not is_path:
-        candidates += [root / model for root in roots]
-    candidates.append(Path(model))
-    for candidate in candidates:
-        folder = _version_folder(candidate)  # None if there is no model at this place
-        if folder is not None:
-            return folder
-    raise ModelError(_not_found_message(model, roots, is_path))
+    candidates = [] if is_path else [root / model for root in roots]
+    return _first_model([*candidates, Path(model)], model, roots, is_path)
 
 
 def find_labelled_model(label: str, models: Path | None = None) -> Path:
@@ -56,11 +49,7 @@ def find_labelled_model(label: str, models: Path | None = None) -> Path:
     if not is_label:
         raise ModelError(f"model {shown(label)}: expected the label NAME/VERSION of a model; give the model by --model")
     roots = repositories(models)
-    for root in roots:
-        folder = root / name / version
-        if (folder / "model.onnx").is_file():
-            return folder
-    raise ModelError(_not_found_message(label, roots, is_path=False))
+    return _first_model([root / label for root in roots], label, roots, is_path=False)
 
 
 def repositories(models: Path | None = None) -> list[Path]:
@@ -146,18 +135,28 @@ def _subfolders(folder: Path) -> list[Path]:
         raise ModelError(f"{folder}: cannot be listed ({error.strerror}); try again, or correct its rights") from error
 
 
-def _not_found_message(model: str | Path, roots: list[Path], is_path: bool) -> str:
-    """Return the text of the error for a model that was not found.
+def _first_model(candidates: list[Path], model: str | Path, roots: list[Path], is_path: bool) -> Path:
+    """Return the version folder of the first path at which there is a model.
 
     Args:
-        model: Name or path of the model.
+        candidates: Paths of model folders, of version folders, or of files `model.onnx`.
+        model: Name or path of the model, for the error message.
         roots: Repositories that were searched for the name.
         is_path: Whether the model was given as a path. No repository is searched for a path.
+
+    Raises:
+        ModelError: If there is no model at any of the paths.
     """
+    for candidate in candidates:
+        folder = _version_folder(candidate)
+        if folder is not None:
+            return folder
     if is_path:
-        return (
+        raise ModelError(
             f"{model}: no model; expected a model folder with numbered versions, a version folder with "
             "model.onnx, or a model.onnx"
         )
     searched = "; ".join(f"{root} ({', '.join(model_names(root)) or 'no models'})" for root in roots)
-    return f"no model {str(model)!r}; looked in: {searched}; give one of these names, a path, or --models DIR"
+    raise ModelError(
+        f"no model {str(model)!r}; looked in: {searched}; give one of these names, a path, or --models DIR"
+    )

@@ -130,26 +130,22 @@ class Validity:
 
     @cached_property
     def inscribed_radius_squared_mm2(self) -> float:
-        """Squared radius of the largest circle around the origin that lies inside the working area, mm^2.
+        """Squared radius of a circle around the origin that lies inside the working area, mm^2.
 
-        The squared radius is the squared distance from the origin to the nearest edge of the working area. If the
-        origin is outside the working area, the squared radius is 0.
+        The radius is the distance from the origin to the nearest line through an edge of the working area. If the
+        origin is outside the working area, the radius is 0.
         """
         origin_coordinate_mm = np.zeros(1)  # x and also y; `inside_polygon` takes arrays of points, here of one point
         is_origin_inside = inside_polygon(origin_coordinate_mm, origin_coordinate_mm, self.corners_mm)[0]
         if not is_origin_inside:
             return 0.0
 
-        # The nearest point of each edge is the projection of the origin onto the edge, limited to the ends of the edge.
-        start = self.corners_mm  # start of each edge, shape (edges, 2)
-        edge = np.roll(start, -1, axis=0) - start  # the last edge ends at the first corner
-        # If the last corner repeats the first corner, one edge has the length 0. The limit avoids a division by 0.
-        edge_length_squared = np.maximum((edge * edge).sum(axis=1), 1e-30)
-        projection = -(start * edge).sum(axis=1) / edge_length_squared  # as a fraction of the edge, shape (edges,)
-        limited_projection = np.clip(projection, 0.0, 1.0)
-        nearest_point = start + limited_projection[:, np.newaxis] * edge
-        distance_squared_mm2 = (nearest_point**2).sum(axis=1)
-        return float(distance_squared_mm2.min())
+        # The line through an edge is at most as far away as the edge, so the radius is not too large.
+        x_start, y_start = self.corners_mm.T
+        x_end, y_end = np.roll(self.corners_mm, -1, axis=0).T  # the last edge ends at the first corner
+        with np.errstate(invalid="ignore"):  # if the last corner repeats the first corner, an edge has the length 0
+            distance_mm = np.abs(x_start * y_end - x_end * y_start) / np.hypot(x_end - x_start, y_end - y_start)
+        return float(np.nanmin(distance_mm)) ** 2
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the flags of one contact, which are the reasons why the contact may be wrong.
