@@ -1,13 +1,11 @@
-"""HTTP: ours against ten lines of uvicorn, an idiomatic FastAPI service and Triton; all serve the same model file.
+"""HTTP: ours against ten lines of uvicorn, which serve the same model file.
 
-    python tests/benchmarks/bench_http.py [--environments DIR] [--without-rivals] [--seconds 10] [--json]
+    python tests/benchmarks/bench_http.py [--seconds 10] [--json]
 
-The ten lines (`bare_app.py`) give the same answer with a Predictor, and need no other packages. FastAPI and Triton get
-environments of their own in `--environments`, made once; one that cannot be installed or does not start is left out,
-and stderr says why. Client and servers share the cores; the client is a plain socket, the same for all. Latency: one
-request at a time over one open connection, contenders take turns. Throughput: 32 connections, each with one request
-under way; contenders take turns in ten rounds. A batch of 1024 is measured twice: bytes on a socket, and arrays in and
-out of Triton's stock client. Triton runs the model in Python, as its wheel has no backend for ONNX.
+The ten lines (`bare_app.py`) give the same answer with a Predictor. Client and servers share the cores; the client is a
+plain socket, the same for all. Latency: one request at a time over one open connection, contenders take turns.
+Throughput: 32 connections, each with one request under way; contenders take turns in ten rounds. A batch of 1024 is
+measured twice: bytes on a socket, and arrays in and out of Triton's stock client.
 """
 
 import argparse
@@ -19,7 +17,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import venv
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import cache, partial
@@ -35,11 +32,6 @@ from isocharge.serve.benchmark import Contender
 from isocharge.serve.model.session import OUTPUTS
 
 HERE = Path(__file__).parent
-DEPLOY = HERE.parents[1] / "serve" / "deploy"
-PACKAGES = {
-    "fastapi": ["fastapi", "uvicorn[standard]", "onnxruntime", "orjson"],
-    "triton": ["nvidia-pytriton", "onnxruntime"],
-}
 CONNECTIONS = 32
 
 Address = tuple[str, int] | str
@@ -47,10 +39,6 @@ Address = tuple[str, int] | str
 
 Contenders = dict[str, tuple[Address, str]]
 """Name to address and path of the request."""
-
-
-class NotStarted(RuntimeError):
-    """A server that cannot be installed or does not start."""
 
 
 class Connection:
@@ -123,29 +111,12 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def python_of(name: str, environments: Path) -> Path:
-    """The interpreter of a rival's environment, made if it is not there; absolute, whatever folder the rival runs in.
-
-    Raises:
-        NotStarted: If its packages cannot be installed.
-    """
-    folder = environments.absolute() / name
-    if not (folder / "done").exists():
-        venv.create(folder, with_pip=True, clear=True)
-        install = [folder / "bin/python", "-m", "pip", "install", "--quiet", *PACKAGES[name]]
-        done = subprocess.run(install, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise NotStarted(f"pip cannot install {' '.join(PACKAGES[name])}: {done.stderr.strip()[-500:]}")
-        (folder / "done").touch()
-    return folder / "bin/python"
-
-
 @contextmanager
 def running(command: list[str | Path], address: Address, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """A server process, from its first accepted connection to the end of the block.
 
     Raises:
-        NotStarted: If it ends instead of listening.
+        RuntimeError: If it ends instead of listening.
     """
     with tempfile.TemporaryFile() as output:
         process = subprocess.Popen(command, stdout=output, stderr=output, **options)
@@ -174,11 +145,11 @@ def _wait_for(process: subprocess.Popen[bytes], address: Address, output: IO[byt
             time.sleep(0.1)
     if process.poll() is not None:
         output.seek(0)
-        raise NotStarted(f"{process.args} ended: {output.read().decode()[-3000:]}")
+        raise RuntimeError(f"{process.args} ended: {output.read().decode()[-3000:]}")
 
 
-def start(stack: ExitStack, model: str, environments: Path | None) -> Contenders:
-    """Start every contender; without `environments`, only ours and the ten lines of uvicorn."""
+def start(stack: ExitStack, model: str) -> Contenders:
+    """Start every contender: ours, and the ten lines of uvicorn."""
     folder = find_model(model).resolve()
     path = f"/v2/models/{load_model(folder).metadata.name}/infer"
     tcp, uds = _local_address(), f"{stack.enter_context(tempfile.TemporaryDirectory())}/isocharge.sock"
@@ -190,26 +161,11 @@ def start(stack: ExitStack, model: str, environments: Path | None) -> Contenders
     words = [sys.executable, HERE / "rivals/bare_app.py", str(bare[1]), folder / "model.onnx"]
     stack.enter_context(running(words, bare))
     contenders["ten lines of uvicorn"] = bare, path
-    for name, (environment, words_of) in RIVALS.items() if environments else ():
-        address = _local_address()
-        try:
-            python = python_of(environment, environments)
-            stack.enter_context(running([python, *words_of(str(address[1]), folder / "model.onnx")], address))
-            contenders[name] = address, path
-        except NotStarted as error:
-            print(f"left out: {name}: {error}", file=sys.stderr)
     return contenders
 
 
 def _local_address() -> tuple[str, int]:
     return "127.0.0.1", free_port()
-
-
-RIVALS = {
-    "FastAPI": ("fastapi", lambda port, model: [HERE / "rivals/fastapi_app.py", port, model]),
-    "Triton": ("triton", lambda port, model: [DEPLOY / "triton/start.py", model.parents[2], "--port", port]),
-}
-"""Environment, and the words of the program that serves a model file."""
 
 
 def throughput(address: Address, request: bytes, seconds: float) -> float:
@@ -248,7 +204,7 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
     """Every table."""
     charges = np.random.default_rng(asked.seed).uniform(300.0, 1500.0, (1024, 3)).astype(np.float32)
     with ExitStack() as stack:
-        servers = start(stack, asked.model, None if asked.without_rivals else asked.environments)
+        servers = start(stack, asked.model)
         one = {name: (address, json_request(path, charges[:1])) for name, (address, path) in servers.items()}
         address, path = servers["isocharge"]
         client = stack.enter_context(tritonclient.http.InferenceServerClient("{}:{}".format(*address)))
@@ -276,7 +232,7 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
 
 
 def main() -> None:
-    asked = options(__doc__, environments=Path("build/bench-environments"), without_rivals=False, seconds=10.0)
+    asked = options(__doc__, seconds=10.0)
     print_results("http", asked, measure(asked))
 
 

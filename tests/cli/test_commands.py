@@ -145,15 +145,6 @@ def test_a_progress_bar_says_how_far_and_how_long(monkeypatch):
     assert re.search(r"pressing .*50/100 .*0:00:0.*slowly", shown)
 
 
-def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys):
-    clock = iter(range(100))
-    monkeypatch.setattr("isocharge.cli.shared.terminal.time.monotonic", lambda: float(next(clock)))
-    with shown_progress():
-        for done in range(12):
-            report("solving", done, 12)
-    assert capsys.readouterr().err == "solving: 4 of 12\nsolving: 9 of 12\n"
-
-
 def test_a_thick_film(command, tmp_path):
     """A film of 1 mm has 3.72 pC on A and a deflection of 0.139 mm (tests/data/film_cases.json).
 

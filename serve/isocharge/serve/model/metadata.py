@@ -14,6 +14,7 @@ from msgspec import Meta, Struct, to_builtins
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, shown
+from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, NotNegative, Positive, Settings, Text, WrongKey, convert, parse_json
 from isocharge.serve.model.model_labels import ModelName
 
@@ -179,6 +180,10 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         has_duplicate_names = len(set(self.electrodes)) < len(self.electrodes)
         if has_duplicate_names:
             raise WrongKey("electrodes", "names that differ", self.electrodes)
+        displayed_texts = {"electrodes": self.electrodes, "probes": self.probes, "sensor.name": (sensor_name,)}
+        for key, texts in displayed_texts.items():
+            if not all(is_printable(text) for text in texts):
+                raise WrongKey(key, "printable characters", texts)
         min_force_N, max_force_N = self.force_range_N
         if min_force_N > max_force_N:
             raise WrongKey("force_range_N", "a smaller and a larger number", [min_force_N, max_force_N])

@@ -187,15 +187,6 @@ def test_connections_above_the_limit_are_refused(limited):
     wait_until(lambda: is_well(server))
 
 
-def test_slow_clients_delay_no_other_client(limited):
-    """The slow clients never finish a request. A new connection replaces the oldest connection of a slow client."""
-    server = limited(connections=200)
-    with ExitStack() as stack:
-        for number in range(200):
-            stack.enter_context(connect(server)).sendall(infer()[: number % 100])
-        assert [is_well(server) for _ in range(5)] == [True] * 5
-
-
 def test_client_that_does_not_read_is_disconnected(limited):
     server = limited(body_seconds=0.3)
     body = json.dumps({"inputs": [TENSOR | {"shape": [4096, 3], "data": TENSOR["data"] * 4096}]}).encode()
@@ -237,20 +228,6 @@ def test_trailers_and_chunk_extensions_have_the_limit_of_headers(server, endless
         time.sleep(0.2)  # the bytes after the latest part of the body count
         send(connection, endless)
         assert statuses(everything(connection)) == [431]
-
-
-def test_many_small_chunks_are_one_body(server):
-    head = b"POST %s HTTP/1.1\r\nHost: localhost\r\n%sTransfer-Encoding: chunked\r\n\r\n" % (INFER.encode(), LAST)
-    chunks = b"".join(b"1\r\n%c\r\n" % byte for byte in BODY)
-    assert statuses(exchange(server, head + chunks + b"0\r\n\r\n", 100)) == [200]
-
-
-def test_expect_100_continue(server):
-    with connect(server) as connection:
-        connection.sendall(infer(LAST + b"Expect: 100-continue\r\n").removesuffix(BODY))
-        assert connection.recv(100) == b"HTTP/1.1 100 Continue\r\n\r\n"
-        connection.sendall(BODY)
-        assert statuses(everything(connection)) == [200]
 
 
 def test_pipelined_requests_are_answered_in_order(server, store, monkeypatch):

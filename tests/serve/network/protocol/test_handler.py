@@ -157,16 +157,6 @@ def test_optional_fields_may_be_null(ask):
     assert ask("POST", "/v2/repository/models/linear/load", b'{"parameters": null}')[0] == 200
 
 
-@pytest.mark.parametrize("datatype", ["FP32", "FP64"])
-@pytest.mark.parametrize("blanks", range(4))
-def test_binary_input_at_any_offset_in_the_body(ask, bare, film, datatype, blanks):
-    body, length = binary_request(film.golden_pC(), datatype, id="x" * blanks)
-    status, headers, body = ask("POST", INFER, body, inference_header_content_length=str(length))
-    assert (status, headers["content-type"]) == (200, "application/json")
-    contact = np.float32(orjson.loads(body)["outputs"][0]["data"])
-    np.testing.assert_array_equal(contact, bare(film.golden_pC())["contact"].ravel())
-
-
 @pytest.mark.parametrize(("way", "pack"), [("gzip", gzip.compress), ("deflate", zlib.compress), ("identity", bytes)])
 def test_compressed_request_body(ask, film, way, pack):
     plain = orjson.dumps(request(film.golden_pC()))
@@ -352,18 +342,6 @@ def test_internal_errors_are_logged_and_not_sent(ask, store, monkeypatch, caplog
     status, error = refusal(ask("GET", "/v2/health/ready"))
     assert (status, error) == (500, "internal error; the server's log says more")
     assert "a secret" in caplog.text
-
-
-def test_repository_index_of_ready_versions(ask, store):
-    store.unload("linear")
-    assert len(orjson.loads(ask("POST", "/v2/repository/index", b"{}")[2])) == 2
-    assert orjson.loads(ask("POST", "/v2/repository/index", b'{"ready": true}')[2]) == []
-    assert refusal(ask("POST", "/v2/repository/index", b'{"ready": 1}'))[0] == 400
-
-
-def test_model_metadata_equal_those_of_the_file(ask, store):
-    properties = orjson.loads(ask("GET", "/v2/models/linear")[2])["properties"]
-    assert properties == store.get("linear").metadata.to_props()
 
 
 CHECKS = [
