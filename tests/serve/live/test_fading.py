@@ -9,8 +9,8 @@ from isocharge.serve.live.fading import cause_of_fading
 
 RATE_HZ = 200.0
 LEAK = r"put \[leak\] tau_s = "
-CREEP = r"creeps, by .* % in each decade .* set no \[leak\]"
-UNDECIDED = "cannot be told apart"
+CREEP = r"creeps by .* % in each decade .* set no \[leak\]"
+UNDECIDED = "neither a leak .* nor creep"
 
 
 def sizes_of_press(law, seconds, seed, relative_noise):
@@ -40,11 +40,11 @@ def sizes_of_press(law, seconds, seed, relative_noise):
 )
 def test_leak_and_creep_of_a_long_press_are_distinguished(law, expected):
     for seed in range(20):
-        assert re.search(expected, cause_of_fading(sizes_of_press(law, 6.0, seed, 0.007)))
+        assert re.search(expected, cause_of_fading(sizes_of_press(law, 6.0, seed, 0.007)).cause)
 
 
 @pytest.mark.parametrize("law", [lambda t: np.exp(-t / 20.0), lambda t: 1.0 - 0.04 * np.log10(t), lambda _: 1.0])
 @pytest.mark.parametrize(("seconds", "relative_noise"), [(1.2, 0.007), (6.0, 0.1)])
 def test_cause_is_undecided_for_short_or_noisy_presses(law, seconds, relative_noise):
     for seed in range(20):
-        assert UNDECIDED in cause_of_fading(sizes_of_press(law, seconds, seed, relative_noise))
+        assert re.search(UNDECIDED, cause_of_fading(sizes_of_press(law, seconds, seed, relative_noise)).cause)

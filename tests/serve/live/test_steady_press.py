@@ -108,7 +108,7 @@ def test_press_whose_force_rises_slowly_is_taken_later():
         (lambda t: math.exp(-t / 10.0), r"fall by (9\.\d|10) % per second on all .* \[leak\] tau_s = 10 "),
         (
             lambda t: 1.0 - 0.3 * math.log10(t + 0.01),
-            r"fall by .* creeps, by (2[5-9]|3\d) % in each decade .* set no \[leak\]",
+            r"fall by .* creeps by (2[5-9]|3\d) % in each decade .* set no \[leak\]",
         ),
         (lambda t: 0.5 + 0.05 * t, r"rise by 5\.[67] % per second: hold the force"),
         (lambda t: np.array([1 + 0.03 * t, 1 - 0.03 * t, 1.0, 1.0]), "the press moves"),

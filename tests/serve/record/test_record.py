@@ -64,12 +64,6 @@ def test_names_of_the_fields_follow_from_the_groups(contract):
     assert set(CONTACT_FIELDS) < set(contract)
 
 
-def test_deviations_of_a_tracked_contact_grow_with_a_common_error():
-    wider = TRACKED.widened((0.03, 0.0, 0.002))
-    assert wider.x_std_mm == pytest.approx((0.01**2 + 0.03**2) ** 0.5)
-    assert (wider.x_mm, wider.y_std_mm) == (TRACKED.x_mm, TRACKED.y_std_mm)
-
-
 def test_schema_accepts_null_only_where_a_value_may_be_unknown(record):
     validator = jsonschema_rs.Draft7Validator(record_schema(("A", "B")))
     values = json.loads(record().to_json())

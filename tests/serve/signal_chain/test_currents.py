@@ -58,10 +58,8 @@ def test_noise_of_currents_gives_no_touch():
     assert not any(frame.is_contact for frame in run(values))
 
 
-def test_currents_are_refused_in_c_and_beside_a_memory():
+def test_currents_are_refused_in_c():
     with pytest.raises(DeviceError, match="b: front_end: this stage does not exist in the signal chain in C"):
         device_header(device_from_table({"front_end": "current"}, "b"), ("A", "B", "C"))
-    with pytest.raises(DeviceError, match=r"b: memory: expected no section \[memory\] beside front_end"):
-        device_from_table({"front_end": "current", "memory": {}}, "b")
     with pytest.raises(DeviceError, match=r"front_end: expected one of .*, got 'voltage'"):
         device_from_table({"front_end": "voltage"}, "b")

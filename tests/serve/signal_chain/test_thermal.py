@@ -9,9 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
-from isocharge.serve.signal_chain.memory import MemoryRule
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.thermal import ThermalRule, Warming
 from stage_runner import StageRunner
@@ -39,13 +37,10 @@ def misfit_of(film):
     return lambda charge_pC: np.abs(charge_pC @ direction) / NOISE_pC
 
 
-def warming_stage(misfit, warmth_s=None):
-    """Return a stage that estimates the warming with a misfit function, and with a memory if `warmth_s` is given."""
+def warming_stage(misfit):
+    """Return a stage that estimates the warming with a misfit function."""
     predictor = SimpleNamespace(predict_batch=lambda charge_pC: SimpleNamespace(misfit=misfit(charge_pC)))
-    rules = {ThermalRule: ThermalRule()}
-    if warmth_s is not None:
-        rules[MemoryRule] = MemoryRule(warmth_s=warmth_s)
-    return Warming(Setup(tuple("ABCD"), rules, predictor=predictor))
+    return Warming(Setup(tuple("ABCD"), {ThermalRule: ThermalRule()}, predictor=predictor))
 
 
 def follow_warming(film, common_charges_pC, seed=0):
@@ -84,50 +79,17 @@ def test_warming_that_is_inseparable_from_force_is_not_subtracted():
     assert warming._is_blind
 
 
-@pytest.mark.parametrize("warmth_s", [None, 1e3])
-def test_uncertainty_of_the_warming_grows_while_it_is_inseparable_from_force(warmth_s):
+def test_uncertainty_of_the_warming_grows_while_it_is_inseparable_from_force():
     """A blind time of 10 s. The first estimate after it removes nearly the whole warming of 18 pC."""
-    warming = warming_stage(lambda charge_pC: film_misfit(charge_pC), warmth_s)
-    warming._rate_variance = 4.0
+    warming = warming_stage(lambda charge_pC: film_misfit(charge_pC))
     film_misfit = misfit_of(BIAXIAL)
     for _ in range(200):
         warming._estimate(np.ones(4), 0.05)
     assert warming._is_blind
-    if warmth_s is None:
-        assert warming._variance_pC2 == pytest.approx(10.0 * ThermalRule().wander_pC ** 2)
-    else:
-        assert min(warming._variance_pC2, warming._covariance, warming._rate_variance - 4.0) > 0.0
+    assert warming._variance_pC2 == pytest.approx(10.0 * ThermalRule().wander_pC ** 2)
     film_misfit = misfit_of(UNIAXIAL)
     warming._estimate(PRESS + 18.0, 0.05)
     assert warming._charge_pC == pytest.approx(18.0, rel=0.05)
-
-
-def test_charge_and_slope_are_estimated_by_a_kalman_filter():
-    """The reference is a Kalman filter in matrices, whose state is the common charge and its slope.
-
-    The slope decays with `warmth_s` and is a random walk. The measurement is the misfit of the common charge.
-    """
-    rule = ThermalRule()
-    dt_s = 0.4
-    warmth_s = 1e3
-    covariance = np.array([[40.0, 5.0], [5.0, 20.0]])
-    transition = expm(dt_s * np.array([[0.0, 1.0], [0.0, -1.0 / warmth_s]]))
-    integrals = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
-    predicted = transition @ covariance @ transition.T + 3.0 * rule.wander_pC**2 * integrals
-    measurement_std_pC = rule.noise * NOISE_pC / fourth_dimension(UNIAXIAL).sum()
-    gain = predicted[:, 0] / (predicted[0, 0] + measurement_std_pC**2)
-    posterior = predicted - np.outer(gain, predicted[0])
-
-    remaining_pC = 4.0  # warming that the previous state does not contain
-    warming = warming_stage(misfit_of(UNIAXIAL), warmth_s)
-    warming._charge_pC = 3.0
-    warming._variance_pC2 = covariance[0, 0]
-    warming._covariance = covariance[0, 1]
-    warming._rate_variance = covariance[1, 1]
-    mean_change = list(warming._estimate(PRESS + remaining_pC, dt_s))
-    variances = [warming._variance_pC2, warming._covariance, warming._rate_variance]
-    assert mean_change == pytest.approx((remaining_pC * gain).tolist(), rel=1e-3)
-    assert variances == pytest.approx([posterior[0, 0], posterior[0, 1], posterior[1, 1]], rel=1e-3)
 
 
 PRESS = UNIAXIAL @ [850.0, 3.0, -2.0]

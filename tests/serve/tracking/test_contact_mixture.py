@@ -232,15 +232,6 @@ def test_records_with_track_have_the_field_other_and_are_repeated_bit_for_bit(mo
     assert (released["tracked"], released["other"]) == (None, None)
 
 
-def test_memory_section_widens_the_force_of_a_tracked_contact_on_a_folding_film(model):
-    rows = np.concatenate([np.zeros((10, 3)), noisy_charges(np.zeros(40))])
-    predictor = Predictor(model)
-    exact = json.loads(recorded_lines(predictor, rows, {})[45])
-    uncertain = json.loads(recorded_lines(predictor, rows, {"memory": {"creep": 0.08, "thermoelastic": 0.06}})[45])
-    for wide, narrow in ((uncertain, exact), (uncertain["tracked"], exact["tracked"])):
-        assert 1.1 < wide["force_std_N"] / narrow["force_std_N"] < 3.0
-
-
 def test_stream_keeps_its_model_if_the_charges_npz_of_the_next_model_is_damaged(model, models):
     first = Predictor(models / "linear")
     stream = TouchStream(first, device_from_table({"track": {}}, "b"))

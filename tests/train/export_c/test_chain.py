@@ -239,8 +239,8 @@ def test_stage_without_code_in_c_is_refused_by_its_name(monkeypatch):
 
 
 def test_sections_that_only_the_host_executes_are_named_in_a_warning(caplog):
-    device_header(device_from_table({"track": {}, "touch_offset": {}}, "board"), ("A", "B", "C"))
-    assert "board: track, touch_offset: not exported" in caplog.text
+    device_header(device_from_table({"track": {}, "follow": {}}, "board"), ("A", "B", "C"))
+    assert "board: follow, track: not exported" in caplog.text
 
 
 FLOAT32 = st.floats(width=32, allow_nan=False)

@@ -11,7 +11,6 @@ from isocharge.serve.examination.channel_health import MAINS_HZ, ChannelHealth
 from isocharge.serve.examination.held_press import HeldPress
 from isocharge.serve.examination.listening import Capture
 from isocharge.serve.live.device import Device
-from isocharge.serve.live.fading import section_text
 from isocharge.serve.port.serial_line import TELNET_ADVICE
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.inflow import LeakSection
@@ -175,10 +174,8 @@ def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress
             "the arrival times, which jitter"
         )
     if held_press is not None:
-        # The sections are parts of a device file that make the charge of this press constant.
-        for section_name, settings in held_press.sections.items():
-            if section_name not in device.table:  # the device file has no such section yet
-                yield f"put {section_text(section_name, settings)} into a device file"
+        if held_press.tau_s is not None and "leak" not in device.table:
+            yield f"put [leak] tau_s = {held_press.tau_s:g} into a device file"
     elif device.rule(LeakSection) is None and device.front_end != "current":
         yield (
             "state the time constants of the amplifiers in a device file ([leak] tau_s): without them the force of a "

@@ -236,8 +236,8 @@ def examine_received(
             "again"
         )
         missing.insert(0, touch)
-    if held_press is not None:
-        table = held_press.sections | table  # keeps a section that the device file already has
+    if held_press is not None and held_press.tau_s is not None:
+        table = {"leak": {"tau_s": held_press.tau_s}} | table  # keeps a section that the device file already has
     missing += channel_count_sentences(capture, device, len(channels), electrodes)
     missing += unit_sentences(unit)
     missing += channel_sentences(channels, unit, device)

@@ -122,8 +122,6 @@ class Frame:
         tare_pC: Charge at rest that was subtracted, shape (n_electrode,), pC; None without touch charges.
         noise_pC: Standard deviation of the charges at rest, shape (n_electrode,), pC. It requires a tare.
         is_contact: Whether something touches the film.
-        charge_scale_std: Relative standard deviation that all touch charges have in common, because the memory of the
-            film is not known exactly.
         base_relax_s: Time constant with which the charge out of contact decays to zero, s.
         is_base_held: Whether a finger is touching or leaving the film. A positive base of the touch detection then does
             not decay.
@@ -152,7 +150,6 @@ class Frame:
     tare_pC: Array | None = None
     noise_pC: Array = field(init=False, repr=False, compare=False)
     is_contact: bool = False
-    charge_scale_std: float = 0.0
     base_relax_s: float = math.inf
     is_base_held: bool = False
     contact: Contact | None = None

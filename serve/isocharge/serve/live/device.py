@@ -40,14 +40,13 @@ from isocharge.common.structs import Settings, convert, read_toml
 from isocharge.serve.frames.formats import AutoFrames, Frames
 from isocharge.serve.frames.frame import Parser
 from isocharge.serve.frames.frame_layout import FrameLayout
-from isocharge.serve.live.contact_stages import ChargeScale, FollowFilm, Prediction, TouchOffset
+from isocharge.serve.live.contact_stages import FollowFilm, Prediction
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain
 from isocharge.serve.signal_chain.hum import Hum
 from isocharge.serve.signal_chain.leak import Integrator, Leak
-from isocharge.serve.signal_chain.memory import Memory, MemoryRule
 from isocharge.serve.signal_chain.rule import Rule
 from isocharge.serve.signal_chain.saturation import Saturation
 from isocharge.serve.signal_chain.stage import R, Setup, Stage
@@ -63,15 +62,12 @@ STAGES: tuple[type[Stage], ...] = (
     Tare,
     Integrator,
     Leak,
-    Memory,
     Touch,
     Saturation,
     Warming,
     Prediction,
     FollowFilm,
     Tracker,
-    ChargeScale,
-    TouchOffset,
 )
 """All stages in the order in which they process a frame. The device file and the export to C follow from the stages."""
 
@@ -240,11 +236,6 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     for section in structs.asdict(sections).values():
         if isinstance(section, Rule) and section.on:
             rules[type(section)] = section
-    if sections.front_end == "current" and MemoryRule in rules:
-        raise DeviceError(
-            f'{where}: memory: expected no section [memory] beside front_end = "current", because the integral of the '
-            "currents forgets slow changes; remove the section"
-        )
     return Device(sections.name, sections.front_end, sections.frames, sections.channels, rules, table, where)
 
 

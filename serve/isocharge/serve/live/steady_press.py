@@ -430,6 +430,6 @@ def _drift_reason(press: SteadyPress, mean_magnitudes: Sequence[tuple[float, flo
     if mean_slope > 0.0:
         return f"the charges rise by {100.0 * mean_slope:.2g} % per second: hold the force"
     return (
-        f"the charges fall by {-100.0 * mean_slope:.2g} % per second on all electrodes alike: hold the force; "
-        f"{cause_of_fading(mean_magnitudes)}"
+        f"the charges fall by {-100.0 * mean_slope:.2g} % per second on all electrodes alike: hold the force; or "
+        f"{cause_of_fading(mean_magnitudes).cause}"
     )

@@ -4,7 +4,6 @@ A contact consists of ten numbers. Other programs rely on the order of the ten n
 """
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -83,53 +82,6 @@ CLOSE_DISTANCE_mm = 0.3
 
 CLOSE_FORCE_RATIO = 0.05
 """Largest difference of the force between two close contacts, relative to the force of the reference contact."""
-
-
-class Sensitivity:
-    """Sensitivity of a contact to an uncertain parameter of the film.
-
-    The sensitivity is computed from a second prediction with another value of the parameter. The sensitivity is used
-    again while the contact hardly moves. Most frames of a held press therefore need only one prediction.
-    """
-
-    def __init__(self, parameter_step: float) -> None:
-        """Start without a stored sensitivity.
-
-        Args:
-            parameter_step: Difference between the values of the parameter in the two predictions.
-        """
-        self._parameter_step = parameter_step
-        self._reference: Contact | None = None  # contact for which the stored sensitivity was computed
-        self._shift_per_step = (0.0, 0.0, 0.0)  # changes of x and y, mm, and of the force, N
-
-    def shift(
-        self, contact: Contact, parameter_change: float, predict_after_step: Callable[[], Contact]
-    ) -> tuple[float, float, float]:
-        """Compute how a change of an uncertain parameter of the film shifts the position and the force of a contact.
-
-        The contact is assumed to change in proportion to the parameter. A second prediction gives the change of the
-        contact for one step of the parameter. This change is stored. If a later contact is close to the contact for
-        which the change was stored, the stored change is used again, and no second prediction is made.
-
-        Args:
-            contact: The contact at the present value of the parameter.
-            parameter_change: Change of the parameter, in the same unit as the step.
-            predict_after_step: Function that predicts the contact with the parameter changed by one step.
-
-        Returns:
-            Changes of x and y, mm, and of the force, N.
-        """
-        if not is_close(contact, self._reference):
-            contact_after_step = predict_after_step()
-            self._reference = contact
-            self._shift_per_step = (
-                contact_after_step.x_mm - contact.x_mm,
-                contact_after_step.y_mm - contact.y_mm,
-                contact_after_step.force_N - contact.force_N,
-            )
-        x_shift_per_step, y_shift_per_step, force_shift_per_step = self._shift_per_step
-        step_count = parameter_change / self._parameter_step  # need not be a whole number
-        return step_count * x_shift_per_step, step_count * y_shift_per_step, step_count * force_shift_per_step
 
 
 def is_close(contact: Contact, reference: Contact | None) -> bool:

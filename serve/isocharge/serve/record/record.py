@@ -7,7 +7,6 @@ CSV file.
 """
 
 import json
-import math
 from typing import Annotated, Any
 
 from msgspec import Struct, structs
@@ -36,20 +35,6 @@ class TrackedContact(Struct, frozen=True):
     vx_mm_s: Annotated[float, Meaning("Velocity along x; 0 while the contact is held.", "mm/s")]
     vy_mm_s: Annotated[float, Meaning("Velocity along y; 0 while the contact is held.", "mm/s")]
     moving: Annotated[float, Meaning("Probability that the contact moves, 0 to 1.")]
-
-    def widened(self, shift: tuple[float, float, float]) -> "TrackedContact":
-        """Return a copy of the contact whose standard deviations include an error that all frames have in common.
-
-        Args:
-            shift: Changes of x and y, mm, and of the force, N, by one standard deviation of the error.
-        """
-        x_shift_mm, y_shift_mm, force_shift_N = shift
-        return structs.replace(
-            self,
-            x_std_mm=math.hypot(self.x_std_mm, x_shift_mm),
-            y_std_mm=math.hypot(self.y_std_mm, y_shift_mm),
-            force_std_N=math.hypot(self.force_std_N, force_shift_N),
-        )
 
 
 class OtherContact(Struct, frozen=True):

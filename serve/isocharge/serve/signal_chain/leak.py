@@ -23,8 +23,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.inflow import Inflow, LeakRule, LeakSection
-from isocharge.serve.signal_chain.memory import MemoryRule
-from isocharge.serve.signal_chain.stage import OffsetStage, Setup, WarmingChange
+from isocharge.serve.signal_chain.stage import OffsetStage, Setup
 
 
 class Leak(OffsetStage):
@@ -45,8 +44,8 @@ class Leak(OffsetStage):
 
     @classmethod
     def is_used(cls, setup: Setup) -> bool:
-        """Return whether charge amplifiers leak. If the film has a memory, a later stage corrects both together."""
-        return super().is_used(setup) and setup.rule(MemoryRule) is None and not setup.has_currents
+        """Return whether the device file states the leak of charge amplifiers."""
+        return super().is_used(setup) and not setup.has_currents
 
     def reset(self) -> None:
         """Discard the state. A new state begins at the first frame after the next tare."""
@@ -97,9 +96,9 @@ class Leak(OffsetStage):
         """
         return output_pC - decay * self._output_pC
 
-    def add_warming(self, change: WarmingChange) -> None:
+    def add_warming(self, warming_pC: Array | float) -> None:
         """Subtract the warming from the touch charge that the stage integrates."""
-        self._charge_pC = self._charge_pC - change.charge_pC
+        self._charge_pC = self._charge_pC - warming_pC
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:

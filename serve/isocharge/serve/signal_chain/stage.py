@@ -9,7 +9,7 @@ export to C follow from the list.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from msgspec import structs
@@ -158,23 +158,11 @@ class OffsetStage(Stage):
         """
         setup.offset_stage = self
 
-    def begin_touch(self, frame: Frame) -> None:  # most stages do nothing
-        """Compute the charges of the first frame of a touch again, because the touch began before it was detected."""
-
     @abstractmethod
-    def add_warming(self, change: "WarmingChange") -> None:
-        """Assign a part of the touch charge of the present frame to the warming of the film."""
+    def add_warming(self, warming_pC: Array | float) -> None:
+        """Assign a part of the touch charge of the present frame to the warming of the film.
 
-
-class WarmingChange(NamedTuple):
-    """A change of the estimated warming.
-
-    Attributes:
-        charge_pC: Part of the touch charge that is warming, shape (n_electrode,), pC.
-        rate_pC_per_s: Change of the slope of the warming, shape (n_electrode,), pC/s.
-        is_learned: Whether the properties of the film may be learned after this touch.
-    """
-
-    charge_pC: Array | float
-    rate_pC_per_s: Array | float
-    is_learned: bool
+        Args:
+            warming_pC: Part of the touch charge that is warming, shape (n_electrode,) or one number for all electrodes,
+                pC.
+        """

@@ -16,7 +16,7 @@ from isocharge.common.structs import WrongKey
 from isocharge.serve.flags import TARE
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.rule import Count, Rule, Setting, TimeConstant
-from isocharge.serve.signal_chain.stage import OffsetStage, Setup, WarmingChange
+from isocharge.serve.signal_chain.stage import OffsetStage, Setup
 
 MAX_TARE_FRAMES_IN_C = 10_000
 """Largest number of frames of a tare in C, which limits the memory that the C program needs."""
@@ -119,11 +119,11 @@ class Tare(OffsetStage):
         self._searched_frames = 0
         self._is_search_limited = False
 
-    def add_warming(self, change: WarmingChange) -> None:
+    def add_warming(self, warming_pC: Array | float) -> None:
         """Add the warming to the tare."""
         assert self._tare_pC is not None
         assert self._previous is not None
-        self._tare_pC = self._tare_pC + change.charge_pC
+        self._tare_pC = self._tare_pC + warming_pC
         present_frame, _ = self._previous
         present_frame.tare_pC = self._tare_pC
 

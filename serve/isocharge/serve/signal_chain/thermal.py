@@ -7,8 +7,7 @@ contact has three unknowns, so four electrodes provide one charge more than is n
 A trial value of the common charge p is subtracted from all charges. The estimate is the trial value with which the
 remaining charges fit a single contact best. As a function of the trial value, the squared misfit is a parabola. The
 curvature of the parabola gives the variance of the estimate. A Kalman filter describes the common charge p as a random
-walk that begins at 0 with every touch. If the memory of the film predicts the warmth, the filter describes the slope of
-p as a random walk instead.
+walk that begins at 0 with every touch.
 
 If warming cannot be distinguished from a change of the force, the curvature vanishes. With three electrodes, the
 curvature vanishes at every position. With four electrodes, the curvature vanishes where a press increases all charges
@@ -26,9 +25,8 @@ from isocharge.common.errors import DeviceError
 from isocharge.common.structs import Finite
 from isocharge.serve.flags import BLIND, SATURATED, THERMAL
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.memory import MemoryRule
 from isocharge.serve.signal_chain.rule import Rule, Setting
-from isocharge.serve.signal_chain.stage import NOT_IN_C, Setup, Stage, WarmingChange
+from isocharge.serve.signal_chain.stage import NOT_IN_C, Setup, Stage
 
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
 """Changes of the common charge at which the misfit is evaluated, pC. A parabola is fitted to the squared misfits."""
@@ -85,17 +83,12 @@ class Warming(Stage):
         self._setup = setup
         self._rule = setup.rule(ThermalRule) or ThermalRule()
         self._ratios = warming_ratios(setup)
-        memory = setup.rule(MemoryRule)
-        # Time constant with which the film follows the temperature of the air; only known with a memory
-        self._warmth_s = None if memory is None else memory.warmth_s
         self.reset()
 
     def reset(self) -> None:
         """Discard the warming, because a touch has ended."""
         self._charge_pC = 0.0  # p
         self._variance_pC2 = 0.0  # variance of p
-        self._covariance = 0.0  # covariance of p and its slope, pC^2/s
-        self._rate_variance = 0.0  # variance of the slope, pC^2/s^2
         self._waited_s = 0.0  # time since the last estimate
         self._is_blind = False  # whether temperature could not be distinguished from force at the last estimate
 
@@ -113,21 +106,17 @@ class Warming(Stage):
             return
         if SATURATED in frame.flags:
             return
-        change_pC, rate_pC_per_s = self._estimate(frame.charge_pC, frame.dt_s)
-
-        # After a touch with a large warming, the stage of the film's memory must not learn the properties of the film.
-        is_large = abs(self._charge_pC) >= self._rule.tell_pC
-        if change_pC != 0.0 and self._setup.offset_stage is not None:
-            change = WarmingChange(change_pC * self._ratios, rate_pC_per_s * self._ratios, is_learned=not is_large)
-            frame.charge_pC = frame.charge_pC - change.charge_pC
-            self._setup.offset_stage.add_warming(change)
-        if is_large:
+        change_pC = self._estimate(frame.charge_pC, frame.dt_s) * self._ratios
+        if self._setup.offset_stage is not None:
+            frame.charge_pC = frame.charge_pC - change_pC
+            self._setup.offset_stage.add_warming(change_pC)
+        if abs(self._charge_pC) >= self._rule.tell_pC:
             frame.flags.append(THERMAL)
         if self._is_blind:
             frame.flags.append(BLIND)
 
-    def _estimate(self, charge_pC: Array, dt_s: float) -> tuple[float, float]:
-        """Update the estimate, and return the changes of p, pC, and of its slope, pC/s.
+    def _estimate(self, charge_pC: Array, dt_s: float) -> float:
+        """Update the estimate, and return the change of p, pC.
 
         If the parabola is too flat, p is not changed, its predicted variance is kept, and the state is blind.
 
@@ -138,8 +127,8 @@ class Warming(Stage):
         rule = self._rule
         self._waited_s += dt_s
         if self._waited_s < rule.every_s:  # no estimate in this frame
-            return 0.0, 0.0
-        self._predict_variances(self._waited_s)
+            return 0.0
+        self._variance_pC2 += rule.wander_pC**2 * self._waited_s
         self._waited_s = 0.0
 
         # Fit: squared misfit = constant + slope * c + curvature * c^2, where c is the trial value of the change.
@@ -153,56 +142,17 @@ class Warming(Stage):
         estimate_variance_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
         self._is_blind = estimate_variance_pC2 > rule.blind_pC**2
         if self._is_blind:
-            return 0.0, 0.0
+            return 0.0
 
         # The estimate is the minimum of the parabola, limited to the range of the trial values.
         minimum_pC = -slope / (2.0 * curvature)
         change_pC = min(max(minimum_pC, float(TRIED_PC[0])), float(TRIED_PC[-1]))
 
-        # Kalman update of p and of its slope, with their variances and their covariance
-        innovation_variance_pC2 = self._variance_pC2 + estimate_variance_pC2
-        charge_gain = self._variance_pC2 / innovation_variance_pC2
-        rate_gain = self._covariance / innovation_variance_pC2
-        previous_pC = self._charge_pC
-        self._charge_pC = previous_pC + charge_gain * change_pC
-        self._variance_pC2 *= 1.0 - charge_gain
-        self._rate_variance -= rate_gain * self._covariance
-        self._covariance *= 1.0 - charge_gain
-        return self._charge_pC - previous_pC, rate_gain * change_pC
-
-    def _predict_variances(self, waited_s: float) -> None:
-        """Predict the uncertainty of p and of its rate of change after a time without an estimate.
-
-        The rate decays with the time constant `warmth_s`, and random changes are added to the rate (white process
-        noise). If this time constant is not known, p is a random walk without a rate.
-
-        Let t be the time since the last estimate. The rate decays by the factor e = exp(-t / warmth_s). A rate of 1
-        changes p by g = warmth_s (1 - e). Let r be the variance that the process noise adds to the rate. The prediction
-        is
-
-            var(p)       <- var(p) + 2 g cov(p, rate) + g^2 var(rate) + r t^2 / 3,
-            cov(p, rate) <- e (cov(p, rate) + g var(rate)) + r t / 2,
-            var(rate)    <- e^2 var(rate) + r.
-        """
-        wander_pC = self._rule.wander_pC
-        if self._warmth_s is None:
-            self._variance_pC2 += wander_pC**2 * waited_s
-            return
-
-        # The variance r is proportional to t. After one second, the variance r t^2 / 3 that is added to p is the square
-        # of `wander_pC`, which is by definition the standard deviation of the change of p in one second.
-        added_rate_variance = 3.0 * wander_pC**2 * waited_s
-        decay = math.exp(-waited_s / self._warmth_s)
-        rate_effect_s = self._warmth_s * (1.0 - decay)
-        covariance = self._covariance
-        rate_variance = self._rate_variance
-        self._variance_pC2 = (
-            self._variance_pC2
-            + rate_effect_s * (2.0 * covariance + rate_effect_s * rate_variance)
-            + added_rate_variance * waited_s**2 / 3.0
-        )
-        self._covariance = decay * (covariance + rate_effect_s * rate_variance) + 0.5 * added_rate_variance * waited_s
-        self._rate_variance = decay * decay * rate_variance + added_rate_variance
+        # Kalman update of p and of its variance
+        gain = self._variance_pC2 / (self._variance_pC2 + estimate_variance_pC2)
+        self._charge_pC += gain * change_pC
+        self._variance_pC2 *= 1.0 - gain
+        return float(gain * change_pC)
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:

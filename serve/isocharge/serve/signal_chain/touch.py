@@ -67,9 +67,6 @@ class TouchRule(Rule, frozen=True, kw_only=True):
 SMALLEST_THRESHOLD_PC = 1e-12
 """Lower limit of the touch threshold, pC. It avoids a division by zero for a board without noise."""
 
-SCALE_STD_FACTOR = 2.0
-"""Number of common standard deviations of the charges by which the release threshold is raised."""
-
 RISE_S = 0.1
 """Time constant of the mean charges that show whether the charges rise slowly, s.
 
@@ -98,7 +95,7 @@ class Touch(Stage):
 
     A touch ends when the size of the charges falls below the release threshold, or when the charges change their sign
     from one frame to the next, or become negative if the charges of the film are positive. The release threshold is a
-    given share of the peak, plus the uncertainty of the charges. It is at least half of the touch threshold. The peak
+    given share of the peak. It is at least half of the touch threshold. The peak
     is the largest size that two consecutive frames of the touch have reached. The spike of a single frame is not a
     peak.
 
@@ -139,14 +136,9 @@ class Touch(Stage):
         self._rest_s = 0.0  # time for which the charges have been small
 
     def step(self, frame: Frame) -> None:
-        """Determine whether something touches the film in this frame.
-
-        If a touch begins, the stage that stores the charge at rest may change the charges of the frame, because the
-        touch began before it was detected.
-        """
+        """Determine whether something touches the film in this frame."""
         if frame.charge_pC is None:
             return
-        was_contact = self._is_contact
         if self._rule is None:
             self._is_contact = True
         else:
@@ -157,9 +149,6 @@ class Touch(Stage):
         frame.is_contact = self._is_contact
         if self._is_contact and self._has_drifted:
             frame.flags.append(DRIFT)
-        offset_stage = self._setup.offset_stage
-        if self._is_contact and not was_contact and offset_stage is not None:
-            offset_stage.begin_touch(frame)
 
     def _detect(self, rule: TouchRule, frame: Frame, charge: Array) -> None:
         """Update the state with the charges of a frame.
@@ -177,8 +166,7 @@ class Touch(Stage):
         self._last = charge
         if self._is_contact:
             self._peak = max(self._peak, two_frame_peak)
-            uncertainty = SCALE_STD_FACTOR * frame.charge_scale_std * size
-            release_size = max((rule.release_share or 0.0) * self._peak + uncertainty, 0.5)
+            release_size = max((rule.release_share or 0.0) * self._peak, 0.5)
             if size < release_size or is_reversed:
                 self._is_contact = False
                 self._base = charge

@@ -10,15 +10,6 @@ charge of the film is the sum of the touch charge and the pyroelectric charge. T
 simulation adds an offset, hum and white noise. The output is finally clipped, and rounded to the codes of the
 converter.
 
-The response of a film with creep to a unit step of the touch charge is
-
-    h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / film_time),
-
-where t is the time since the step. The logarithm describes the creep of the film, and is valid from some milliseconds
-to days. A Prony series with two terms per decade of time approximates the logarithm. The response to an arbitrary touch
-charge follows from Boltzmann's superposition principle. The exponential term describes the thermoelastic effect: the
-film cools when it is stretched, and then returns to its initial temperature.
-
 The noise levels `bench` and `surgery` contain plausible values of the hum, the offset, the bias current and the
 mismatch for environments with weak or strong electrical interference. The values of `bench` and `surgery` were not
 measured. The noise levels `clean` and `reference` contain only noise that does not depend on earlier readings. The
@@ -52,11 +43,6 @@ The time constant is density * specific heat * thickness / (2 * heat transfer co
 K) and 10 W/(m^2 K). The value of the heat transfer coefficient is typical of free convection and radiation.
 """
 
-
-CREEP_TIMES = 10.0 ** np.arange(-3.0, 6.1, 0.5)
-"""Time constants of the exponential terms in the Prony series of creep, s."""
-
-
 PositiveOrInfinite = Annotated[float, Meta(gt=0.0, description="a positive number or inf")]
 """Type of a positive parameter that may be infinite."""
 
@@ -78,9 +64,6 @@ class Amplifier:
         bias: Magnitude of the bias current that every channel integrates, pC/s. The sign is drawn for each channel.
         pyro: Pyroelectric charge of each electrode per temperature change, pC/K; negative for PVDF with d31 > 0.
         pyro_mismatch: Standard deviation of the relative error of the pyroelectric charge of a channel, dimensionless.
-        creep: Share of a touch charge that is lost in each decade of time, dimensionless.
-        thermoelastic: Initial increase of a touch charge by the cooling of the film, relative to the touch charge,
-            dimensionless.
         temperature_rms: Root mean square of the temperature drift of the film, K.
         temperature_time: Time constant of the temperature drift of the air, s.
         step: Temperature step of the air, K.
@@ -102,8 +85,6 @@ class Amplifier:
     bias: NotNegative = 0.0
     pyro: Finite = PVDF_PYRO
     pyro_mismatch: NotNegative = 0.0
-    creep: Annotated[float, Meta(ge=0.0, lt=0.2)] = 0.0
-    thermoelastic: NotNegative = 0.0
     temperature_rms: NotNegative = 0.0
     temperature_time: Positive = 120.0
     step: Finite = 0.0
@@ -186,8 +167,6 @@ class Measurement:
     _output: Array = field(init=False)
     _air_temperature: float = field(init=False)
     _film_temperature: float = field(init=False)
-    _creep_filter_state: Array = field(init=False)
-    _touch_charge: Array = field(init=False)
 
     def __post_init__(self) -> None:
         """Draw the initial temperatures, and set all charges to their stationary values at these temperatures."""
@@ -205,9 +184,6 @@ class Measurement:
 
         # There is no touch before the measurement, so the film has only its pyroelectric charge.
         self._film_charge = self.pyro_charge_per_K * self._film_temperature
-        self._touch_charge = np.zeros_like(self.gain)
-        # State of the filters in `_apply_creep`: one filter for each creep time and one for the thermoelastic effect
-        self._creep_filter_state = np.zeros((CREEP_TIMES.size + 1, 1, self.gain.size))
 
         # The stationary output satisfies output = decay * output + bias / rate for each channel. Without a leak, there
         # is no stationary output, and the output starts at zero.
@@ -238,7 +214,7 @@ class Measurement:
         # Charge of the film
         temperature = self._simulate_temperature(time)[:, np.newaxis]  # difference from the mean, shape (n, 1), K
         touch_charge = charge if charge_per_K is None else charge + charge_per_K * temperature
-        film_charge = self._apply_creep(touch_charge) + self.pyro_charge_per_K * temperature
+        film_charge = touch_charge + self.pyro_charge_per_K * temperature
 
         # Output of the amplifiers, and disturbances of the output
         output = self._integrate(film_charge) + self.offset
@@ -246,42 +222,6 @@ class Measurement:
         output_with_hum = output + self.amplifier.hum * np.sin(hum_angle)
         noisy_output = self.amplifier.noise.add(output_with_hum, self.rng)
         return self._convert(noisy_output)
-
-    def _apply_creep(self, charge: Array) -> Array:
-        """Apply creep and the thermoelastic effect to touch charges.
-
-        The response of the charge to a step is a sum of decaying exponentials. For each exponential, a recursive filter
-        is applied to the changes of the charge. The state of each filter is stored for the next call.
-
-        Args:
-            charge: Touch charges, shape (n, n_electrode), pC.
-
-        Returns:
-            Touch charges with creep and thermoelastic effect, same shape, pC.
-        """
-        amplifier = self.amplifier
-        if not amplifier.creep and not amplifier.thermoelastic:
-            return charge
-        changes = np.diff(charge, axis=0, prepend=self._touch_charge[np.newaxis])
-        self._touch_charge = charge[-1]
-
-        # The last exponential describes the thermoelastic effect, and all others describe the creep. The creep has two
-        # exponentials per decade of time, so each has half of the amplitude of a decade.
-        time_constants = np.append(CREEP_TIMES, amplifier.film_time)
-        creep_amplitudes = np.full(CREEP_TIMES.size, 0.5 * amplifier.creep)
-        amplitudes = np.append(creep_amplitudes, amplifier.thermoelastic)
-
-        # The constant part of the response is chosen such that the creep is zero one second after a touch.
-        constant_part = 1.0 - 0.5 * amplifier.creep * np.exp(-1.0 / CREEP_TIMES).sum()
-        charge_with_creep: Array = constant_part * charge
-        for index, (time_constant, amplitude) in enumerate(zip(time_constants, amplitudes, strict=True)):
-            decay = math.exp(-1.0 / (self.rate * time_constant))
-            # exponential[n] = decay * exponential[n - 1] + amplitude * changes[n]
-            exponential, self._creep_filter_state[index] = scipy.signal.lfilter(
-                [amplitude], [1.0, -decay], changes, axis=0, zi=self._creep_filter_state[index]
-            )
-            charge_with_creep = charge_with_creep + exponential
-        return charge_with_creep
 
     @property
     def _variance_ratio(self) -> float:
