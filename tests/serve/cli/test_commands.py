@@ -269,7 +269,7 @@ def test_doctor_states_the_share_of_presses_outside_the_working_area_without_a_f
 
 
 def test_doctor_exit_code_if_no_frames_are_recognised(command, monkeypatch):
-    monkeypatch.setattr("isocharge.serve.port.source.START_UP_FACTOR", 0.1)
+    monkeypatch.setattr("isocharge.serve.port.source.START_UP_s", 0.5)
     silent = PseudoPort()
     words = ("--seconds", 0.5, "--model", "three-25um-biaxial")
     code, out, err = command("serve", "doctor", "--port", silent.url, *words)

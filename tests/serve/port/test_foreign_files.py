@@ -34,8 +34,10 @@ FOREIGN = {
         lambda path: write_table(pa.table({"A": [1.0]}), path),
         "got a Parquet file; .*isocharge serve predict MODEL",
     ),
-    "presses.csv": (table("A,B,C\n1,2,3\n"), "got a table of presses; .*isocharge serve predict MODEL .*--port - <"),
-    "measured.txt": (table("x_mm,y_mm,force_N,A,B,C\n1,2,3,4,5,6\n"), "got a table of presses"),
+    "measured.txt": (
+        table("x_mm,y_mm,force_N,A,B,C\n1,2,3,4,5,6\n"),
+        "got a table of presses; .*isocharge serve predict MODEL .*--port - <",
+    ),
     "touch.csv": (table(csv_header(("A", "B", "C")) + "\n"), "got a table of presses"),
 }
 
@@ -82,13 +84,6 @@ def test_bytes_of_a_board_in_a_file_are_read(tmp_path, name, text):
     path.write_text(text)
     with open_source(str(path)) as source:
         assert b"".join(chunk.data for chunk in source) == text.encode()
-
-
-def test_lines_of_a_board_in_a_csv_file_are_read_from_stdin(tmp_path):
-    path = tmp_path / "lines.csv"
-    path.write_text("A,B,C\n1,2,3\n")
-    with path.open("rb") as file:
-        assert [chunk.data for chunk in FileSource(file.fileno(), "-")] == [b"A,B,C\n1,2,3\n"]
 
 
 def test_file_of_bytes_is_refused_as_a_port(tmp_path):

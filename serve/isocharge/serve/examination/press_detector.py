@@ -12,7 +12,7 @@ from an amplifier with another rest level.
 
 import math
 from collections import deque
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -194,43 +194,19 @@ def block_medians(values: Array, times_s: Array) -> Array:
     if not complete_blocks:
         channel_count = values.shape[1]
         return np.zeros((0, channel_count))
-    return np.array([_finite_medians(block) for block in complete_blocks])
-
-
-def _finite_medians(block: Array) -> Array:
-    """Compute the median of the finite values of each column.
-
-    Args:
-        block: Values, shape (n, channels), some of which may be NaN or infinite.
-
-    Returns:
-        Medians, shape (channels,); NaN for a column without a finite value.
-    """
-    medians = np.full(block.shape[1], np.nan)
-    for channel_index, column in enumerate(block.T):
-        finite_values = column[np.isfinite(column)]
-        if finite_values.size:
-            medians[channel_index] = np.median(finite_values)
-    return medians
-
-
-def _rounding_error_std(column: Array) -> float:
-    """Return the standard deviation of the rounding errors of a channel.
-
-    It is 12**-0.5 if all finite values are whole numbers, because rounding errors are distributed uniformly between
-    -0.5 and 0.5. It is 0 for other values, whose rounding is not known.
-
-    Args:
-        column: Values of the channel, shape (n,).
-    """
-    finite_values = column[np.isfinite(column)]
-    are_whole_numbers = bool((finite_values == np.round(finite_values)).all())
-    return 12.0**-0.5 if are_whole_numbers else 0.0
+    masked_median: Any = np.ma.median  # has no types
+    medians = [masked_median(np.ma.masked_invalid(block), axis=0) for block in complete_blocks]
+    return np.array([np.ma.filled(median, np.nan) for median in medians])
 
 
 def channel_noise(column: Array) -> float:
-    """Return the noise of a channel, shape (n,), at least the error of rounding, because coarse values may be equal."""
-    return max(estimate_noise(column), _rounding_error_std(column))
+    """Return the noise of a channel, shape (n,), at least the error of rounding if all values are whole numbers.
+
+    Rounding errors are distributed uniformly between -0.5 and 0.5, so that their standard deviation is 12**-0.5.
+    """
+    finite_values = column[np.isfinite(column)]
+    are_whole_numbers = bool((finite_values == np.round(finite_values)).all())
+    return max(estimate_noise(column), 12.0**-0.5 if are_whole_numbers else 0.0)
 
 
 def estimate_noise(values: Array) -> float:

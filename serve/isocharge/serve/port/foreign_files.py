@@ -17,11 +17,8 @@ RECORD_KEYS = (b'"frame_id"', b'"charge_pC"', b'"tare_pC"')
 MCAP_START = b"\x89MCAP"
 PARQUET_START = b"PAR1"
 
-PRESS_COLUMNS = frozenset({"x_mm", "y_mm", "force_N", "charge_pC.A", "flags"})
+PRESS_COLUMNS = {"x_mm", "y_mm", "force_N", "charge_pC.A", "flags"}
 """Columns that only tables of presses and records have."""
-
-BOARD_COLUMNS = frozenset({"seq", "t_us", "t_ms", "t_s"})
-"""Columns that only lines from boards have."""
 
 
 def refuse_foreign_file(name: str, head: bytes) -> None:
@@ -63,29 +60,10 @@ def foreign_kind(name: str, head: bytes) -> str:
         )
     if head.startswith(PARQUET_START):
         return f"a Parquet file; compute its contacts with: isocharge serve predict MODEL {quoted_name}"
-    if _is_table_of_presses(name, first_line):
+    columns = {column.strip(' "') for column in first_line.decode("utf-8", "replace").strip().split(",")}
+    if columns & PRESS_COLUMNS:
         return (
             f"a table of presses; compute its contacts with: isocharge serve predict MODEL {quoted_name}; if a board "
             f"has sent these lines, use: isocharge serve stream MODEL --port - < {quoted_name}"
         )
     return ""
-
-
-def _is_table_of_presses(name: str, first_line: bytes) -> bool:
-    """Return whether a file is a CSV table of presses or of records.
-
-    The file is a table if its header contains a column that only presses or records have. A file whose name ends in
-    `.csv` is also a table if its header consists only of names, and if none of the names is one that only boards send.
-
-    Args:
-        name: Path of the file, or - for the standard input.
-        first_line: First line of the file.
-    """
-    header = first_line.decode("utf-8", "replace").strip()
-    columns = {column.strip().strip('"') for column in header.split(",")}
-    has_press_column = bool(columns & PRESS_COLUMNS)
-    if has_press_column:
-        return True
-    has_board_column = bool(columns & BOARD_COLUMNS)
-    has_only_names = len(columns) > 1 and all(column[:1].isalpha() for column in columns)  # numbers begin otherwise
-    return name.endswith(".csv") and has_only_names and not has_board_column

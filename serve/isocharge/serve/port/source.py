@@ -43,21 +43,14 @@ from isocharge.serve.port.serial_line import (
     UdpSocket,
 )
 
-FIRST_RETRY_PAUSE_s = 0.1
-"""First pause before a lost port is opened again, s. Each pause is twice as long as the previous pause."""
+RETRY_PAUSE_s = 0.3
+"""Pause before a port that cannot be opened or was lost is opened again, s."""
 
-MAX_RETRY_PAUSE_s = 2.0
-"""Longest pause before a lost port is opened again, s."""
+START_UP_s = 10.0
+"""Time for which a board may be silent after its port was opened, s.
 
-START_UP_FACTOR = 2.0
-"""Factor by which a board may be silent for longer after the port was opened than later.
-
-Many boards restart when their port is opened, and send nothing for up to 6 s. If a port was opened again and remained
-silent, the time is longer by the same factor at the next attempt, so that a slow board is not restarted for ever.
+Many boards restart when their port is opened, and send nothing for up to 6 s.
 """
-
-MAX_START_UP_s = 60.0
-"""Longest wait for the first byte after a lost port was opened again, s, unless the user has set a longer time."""
 
 MAX_CHUNK_BYTES = 65536
 """Number of bytes after which no further waiting bytes are added to a chunk."""
@@ -106,7 +99,7 @@ class Port:
         reconnect: Whether to open a lost port repeatedly until it is back, instead of raising an error.
         request: Request that the board needs for each frame; None for a board that sends frames by itself.
         wait: Time to wait until the port can be opened, s. The port may also take this time to send its first byte, but
-            at least `START_UP_FACTOR * silence_s`.
+            at least `silence_s` and `START_UP_s`.
 
     Attributes:
         outages: Number of times that the port was lost and came back.
@@ -140,7 +133,7 @@ class Port:
         self._reconnect = reconnect
         self._requester = Requester(request) if request else None
         self._wait = wait
-        self.start_up_s = max(wait, START_UP_FACTOR * silence_s)
+        self.start_up_s = max(wait, silence_s, START_UP_s)
         self._line: SerialLine | UdpSocket | None = None
         self._is_starting_up = True  # whether no byte has arrived since the port was opened
 
@@ -162,7 +155,7 @@ class Port:
                 is_wrong_url = isinstance(error.__cause__, ValueError)  # another attempt would fail, too
                 if is_wrong_url or time.monotonic() >= deadline_s:
                     raise
-                time.sleep(FIRST_RETRY_PAUSE_s)
+                time.sleep(RETRY_PAUSE_s)
 
     def _open(self) -> None:
         """Open the line to the board, and discard the bytes in its buffer.
@@ -228,7 +221,7 @@ class Port:
             wait_start_s = time.monotonic()
             outage_s = 0.0
             try:
-                data = self._read(self.start_up_s)
+                data = self._read()
             except PortLost as error:
                 data = self._read_after_reconnecting(error)
                 outage_s = time.monotonic() - wait_start_s
@@ -265,35 +258,24 @@ class Port:
         if not self._reconnect:
             raise reason
         log.warning("%s; trying again until it is back", reason)
-        pause_s = FIRST_RETRY_PAUSE_s
-        start_up_s = self.start_up_s
         while True:
             self._close()
-            time.sleep(pause_s)
-            pause_s = min(2.0 * pause_s, MAX_RETRY_PAUSE_s)
-            try:
+            time.sleep(RETRY_PAUSE_s)
+            with contextlib.suppress(PortError):  # also PortLost, if no bytes have arrived after opening
                 self._open()
-                return self._read(start_up_s)
-            except PortLost:  # no bytes have arrived after opening
-                start_up_s = max(start_up_s, min(START_UP_FACTOR * start_up_s, MAX_START_UP_s))
-            except PortError:  # the port cannot be opened
-                continue
+                return self._read()
 
-    def _read(self, start_up_s: float) -> bytes:
+    def _read(self) -> bytes:
         """Wait for a byte, and return all bytes that have arrived.
 
         If the program did not read the port for some time, many bytes wait. They belong to one chunk, so that their
         frames share the time since the previous chunk.
 
-        Args:
-            start_up_s: Longest wait for the first byte after the port was opened, s. The longest wait for later bytes
-                is `silence_s`.
-
         Raises:
             PortLost: If the port disappears, or no byte arrives in time.
             PortError: If the port is not open.
         """
-        timeout_s = start_up_s if self._is_starting_up else self._silence_s
+        timeout_s = self.start_up_s if self._is_starting_up else self._silence_s
         data = self._receive(timeout_s)
         if not data:
             speed_advice = f", and that {self._baud} baud is its speed" if has_speed(self.url) else ""
@@ -475,7 +457,7 @@ def open_source(
     is_path = "://" not in url
     deadline_s = time.monotonic() + wait
     while is_path and not Path(url).exists() and time.monotonic() < deadline_s:
-        time.sleep(FIRST_RETRY_PAUSE_s)
+        time.sleep(RETRY_PAUSE_s)
     if is_path and _is_file_or_pipe(Path(url)):
         return _open_file(Path(url))
     remaining_s = max(0.0, deadline_s - time.monotonic())

@@ -13,7 +13,7 @@ from typing import TextIO
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Singles
+from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError
 from isocharge.serve.model.contact import Contact, Contacts
 from isocharge.serve.model.predictor import Predictor
@@ -137,39 +137,15 @@ def write_contacts(
     if has_header:
         writer.writerow(header)
 
-    # The rows are converted in blocks, so that the texts of a large table are not all in memory at the same time.
-    rows = np.column_stack(contacts)
-    for start in range(0, len(rows), BLOCK_ROWS):
-        block = slice(start, start + BLOCK_ROWS)
-        writer.writerows(_contact_rows(rows[block], is_touch[block], validity))
-
-
-def _contact_rows(contact_values: Singles, is_touch: Booleans, validity: Validity | None) -> Iterator[tuple[str, ...]]:
-    """For each press, yield the cells of its row in the CSV text.
-
-    If a press is not a touch, its force is 0, and its other cells are empty.
-
-    Args:
-        contact_values: Values of the attributes of `Contact` for each press, shape (n, 10). The correlations are not
-            written.
-        is_touch: Whether each press is a touch, shape (n,).
-        validity: Domain of the model. If it is given, the last cell contains the flags, separated by blanks.
-    """
-    names = Contacts._fields[:N_WITHOUT_CORRELATION]
-    cells_without_touch = tuple("0.000000" if name == "force_N" else "" for name in names)
-    values_of_presses = contact_values[:, :N_WITHOUT_CORRELATION].tolist()
-    flags_of_presses: list[tuple[str, ...]] = [()] * len(contact_values)
-    if validity is not None:
-        flags_of_presses = validity.batch_flags(Contacts(*contact_values.T))
-    for values, is_press_touch, flags in zip(values_of_presses, is_touch.tolist(), flags_of_presses, strict=True):
-        cells = cells_without_touch
-        flag_text = ""
-        if is_press_touch:
-            cells = tuple(f"{value:.6f}" for value in values)
-            flag_text = " ".join(flags)
+    rows = np.column_stack(contacts)[:, : len(names)].tolist()
+    flags = [()] * len(rows) if validity is None else validity.batch_flags(contacts)
+    for values, is_press_touch, words in zip(rows, is_touch.tolist(), flags, strict=True):
+        cells = [f"{value:.6f}" for value in values]
+        if not is_press_touch:
+            cells = ["0.000000" if name == "force_N" else "" for name in names]
         if validity is not None:
-            cells = (*cells, flag_text)
-        yield cells
+            cells.append(" ".join(words) if is_press_touch else "")
+        writer.writerow(cells)
 
 
 def blocks(rows: Array) -> Iterator[Array]:
