@@ -105,10 +105,6 @@ def stream_command(
             "--policy", help="If several frames come at once: a record for each of them, or for the latest alone."
         ),
     ] = Policy.every,
-    reconnect: Annotated[
-        bool,
-        typer.Option("--reconnect/--no-reconnect", help="If the port is lost: try for ever to open it again, or fail."),
-    ] = True,
     seconds: Annotated[
         float | None, typer.Option("--seconds", min=0.0, help="Time after which to stop, s. (default: at Ctrl-C)")
     ] = None,
@@ -187,9 +183,7 @@ def stream_command(
                 live_page(address, token, touch.frame_id, predictor.metadata, folder, tls=tls, allow_host=allow_host)
             )
         stack.enter_context(timer)
-        source = stack.enter_context(
-            open_source(port, baud=baud, reconnect=reconnect, request=board.request, wait=wait)
-        )
+        source = stack.enter_context(open_source(port, baud=baud, reconnect=True, request=board.request, wait=wait))
 
         # The handlers of the signals only request changes, which the stream carries out later.
         stack.enter_context(on_signal(signal.SIGUSR1, stream.request_tare))

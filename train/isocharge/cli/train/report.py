@@ -37,15 +37,6 @@ def report_command(
             "the sensor)",
         ),
     ] = None,
-    student: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--student",
-            metavar="MODEL",
-            help="Name or path of a small model to compare as well; may be repeated. (default: the model named "
-            "MODEL-student, if there is one)",
-        ),
-    ] = None,
     models: ModelsOption = None,
     sensor: Annotated[
         str | None,
@@ -79,7 +70,7 @@ def report_command(
     loaded_datasets = [_read_dataset(path, sensor, probe) for path in datasets]
     model_names = model or [dataset.sensor.name for dataset in loaded_datasets]
     model_folders = [find_model(name, models) for name in model_names]
-    student_folders = _find_students(student, model_names, models)  # small models, which are compared as well
+    student_folders = _find_students(model_names, models)  # small models, which are compared as well
 
     settings = QUICK if quick else Settings()
     with shown_progress():
@@ -100,21 +91,13 @@ def report_command(
         show_json(record)
 
 
-def _find_students(student_names: list[str] | None, model_names: list[str], models: Path | None) -> list[Path]:
-    """Return the version folders of the small models to compare.
-
-    Without names, the model NAME-student of each compared model NAME is returned if it exists.
+def _find_students(model_names: list[str], models: Path | None) -> list[Path]:
+    """Return the version folder of the small model NAME-student of each compared model NAME, if it exists.
 
     Args:
-        student_names: Names or paths from `--student`; None for the models named MODEL-student that exist.
         model_names: Names or paths of the compared models.
         models: Folder of models that is searched first.
-
-    Raises:
-        ModelError: If a model of `student_names` does not exist.
     """
-    if student_names:
-        return [find_model(name, models) for name in student_names]
     folders = []
     for name in model_names:
         with suppress(ModelError):  # a model need not have a student
