@@ -13,7 +13,7 @@ import pytest
 from tests.benchmarks.measured_films import measured_presses
 
 from boards import TcpBoard, until
-from isocharge.cli.train.press_dialogue import Dialogue, Screen
+from isocharge.cli.train.press_dialogue import Dialogue
 from isocharge.cli.train.press_events import PressEvents, SessionEnd
 from isocharge.common.errors import OutputExists, PortLost, PressError
 from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_frame, read_presses
@@ -97,7 +97,7 @@ def refused(reason):
 def dialogue(*events, asks=True, contacts=None):
     """The session after a dialogue with a person, or with a machine that makes the presses of a list."""
     session, script, taken = FakeSession(), Script(*events), []
-    talk = Dialogue(session, script, Screen(NAMES), lambda *_: taken.append(len(session)))
+    talk = Dialogue(session, script, NAMES, lambda *_: taken.append(len(session)))
     if contacts is None:
         talk.guide_person(asks=asks)
     else:
@@ -113,9 +113,8 @@ def test_enter_takes_a_press_as_proposed(capsys):
     assert taken == [1, 2, 3]
     message = capsys.readouterr().err
     assert "\n1. Press 1.00 N at (0.0, 0.0) mm and hold." in message
-    assert "hold it, 0.3 s: A 400.0, B 400.0, C 400.0, D 400.0 pC" in message
-    assert ("0.8 s" in message, "hold it, 1.4 s" in message) == (False, True)  # one line a second
-    assert re.findall(r": A (\S+),", message) == ["400.0"] * 2 + ["500.0"] * 3
+    assert message.count("   hold it\n") == 1
+    assert re.findall(r": A (\S+),", message) == ["500.0"] * 3
     assert message.count("so much is known") == 3
     assert message.endswith("With --until 0 the same command takes more presses.\n")
 

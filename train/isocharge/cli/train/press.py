@@ -13,7 +13,7 @@ from isocharge.cli.shared.port_hints import no_frames_advice_added
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json
-from isocharge.cli.train.press_dialogue import Dialogue, Screen
+from isocharge.cli.train.press_dialogue import Dialogue
 from isocharge.cli.train.press_events import PressEvents
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError, PressError, error_prefix
@@ -149,7 +149,7 @@ def press_command(
                 open_source(port, baud=baud, reconnect=contacts is None, request=board.request) as source,
                 PressEvents(source, stream, PressWatch(problem.electrodes), keyboard) as events,
             ):
-                dialogue = Dialogue(session, events, Screen(problem.electrodes), on_taken)
+                dialogue = Dialogue(session, events, problem.electrodes, on_taken)
                 if contacts is None:
                     dialogue.guide_person(asks=asks_person)
                 else:
