@@ -9,7 +9,6 @@ The touch is compared with the model's own answer on the true charges: 0.03 mm a
 import binascii
 import json
 import struct
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
@@ -23,7 +22,6 @@ from isocharge.serve import Chunk, Predictor, TouchStream, load_device
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.port.serial_line import Request
-from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 
 RATE_HZ = 400.0
 predictor = cache(Predictor)
@@ -197,35 +195,3 @@ def test_a_board_gets_to_a_right_touch(name, written):
     stream = TouchStream(predictor(kind.model), load_device(written(examined(board, kind, kind.gain))))
     chunks = [*board.chunks(480), *board.chunks(171, pressed=True)]
     check_touch([json.loads(record.to_json()) for chunk in chunks for record in stream.feed(chunk)], kind.model)
-
-
-def test_a_board_that_is_plugged_in(command, tmp_path):
-    """By the commands, over a pseudo-terminal; at first for a model of four electrodes, which does not fit."""
-    kind, port, stop = Kind(answer, model=THREE), PseudoPort(), threading.Event()
-    board, sent, rest = Board(kind), 0, float("inf")
-
-    def send():
-        nonlocal sent
-        while not stop.wait(0.0025):
-            sent += port.write_whole(board.frame(pressed=sent > rest))
-
-    sender = threading.Thread(target=send)
-    sender.start()
-    try:
-        path = tmp_path / "board.toml"
-        doctor = ("serve", "doctor", "--port", port.url, "--seconds", "0.8")
-        code, out, err = command(*doctor, "--model", FOUR)
-        assert code == 0
-        assert "3 of 3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')" in out
-        code, _, err = command(*doctor, "--model", THREE, "--write", path)
-        assert code == 0
-        code, _, err = command(*doctor, "--model", THREE, "--write", path)
-        assert (code, "not overwritten" in err) == (1, True)
-        rest = sent + 600  # of which the port may hold two hundred that nobody reads
-        code, out, err = command("serve", "stream", THREE, "--port", port.url, "--device", path, "--count", "750")
-        assert code == 0, err
-    finally:
-        stop.set()
-        sender.join()
-        port.close()
-    check_touch([json.loads(line) for line in out.splitlines()], THREE)

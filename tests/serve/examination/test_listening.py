@@ -1,50 +1,12 @@
 """Listening to a port at several baud rates, and with requests."""
 
-import os
-import socket
-import threading
-import tty
-from contextlib import suppress
 from typing import ClassVar
 
 import pytest
 
 from isocharge.serve import examine
 from isocharge.serve.examination import listening
-from isocharge.serve.examination.listening import listen
-from isocharge.serve.port.serial_line import Request
 from isocharge.serve.port.source import Chunk
-
-
-@pytest.fixture
-def pty():
-    """Return the descriptor of the board's end of a pseudo-terminal, and the path of the reader's end."""
-    board, reader = os.openpty()
-    tty.setraw(reader)
-    os.set_blocking(board, False)
-    yield board, os.ttyname(reader)
-    os.close(board)
-    os.close(reader)
-
-
-@pytest.fixture
-def run(pty):  # noqa: ARG001 - the threads end before the pseudo-terminal does
-    """Return a function that calls another function repeatedly in a thread until the test ends."""
-    stop = threading.Event()
-    threads = []
-
-    def start(function, pause_s=0.0):
-        def loop():
-            while not stop.wait(pause_s):
-                function()
-
-        threads.append(threading.Thread(target=loop))
-        threads[-1].start()
-
-    yield start
-    stop.set()
-    for thread in threads:
-        thread.join()
 
 
 class PortOfOneSpeed:
@@ -115,33 +77,3 @@ def test_board_that_restarts_when_the_port_is_opened_is_heard_at_its_baud_rate(m
     report = examine("/dev/ttyUSB9", bauds=(115200, 57600, 9600), seconds=2.0)
     assert [baud for _, baud, _ in opened] == [115200, 57600, 57600]
     assert report.seconds == pytest.approx(2.0)
-
-
-@pytest.mark.parametrize("echo", [True, False])
-def test_echo_of_a_request_is_removed(run, pty, echo):
-    board, url = pty
-
-    def answer():
-        with suppress(BlockingIOError):
-            asked = os.read(board, 100)
-            os.write(board, (asked if echo else b"") + b"1,2\n")
-
-    run(answer, 0.001)
-    received = listen(url, (115200,), 0.3, Request(b"?\n", 100.0), lambda _: True)
-    lines = b"".join(received.data).split(b"\n")
-    assert set(lines) == {b"1,2", b""}
-
-
-def test_each_datagram_is_a_chunk(run):
-    with socket.socket(type=socket.SOCK_DGRAM) as sender:
-        sender.bind(("127.0.0.1", 0))
-        url = f"udp://127.0.0.1:{sender.getsockname()[1] + 1}"
-
-        def send():
-            with suppress(OSError):  # the socket may be closed before the thread ends
-                sender.sendto(b"\x01\x02\x03", ("127.0.0.1", int(url.rpartition(":")[2])))
-
-        run(send, 0.01)
-        received = listen(url, (115200,), 0.3, None, lambda _: True)
-        assert received.are_datagrams
-        assert set(received.data) == {b"\x01\x02\x03"}

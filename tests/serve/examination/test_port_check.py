@@ -165,24 +165,6 @@ def test_level_at_rest_is_proposed_as_offset(gain, rests, offset):
     assert proposed == gain | ({} if offset is None else {"offset": offset})
 
 
-def test_proposed_file_of_a_board_far_from_zero_works():
-    rng = np.random.default_rng(0)
-    board = lambda _: b"%.2f;%.2f;%.2f\n" % tuple(rng.normal((312.0, -128.0, 3.0), 1.0))  # noqa: E731
-    report = examine_received(received(board))
-    assert report.device["gain"]["offset"] == pytest.approx({"A": 312.0, "B": -128.0, "C": 3.0}, abs=0.3)
-    assert "channel 1 has 311.9 pC at rest" in missing(report)
-
-
-@pytest.mark.parametrize("number", [b"nan", b"ovf", b"1e30"])
-@pytest.mark.parametrize("electrodes", [(), ("A", "B")])
-def test_value_that_is_no_charge_is_named_with_its_channel(number, electrodes):
-    board = lambda k: b"%s,%d\n" % (number if k % 20 == 7 else b"%d" % (3 + k % 5), k % 7)  # noqa: E731
-    report = examine_received(received(board), electrodes=electrodes)
-    assert f"channel 1 is {number.decode().replace('ovf', 'nan')} in 20 frames" in missing(report).replace("+", "")
-    assert "cable" not in missing(report)
-    assert report.device["channels"] == {"A": "1", "B": "2"}
-
-
 def test_line_that_is_not_read_is_shown():
     board = lambda k: b'{"A":%s,"B":%d}\n' % (b"null" if k % 20 == 7 else b"3", k % 7)  # noqa: E731
     assert """the line '{"A":null,"B":""" in missing(examine_received(received(board)))

@@ -366,15 +366,6 @@ def test_clock_in_text_that_wraps(name, unit, modulus):
     np.testing.assert_allclose(np.diff(times_us), step_us, atol=1.1)
 
 
-def test_clock_in_text_that_restarts_has_not_wrapped():
-    parser = TextParser()
-    clock = DeviceClock()
-    for number in [*range(1000, 1200), *range(20)]:
-        frames = feed(f"t_ms:{5 * number},A:1", parser=parser)
-        clock.stamp(Chunk(b"", 0.0, 0), frames, parser.t_us_modulus)
-    assert clock.restarts == 1
-
-
 @pytest.mark.parametrize(
     ("begin", "end", "restarts"), [*((modulus - 20, modulus, 0) for modulus in (256, 65536)), (290, 301, 1)]
 )

@@ -226,14 +226,6 @@ def test_source_of_a_dash_is_stdin(monkeypatch):
             assert [chunk.data for chunk in source] == [b"hello"]
 
 
-def test_file_without_read_permission_is_refused(tmp_path, monkeypatch):
-    path = tmp_path / "frames.bin"
-    path.write_bytes(b"x")
-    monkeypatch.setattr("pathlib.Path.open", lambda *_, **__: (_ for _ in ()).throw(PermissionError(13, "not yours")))
-    with pytest.raises(InputError, match=r"frames.bin: cannot be read \(not yours\)"), open_source(str(path)):
-        pass
-
-
 @pytest.fixture
 def address():
     """Return a UDP address that is not in use."""

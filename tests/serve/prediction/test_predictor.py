@@ -167,12 +167,6 @@ def test_predict_into_allocates_no_array(predictor):
     assert grown_bytes < 20_000
 
 
-@pytest.mark.parametrize("position_mm", [(200.0, 0.0), (0.0, 200.0), (150.0, -150.0)])
-def test_contact_far_from_the_film_is_logged_as_a_warning(models, film, caplog, position_mm):
-    Predictor("linear", models=models).predict(film.charge_pC(*np.array([[*position_mm, 1.0]]).T)[0])
-    assert len(caplog.messages) == 1
-
-
 def test_warning_about_an_implausible_contact_is_logged_once(models, film, caplog):
     predictor = Predictor("linear", models=models)
     presses = film.charge_pC([0.0, 0.0], [0.0, 0.0], [1.0, 5.9])
