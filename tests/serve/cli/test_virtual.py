@@ -12,7 +12,7 @@ import pytest
 from boards import interrupt
 from isocharge.cli.shared import virtual_sensor
 from isocharge.common.errors import InputError, OutputExists, SceneError, SensorError
-from isocharge.serve import AutoParser, Port, Script, VirtualSensor, wander
+from isocharge.serve import AutoParser, Port, wander
 from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor, virtual_film
 from kept import kept
 
@@ -141,23 +141,6 @@ def test_charges_below_the_smallest_force_follow_the_power_law_of_a_membrane():
     linear = SimpleNamespace(domain=Domain(3.0, (0.2, 1.0)), charges=lambda contact: 100.0 * contact[:, 2:])
     charges = virtual_sensor.film_charges(linear)
     assert charges(np.array([[1.0, 2.0, 0.025], [1.0, 2.0, 0.5]])) == pytest.approx(np.array([[5.0], [50.0]]))
-
-
-def test_amplifier_gets_the_change_of_the_charges_per_kelvin():
-    """Frames are computed without a port. The script is a press of two frames and a pause of one."""
-    script = Script(np.array([1.0, 1.0, np.nan]), np.array([2.0, 2.0, np.nan]), np.array([0.5, 0.4, 0.0]), 200.0)
-    received = []
-
-    def amplifier(charge, _, charge_per_K=None):
-        received.append(charge_per_K)
-        return charge
-
-    player = VirtualSensor(lambda contact: 100.0 * contact[:, 2:], script, noise=amplifier)
-    next(player.frames())
-    player.use(lambda contact: 100.0 * contact[:, 2:], script, lambda contact: 7.0 * contact[:, 2:])
-    next(player.frames())
-    assert received[0] is None
-    np.testing.assert_allclose(received[1][:6, 0], [3.5, 2.8, 0.0, 3.5, 2.8, 0.0])
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ def test_wander_begins_with_one_second_without_a_press(script):
 
 def test_wander_stays_inside_radius_and_forces(script):
     on = script.touching
-    assert np.hypot(script.x_mm[on], script.y_mm[on]).max() < 8.0
+    assert 6.0 < np.hypot(script.x_mm[on], script.y_mm[on]).max() <= 8.0
     assert script.force_N[on].min() == pytest.approx(0.05)
     assert 1.0 < script.force_N[on].max() <= 2.0 * (1 + 1e-12)
     assert np.isnan([script.x_mm[~on], script.y_mm[~on]]).all()
@@ -55,9 +55,9 @@ PRESSES = "presses = [[0, 1, 2, 0], [1, 1, 2, 0], [1.1, 1, 2, 0.5], [2.1, 3, 2, 
 
 def test_load_script_reads_a_toml_file(tmp_path):
     path = tmp_path / "play.toml"
-    path.write_text(PRESSES + "limit_pC = 900\n[faults]\nlose_share = 0.1\n")
+    path.write_text(PRESSES + "[faults]\nlose_share = 0.1\n")
     play = load_script(path)
-    assert (play.faults, play.limit_pC, play.temperature_step_K) == (Faults(lose_share=0.1), 900.0, None)
+    assert play.faults == Faults(lose_share=0.1)
     script = play.script(100.0)
     assert (len(script), script.rate_Hz) == (220, 100.0)
     assert not script.touching[:101].any()
@@ -66,8 +66,6 @@ def test_load_script_reads_a_toml_file(tmp_path):
     assert script.force_N[105] == pytest.approx(0.25)
     path.write_text("")
     assert load_script(path).script(100.0) is None
-    with pytest.raises(SceneError, match=r"expected at most 2000000 frames, got 2\.2 s at 1e"):
-        play.script(1e6)
 
 
 @pytest.mark.parametrize(

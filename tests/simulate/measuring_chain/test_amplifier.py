@@ -150,14 +150,3 @@ def test_unknown_noise_level_raises_input_error():
         InputError, match=r"expected one of clean, reference, measured, bench, surgery, or a TOML file, got 'lab'"
     ):
         load_amplifier("lab")
-
-
-def test_a_warm_film_changes_the_touch_charge_as_well_as_its_own():
-    """A step of 0.5 K that the film follows at once, with and without a change of the touch charge per kelvin."""
-    part = Amplifier(noise=CLEAN, step=0.5, step_at=1.0, step_time=1e-3, film_time=1e-3, pyro=-270.0)
-    charge = np.full((400, 1), 100.0)
-    plain = part.start(1, 200.0, np.random.default_rng(0))(charge)
-    warm = part.start(1, 200.0, np.random.default_rng(0))(charge, np.full((400, 1), 30.0))
-    np.testing.assert_allclose((warm - plain)[:190], 0.0, atol=1e-9)
-    np.testing.assert_allclose((warm - plain)[-100:], 15.0, rtol=1e-6)
-    np.testing.assert_allclose(plain[-100:] - plain[:100], -135.0, rtol=1e-6)

@@ -2,10 +2,9 @@
 
 import threading
 import time
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -14,15 +13,13 @@ from isocharge.cli.shared.forward_maps import ROUNDING_MARGIN
 from isocharge.cli.shared.options import SensorArgument
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import announce, say, shown_progress, until_stopped
-from isocharge.cli.shared.virtual_sensor import film_charges, film_charges_per_K, measure_function, random_script
+from isocharge.cli.shared.virtual_sensor import film_charges, measure_function, random_script
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
 from isocharge.serve import Script, VirtualSensor, encode_frame, encode_text
-from isocharge.serve.virtual_sensor.pseudo_port import posix_modules
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
 from isocharge.simulate import (
-    Amplifier,
     Circle,
     ForwardMap,
     Probe,
@@ -84,8 +81,7 @@ def virtual_command(
         typer.Option(
             "--script",
             metavar="FILE",
-            help="What to play, TOML: presses, faults of the line, warming, drift, the converter's limit. "
-            "(default: random presses, no faults)",
+            help="What to play, TOML: presses, faults of the line. (default: random presses, no faults)",
         ),
     ] = None,
     frames: Annotated[
@@ -99,20 +95,22 @@ def virtual_command(
 
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
-    posix_modules()  # raises an error before anything is computed if there are no pseudo-terminals
     if link is not None:
         refuse_existing(link)
     settings = load_script(script) if script else VirtualScript()
     scripted_presses = settings.script(rate)
     played_sensor, footprint = _sensor_and_probe(sensor, probe, film)
-    amplifier = _amplifier(noise, settings)
+    if scripted_presses is not None and scripted_presses.touching.any():  # the map must contain the presses
+        distance_mm = np.hypot(scripted_presses.x_mm, scripted_presses.y_mm)
+        radius = max(DEFAULT_RADIUS, ROUNDING_MARGIN * float(np.nanmax(distance_mm)))
+        force_max = max(force_max, ROUNDING_MARGIN * float(scripted_presses.force_N.max()))
     electrode_count = len(played_sensor.electrodes)
     # Until the film is solved, the player sends frames without a touch. It then only computes the charges of an empty
     # list of contacts, for which the first function returns an empty array.
     player = VirtualSensor(
         lambda _: np.zeros((0, electrode_count)),
         _untouched_frame(rate),
-        noise=measure_function(amplifier, electrode_count, rate, seed),
+        noise=measure_function(load_amplifier(noise), electrode_count, rate, seed),
         seed=seed,
         encode=encode_frame if frames == "binary" else partial(encode_text, notation=frames),
         faults=settings.faults,
@@ -126,15 +124,14 @@ def virtual_command(
             forward_map = ForwardMap.build(
                 played_sensor,
                 footprint,
-                radius=_largest_distance_mm(radius, scripted_presses),
-                force_range=(DEFAULT_PLAYED_FORCE_RANGE[0], _largest_force_N(force_max, scripted_presses)),
+                radius=radius,
+                force_range=(DEFAULT_PLAYED_FORCE_RANGE[0], force_max),
             )
-            charges_per_K = film_charges_per_K(forward_map)
         remaining_rest_s = start_s + rest - time.monotonic()
         if remaining_rest_s > 0.0:
             threading.Event().wait(remaining_rest_s)  # sleeps, because nothing sets the event
         presses = scripted_presses or random_script(forward_map, seed, rate, force_max)
-        player.use(film_charges(forward_map), presses, charges_per_K)
+        player.use(film_charges(forward_map), presses)
         played_name = sensor if film is None else f"film {film} of {sensor}"
         say(f"playing {played_name} at {rate:g} Hz; Ctrl-C stops")
         threading.Event().wait(seconds)  # sleeps until Ctrl-C if `seconds` is None
@@ -166,54 +163,8 @@ def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) 
     return virtual_film(sensor, probe, film_seed)
 
 
-def _amplifier(noise: str, settings: VirtualScript) -> Amplifier:
-    """Return the amplifier that `--noise` describes, with the changes in the script.
-
-    Args:
-        noise: Value of `--noise`: name of an amplifier or path of its file.
-        settings: Settings of the script. Each setting that is None leaves the amplifier unchanged.
-    """
-    scripted_values: dict[str, Any] = {
-        "step": settings.temperature_step_K,
-        "bias": settings.drift_pC_per_s,
-        "limit": settings.limit_pC,
-    }
-    changes = {attribute: value for attribute, value in scripted_values.items() if value is not None}
-    return replace(load_amplifier(noise), **changes)
-
-
 def _untouched_frame(rate_Hz: float) -> Script:
     """Return a script of one frame without a press."""
     no_position = np.full(1, np.nan)
     no_force = np.zeros(1)
     return Script(no_position, no_position, no_force, rate_Hz)
-
-
-def _largest_distance_mm(radius_mm: float, scripted_presses: Script | None) -> float:
-    """Return the largest distance from the centre of the film at which charges are needed, mm.
-
-    For scripted presses, the result is at least `DEFAULT_RADIUS`, and slightly larger than the largest distance in the
-    script, because rounding may move the outermost presses outwards.
-
-    Args:
-        radius_mm: Largest distance of a random press, mm. It is also used if the script contains no press.
-        scripted_presses: Presses of the script; None if the presses are random.
-    """
-    if scripted_presses is None or not scripted_presses.touching.any():
-        return radius_mm
-    distance_mm = np.hypot(scripted_presses.x_mm, scripted_presses.y_mm)
-    return max(DEFAULT_RADIUS, ROUNDING_MARGIN * float(np.nanmax(distance_mm)))
-
-
-def _largest_force_N(force_max_N: float, scripted_presses: Script | None) -> float:
-    """Return the largest force for which charges are needed, N.
-
-    For scripted presses, the result is slightly larger than the largest force in the script, because of rounding.
-
-    Args:
-        force_max_N: Largest force of a random press, N.
-        scripted_presses: Presses of the script; None if the presses are random.
-    """
-    if scripted_presses is None:
-        return force_max_N
-    return max(force_max_N, ROUNDING_MARGIN * float(scripted_presses.force_N.max()))

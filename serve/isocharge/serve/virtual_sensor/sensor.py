@@ -30,11 +30,8 @@ Charges = Callable[[Array], Array]
 """Forward map: function of contacts (x, y, F), shape (n, 3), mm and N. It returns charges, shape (n, n_electrode),
 pC."""
 
-Noise = Callable[..., Array]
+Noise = Callable[[Array, np.random.Generator], Array]
 """Amplifier: function from charges and a random generator to measured charges, both of shape (n, electrodes), pC.
-
-If the touch charges depend on the temperature of the film, the third argument is their change per kelvin, shape
-(n, electrodes), pC/K.
 
 The function is called block by block in the order of time, so that the output may depend on earlier charges.
 """
@@ -62,14 +59,12 @@ class Truth(NamedTuple):
         x_mm: Position, mm; NaN if nothing touches.
         y_mm: Position, mm; NaN if nothing touches.
         force_N: Force, N; 0 if nothing touches.
-        charge_pC: Touch charges without noise and offset, shape (electrodes,), pC.
         sent_s: Time at which the frame was written, on the clock `time.perf_counter`, s.
     """
 
     x_mm: float
     y_mm: float
     force_N: float
-    charge_pC: Array
     sent_s: float
 
 
@@ -126,11 +121,8 @@ class VirtualSensor:
         self._encode = encode
         self._faults = faults or Faults()
         self._link = link
-        # Touch charges of the script, and their changes per kelvin of the film, each of shape (n, electrodes).
-        self._clean_pC = _clean_charges(charges, script)
-        self._clean_pC_per_K: Array | None = None
-        # The script that follows the present one, with its charges and their changes per kelvin.
-        self._next_script: tuple[Script, Array, Array | None] | None = None
+        self._clean_pC = _clean_charges(charges, script)  # touch charges of the script, shape (n, electrodes)
+        self._next_script: tuple[Script, Array] | None = None  # script that follows the present one, with its charges
         n_electrode = self._clean_pC.shape[1]
         random_pC = self._rng.uniform(-MAX_RANDOM_OFFSET_pC, MAX_RANDOM_OFFSET_pC, n_electrode)
         self._offset_pC = random_pC if offset_pC is None else np.asarray(offset_pC)
@@ -164,7 +156,7 @@ class VirtualSensor:
         """Number of frames that were written."""
         return self._frame_count - self.withheld - self.lost
 
-    def use(self, charges: Charges, script: Script, charges_per_K: Charges | None = None) -> None:
+    def use(self, charges: Charges, script: Script) -> None:
         """Replace the script by another script with the same frame rate, and play the new script from its beginning.
 
         The change takes effect within `BLOCK_S`. The amplifier keeps its state.
@@ -172,14 +164,11 @@ class VirtualSensor:
         Args:
             charges: Forward map.
             script: The presses.
-            charges_per_K: Function from contacts to the change of the touch charges per kelvin of the film, pC/K; None
-                if the temperature does not change the touch charges.
 
         Raises:
             SceneError: If the forward map returns charges of another shape, or charges that are not finite.
         """
-        clean_pC_per_K = None if charges_per_K is None else _clean_charges(charges_per_K, script)
-        self._next_script = (script, _clean_charges(charges, script), clean_pC_per_K)
+        self._next_script = (script, _clean_charges(charges, script))
 
     def frames(self) -> Iterator[bytes]:
         """Compute the frames of the script, and yield the bytes of each frame without waiting until the frame is due.
@@ -196,7 +185,7 @@ class VirtualSensor:
         block_size = max(1, round(BLOCK_S * self._script.rate_Hz))
         for first_frame_of_block in itertools.count(step=block_size):
             if self._next_script is not None:
-                self._script, self._clean_pC, self._clean_pC_per_K = self._next_script
+                self._script, self._clean_pC = self._next_script
                 self._next_script = None
                 self._first_frame_of_script = first_frame_of_block
             first_row = first_frame_of_block - self._first_frame_of_script
@@ -216,10 +205,7 @@ class VirtualSensor:
         clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")  # touch charges without noise
         if self._noise is None:
             return clean_pC
-        if self._clean_pC_per_K is None:
-            return self._noise(clean_pC, self._rng)
-        clean_pC_per_K = self._clean_pC_per_K.take(rows, axis=0, mode="wrap")  # their changes per kelvin
-        return self._noise(clean_pC, self._rng, clean_pC_per_K)
+        return self._noise(clean_pC, self._rng)
 
     def _frame_bytes(self, frame_number: int, charge_pC: tuple[float, ...]) -> bytes:
         """Encode a frame, and apply the faults of the transmission to its bytes. Count lost and damaged frames.
@@ -232,7 +218,8 @@ class VirtualSensor:
             The bytes that the sensor sends; empty if the frame is lost because of a fault.
         """
         faults = self._faults
-        is_lost = faults.is_silent(self._script_time_s(frame_number))
+        time_s = frame_number / self._script.rate_Hz
+        is_lost = faults.is_unplugged(time_s)
         # A random number is drawn only if random frames are to be lost. Otherwise, it would change the noise that
         # belongs to the seed.
         if not is_lost and faults.lose_share > 0.0:
@@ -240,8 +227,7 @@ class VirtualSensor:
         if is_lost:
             self.lost += 1
             return b""
-        device_us_per_s = 1e6 + faults.clock_ppm  # an error of 1 ppm is 1 us in a second
-        t_us = round(frame_number / self._script.rate_Hz * device_us_per_s) % T_US_MODULUS
+        t_us = round(1e6 * time_s) % T_US_MODULUS
         data = self._encode(Frame(frame_number % SEQ_MODULUS, t_us, charge_pC))
         if not faults.corrupt_share:
             return data
@@ -250,36 +236,26 @@ class VirtualSensor:
             self.corrupted += 1
         return damaged_data
 
-    def _script_time_s(self, frame_number: int) -> float:
-        """Return the time of a frame since the start of the script, s."""
-        return (frame_number - self._first_frame_of_script) / self._script.rate_Hz
-
     def truth(self, seq: int) -> Truth:
-        """Return the true press in the latest frame that has the given frame counter.
+        """Return the true press in the latest frame of the present script that has the given frame counter.
 
         Args:
             seq: The frame counter: number of the frame since the start, modulo `SEQ_MODULUS`.
 
         Raises:
-            SceneError: If no frame with this counter has been played, or if the frame belongs to an earlier script.
+            SceneError: If no frame with this counter has been played.
         """
         # Several frames may have this counter, because the counter wraps. Find the latest of these frames.
         latest_number = self._frame_count - 1
         frame_number = latest_number - (latest_number - seq) % SEQ_MODULUS
         if frame_number < 0 or not 0 <= seq < SEQ_MODULUS:
             raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest_number, SEQ_MODULUS - 1)}")
-        if frame_number < self._first_frame_of_script:
-            raise SceneError(
-                f"frame {seq} was played before the script was replaced; expected a frame of the present script, which "
-                f"began with frame {self._first_frame_of_script % SEQ_MODULUS}"
-            )
         script = self._script
         row = (frame_number - self._first_frame_of_script) % len(script)  # the script is repeated without end
         return Truth(
             x_mm=float(script.x_mm[row]),
             y_mm=float(script.y_mm[row]),
             force_N=float(script.force_N[row]),
-            charge_pC=self._clean_pC[row],
             sent_s=float(self._sent_s[frame_number % SEQ_MODULUS]),
         )
 
@@ -345,7 +321,7 @@ class VirtualSensor:
         Args:
             frame_number: Number of the frame that is due, which determines whether there is an outage.
         """
-        if self._faults.is_unplugged(self._script_time_s(frame_number)):
+        if self._faults.is_unplugged(frame_number / self._script.rate_Hz):
             self._close_port()
         elif self._port is None:
             self._open_port()

@@ -193,7 +193,7 @@ class Measurement:
             decay = np.exp(-1.0 / (self.rate * self.leak_time))  # factor of the output from one reading to the next
             self._output = self.bias / (1.0 - decay) / self.rate
 
-    def __call__(self, charge: Array, charge_per_K: Array | None = None) -> Array:
+    def __call__(self, charge: Array) -> Array:
         """Simulate the readings of the next block of touch charges.
 
         The simulation applies the effects of the film, the amplifiers, the hum, the noise and the converter one after
@@ -201,9 +201,6 @@ class Measurement:
 
         Args:
             charge: Touch charges, shape (n, electrodes), pC.
-            charge_per_K: Change of the touch charges per temperature change of the film, shape (n, electrodes), pC/K.
-                The touch charges change because the pretension of a warm film is smaller. None if the temperature does
-                not change the touch charges.
 
         Returns:
             Readings, shape (n, electrodes), pC.
@@ -213,8 +210,7 @@ class Measurement:
 
         # Charge of the film
         temperature = self._simulate_temperature(time)[:, np.newaxis]  # difference from the mean, shape (n, 1), K
-        touch_charge = charge if charge_per_K is None else charge + charge_per_K * temperature
-        film_charge = touch_charge + self.pyro_charge_per_K * temperature
+        film_charge = charge + self.pyro_charge_per_K * temperature
 
         # Output of the amplifiers, and disturbances of the output
         output = self._integrate(film_charge) + self.offset
