@@ -105,17 +105,12 @@ def test_press_whose_force_rises_slowly_is_taken_later():
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda t: math.exp(-t / 10.0), r"fall by (9\.\d|10) % per second on all .* \[leak\] tau_s = 10 "),
-        (
-            lambda t: 1.0 - 0.3 * math.log10(t + 0.01),
-            r"fall by .* creeps by (2[5-9]|3\d) % in each decade .* set no \[leak\]",
-        ),
-        (lambda t: 0.5 + 0.05 * t, r"rise by 5\.[67] % per second: hold the force"),
-        (lambda t: np.array([1 + 0.03 * t, 1 - 0.03 * t, 1.0, 1.0]), "the press moves"),
+        (lambda t: math.exp(-t / 10.0), r"the charge of . changes by -\d+ pC per second .* isocharge serve doctor"),
+        (lambda t: np.array([1.0, 1 + 0.05 * t, 1.0, 1.0]), "the charge of B changes by (1[89]|2[0-2]) pC per second"),
         (lambda t: 1.0 + 0.1 * math.sin(40.0 * t), "the charge of A shakes by"),
     ],
 )
-def test_press_that_creeps_moves_or_shakes_is_refused_with_a_reason(change, reason):
+def test_press_that_leaks_moves_or_shakes_is_refused_with_a_reason(change, reason):
     results = watch_presses(rest(1), held(9, change), rest(1))
     assert phases_of(results) == ["waiting", "settling", "refused", "lift", "waiting"]
     (refusal,) = reasons_of(results)
@@ -123,17 +118,11 @@ def test_press_that_creeps_moves_or_shakes_is_refused_with_a_reason(change, reas
     assert re.search(reason, refusal), refusal
 
 
-def test_reason_of_each_press_is_its_own_leak_or_creep_and_not_the_release():
-    """The force of each press falls to 0 in the last tenth of a second."""
-
-    def release(t):
-        return min(1.0, 10.0 * (5.0 - t))
-
-    leak = held(5, lambda t: release(t) * math.exp(-t / 5.0))
-    creep = held(5, lambda t: release(t) * (1.0 - 0.3 * math.log10(t + 0.01)))
-    reasons = reasons_of(watch_presses(rest(1), leak, rest(1), creep, rest(1), leak, rest(1)))
-    for expected, reason in zip(("tau_s = 5 ", "the film creeps", "tau_s = 5 "), reasons, strict=True):
-        assert expected in reason
+def test_reason_of_a_press_is_not_its_release():
+    """The force falls to 0 in the last tenth of a second."""
+    leak = held(5, lambda t: min(1.0, 10.0 * (5.0 - t)) * math.exp(-t / 5.0))
+    (reason,) = reasons_of(watch_presses(rest(1), leak, rest(1)))
+    assert re.search(r"released after .* the charge of . changes by -\d+ pC per second", reason)
 
 
 def test_press_of_a_trembling_hand_is_taken():

@@ -3,6 +3,14 @@
 A press is recognised by a change of the channels that is large compared with their noise, because the gain of the board
 may be unknown. The charge of the press is the projection of the channel levels onto the direction of this change, minus
 the mean level before the press.
+
+A leak removes the same share of the charge in every second. The logarithm of the charge Q is then a linear function of
+the time t since the touch, ln Q = a - t / tau. Creep removes the same share of the charge in every decade of time. The
+logarithm of the charge Q is then a linear function of ln t, ln Q = a + b ln t. Both functions are fitted to the charges
+of a press. A cause is only stated if the other function has a much larger sum of squared residuals.
+
+The section `[leak]` of a device file corrects a leak. Creep is not corrected. If the section `[leak]` is used for a
+film that creeps, the error of the charges increases with time.
 """
 
 from dataclasses import dataclass
@@ -11,7 +19,6 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Reals
 from isocharge.serve.examination.press_detector import BLOCK_S, PressDetector, block_medians, channel_noise
-from isocharge.serve.live.fading import cause_of_fading
 
 MIN_REST_S = 1.0
 """Shortest rest before the press, s."""
@@ -24,6 +31,13 @@ MIN_HELD_S = 4.0
 
 STEADY_SHARE = 0.02
 """Largest relative change of the charge of a steady press, dimensionless."""
+
+
+MIN_RESIDUAL_RATIO = 9.0
+"""Smallest ratio of the sums of the squared residuals of two laws for which the better law is reported.
+
+With a smaller ratio, variations in the force of a hand could decide which law is reported.
+"""
 
 
 @dataclass(frozen=True)
@@ -105,6 +119,39 @@ def _describe(held_times_s: Reals, charge: Reals, drift_per_s: float) -> tuple[f
     change = float(last_third.mean() / first_third.mean()) - 1.0
     if abs(change) < STEADY_SHARE:
         return None, f"a held press keeps its charge for {held_times_s[-1]:.0f} s"
-    positive_charge = np.maximum(charge, 1e-9)  # the laws are fitted to the logarithm of the charge
-    fading = cause_of_fading(list(zip(held_times_s.tolist(), positive_charge.tolist(), strict=True)))
-    return fading.tau_s, f"a held press changes by {100.0 * change:.2g} %: {fading.cause}"
+    tau_s, cause = _cause_of_change(held_times_s, np.maximum(charge, 1e-9))  # the logarithm needs positive charges
+    return tau_s, f"a held press changes by {100.0 * change:.2g} %: {cause}"
+
+
+def _cause_of_change(held_s: Reals, charge: Reals) -> tuple[float | None, str]:
+    """Determine why the charge of a press with a constant force changes.
+
+    Args:
+        held_s: Times since the beginning of the press, shape (n,), s.
+        charge: Positive charge of the press at these times, shape (n,), in any unit.
+
+    Returns:
+        The time constant of the leak with two significant digits, s, or None if the cause is not a leak, and the cause
+        with advice to the user, as a part of a sentence.
+    """
+    leak_slope_per_s, leak_residual = _fit_line(held_s, np.log(charge))
+    creep_slope, creep_residual = _fit_line(np.log(held_s), np.log(charge))
+    if leak_slope_per_s < 0.0 and creep_residual > MIN_RESIDUAL_RATIO * leak_residual:
+        tau_s = float(f"{-1.0 / leak_slope_per_s:.2g}")
+        return tau_s, f"the amplifier leaks: put [leak] tau_s = {tau_s:g} into a device file"
+    if creep_slope < 0.0 and leak_residual > MIN_RESIDUAL_RATIO * creep_residual:
+        lost_percent = 100.0 * (1.0 - 10.0**creep_slope)
+        return None, (
+            f"the film creeps by {lost_percent:.2g} % in each decade of time, which is not corrected: set no [leak] "
+            "for it, and wait longer before each reading"
+        )
+    return None, (
+        "the charges follow neither a leak of the amplifier nor creep of the film clearly: hold a press for several "
+        "seconds, with a weight, and set no [leak] before"
+    )
+
+
+def _fit_line(x: Reals, y: Reals) -> tuple[float, float]:
+    """Return the slope and the sum of the squared residuals of a least-squares line through points of shape (n,)."""
+    (slope, _), (squared_residual,), *_ = np.polyfit(x, y, deg=1, full=True)
+    return float(slope), float(squared_residual)

@@ -3,7 +3,8 @@
 The charges of a press are examined in a time window. The press is steady if the scatter and the drift of each charge in
 the window are small. The charge of a press is the mean charge in the window minus the mean charge at rest just before
 the touch. A slow drift of the amplifiers or of the film's temperature therefore does not affect the measured charge. A
-press is refused if it saturates an amplifier, moves, creeps or ends too early. The reason for the refusal is returned.
+press is refused if it saturates an amplifier, moves, changes its force or ends too early. The reason for the refusal is
+returned.
 """
 
 import math
@@ -17,7 +18,6 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.live.fading import cause_of_fading
 
 CHECKS_PER_WINDOW = 10
 """Number of times that a window is examined within its length.
@@ -36,23 +36,6 @@ NO_REST_BEFORE_PRESS = (
 
 MIN_REST_FRAMES = 3
 """Smallest number of frames at rest that must precede a press."""
-
-MAX_SCATTER_RATIO = 2.0
-"""Largest scatter in a calm window, relative to the smallest scatter in a window of the same press.
-
-A larger scatter means that the probe has moved suddenly.
-"""
-
-MAX_SLOPE_DIFFERENCE = 0.3
-"""Largest difference between the slope of a charge and a proportional change of all charges, dimensionless.
-
-The difference is relative to the magnitude of the charge or to the mean magnitude, whichever is larger, and to the
-relative slope of the mean magnitude. If no difference is larger, all charges change in proportion, and the press does
-not move.
-"""
-
-MIN_CHARGE_pC = 1e-9
-"""Smallest charge by which a drift is divided, pC. It avoids a division by zero."""
 
 
 class Phase(StrEnum):
@@ -173,8 +156,6 @@ class Press:
         self._window: deque[Frame] = deque()  # the latest frames
         self._last_check_s = begin_s  # time at which the window was last examined
         self._min_scatter_pC = math.inf  # smallest scatter of all windows
-        # Time since the touch, s, and mean magnitude of the charges, pC, of each calm window
-        self._mean_magnitudes: list[tuple[float, float]] = []
 
     def add(self, frame: Frame) -> "SteadyPress | str":
         """Add the next frame to the window, and accept or refuse the press if this can be decided.
@@ -212,27 +193,19 @@ class Press:
     def _examine_window(self, noise_pC: Array) -> "SteadyPress | None":
         """Return the press in the window if the press is steady. Otherwise, return None and store the reason.
 
-        A window is calm if it contains no sudden movement: its scatter is at most `MAX_SCATTER_RATIO` times the
-        smallest scatter in the earlier windows of the press. If the window is not calm, neither its mean magnitude nor
-        the reason is stored, because they would only describe the movement.
-
-        The cause of a slow decrease of the charges is determined from the mean magnitudes. A window that overlaps the
-        first window of the press has none, because the force may still rise in the first window.
+        The reason is that of the window with the smallest scatter, because the reason of a window with a sudden
+        movement, such as the release, would only describe the movement.
 
         Args:
             noise_pC: Standard deviation of each charge at rest, shape (n_electrode,), pC.
         """
         press = self._measure_window()
-        scatter_pC = float(press.scatter_pC.max())
-        is_calm = scatter_pC <= MAX_SCATTER_RATIO * self._min_scatter_pC
-        self._min_scatter_pC = min(self._min_scatter_pC, scatter_pC)
-        if is_calm and press.held_s >= 2.0 * press.window_s:
-            middle_s = press.held_s - 0.5 * press.window_s
-            self._mean_magnitudes.append((middle_s, float(np.abs(press.charge_pC).mean())))
-        reason = unsteadiness(press, noise_pC, self._electrodes, self._mean_magnitudes)
+        reason = unsteadiness(press, noise_pC, self._electrodes)
         if not reason:
             return press
-        if is_calm:
+        scatter_pC = float(press.scatter_pC.max())
+        if scatter_pC <= self._min_scatter_pC:
+            self._min_scatter_pC = scatter_pC
             self.reason = reason
         return None
 
@@ -364,12 +337,7 @@ class PressWatch:
         return WatchResult(Phase.waiting, charge_pC)
 
 
-def unsteadiness(
-    press: SteadyPress,
-    noise_pC: Array,
-    electrodes: tuple[str, ...],
-    mean_magnitudes: Sequence[tuple[float, float]],
-) -> str:
+def unsteadiness(press: SteadyPress, noise_pC: Array, electrodes: tuple[str, ...]) -> str:
     """Return the reason why a press is not steady, or an empty text if the press is steady.
 
     A straight line was fitted to each charge in the window. The press is steady if the scatter of each charge about its
@@ -380,8 +348,6 @@ def unsteadiness(
         press: Charges, scatter and drift in a window of the press.
         noise_pC: Standard deviation of each charge at rest, shape (n_electrode,), pC.
         electrodes: Names of the electrodes, for the reason.
-        mean_magnitudes: Time since the touch, s, and mean magnitude of the charges, pC, of each calm window so far. The
-            cause of a slow decrease is determined from these values.
 
     Returns:
         The reason as a part of a sentence.
@@ -399,37 +365,13 @@ def unsteadiness(
     # A charge that is smaller than the mean magnitude may change as much as a charge of the mean magnitude.
     reference_pC = np.maximum(np.abs(press.charge_pC), mean_magnitude_pC)
     max_drift_pC = Press.MAX_RELATIVE_DRIFT * reference_pC + Press.DRIFT_SIGMAS * drift_std_pC
-    is_drift_small = (np.abs(press.drift_pC) <= max_drift_pC).all()
-    if is_drift_small:
+    relative_drift = np.abs(press.drift_pC) / max_drift_pC
+    if relative_drift.max() <= 1.0:
         return ""
-    return _drift_reason(press, mean_magnitudes)
-
-
-def _drift_reason(press: SteadyPress, mean_magnitudes: Sequence[tuple[float, float]]) -> str:
-    """Return the probable reason for a drift of the charges, as a part of a sentence.
-
-    If only the force changes, all charges change in proportion. If they change otherwise, the position of the press
-    changes. A charge rises if its magnitude becomes larger, so that charges of both signs can be compared.
-
-    Args:
-        press: Charges and drift in a window of the press. The drift is the change of each charge over the window.
-        mean_magnitudes: Time since the touch, s, and mean magnitude of the charges, pC, of each calm window so far.
-    """
-    magnitude_pC = np.abs(press.charge_pC)
-    mean_magnitude_pC = max(float(magnitude_pC.mean()), MIN_CHARGE_pC)  # avoids a division by 0
-    magnitude_slope_pC_per_s = np.sign(press.charge_pC) * press.drift_pC / press.window_s
-    mean_slope = float(magnitude_slope_pC_per_s.mean()) / mean_magnitude_pC  # relative, 1/s
-
-    # A charge that is smaller than the mean magnitude is compared with the mean magnitude. Otherwise, the noise of a
-    # charge near zero would look like a movement.
-    reference_pC = np.maximum(magnitude_pC, mean_magnitude_pC)
-    proportional_slope_pC_per_s = mean_slope * magnitude_pC
-    slope_difference = (magnitude_slope_pC_per_s - proportional_slope_pC_per_s) / reference_pC  # shape (n_electrode,)
-    if np.abs(slope_difference).max() > MAX_SLOPE_DIFFERENCE * abs(mean_slope):
-        return "the press moves: the ratios of the charges change"
-    if mean_slope > 0.0:
-        return f"the charges rise by {100.0 * mean_slope:.2g} % per second: hold the force"
+    worst_index = int(relative_drift.argmax())
+    drift_pC_per_s = press.drift_pC[worst_index] / press.window_s
     return (
-        f"the charges fall by {-100.0 * mean_slope:.2g} % per second on all electrodes alike: hold the force; or "
-        f"{cause_of_fading(mean_magnitudes).cause}"
+        f"the charge of {electrodes[worst_index]} changes by {drift_pC_per_s:.2g} pC per second from "
+        f"{press.charge_pC[worst_index]:.3g} pC: hold place and force still; if it also changes under a weight, "
+        "measure the leak of the amplifiers with isocharge serve doctor"
     )
