@@ -80,7 +80,7 @@ def test_a_value_that_fits_is_taken():
             {"offset": 10**400},
             f"board.offset: expected a finite number, got {'1' + '0' * (MAX_VALUE_CHARACTERS - 1)}...",
         ),
-        ({"poisson": 0.6}, "board.poisson: expected a number above -1 and at most 0.5, got 0.6"),
+        ({"poisson": 0.6}, "board.poisson: expected a number above -1 to 0.5, got 0.6"),
         ({"low": 3, "high": 2}, "board.low: expected at most high (2), got 3"),
         ({"on": 1}, "board.on: expected true or false, got 1"),
         ({"order": "odd"}, "board.order: expected one of little, big, got 'odd'"),

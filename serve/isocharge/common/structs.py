@@ -475,26 +475,13 @@ def _describe_number(noun: str, exclusive_minimum: float | None, minimum: float 
         maximum: Largest allowed number; None if there is no such bound.
     """
     # The bounds +-`MAX_FLOAT` exclude only infinity, and are not mentioned.
-    if minimum is not None and abs(minimum) == MAX_FLOAT:
-        minimum = None
-    if maximum is not None and abs(maximum) == MAX_FLOAT:
-        maximum = None
-
-    if exclusive_minimum == 0 and maximum is None:
+    bounds = {"above": exclusive_minimum, "from": minimum, "to": maximum}
+    mentioned = {word: bound for word, bound in bounds.items() if bound is not None and abs(bound) != MAX_FLOAT}
+    if mentioned == {"above": 0}:
         return f"a positive {noun}"
-    if exclusive_minimum is not None:
-        description = f"a {noun} above {_bound_text(exclusive_minimum)}"
-        return description if maximum is None else f"{description} and at most {_bound_text(maximum)}"
-    if minimum is not None:
-        description = f"a {noun} from {_bound_text(minimum)}"
-        return description if maximum is None else f"{description} to {_bound_text(maximum)}"
-    if maximum is not None:
-        return f"a {noun} of at most {_bound_text(maximum)}"
-
-    # There is no bound to mention. A whole number is always finite.
-    return f"a {noun}" if noun == "whole number" else f"a finite {noun}"
-
-
-def _bound_text(bound: float) -> str:
-    """Return a bound as a text. A float is rounded to six significant digits, and an integer keeps all digits."""
-    return f"{bound:g}" if isinstance(bound, float) else str(bound)
+    if not mentioned and noun == "number":
+        return "a finite number"
+    texts = [
+        f"{word} {bound:g}" if isinstance(bound, float) else f"{word} {bound}" for word, bound in mentioned.items()
+    ]
+    return " ".join([f"a {noun}", *texts])

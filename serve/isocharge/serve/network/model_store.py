@@ -12,7 +12,7 @@ are refused, the old version remains available.
 import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
@@ -22,7 +22,6 @@ from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import Model, load_checked_model
 from isocharge.serve.model.model_search import model_names, repositories, version_folders
-from isocharge.serve.model.session import BoundPress
 from isocharge.serve.model.validity import Validity
 from isocharge.serve.network.metrics import ModelMetrics, Statistics
 
@@ -44,23 +43,11 @@ class LoadedVersion:
     metadata: ModelMetadata
     version: str
     statistics: Statistics
-    _thread_local: threading.local = field(default_factory=threading.local, repr=False)
 
     @cached_property
     def validity(self) -> Validity:
         """Limits within which the contacts that the model estimates are valid."""
         return Validity.of(self.metadata)
-
-    def press_of_thread(self) -> BoundPress:
-        """Return an object that runs the model for single presses and reuses the memory of earlier presses.
-
-        Each thread has its own object, which is created when the thread calls this method for the first time.
-        """
-        press: BoundPress | None = getattr(self._thread_local, "press", None)
-        if press is None:
-            press = BoundPress(self.model.session, len(self.metadata.electrodes))
-            self._thread_local.press = press
-        return press
 
 
 class _Versions(NamedTuple):

@@ -17,7 +17,7 @@ from isocharge.common.arrays import Singles
 from isocharge.common.errors import RequestError, TooLarge
 from isocharge.common.structs import parse_json
 from isocharge.serve.model.contact import Contacts
-from isocharge.serve.model.session import COLUMNS, INPUT, OUTPUTS, as_float32, run, run_error
+from isocharge.serve.model.session import COLUMNS, INPUT, OUTPUTS, as_float32, run
 from isocharge.serve.network.model_store import LoadedVersion
 from isocharge.serve.network.protocol.bodies import InferBody, InputTensor, Parameters
 
@@ -176,33 +176,6 @@ def _json_charges(values: list[Any] | None, shape: list[int]) -> np.ndarray[Any,
     return charges.reshape(shape)
 
 
-def infer(loaded: LoadedVersion, charge_pC: Singles) -> dict[str, Rows]:
-    """Compute all outputs of a model for the charges of presses. Any thread may call this function.
-
-    The memory of a single press belongs to the thread and is reused, which is faster than `session.run`. The next call
-    in the same thread therefore changes the outputs of a single press.
-
-    Args:
-        loaded: Version of the model that is run.
-        charge_pC: Charges, shape (n, electrodes), pC.
-
-    Returns:
-        Values of each output by its name, each of shape (n, width).
-
-    Raises:
-        ModelError: If onnxruntime fails to run the graph.
-    """
-    if len(charge_pC) > 1:
-        return dict[str, Rows](run(loaded.model.session, charge_pC))
-    press = loaded.press_of_thread()
-    press.write(*charge_pC[0].tolist())
-    try:
-        press.run()
-    except Exception as error:  # the exceptions of onnxruntime have no common base class other than Exception
-        raise run_error(error) from error
-    return dict[str, Rows](press.outputs)
-
-
 def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
     """Return the flags of each press as one text with commas between the flags, shape (n, 1).
 
@@ -235,7 +208,7 @@ def answer_inference(
     try:
         request = read()
         read_end_ns = clock_ns()
-        outputs = infer(loaded, request.charge_pC)
+        outputs = dict[str, Rows](run(loaded.model.session, request.charge_pC))
         if FLAGS in request.outputs:
             outputs[FLAGS] = _flags(loaded, outputs)
         run_end_ns = clock_ns()
