@@ -33,9 +33,6 @@ ROUNDS = 10
 BATCH_SIZES = (16, 256, 4096)
 """Numbers of presses in a batch. The last number is the size of the largest batch that a server accepts by default."""
 
-N_CHARGES = 4096
-"""Number of presses through which the calls cycle."""
-
 
 class Contender(NamedTuple):
     """One way to compute predictions.
@@ -131,24 +128,18 @@ def _measure_turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> lis
     return durations_ns
 
 
-def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Singles:
-    """Draw charges at random from the golden vectors, which are charges that are stored with a model.
+def press_charges(predictor: Predictor, golden_pC: Singles) -> Singles:
+    """Return charges of as many presses as the largest batch, from the golden vectors that are stored with a model.
 
-    Golden vectors for which the model returns a contact with flags are excluded. A press may be drawn several times.
+    Golden vectors for which the model returns a contact with flags are excluded. The others are repeated in turn.
 
     Args:
         predictor: Predictor with the model.
         golden_pC: Charges of the golden vectors, shape (n, electrodes), pC.
-        seed: Seed of the random choice.
-
-    Returns:
-        Charges of shape (N_CHARGES, electrodes), pC.
     """
     flags_of_presses = predictor.validity.batch_flags(predictor.predict_batch(golden_pC))
     is_valid = [not flags for flags in flags_of_presses]
-    valid_pC: Singles = golden_pC[is_valid]
-    rows = np.random.default_rng(seed).integers(0, len(valid_pC), N_CHARGES)
-    return valid_pC[rows]
+    return np.resize(golden_pC[is_valid], (max(BATCH_SIZES), golden_pC.shape[1]))
 
 
 def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Contender]:

@@ -153,8 +153,6 @@ class BoundPress:
         write: Function that stores charges, pC, which are passed as separate arguments.
         run: Function that computes the outputs from the stored charges.
         read: Function that returns the ten computed values in the order of a `Contact`.
-        outputs: Views of the computed values, each of shape (1, width), by the name of the output. The next press
-            changes their values.
     """
 
     def __init__(self, session: ort.InferenceSession, n_electrode: int) -> None:
@@ -166,11 +164,11 @@ class BoundPress:
         """
         charges = np.zeros((1, n_electrode), dtype=np.float32)
         values = np.zeros(sum(OUTPUTS.values()), dtype=np.float32)
-        self.outputs = {name: values[np.newaxis, COLUMNS[name]] for name in OUTPUTS}
         # The session stores only the addresses of the arrays. The views in `write` and `read` keep the arrays alive.
         binding = session.io_binding()
         binding.bind_input(INPUT, "cpu", 0, np.float32, charges.shape, charges.ctypes.data)
-        for name, output in self.outputs.items():
+        for name, columns in COLUMNS.items():
+            output = values[np.newaxis, columns]
             binding.bind_output(name, "cpu", 0, np.float32, output.shape, output.ctypes.data)
         self.run: Callable[[], None] = partial(session.run_with_iobinding, binding)
 
