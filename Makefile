@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test types tests test-all lower-bounds browser workflows ros2 conda-recipe size attack docs bench soak dist sbom installed release report paper \
+.PHONY: demo test types tests test-all lower-bounds browser workflows ros2 conda-recipe size attack docs bench dist sbom installed release report paper \
 	proto clean
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
@@ -79,10 +79,6 @@ bench: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_touch.py
 	$(BIN)/python tests/benchmarks/bench_http.py
 	$(BIN)/python tests/benchmarks/bench_live.py
-
-# A million requests; some minutes.
-soak: $(VENV)/installed
-	$(BIN)/python tests/benchmarks/bench_soak.py
 
 # The source distribution and the wheel, in dist. Both are built again, in another folder, from the source distribution;
 # the command fails if a byte differs.

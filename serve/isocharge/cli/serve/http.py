@@ -86,7 +86,7 @@ def http_command(
     browser_check = BrowserCheck(host, allow_host or (), any_host=secret is not None or uds is not None)
 
     # Load the models, and serve them until Ctrl-C.
-    with suppress(KeyboardInterrupt), _traffic(log, token) as traffic:
+    with suppress(KeyboardInterrupt), _traffic(log) as traffic:
         store = open_model_store(models)
         for reason in store.refusals():
             _report(traffic, "warning", "refused", reason)
@@ -134,7 +134,7 @@ def _load_all(store: ModelStore, traffic: Traffic) -> None:
 
 
 @contextmanager
-def _traffic(log: str, token: str | None) -> Iterator[Traffic]:
+def _traffic(log: str) -> Iterator[Traffic]:
     """Context manager that yields the traffic counters of the servers, and writes a log of requests for `--log json`.
 
     A separate thread writes the log to stderr, so that a slow reader of stderr does not delay the answers. The warnings
@@ -142,13 +142,12 @@ def _traffic(log: str, token: str | None) -> Iterator[Traffic]:
 
     Args:
         log: Value of `--log`.
-        token: Token that the log must not contain.
     """
     if log == "text":
         yield Traffic()  # counters without a log of requests
         return
     with WriterQueue(write_stderr) as line_queue:
-        request_log = RequestLog(line_queue.put, secret=token)
+        request_log = RequestLog(line_queue.put)
         logging.basicConfig(level=logging.WARNING, handlers=[request_log], force=True)
         logging.captureWarnings(True)
         traffic = Traffic(request_log)

@@ -5,9 +5,10 @@ of JSON for each request.
 
 The log line of a request contains no text that a client has sent. The names of routes, models, statuses and errors are
 defined by this server, and the address of the client comes from the operating system. A client therefore cannot forge a
-log line, fill the disk with long lines, write a secret into the log, or create new counters.
+log line, fill the disk with long lines, or create new counters.
 """
 
+import json
 import logging
 import traceback
 from collections.abc import Callable
@@ -16,9 +17,6 @@ from typing import NamedTuple
 
 import orjson
 from prometheus_client import CollectorRegistry, Counter, Gauge
-
-MAX_TEXT_CHARACTERS = 4000
-"""Largest number of characters of a message or a traceback in a line. The middle of a longer text is left out."""
 
 Client = tuple[str, int] | None
 """Address and port of a client. None if the client has connected through a Unix socket."""
@@ -56,13 +54,11 @@ class RequestLog(logging.Handler):
     Args:
         write: Function that writes a line, which is given without a line feed. The function is called by several
             threads and must not wait.
-        secret: Secret text, such as a token, that is replaced by `[secret]` in all messages.
     """
 
-    def __init__(self, write: Callable[[str], object], *, secret: str | None = None) -> None:
+    def __init__(self, write: Callable[[str], object]) -> None:
         super().__init__()
         self._write = write
-        self._secret = secret
 
     def write_exchange(self, exchange: Exchange) -> None:
         """Write a line about a request and its response."""
@@ -86,31 +82,17 @@ class RequestLog(logging.Handler):
 
     def write_message(self, level: str, event: str, message: str) -> None:
         """Write a line about the server itself, for example when the server starts."""
-        self._write_line(level, event=event, message=self._clean(message))
+        self._write_line(level, event=event, message=message)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line with a message of the module `logging`, and with the traceback of the message if it has one."""
-        fields = {"event": "message", "logger": record.name, "message": self._clean(record.getMessage())}
+        fields = {"event": "message", "logger": record.name, "message": record.getMessage()}
         if record.exc_info and record.exc_info[0] is not None:
-            fields["traceback"] = self._clean("".join(traceback.format_exception(*record.exc_info)))
+            fields["traceback"] = "".join(traceback.format_exception(*record.exc_info))
         self._write_line(record.levelname.lower(), **fields)
 
     def _write_line(self, level: str, **fields: str) -> None:
-        self._write(orjson.dumps({"time": datetime.now(UTC), "level": level} | fields).decode())
-
-    def _clean(self, text: str) -> str:
-        """Replace characters that the log must not contain, and shorten a long text.
-
-        Characters that UTF-8 cannot encode are replaced by "?", and the secret is replaced by "[secret]". If the
-        resulting text is longer than `MAX_TEXT_CHARACTERS` characters, its middle is replaced by " [...] ".
-        """
-        cleaned = text.encode("utf-8", "replace").decode()  # lone surrogates become "?"
-        if self._secret:
-            cleaned = cleaned.replace(self._secret, "[secret]")
-        if len(cleaned) <= MAX_TEXT_CHARACTERS:
-            return cleaned
-        half = MAX_TEXT_CHARACTERS // 2
-        return f"{cleaned[:half]} [...] {cleaned[-half:]}"
+        self._write(json.dumps({"time": datetime.now(UTC).isoformat(), "level": level} | fields))
 
 
 class Traffic:
