@@ -22,7 +22,7 @@ VERSION = PROJECT["version"]
 
 COMMANDS_OF_EXTRAS = {
     "simulate": "simulate point three-25um-biaxial --at 1,2 --force 1",
-    "train": "train distil --help",
+    "train": "train fit --help",
     "http": "serve http --help",
     "grpc": "serve http --help",
     "cluster": "simulate sweep --help",

@@ -37,7 +37,7 @@ from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fit import contact_stage, threads_and_seed
 from isocharge.train.training.linear_targets import LinearTargets
-from isocharge.train.training.network import InverseNetwork, as_tensor
+from isocharge.train.training.network import InverseNetwork, fold_network
 
 NOISE = noise_model("reference")
 N_COPIES = 4
@@ -132,7 +132,6 @@ TRAINING = "isocharge.train.training"
 WITHOUT = {
     "SOAP, but Adam": patch(f"{TRAINING}.descent.Soap", Adam),
     "sharpened first layer": patch(f"{TRAINING}.network.TrainablePerceptron.sharpen_first_layer"),
-    "linear part fitted before": patch(f"{TRAINING}.network.TrainablePerceptron.fit_linear_part"),
     "weights in the loss of the mean": patch(f"{TRAINING}.losses.STD_EXPONENT", 0.0),
     "linear targets": patch(f"{TRAINING}.fit.LINEAR_TARGET_FRACTION", 0.0),
 }
@@ -152,13 +151,8 @@ def train(case: Case, steps: int | None, change: AbstractContextManager[object] 
 
 def predictor(network: InverseNetwork) -> Predict:
     """Return the contacts of a network as a function of charges."""
-
-    def predict(charge: Array) -> Array:
-        with torch.no_grad():
-            contact, _, _ = network(as_tensor(charge))
-        return contact.double().numpy()
-
-    return predict
+    folded = fold_network(network)
+    return lambda charge: folded.predict(charge)[0]
 
 
 REGRESSORS = {

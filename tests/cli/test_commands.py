@@ -222,12 +222,7 @@ BAD = [
     (("simulate", "sweep", SENSOR, "--cluster", "pigeon://1", "-o", "OUT"), 2, "InputError: cluster 'pigeon://1'"),
     (("train", "fit", "-o", "OUT"), 2, "InputError: expected either a DATASET folder or a SENSOR"),
     (("train", "fit", SENSOR, "--sensor", SENSOR, "-o", "OUT"), 2, f"expected one sensor, got {SENSOR} and"),
-    (
-        ("train", "distil", "four-25um-biaxial", "-o", "OUT", "--int8", "--config", "quick.toml"),
-        2,
-        "--int8: expected no --config beside it",
-    ),
-    (("train", "distil", SENSOR, "-o", "OUT", "--config", "none.toml"), 2, "ConfigError: none.toml: cannot be"),
+    (("train", "fit", SENSOR, "-o", "OUT", "--config", "none.toml"), 2, "ConfigError: none.toml: cannot be"),
     (("simulate", "identify", SENSOR, "--noise", "clean"), 2, "expected white noise above 0 pC, got that of 'clean'"),
     *(
         (("simulate", "identify", SENSOR, "--error", error), 2, "--error: expected a positive number")

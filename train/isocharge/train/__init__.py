@@ -34,12 +34,11 @@ if TYPE_CHECKING:
     from isocharge.train.data.presses import LabelledPresses
     from isocharge.train.model_release.evaluate import evaluate
     from isocharge.train.model_release.release import Release, release
-    from isocharge.train.model_release.student import StudentCase, student_config, student_data
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
     from isocharge.train.training.cross_fit import fit_presses
     from isocharge.train.training.fit import fit
     from isocharge.train.training.fitted import Fitted, Provenance
-    from isocharge.train.training.source import Teacher, TrainingData
+    from isocharge.train.training.source import TrainingData
 else:  # hidden from type checkers, which would otherwise accept every misspelt name
     __getattr__ = lazy_names(__name__, "train")
 
@@ -56,8 +55,6 @@ __all__ = [
     "ProposedPress",
     "Provenance",
     "Release",
-    "StudentCase",
-    "Teacher",
     "TrainingConfig",
     "TrainingData",
     "calibrate",
@@ -68,8 +65,6 @@ __all__ = [
     "next_presses",
     "read_earlier",
     "release",
-    "student_config",
-    "student_data",
     "write_calibration",
 ]
 

@@ -21,11 +21,6 @@ train_app = lazy_group(
         "report": LazyCommand(
             "isocharge.cli.train.report:report_command", "Compare methods: speed against error.", extra="train"
         ),
-        "distil": LazyCommand(
-            "isocharge.cli.train.distil:distil_command",
-            "Train a small network for microcontrollers on a model's answers.",
-            extra="train",
-        ),
         "export-c": LazyCommand(
             "isocharge.cli.train.export_c:export_c_command", "Write a model as C source.", extra="train"
         ),

@@ -1,6 +1,5 @@
 """`isocharge train report`: compare a model with other methods by error and speed."""
 
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +9,7 @@ from isocharge.cli.shared.options import JsonOption, ModelsOption, NewFolderOpti
 from isocharge.cli.shared.press_options import read_press_file
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
-from isocharge.common.errors import InputError, ModelError
+from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
 from isocharge.serve import find_model
 from isocharge.simulate import Dataset, load_sensor, parse_probe, read_dataset
@@ -70,7 +69,6 @@ def report_command(
     loaded_datasets = [_read_dataset(path, sensor, probe) for path in datasets]
     model_names = model or [dataset.sensor.name for dataset in loaded_datasets]
     model_folders = [find_model(name, models) for name in model_names]
-    student_folders = _find_students(model_names, models)  # small models, which are compared as well
 
     settings = QUICK if quick else Settings()
     with shown_progress():
@@ -78,7 +76,6 @@ def report_command(
             output,
             list(zip(loaded_datasets, model_folders, strict=True)),
             settings,
-            students=student_folders,
             command=this_command(),
         )
 
@@ -89,20 +86,6 @@ def report_command(
     say(str(output / "report.md"))
     if json:
         show_json(record)
-
-
-def _find_students(model_names: list[str], models: Path | None) -> list[Path]:
-    """Return the version folder of the small model NAME-student of each compared model NAME, if it exists.
-
-    Args:
-        model_names: Names or paths of the compared models.
-        models: Folder of models that is searched first.
-    """
-    folders = []
-    for name in model_names:
-        with suppress(ModelError):  # a model need not have a student
-            folders.append(find_model(f"{name}-student", models))
-    return folders
 
 
 def _read_dataset(path: Path, sensor: str | None, probe: str) -> Dataset:

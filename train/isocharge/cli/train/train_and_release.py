@@ -1,4 +1,4 @@
-"""Training and release of a model. `isocharge train fit` and `isocharge train distil` use this module."""
+"""Training and release of a model. The command `isocharge train fit` uses this module."""
 
 from collections.abc import Callable
 from pathlib import Path

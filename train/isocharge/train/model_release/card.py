@@ -57,8 +57,6 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     electrodes = metadata.electrodes
     sensor_name = metadata.sensor["name"]
     is_measured = HELD_PRESSES in metadata.errors
-    teacher = metadata.made_with.get("teacher")
-    teacher_text = f"\nThe model is a small network that learned the answers of `{teacher}`." if teacher else ""
     correlations = ", `contact_correlation` (xy, xF, yF)" if fitted.network.n_angle > 0 else ""
     noise = zip(electrodes, *metadata.noise.for_each_electrode(len(electrodes)), strict=True)
     noise_text = "; ".join(f"{name} {white:g} pC and {100 * gain:.3g} %" for name, white, gain in noise)
@@ -69,7 +67,7 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     cautions_text = "".join(f"- {caution}.\n" for caution in fitted.cautions)
     return f"""# {metadata.name}, version {metadata.version}
 
-Estimates the position and the force of one press from the charges of the sensor `{sensor_name}`.{teacher_text}
+Estimates the position and the force of one press from the charges of the sensor `{sensor_name}`.
 
 | | |
 |---|---|

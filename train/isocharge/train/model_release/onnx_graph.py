@@ -12,7 +12,6 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, cut
 from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS
 from isocharge.train.training.activations import ACTIVATIONS
@@ -185,7 +184,7 @@ def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
     return builder.add("Sub", builder.add("Asinh", ratio), builder.constant(features.mean))
 
 
-def _add_perceptron(builder: GraphBuilder, inputs: str, perceptron: Perceptron[Array]) -> str:
+def _add_perceptron(builder: GraphBuilder, inputs: str, perceptron: Perceptron) -> str:
     """Add nodes that evaluate a perceptron with hidden layers and a skip layer.
 
     The operator `Gemm` computes inputs @ weights + bias. The last layer adds the output of the skip layer.

@@ -27,7 +27,6 @@ def write_report(
     subjects: Sequence[tuple[Dataset, Path]],
     settings: Settings | None = None,
     *,
-    students: Sequence[Path] = (),
     command: str = "",
 ) -> dict[str, Any]:
     """Measure every method on every dataset, and write `report.md`, `report.json` and the picture.
@@ -39,7 +38,6 @@ def write_report(
         folder: Folder to write; it must not exist.
         subjects: Datasets, each with the version folder of the model that is evaluated on it.
         settings: Settings of the report; None for the settings of a full report.
-        students: Version folders of small models. Each of them is compared on the datasets of its sensor.
         command: Command that repeats the report, for the page; empty if there is none.
 
     Returns:
@@ -53,9 +51,7 @@ def write_report(
     """
     refuse_existing(folder)
     settings = settings or Settings()
-    evaluations = [
-        DatasetEvaluation.prepare(dataset, model_folder, students, settings) for dataset, model_folder in subjects
-    ]
+    evaluations = [DatasetEvaluation.prepare(dataset, model_folder, settings) for dataset, model_folder in subjects]
     with threads_and_seed(1, settings.seed):  # all methods are timed with one thread
         sections = [evaluation.measure() for evaluation in track(evaluations, "datasets")]
 

@@ -130,7 +130,7 @@ class DatasetEvaluation:
 
     Attributes:
         dataset: The dataset.
-        models: Version folders of the evaluated model and of the small models of the same sensor.
+        model_folder: Version folder of the evaluated model.
         domain: Contacts that both the model and the dataset cover.
         presses: The presses to which the methods are fitted.
         held_out_presses: The test presses of a measured dataset; None if the test presses are simulated.
@@ -140,7 +140,7 @@ class DatasetEvaluation:
     """
 
     dataset: Dataset
-    models: tuple[Path, ...]
+    model_folder: Path
     domain: Domain
     presses: LabelledPresses
     held_out_presses: LabelledPresses | None
@@ -149,15 +149,12 @@ class DatasetEvaluation:
     settings: Settings
 
     @classmethod
-    def prepare(
-        cls, dataset: Dataset, model_folder: Path, students: Sequence[Path], settings: Settings
-    ) -> "DatasetEvaluation":
+    def prepare(cls, dataset: Dataset, model_folder: Path, settings: Settings) -> "DatasetEvaluation":
         """Select the presses that the model covers, and hold out a part of measured presses for the test.
 
         Args:
             dataset: The dataset.
             model_folder: Version folder of the model.
-            students: Version folders of small models; models of other sensors are ignored.
             settings: Settings of the report.
 
         Returns:
@@ -169,7 +166,6 @@ class DatasetEvaluation:
             PressError: If there are too few measured presses.
         """
         model = Predictor(model_folder).metadata
-        own_students = [path for path in students if Predictor(path).metadata.sensor == model.sensor]
         _check_same_sensor(model, dataset)
 
         trained_domain = model_domain(model)
@@ -190,7 +186,7 @@ class DatasetEvaluation:
         probes, is_rotated = _read_probes(covered.samples)
         return cls(
             dataset=covered,
-            models=tuple(dict.fromkeys([model_folder, *own_students])),  # without repetitions
+            model_folder=model_folder,
             domain=domain,
             presses=presses,
             held_out_presses=held_out_presses,
@@ -209,7 +205,7 @@ class DatasetEvaluation:
             test_presses = self.held_out_presses
 
         fitted_methods, failure_reasons = fit_methods(task)
-        methods = [*map(model_method, self.models), *fitted_methods]
+        methods = [model_method(self.model_folder), *fitted_methods]
         return Section(
             sensor=self.dataset.sensor.name,
             measured=self.held_out_presses is not None,

@@ -15,9 +15,6 @@ from isocharge.common.structs import Settings, WrongKey, convert, read_toml
 from isocharge.simulate import NoiseModel, noise_model
 from isocharge.train.training.activations import ACTIVATIONS, TANH
 
-MAX_ELECTRODES = 64
-"""Largest number of electrodes that a configuration can require."""
-
 
 class DefaultSizes(NamedTuple):
     """Default values of the settings that depend on the number of electrodes.
@@ -69,7 +66,6 @@ class NetworkConfig(Settings, frozen=True):
         hidden: Widths of the hidden layers of the contact network; None for the width in `DefaultSizes`.
         misfit_hidden: Widths of the hidden layers of the misfit network, which must have as many hidden layers as the
             contact network; None for the width in `DefaultSizes`.
-        electrodes: Number of electrodes that the dataset must have; 0 if every number is allowed.
         activation: Name of the activation of the hidden layers (`isocharge.train.training.activations`).
         weights: "float32", or "int8" to round the weights between hidden layers to 8 bits and then train the other
             weights further. In C, the rounded weights take a quarter of the memory.
@@ -77,7 +73,6 @@ class NetworkConfig(Settings, frozen=True):
 
     hidden: Widths | None = None
     misfit_hidden: Widths | None = None
-    electrodes: int = 0
     activation: str = TANH.name
     weights: Literal["float32", "int8"] = "float32"
 
@@ -94,10 +89,6 @@ class NetworkConfig(Settings, frozen=True):
                 raise WrongKey("misfit_hidden", expected, list(self.misfit_hidden))
         if self.activation not in ACTIVATIONS:
             raise WrongKey("activation", f"one of {', '.join(ACTIVATIONS)}", self.activation)
-        allows_every_number = self.electrodes == 0
-        is_in_range = 3 <= self.electrodes <= MAX_ELECTRODES
-        if not (allows_every_number or is_in_range):
-            raise WrongKey("electrodes", f"0 (as the dataset) or 3 to {MAX_ELECTRODES}", self.electrodes)
 
     def contact_widths(self, n_electrode: int) -> Widths:
         """Return the widths of the hidden layers of the contact network.

@@ -376,12 +376,8 @@ def _cross_validated_contact(
     contact = np.empty((len(charge), 3))
     std = np.empty((len(charge), 3))
     for fold_index, network in enumerate(fold_networks):
-        # The network estimates the contacts of all presses. Only the contacts of its own fold are used.
-        with torch.no_grad():
-            estimated_contact, estimated_std, _ = network(as_tensor(charge))
         is_in_fold = fold_of_press == fold_index
-        contact[is_in_fold] = estimated_contact.double().numpy()[is_in_fold]
-        std[is_in_fold] = estimated_std.double().numpy()[is_in_fold]
+        contact[is_in_fold], std[is_in_fold], _ = fold_network(network).predict(charge[is_in_fold])
     return contact, std
 
 
@@ -411,7 +407,6 @@ def _distillation_stage(
     with torch.no_grad():
         outputs = [fold_network.posterior(charge) for fold_network in fold_networks]
     targets = Posterior(*(torch.stack(values).mean(dim=0) for values in zip(*outputs, strict=True)))
-    network.contact.fit_linear_part(network.inputs(charge), targets.mean)
 
     def loss(_: float, random: torch.Generator) -> Tensor:  # the loss is the same in every step
         """Return the mean squared differences from the targets for a random batch.

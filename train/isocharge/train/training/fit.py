@@ -1,9 +1,8 @@
 """Training of a network on presses.
 
 The contact perceptron learns the mean and the covariance of the contact, with fresh noise on the charges in every step.
-If a teacher is given, the mean learns the teacher's answers to these charges. The misfit perceptron learns residuals,
-which are computed before the training. The residual of a set of charges is its difference from the charges of the
-nearest contact.
+The misfit perceptron learns residuals, which are computed before the training. The residual of a set of charges is its
+difference from the charges of the nearest contact.
 """
 
 import logging
@@ -16,17 +15,16 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from isocharge.common.defaults import FEW_ELECTRODES
-from isocharge.common.errors import ConfigError
 from isocharge.common.progress import second_thread
 from isocharge.serve.model.charge_file import FILE as CHARGES_FILE
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
-from isocharge.simulate import Dataset, NoiseModel, Sensor
+from isocharge.simulate import Dataset, NoiseModel
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
+from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.exact_search import error_cautions
 from isocharge.train.training.fitted import Fitted, Provenance
@@ -34,7 +32,7 @@ from isocharge.train.training.linear_targets import LinearTargets
 from isocharge.train.training.losses import contact_loss, fresh_noise
 from isocharge.train.training.misfit_training import misfit_examples, misfit_stage
 from isocharge.train.training.network import InverseNetwork, TrainablePerceptron, as_tensor, fold_network
-from isocharge.train.training.source import Teacher, TrainingData
+from isocharge.train.training.source import TrainingData
 from isocharge.train.training.split import Split
 
 _log = logging.getLogger(__name__)
@@ -54,14 +52,14 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
     errors of the network are clearly larger than the errors of an exact search.
 
     Args:
-        source: A dataset, simulated or measured, or other training data, for example of a student.
+        source: A dataset, simulated or measured, or other training data.
         config: Sizes, steps, noise and seed; None for the defaults.
 
     Returns:
         The trained network with everything that a release needs.
 
     Raises:
-        ConfigError: If a setting is out of its range, or is for another number of electrodes.
+        ConfigError: If a setting is out of its range.
         DatasetError: If a network cannot be trained on the presses.
         TrainingError: If the loss is not finite.
     """
@@ -77,8 +75,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
     network = fold_network(trained.network)
     cautions = split.cautions
     noise = settings.training.noise_model
-    # A search for the true contacts can only be compared with a network that has learned the true contacts.
-    if data.teacher is None and _is_noise_known(data, noise):
+    if _is_noise_known(data, noise):
         for caution in error_cautions(network, split.test, split.field, noise, settings.training.seed):
             _log.warning("%s", caution)
             cautions = (*cautions, caution)
@@ -118,7 +115,7 @@ def _provenance(
     """Return the provenance of the training data, with the settings of the training and other additional entries.
 
     Args:
-        data: Training data, which may contain entries and files of their own and a teacher.
+        data: Training data, which may contain entries and files of their own.
         folded_charges: Approximation of the charges by a series, which is added as a file; None if the map from
             contacts to charges does not fold.
         cautions: Sentences about the limits of the network.
@@ -127,8 +124,6 @@ def _provenance(
     made_with: dict[str, object] = {"config": config.to_dict(), "torch": torch.__version__}
     if cautions:
         made_with["cautions"] = list(cautions)
-    if data.teacher is not None:
-        made_with["teacher"] = data.teacher.label
     made_with.update(data.provenance.made_with)
     files = dict(data.provenance.files)
     if folded_charges is not None:
@@ -151,15 +146,13 @@ def train_network(data: TrainingData, config: FitConfig) -> TrainedNetwork:
     The misfit perceptron is trained on examples from the working area and from the rest of the film.
 
     Args:
-        data: Presses, and possibly a teacher.
+        data: Presses.
         config: Sizes, steps, noise and seed.
 
     Raises:
-        ConfigError: If the configuration is for another number of electrodes.
         DatasetError: If a network cannot be trained on the presses.
         TrainingError: If the loss is not finite.
     """
-    _check_electrodes(config.network, data.sensor)
     training = config.training
     with threads_and_seed(training.threads, training.seed), second_thread() as executor:
         split = Split.by_position(data, training)
@@ -178,24 +171,12 @@ def train_network(data: TrainingData, config: FitConfig) -> TrainedNetwork:
         misfit_training = executor.submit(train_misfit)
         linear_targets = None
         has_many_electrodes = network.n_electrode > FEW_ELECTRODES
-        if has_many_electrodes and data.teacher is None and _is_noise_known(data, training.noise_model):
+        if has_many_electrodes and _is_noise_known(data, training.noise_model):
             linear_targets = LinearTargets.compute(split.train, split.field, training.noise_model)
-        stage = contact_stage(
-            network, split.train, training.noise_model, training, teacher=data.teacher, linear_targets=linear_targets
-        )
+        stage = contact_stage(network, split.train, training.noise_model, training, linear_targets=linear_targets)
         train_perceptron(stage, network.contact, config)
         misfit_training.result()
     return TrainedNetwork(network.eval(), split, outside)
-
-
-def _check_electrodes(config: NetworkConfig, sensor: Sensor) -> None:
-    """Raise a `ConfigError` if a configuration is for another number of electrodes than that of the sensor."""
-    names = sensor.electrode_names
-    if config.electrodes not in (0, len(names)):
-        raise ConfigError(
-            f"network.electrodes: the configuration is for {config.electrodes} electrodes, the dataset of "
-            f"{sensor.name!r} has {len(names)} ({', '.join(names)}); use another dataset or leave the key out"
-        )
 
 
 @contextmanager
@@ -250,14 +231,13 @@ def contact_stage(
     noise: Noise,
     config: TrainingConfig,
     *,
-    teacher: Teacher | None = None,
     linear_targets: LinearTargets | None = None,
 ) -> TrainingStage:
     """Define the training of the contact perceptron on charges with fresh noise.
 
-    Before the training, the linear part of the perceptron is fitted by least squares. If there are linear targets, the
+    If there are linear targets, the
     mean of the network learns from them during the first `LINEAR_TARGET_FRACTION` of the steps. Later, or without
-    linear targets, it learns from the answers of the teacher or, without a teacher, from the true contacts. The
+    linear targets, it learns from the true contacts. The
     covariance always learns from the errors.
 
     Args:
@@ -265,16 +245,12 @@ def contact_stage(
         train: Presses for training.
         noise: Noise that is added to the charges in every step.
         config: Number of steps, batch size, learning rate and seed.
-        teacher: Model whose answers are learned; None to learn the contacts of the presses.
-        linear_targets: Targets of the presses of `train` for the first steps; None to use only the contacts or the
-            teacher.
+        linear_targets: Targets of the presses of `train` for the first steps; None to use only the contacts.
     """
     domain = network.domain
     charge = as_tensor(train.charge)
     unit_contact = as_tensor(domain.to_unit(train.contact))
     batch = min(config.batch, len(charge))
-    noisy_charge = charge + fresh_noise(charge, noise, torch.Generator().manual_seed(config.seed))
-    network.contact.fit_linear_part(network.inputs(noisy_charge), unit_contact)
 
     def loss(progress: float, random: torch.Generator) -> Tensor:
         """Return the loss of a random batch with new noise.
@@ -294,8 +270,7 @@ def contact_stage(
 
         noisy_batch = charge[rows] + fresh_noise(charge[rows], noise, random)
         posterior = network.posterior(noisy_batch)
-        target = contact if teacher is None else teacher.unit_contact(noisy_batch, domain)
-        return contact_loss(posterior, target, contact - posterior.mean)
+        return contact_loss(posterior, contact, contact - posterior.mean)
 
     sizes = config.sizes(network.n_electrode)
     rate = config.learning_rate * sizes.rate_factor

@@ -19,7 +19,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.train.training.charge_features import ChargeFeatures
-from isocharge.train.training.perceptron import Layer, Perceptron, evaluate
+from isocharge.train.training.perceptron import Layer, Perceptron
 
 POSITION = slice(0, 2)
 """Columns of the answers with x and y, mm."""
@@ -84,7 +84,7 @@ class FoldedNetwork:
     """
 
     features: ChargeFeatures
-    layers: Perceptron[Array]
+    layers: Perceptron
     log_std_limits: Array | None = None
 
     @property
@@ -106,7 +106,7 @@ class FoldedNetwork:
         Returns:
             Answers, shape (n, n_answer).
         """
-        return np.asarray(evaluate(self.layers, self.features.evaluate(charge)), dtype=float)
+        return np.asarray(self.layers.evaluate(self.features.evaluate(charge)), dtype=float)
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Estimate contacts.

@@ -59,9 +59,7 @@ LOG_FORCE_STD = slice(LOG_STD.stop - 1, LOG_STD.stop)
 """Column of the answers with the logarithm of the standard deviation of the force."""
 
 
-def fold(
-    perceptrons: Sequence[Perceptron[Array]], mean: Array, matrix: Array, answer_map: Layer[Array]
-) -> Perceptron[Array]:
+def fold(perceptrons: Sequence[Perceptron], mean: Array, matrix: Array, answer_map: Layer) -> Perceptron:
     """Fold several perceptrons into one perceptron that computes answers from features without whitening.
 
     The whitening of the features becomes part of the first layer and of the skip layer. The linear map from the outputs
@@ -95,7 +93,7 @@ def fold(
     )
 
 
-def linear_answer_map(domain: Domain, n_electrode: int) -> Layer[Array]:
+def linear_answer_map(domain: Domain, n_electrode: int) -> Layer:
     """Return the linear map from the outputs of the contact perceptron and the misfit perceptron to the answers.
 
     The contact perceptron estimates unit coordinates, which the map converts to (x, y, ln F). The perceptron also
@@ -143,7 +141,7 @@ def log_std_limits(domain: Domain) -> Array:
     return np.asarray(limits)
 
 
-def _join_perceptrons(perceptrons: Sequence[Perceptron[Array]]) -> Perceptron[Array]:
+def _join_perceptrons(perceptrons: Sequence[Perceptron]) -> Perceptron:
     """Join several perceptrons with the same inputs into one perceptron, which computes all their outputs."""
     # Group the hidden layers by depth: each group contains one layer of each perceptron.
     first_layers, *later_groups = zip(*(perceptron.hidden for perceptron in perceptrons), strict=True)
@@ -157,7 +155,7 @@ def _join_perceptrons(perceptrons: Sequence[Perceptron[Array]]) -> Perceptron[Ar
     )
 
 
-def _join_layers(layers: Sequence[Layer[Array]], join_weights: Callable[[Sequence[Array]], Array]) -> Layer[Array]:
+def _join_layers(layers: Sequence[Layer], join_weights: Callable[[Sequence[Array]], Array]) -> Layer:
     """Join several layers into one layer, which computes the outputs of all these layers in order.
 
     Args:

@@ -35,7 +35,6 @@ from isocharge.train.training.folded_network import (
 )
 from isocharge.train.training.folding import N_CONTACT_OUTPUTS, TURN, fold, linear_answer_map, log_std_limits
 from isocharge.train.training.perceptron import Layer, Perceptron
-from isocharge.train.training.torch_evaluation import evaluate, evaluate_features
 
 LARGEST_INT8 = 127
 """Largest absolute value of the integers by which weights are represented in 8 bits."""
@@ -48,9 +47,6 @@ The inputs of the layer have unit variance.
 
 FORCE_OUTPUTS = [LOG_FORCE.start, LOG_STD.stop - 1, TURN.start + 1, TURN.start + 2]
 """Outputs of the contact perceptron for ln F, for the logarithm of its standard deviation and for its correlations."""
-
-INITIAL_NONLINEAR_SIZE = 0.2
-"""Factor by which the initial weights of an output are multiplied after its linear part was fitted."""
 
 MIN_LENGTH = 1e-9
 """Smallest length of a residual by which the compression divides, so that no division by zero occurs."""
@@ -121,28 +117,6 @@ class TrainablePerceptron(nn.Module):
             first.weight.copy_(slope * direction)
             first.bias.copy_(-(first.weight * centre).sum(dim=1))  # weight @ centre + bias = 0
 
-    def fit_linear_part(self, inputs: Tensor, targets: Tensor) -> None:
-        """Fit the first outputs to targets by linear least squares.
-
-        The slopes are stored in the skip layer, and the offset is stored in the bias of the last layer. The weights
-        from the last hidden layer to these outputs are reduced, so that the hidden layers contribute little at first.
-        During the training, the hidden layers learn the nonlinear part of the outputs.
-
-        Args:
-            inputs: Inputs, shape (n, n_input).
-            targets: Targets of the first n_target outputs, shape (n, n_target).
-        """
-        n_input = inputs.shape[1]
-        n_target = targets.shape[1]
-        *_, last = self.linear_layers()
-        design = torch.cat([inputs, torch.ones(len(inputs), 1)], dim=1)  # the column of ones is for the offset
-        coefficients = torch.linalg.lstsq(design.double(), targets.double()).solution.float()
-        slopes, offset = torch.split(coefficients, [n_input, 1])
-        with torch.no_grad():
-            self.skip.weight[:n_target] = slopes.T
-            last.weight[:n_target] *= INITIAL_NONLINEAR_SIZE
-            last.bias[:n_target] = offset[0]
-
     def forward(self, inputs: Tensor) -> Tensor:
         """Compute the outputs of the perceptron.
 
@@ -152,16 +126,18 @@ class TrainablePerceptron(nn.Module):
         Returns:
             Outputs, shape (n, n_output).
         """
-        return evaluate(self.definition(), inputs)
+        activation = getattr(nn.functional, self.activation.torch_name)
+        *hidden, last = self.linear_layers()
+        value = inputs
+        for layer in hidden:
+            value = activation(layer(value))
+        outputs: Tensor = last(value) + self.skip(inputs)
+        return outputs
 
-    def definition(self) -> Perceptron[Tensor]:
-        """Return the definition of the perceptron, which refers to the trained tensors without copying them."""
-        *hidden, last = (Layer(layer.weight.T, layer.bias) for layer in self.linear_layers())
-        return Perceptron(tuple(hidden), last, self.skip.weight.T, self.activation)
-
-    def to_numpy(self) -> Perceptron[Array]:
+    def to_numpy(self) -> Perceptron:
         """Return a copy of the perceptron as NumPy arrays in double precision."""
-        return perceptron_to_numpy(self.definition())
+        *hidden, last = (Layer(_to_numpy(layer.weight.T), _to_numpy(layer.bias)) for layer in self.linear_layers())
+        return Perceptron(tuple(hidden), last, _to_numpy(self.skip.weight.T), self.activation)
 
     def linear_layers(self) -> list[nn.Linear]:
         """Return the hidden layers and the output layer, from first to last."""
@@ -205,8 +181,7 @@ class InverseNetwork(nn.Module):
     ) -> None:
         """Create the perceptrons with random weights.
 
-        The following tensors are stored as buffers, because they are not trained: centre and scale of the unit
-        coordinates, and mean and whitening matrix of the features.
+        The mean and the whitening matrix of the features are stored as buffers, because they are not trained.
 
         Args:
             domain: Contacts for which the network is trained.
@@ -230,8 +205,6 @@ class InverseNetwork(nn.Module):
         if force_std is not None:
             self.output_factor[FORCE_OUTPUTS] = 0.0
             self.output_offset[LOG_STD.stop - 1] = np.log(force_std / domain.scale[2])
-        self.centre = nn.Buffer(as_tensor(domain.centre))
-        self.scale = nn.Buffer(as_tensor(domain.scale))
         self.features_mean = nn.Buffer(as_tensor(features.mean))
         self.whitening = nn.Buffer(as_tensor(features.matrix))
 
@@ -249,38 +222,18 @@ class InverseNetwork(nn.Module):
         Returns:
             Inputs, shape (n, n_electrode).
         """
-        features = evaluate_features(self.features.charge_features, charge)
-        return (features - self.features_mean) @ self.whitening
+        features = self.features.charge_features
+        clipped_charge = charge.clamp(as_tensor(features.low_pC), as_tensor(features.high_pC))
+        ratio = clipped_charge / as_tensor(features.typical_pC)
+        # Without a mean, all charges of the presses are positive.
+        values = torch.log(ratio) if features.mean is None else torch.asinh(ratio) - as_tensor(features.mean)
+        return (values - self.features_mean) @ self.whitening
 
     def posterior(self, charge: Tensor) -> Posterior:
         """Estimate the contacts of n presses from their charges, shape (n, n_electrode), pC."""
         outputs = self.contact(self.inputs(charge)) * self.output_factor + self.output_offset
         mean = outputs[:, MEAN]
         return Posterior(mean, limit_log_std(outputs[:, LOG_STD], mean, self.domain), outputs[:, TURN])
-
-    def forward(self, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Estimate contacts.
-
-        Args:
-            charge: Charges, shape (n, n_electrode), pC.
-
-        Returns:
-            Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3). Misfits,
-            shape (n, 1).
-        """
-        # Convert the unit coordinates to (x, y, ln F).
-        unit_mean, unit_log_std, _ = self.posterior(charge)
-        log_contact = unit_mean * self.scale + self.centre
-        log_contact_std = torch.exp(unit_log_std) * self.scale
-
-        # Convert (x, y, ln F) to (x, y, F). The standard deviation of F is the standard deviation of ln F times F.
-        force = torch.exp(log_contact[:, 2:])  # shape (n, 1)
-        contact = torch.cat([log_contact[:, :2], force], dim=1)
-        contact_std = torch.cat([log_contact_std[:, :2], log_contact_std[:, 2:] * force], dim=1)
-
-        misfit_vector = self.misfit_vector(self.inputs(charge))
-        compressed_misfit = torch.linalg.vector_norm(misfit_vector, dim=1, keepdim=True)
-        return contact, contact_std, MISFIT_UNIT * torch.sinh(compressed_misfit)
 
 
 def limit_log_std(log_std: Tensor, mean: Tensor, domain: Domain) -> Tensor:
@@ -323,13 +276,6 @@ def compress_length(residual: Tensor) -> Tensor:
 def as_tensor(values: Array) -> Tensor:
     """Return a copy of an array as a tensor in single precision."""
     return torch.tensor(values).float()
-
-
-def perceptron_to_numpy(perceptron: Perceptron[Tensor]) -> Perceptron[Array]:
-    """Return a copy of a perceptron as NumPy arrays in double precision."""
-    hidden = tuple(Layer(_to_numpy(layer.weight), _to_numpy(layer.bias)) for layer in perceptron.hidden)
-    last = Layer(_to_numpy(perceptron.last.weight), _to_numpy(perceptron.last.bias))
-    return Perceptron(hidden, last, _to_numpy(perceptron.skip), perceptron.activation)
 
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
