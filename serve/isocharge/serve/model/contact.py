@@ -41,33 +41,14 @@ class Contact(NamedTuple):
     xF_correlation: float = math.nan
     yF_correlation: float = math.nan
 
-    def widened(self, shift: tuple[float, float, float]) -> "Contact":
-        """Return the contact with standard deviations and correlations that include an additional independent error.
-
-        The additional error changes x, y and the force together. The changes of x, y and the force are therefore fully
-        correlated. The additional error increases the variance of x by the square of the change of x, and the
-        covariance of x and y by the product of the changes of x and y. The position, the force and the misfit are not
-        changed. Correlations that are NaN remain NaN.
+    def with_covariance(self, covariance: Array) -> "Contact":
+        """Return the contact with the covariance of an additional independent error.
 
         Args:
-            shift: Changes of x (mm), y (mm) and the force (N) that one standard deviation of the additional error
-                causes.
+            covariance: Covariance of the additional error of x, y and the force, shape (3, 3), mm and N.
         """
-        x_shift, y_shift, force_shift = shift
-        x_std_mm = math.hypot(self.x_std_mm, x_shift)
-        y_std_mm = math.hypot(self.y_std_mm, y_shift)
-        force_std_N = math.hypot(self.force_std_N, force_shift)
-        xy_covariance = self.xy_correlation * self.x_std_mm * self.y_std_mm + x_shift * y_shift
-        xF_covariance = self.xF_correlation * self.x_std_mm * self.force_std_N + x_shift * force_shift
-        yF_covariance = self.yF_correlation * self.y_std_mm * self.force_std_N + y_shift * force_shift
-        return self._replace(
-            x_std_mm=x_std_mm,
-            y_std_mm=y_std_mm,
-            force_std_N=force_std_N,
-            xy_correlation=xy_covariance / (x_std_mm * y_std_mm),
-            xF_correlation=xF_covariance / (x_std_mm * force_std_N),
-            yF_correlation=yF_covariance / (y_std_mm * force_std_N),
-        )
+        contacts = Contacts(*np.array([self], np.float32).T).with_covariance(covariance[np.newaxis])
+        return Contact(*np.asarray(contacts)[0].tolist())
 
     def __repr__(self) -> str:
         """Return a text with x, y, the force and their standard deviations, rounded to a few significant digits."""

@@ -253,9 +253,8 @@ class FilmFollower:
             self._conversion = conversion
             self._conversion_contact = contact
         corrected_pC = conversion.factor * charge_pC + conversion.shift_pC
-        corrected = self.predictor.predict(corrected_pC)
-        for x_mm, y_mm, force_N in conversion.contact_shifts.tolist():
-            corrected = corrected.widened((x_mm, y_mm, force_N))
+        covariance = conversion.contact_shifts.T @ conversion.contact_shifts
+        corrected = self.predictor.predict(corrected_pC).with_covariance(covariance)
         return FollowedContact(corrected, corrected_pC)
 
     def _discard_conversion(self) -> None:
