@@ -16,26 +16,19 @@ from isocharge.common.errors import UnknownPath, WrongMethod
 from isocharge.serve.network.address import ServerLimits, Token
 from isocharge.serve.network.browser_check import BrowserCheck, header_values
 from isocharge.serve.network.model_store import ModelStore
-from isocharge.serve.network.protocol.response import Response, decompress, error_response
+from isocharge.serve.network.protocol.response import Response, decompress, error_response, json_response
 from isocharge.serve.network.protocol.routes import ROUTES, Request, Route
 from isocharge.serve.network.traffic import Client, Exchange, Traffic
 
 Headers = Iterable[tuple[bytes, bytes]]
 """Headers of a request. The names are in lower case, and the values are unchanged."""
 
-_PARAMETERS = {"{model}": "(?P<model>[^/]*)", "{version}": "(?P<version>[^/]+)"}
-"""Regular expression for each placeholder that a template of a path may contain."""
-
-
-def _pattern(template: str) -> re.Pattern[str]:
-    """Return a regular expression that matches the paths of a template, such as `/v2/models/{model}/infer`."""
-    expression = re.escape(template)
-    for placeholder, parameter_expression in _PARAMETERS.items():
-        expression = expression.replace(re.escape(placeholder), parameter_expression)
-    return re.compile(expression)
-
-
-_PATTERNS = [(_pattern(template), route) for route in ROUTES for template in route.paths]
+_PATTERNS = [
+    (re.compile(template.format(model="(?P<model>[^/]*)", version="(?P<version>[^/]+)")), route)
+    for route in ROUTES
+    for template in route.paths
+]
+"""Regular expressions of the paths of each route. Templates of paths contain no special characters but the point."""
 
 
 @lru_cache
@@ -158,4 +151,5 @@ class Handler:
         if encoding is not None:
             plain_body = decompress(request.body, encoding.lower(), self.limits.body_bytes)
             request = request._replace(body=plain_body)
-        return route.respond(request)
+        answer = route.respond(request)
+        return answer if isinstance(answer, Response) else json_response(answer)

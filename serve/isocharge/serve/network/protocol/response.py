@@ -1,6 +1,5 @@
 """HTTP responses, compression of their bodies, and statuses of errors for HTTP and gRPC."""
 
-import gzip
 import logging
 import zlib
 from typing import Any, NamedTuple
@@ -169,11 +168,9 @@ def compress(body: bytes, accepted: bytes) -> tuple[bytes, bytes]:
     if len(body) < MIN_COMPRESSED_BYTES:
         return body, b""
     encodings = _accepted_encodings(accepted)
-    # The lowest level of compression is the fastest. With the time stamp 0, equal bodies are compressed to equal bytes.
-    if b"gzip" in encodings:
-        return gzip.compress(body, compresslevel=1, mtime=0), b"gzip"
-    if b"deflate" in encodings:
-        return zlib.compress(body, level=1), b"deflate"
+    for encoding in (b"gzip", b"deflate"):
+        if encoding in encodings:  # the lowest level of compression is the fastest
+            return zlib.compress(body, 1, _WINDOW_BITS[encoding]), encoding
     return body, b""
 
 

@@ -18,7 +18,7 @@ from isocharge.serve.network.protocol import describe
 from isocharge.serve.network.protocol.bodies import IndexBody
 from isocharge.serve.network.protocol.inference import answer_inference, read_infer, write_answer
 from isocharge.serve.network.protocol.openapi import openapi_document
-from isocharge.serve.network.protocol.response import Response, compress, json_response, response_of
+from isocharge.serve.network.protocol.response import Response, compress, response_of
 from isocharge.serve.network.traffic import Traffic
 
 
@@ -59,7 +59,7 @@ class Route(NamedTuple):
     Attributes:
         method: HTTP method. A route with the method GET also answers HEAD requests, without a body.
         paths: Templates of the paths. Requests are logged and counted under the first template.
-        respond: Function that answers a request.
+        respond: Function that answers a request by a response, or by the content of a JSON response.
         needs_token: Whether requests must contain the token of the server. Health checks need no token, because the
             programs that start and monitor servers do not have it.
         may_block: Whether an answer may take a long time. The server then computes the answer in another thread.
@@ -67,16 +67,9 @@ class Route(NamedTuple):
 
     method: str
     paths: tuple[str, ...]
-    respond: Callable[[Request], Response]
+    respond: Callable[[Request], Any]
     needs_token: bool = True
     may_block: bool = False
-
-
-# The functions below answer the requests of the routes. A parameter `_` is a request whose content is not needed.
-
-
-def _show_openapi(request: Request) -> Response:
-    return json_response(openapi_document(request.store))
 
 
 def _show_metrics(request: Request) -> Response:
@@ -84,56 +77,32 @@ def _show_metrics(request: Request) -> Response:
     return response_of(200, CONTENT_TYPE, b"".join(texts))
 
 
-def _show_server(_: Request) -> Response:
-    return json_response(describe.server_metadata())
-
-
-def _is_live(_: Request) -> Response:
-    return json_response({"live": True})
-
-
-def _is_ready(request: Request) -> Response:
+def _is_ready(request: Request) -> dict[str, bool]:
     request.store.check_ready()
-    return json_response({"ready": True})
+    return {"ready": True}
 
 
-def _show_statistics(request: Request) -> Response:
-    return json_response(describe.statistics_of(request.store, request.model, request.version))
-
-
-def _show_index(request: Request) -> Response:
+def _show_index(request: Request) -> list[dict[str, str]]:
     """Return the index of the repository, which contains all versions of all models.
 
     If the body contains `ready: true`, the index contains only the loaded versions.
     """
     body = parse_json(request.body or b"{}", "", RequestError, IndexBody)
-    return json_response(describe.repository_index(request.store, ready=body.ready is True))
+    return describe.repository_index(request.store, ready=body.ready is True)
 
 
-def _load(request: Request) -> Response:
+def _load(request: Request) -> dict[str, Any]:
     """Read the files of a model again, and return an empty object."""
     if request.object().get("parameters") not in (None, {}):
         raise RequestError(describe.NO_LOAD_PARAMETERS)
     request.store.load(request.model)
-    return json_response({})
+    return {}
 
 
-def _unload(request: Request) -> Response:
+def _unload(request: Request) -> dict[str, Any]:
     request.object()  # refuses a body that is not an object
     request.store.unload(request.model)
-    return json_response({})
-
-
-def _show_model(request: Request) -> Response:
-    return json_response(describe.model_metadata(request.loaded, request.store))
-
-
-def _is_model_ready(request: Request) -> Response:
-    return json_response({"ready": bool(request.loaded)})
-
-
-def _show_config(request: Request) -> Response:
-    return json_response(describe.model_config(request.loaded, request.limits))
+    return {}
 
 
 def _infer(request: Request) -> Response:
@@ -175,19 +144,22 @@ def _model_paths(ending: str = "") -> tuple[str, str]:
 
 
 ROUTES = (
-    Route("GET", ("/openapi.json",), _show_openapi),
-    Route("GET", ("/v2/health/live",), _is_live, needs_token=False),
+    Route("GET", ("/openapi.json",), lambda request: openapi_document(request.store)),
+    Route("GET", ("/v2/health/live",), lambda _: {"live": True}, needs_token=False),
     Route("GET", ("/v2/health/ready",), _is_ready, needs_token=False),
     Route("GET", ("/metrics",), _show_metrics),
-    Route("GET", ("/v2",), _show_server),
-    Route("GET", ("/v2/models/stats",), _show_statistics),
+    Route("GET", ("/v2",), lambda _: describe.server_metadata()),
+    Route(
+        "GET",
+        ("/v2/models/stats", *_model_paths("/stats")),
+        lambda request: describe.statistics_of(request.store, request.model, request.version),
+    ),
     Route("POST", ("/v2/repository/index",), _show_index),
     Route("POST", ("/v2/repository/models/{model}/load",), _load, may_block=True),
     Route("POST", ("/v2/repository/models/{model}/unload",), _unload, may_block=True),
-    Route("GET", _model_paths(), _show_model),
-    Route("GET", _model_paths("/ready"), _is_model_ready),
-    Route("GET", _model_paths("/config"), _show_config),
-    Route("GET", _model_paths("/stats"), _show_statistics),
+    Route("GET", _model_paths(), lambda request: describe.model_metadata(request.loaded, request.store)),
+    Route("GET", _model_paths("/ready"), lambda request: {"ready": bool(request.loaded)}),
+    Route("GET", _model_paths("/config"), lambda request: describe.model_config(request.loaded, request.limits)),
     Route("POST", _model_paths("/infer"), _infer),
 )
 """All routes of the HTTP server. If several templates match a path, the first of them is used."""
