@@ -1,8 +1,6 @@
 """A command that needs an extra names the install command, and no command ends in a traceback without extras."""
 
 import json
-import re
-import shlex
 import subprocess
 import sys
 
@@ -96,20 +94,10 @@ ABSENT_PACKAGES = {extra: packages - {"google"} for extra, packages in PACKAGES.
 """Packages that are absent without an extra; "every extra" for the base install. protobuf comes with onnxruntime."""
 ABSENT_PACKAGES["every extra"] = frozenset().union(*ABSENT_PACKAGES.values())
 
-IN_A_PROCESS = {"verify", "serve predict", "serve stream", "demo", "serve http", "simulate point", "train fit"}
-"""Commands that run in a process of the base install in `make test`: some of the base install, one of each extra."""
-
 
 def extra_of(command):
     group = command.split()[0]
     return EXTRAS.get(command, "train" if group == "demo" else group)
-
-
-def example_of(command):
-    """The words of the example in the help of a command, in a form that takes no time."""
-    text = COMMANDS[command].help
-    example = re.search(r"Example: isocharge (.*)", text)[1].partition(" > ")[0]
-    return shlex.split(example.replace("--seconds 10", "--seconds 0.1"))
 
 
 def run(words, environment, folder):
@@ -125,19 +113,6 @@ def run(words, environment, folder):
     )
     assert "Traceback" not in done.stderr, done.stderr
     return done
-
-
-@pytest.mark.parametrize(
-    "command", [pytest.param(name, marks=[] if name in IN_A_PROCESS else [pytest.mark.slow]) for name in COMMANDS]
-)
-def test_a_command_in_the_base_install_runs_or_names_the_install_command(command, installed, tmp_path):
-    done = run(example_of(command), installed(), tmp_path)
-    if command in BASE_COMMANDS:
-        assert "not installed" not in done.stderr
-    else:
-        assert done.returncode == 1
-        assert f"pip install 'isocharge[{extra_of(command)}]'" in done.stderr
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("line", "extra"), OPTIONS)
@@ -194,10 +169,3 @@ def test_the_base_install_writes_the_playground(installed, tmp_path):
     again = run(["demo", "--playground", "pages/playground.html"], installed(), tmp_path)
     assert again.returncode == 1
     assert "is already there" in again.stderr
-
-
-def test_the_playground_is_refused_together_with_another_option(installed, tmp_path):
-    done = run(["demo", "--playground", "playground.html", "--seconds", "5"], installed(), tmp_path)
-    assert done.returncode == 2
-    assert "expected --playground without another option" in done.stderr
-    assert list(tmp_path.iterdir()) == []

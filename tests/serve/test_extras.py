@@ -14,16 +14,8 @@ from isocharge.common.extras import require
     ("extra", "module"),
     [
         ("simulate", "scipy"),
-        ("simulate", "scipy.sparse"),
         ("train", "torch"),
-        ("train", "scipy"),
-        ("http", "uvloop"),
-        ("http", "orjson"),
-        ("grpc", "grpc"),
         ("grpc", "google.protobuf"),
-        ("grpc", "uvloop"),
-        ("record", "mcap.writer"),
-        ("record", "zstandard"),
         ("parquet", "pyarrow.parquet"),
     ],
 )

@@ -19,12 +19,6 @@ from isocharge.cli.train.app import train_app
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.versions import package_version
 
-EXIT_CODE_FAILURE = 1
-"""Exit code of a command that failed."""
-
-EXIT_CODE_WRONG_INPUT = 2
-"""Exit code of a command with wrong usage or wrong input."""
-
 app = lazy_group(
     "Compute the position and the force of a contact on a piezoelectric tactile film from the charges of three to "
     "eight electrodes.",
@@ -71,6 +65,4 @@ def main() -> None:
             app()
     except (IsochargeError, OSError, MemoryError) as error:
         say(f"{type(error).__name__}: {error}")
-        if isinstance(error, InputError):
-            sys.exit(EXIT_CODE_WRONG_INPUT)
-        sys.exit(EXIT_CODE_FAILURE)
+        sys.exit(2 if isinstance(error, InputError) else 1)

@@ -106,7 +106,7 @@ def stream_command(
         ),
     ] = Policy.every,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0.0, help="Time after which to stop, s. (default: at Ctrl-C)")
+        float | None, typer.Option("--seconds", min=1e-3, help="Time after which to stop, s. (default: at Ctrl-C)")
     ] = None,
     count: Annotated[
         int | None, typer.Option("--count", min=1, help="Number of records after which to stop. (default: at Ctrl-C)")

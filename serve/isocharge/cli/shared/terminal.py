@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from pty import STDERR_FILENO, STDIN_FILENO, STDOUT_FILENO
 from typing import Any, Self
 
 import typer
@@ -25,16 +26,7 @@ from isocharge.common.errors import OutputError
 from isocharge.common.printable_text import printable, printable_lines
 from isocharge.common.progress import Listener, listening
 
-STDIN_DESCRIPTOR = 0
-"""File descriptor of the standard input of a process."""
-
-STDOUT_DESCRIPTOR = 1
-"""File descriptor of the standard output of a process."""
-
-STDERR_DESCRIPTOR = 2
-"""File descriptor of the standard error of a process."""
-
-STANDARD_DESCRIPTORS = (STDIN_DESCRIPTOR, STDOUT_DESCRIPTOR, STDERR_DESCRIPTOR)
+STANDARD_DESCRIPTORS = (STDIN_FILENO, STDOUT_FILENO, STDERR_FILENO)
 """File descriptors of the three standard streams, in increasing order."""
 
 
@@ -66,11 +58,11 @@ def open_closed_streams() -> None:
     # Python sets the stream object to None if its file descriptor was closed when the interpreter started. The new
     # objects must not close the descriptors when they are destroyed.
     if sys.stdin is None:
-        sys.stdin = open(STDIN_DESCRIPTOR, closefd=False)  # noqa: SIM115
+        sys.stdin = open(STDIN_FILENO, closefd=False)  # noqa: SIM115
     if sys.stdout is None:
         sys.stdout = ClosedOutput()
     if sys.stderr is None:
-        sys.stderr = open(STDERR_DESCRIPTOR, "w", closefd=False)  # noqa: SIM115
+        sys.stderr = open(STDERR_FILENO, "w", closefd=False)  # noqa: SIM115
 
 
 def discard_output(descriptor: int) -> None:
@@ -162,7 +154,7 @@ def announce(line: str) -> None:
     try:
         print(printable(line), flush=True)
     except OSError:
-        discard_output(STDOUT_DESCRIPTOR)
+        discard_output(STDOUT_FILENO)
 
 
 def stdout_writer() -> Callable[[str], None]:
@@ -181,9 +173,9 @@ def stdout_writer() -> Callable[[str], None]:
 def write_stderr(line: str) -> None:
     """Write a line to stderr at once. The command continues if stderr is full or closed."""
     try:
-        _write_all(STDERR_DESCRIPTOR, f"{printable(line)}\n".encode())
+        _write_all(STDERR_FILENO, f"{printable(line)}\n".encode())
     except OSError:
-        discard_output(STDERR_DESCRIPTOR)
+        discard_output(STDERR_FILENO)
 
 
 def stdout_is_ready() -> bool:
@@ -228,13 +220,9 @@ def until_stopped() -> Iterator[None]:
     except KeyboardInterrupt:  # Ctrl-C or SIGTERM
         pass
     except BrokenPipeError:  # no program reads stdout any more
-        discard_output(STDOUT_DESCRIPTOR)
+        discard_output(STDOUT_FILENO)
     finally:
         signal.signal(signal.SIGTERM, previous_handler)
-
-
-MIN_TIMER_S = 1e-3
-"""Shortest time of a `StopTimer`, s. A time of 0 would switch the timer off."""
 
 
 class StopTimer:
@@ -247,7 +235,7 @@ class StopTimer:
     """
 
     def __init__(self, seconds: float | None) -> None:
-        """Store the time, s; None for no limit."""
+        """Store the time, s, which must be positive; None for no limit."""
         self.has_expired = False
         self._seconds = seconds
         self._previous_handler: Any = None
@@ -256,7 +244,7 @@ class StopTimer:
         """Start the timer."""
         if self._seconds is not None:
             self._previous_handler = signal.signal(signal.SIGALRM, self._interrupt)
-            signal.setitimer(signal.ITIMER_REAL, max(self._seconds, MIN_TIMER_S))
+            signal.setitimer(signal.ITIMER_REAL, self._seconds)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -330,7 +318,7 @@ def say(message: str) -> None:
     try:
         typer.echo(printable_lines(message), err=True)
     except OSError:
-        discard_output(STDERR_DESCRIPTOR)
+        discard_output(STDERR_FILENO)
 
 
 def this_command() -> str:

@@ -268,7 +268,9 @@ class ServerLimits:
         body_seconds: Longest time from the end of the headers to the end of the body, s. It is also the longest time in
             which the client must read the response.
         idle_seconds: Longest time between two requests of a connection, s.
+        grace_seconds: Longest time to wait, when a server stops, until the requests that have begun are finished, s.
         connections: Largest number of open connections.
+        queued_requests: Largest number of requests of a connection that wait for the response to an earlier request.
     """
 
     batch: int = MAX_BATCH
@@ -277,7 +279,9 @@ class ServerLimits:
     header_seconds: float = 10.0
     body_seconds: float = 30.0
     idle_seconds: float = 75.0
+    grace_seconds: float = 10.0
     connections: int = 1024
+    queued_requests: int = 100
 
     def check_body(self, size: int) -> None:
         """Check that the size of a body, or of the part that has arrived so far, does not exceed `body_bytes`.

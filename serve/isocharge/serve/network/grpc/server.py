@@ -20,9 +20,6 @@ from isocharge.serve.network.protocol import Handler
 
 T = TypeVar("T")
 
-GRACE_SECONDS = 10
-"""Longest time to wait, when the server stops, until the calls that have already begun are finished, s."""
-
 MAX_CALLS_PER_CONNECTION = 100
 """Largest number of open calls on one connection. HTTP/2 recommends at least this number.
 
@@ -59,7 +56,7 @@ def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) 
         try:
             yield f"{scheme}://{url_host}:{actual_port}"
         finally:
-            _run_in(loop, server.stop(GRACE_SECONDS))
+            _run_in(loop, server.stop(handler.limits.grace_seconds))
 
 
 @contextmanager

@@ -16,12 +16,6 @@ from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.protocol.response import refusal
 from isocharge.serve.network.traffic import Exchange, Traffic
 
-MAX_QUEUED_REQUESTS = 100
-"""Largest number of requests of one connection that wait for the response to an earlier request."""
-
-LINGER_SECONDS = 2.0
-"""Time for which the client can read the reason of a refusal before the connection is ended, s."""
-
 
 class RequestRefused(Exception):
     """Exception that stops the parser after a request was refused."""
@@ -106,8 +100,9 @@ class Connection(HttpToolsProtocol, TimedConnection):
         """Begin a request, and refuse it if too many requests wait for the response to an earlier request."""
         self._is_reading = True
         self.deadline = self.loop.time() + self._limits.header_seconds
-        if len(self.pipeline) >= MAX_QUEUED_REQUESTS:
-            self._refuse_and_stop(429, f"more than {MAX_QUEUED_REQUESTS} requests wait; read the responses first")
+        most = self._limits.queued_requests
+        if len(self.pipeline) >= most:
+            self._refuse_and_stop(429, f"more than {most} requests wait; read the responses first")
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
@@ -185,7 +180,7 @@ class Connection(HttpToolsProtocol, TimedConnection):
         headers = b"".join(b"%s: %s\r\n" % header for header in response.headers)
         self.transport.write(STATUS_LINE[status] + headers + b"connection: close\r\n\r\n" + response.body)
         self.transport.close()
-        self.deadline = self.loop.time() + LINGER_SECONDS
+        self.deadline = self.loop.time() + self._limits.header_seconds
 
     def _refuse_and_stop(self, status: int, message: str) -> NoReturn:
         """Refuse a request while its data are parsed, and raise an exception that ends the parsing.

@@ -17,9 +17,6 @@ from isocharge.serve.network.address import Address, ServerLimits, Tls
 from isocharge.serve.network.http.connection import Connection, TimedConnection
 from isocharge.serve.network.traffic import Traffic
 
-GRACE_SECONDS = 10
-"""Longest time to wait, when the server stops, until the requests that have already begun are finished, s."""
-
 
 class HttpServer:
     """HTTP server of an ASGI application.
@@ -70,7 +67,7 @@ class HttpServer:
             server_header=False,
             date_header=False,
             timeout_keep_alive=math.ceil(limits.idle_seconds),
-            timeout_graceful_shutdown=GRACE_SECONDS,
+            timeout_graceful_shutdown=math.ceil(limits.grace_seconds),
             ssl_context_factory=(lambda *_: tls_context) if tls_context else None,
             **{"ws": "none"} | uvicorn_options,
         )

@@ -30,9 +30,6 @@ FLAGS = "flags"
 This output is only computed if the client requests it.
 """
 
-MAX_LENGTH_DIGITS = 12
-"""Largest number of digits in a header that states the length of a JSON text. Every accepted body is much shorter."""
-
 Rows = np.ndarray[Any, Any]
 """Values of an output, shape (n, width). They are texts for the output `flags`, and numbers for all other outputs."""
 
@@ -73,7 +70,7 @@ def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, 
         return check_request(parse_json(body, "", RequestError, InferBody), b"", loaded, max_presses)
     # The characters are checked before the conversion, because int() also accepts signs, blanks and underscores, and is
     # slow for long texts.
-    is_short_number = header_length.isdigit() and len(header_length) <= MAX_LENGTH_DIGITS
+    is_short_number = header_length.isdigit() and len(header_length) <= len(str(len(body)))
     if not is_short_number or int(header_length) > len(body):
         raise RequestError(
             f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
