@@ -43,12 +43,6 @@ STUFFED_SHARE = 0.9
 COVERED_SHARE = 0.4
 """Smallest share of a stream that frames of one length must cover, dimensionless."""
 
-SINGLE_BYTE_PENALTY = 0.05
-"""Share by which frames that begin at a single byte must cover more of a stream than frames that begin at a pair.
-
-A pair of bytes rarely repeats by chance, but a single byte often does.
-"""
-
 MAX_FRAME_LENGTHS = 3
 """Number of frame lengths that are tried."""
 
@@ -186,8 +180,8 @@ def _synchronised_frames(stream: Bytes) -> Iterator[FrameDivision]:
 
     If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. Frames are
     therefore assumed to begin at every repetition of a byte or pair. The score of this assumption is the share of the
-    stream that these frames would cover. The score of a single byte is reduced by a penalty, because single bytes often
-    repeat by chance. For each frame length, the byte or pair with the highest score is chosen. The divisions with the
+    stream that these frames would cover. For each frame length, the byte or pair with the highest score is chosen. The
+    divisions with the
     `MAX_FRAME_LENGTHS` highest scores are yielded.
 
     Args:
@@ -199,11 +193,10 @@ def _synchronised_frames(stream: Bytes) -> Iterator[FrameDivision]:
     # For each length of a frame, the highest score so far, and the positions at which the frames begin
     best_score: dict[int, float] = {}
     best_starts: dict[int, NDArray[np.int64]] = {}
-    for codes, penalty in ((byte_pairs, 0.0), (single_bytes, SINGLE_BYTE_PENALTY)):
+    for codes in (byte_pairs, single_bytes):
         for length, frame_starts in _frequent_distances(codes):
-            covered_share = len(frame_starts) * length / len(stream)
-            score = covered_share - penalty
-            if covered_share > COVERED_SHARE and score > best_score.get(length, -np.inf):
+            score = len(frame_starts) * length / len(stream)
+            if score > best_score.get(length, COVERED_SHARE):
                 best_score[length] = score
                 best_starts[length] = frame_starts
 
@@ -253,9 +246,6 @@ def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray
             yield distance, positions[code_distance_pairs == pair]
 
 
-MIN_CHECKED_FRAMES = 6
-"""Smallest number of different frames from which a checksum is recognised."""
-
 MAX_CHECKED_FRAMES = 24
 """Largest number of different frames from which a checksum is recognised."""
 
@@ -285,13 +275,13 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
 
     The checksum is at the end of each frame. The checksum covers the other bytes of the frame. Constant bytes at the
     beginning, such as a sync pattern, need not be covered. For each size and byte order, at most one checksum is
-    yielded. If there are fewer than `MIN_CHECKED_FRAMES` different frames, no checksum is yielded.
+    yielded. If there are fewer than `MIN_FRAMES` different frames, no checksum is yielded.
 
     Args:
         rows: Bytes of the frames, shape (n, length).
     """
     checked_rows = _drawn_rows(rows)
-    if len(checked_rows) < MIN_CHECKED_FRAMES:
+    if len(checked_rows) < MIN_FRAMES:
         return
     frames = [row.tobytes() for row in checked_rows]
     _usual, is_constant = usual_bytes(checked_rows)  # `is_constant` has the shape (length,)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.common.arrays import Booleans
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import SEQ, Frame, Parser
 from isocharge.serve.frames.frame_field import PADDING, ByteOrder
@@ -17,6 +16,7 @@ from isocharge.serve.frames.frame_layout import SYNC
 from isocharge.serve.frames.text import Layout, TextParser
 from isocharge.serve.recognition.fields import Part, Weights, identify_clock, possible_parts, split_frame, steady_step
 from isocharge.serve.recognition.framing import (
+    COVERED_SHARE,
     MAX_EXAMINED_BYTES,
     MIN_FRAMES,
     ORDERS,
@@ -26,15 +26,6 @@ from isocharge.serve.recognition.framing import (
     possible_divisions,
     usual_bytes,
 )
-
-MAX_EXAMINED_FRAMES = 300
-"""Largest number of frames that are examined."""
-
-MAX_FRAME_STARTS = 24
-"""Largest number of constant bytes that are tried as the first byte of a frame."""
-
-MAX_SYNC_BYTES = 6
-"""Length of the longest sync pattern, bytes. Further bytes after the pattern may be constant only by chance."""
 
 WEIGHTS = Weights()
 """Weights that were fitted to random boards."""
@@ -71,22 +62,6 @@ def described_frames_section(
     return None
 
 
-def _sync_lengths(may_be_sync: Booleans, start: int) -> Sequence[int]:
-    """Return the possible lengths of the sync pattern with which a frame begins, in bytes.
-
-    A window is a sequence of bytes with the length of a frame. The frame begins at any byte of the window, and
-    continues at the beginning of the window after the last byte.
-
-    Args:
-        may_be_sync: Whether each byte of a window may belong to a sync pattern, shape (length,).
-        start: Position of the first byte of the frame in the window.
-    """
-    may_be_sync_from_start = np.roll(may_be_sync, -start)[:MAX_SYNC_BYTES]
-    # The position of the first False is the number of possible sync bytes at the beginning of the frame.
-    max_length = int(np.argmin([*may_be_sync_from_start, False]))
-    return range(1, max_length + 1)
-
-
 def _scored_sections(
     division: FrameDivision, seconds: float, weights: Weights
 ) -> Iterator[tuple[float, dict[str, Any]]]:
@@ -104,7 +79,7 @@ def _scored_sections(
         weights: Contributions to the score.
     """
     length = division.length
-    rows = division.rows()[:MAX_EXAMINED_FRAMES]  # each row contains a window and the bytes of the next window
+    rows = division.rows()  # each row contains a window and the bytes of the next window
     if len(rows) < MIN_FRAMES - 1:  # the last window has no row, because no window follows it
         return
 
@@ -115,7 +90,7 @@ def _scored_sections(
     may_be_sync = is_constant & (usual != 0)  # shape (length,); zeros are mostly the high bytes of numbers
     starts = [0]
     if has_sync:
-        starts = np.flatnonzero(may_be_sync)[:MAX_FRAME_STARTS].tolist()
+        starts = np.flatnonzero(may_be_sync).tolist()
 
     # Find the possible pairs of a first byte and a checksum.
     starts_and_checks = [(start, check) for start in starts for check in find_checks(rows[:, start : start + length])]
@@ -132,7 +107,9 @@ def _scored_sections(
         for start, check in starts_and_checks:
             parts_from_start = parts_in_window[start:] + parts_in_window[:start]  # from the first byte of the frame
             parts_before_check = parts_from_start[: length - check.size]
-            sync_lengths = _sync_lengths(may_be_sync, start) if has_sync else [0]
+            # The sync pattern has at most as many bytes as there are possible sync bytes from its beginning on.
+            max_sync_length = int(np.argmin([*np.roll(may_be_sync, -start), False]))
+            sync_lengths = range(1, max_sync_length + 1) if has_sync else [0]
             score, sync_length, parts = split_frame(parts_before_check, sync_lengths, weights)
             has_channel = any(part.role == "channel" for part in parts)
             if has_channel:
@@ -175,35 +152,21 @@ def _field_tables(parts: Sequence[Part]) -> list[dict[str, Any]]:
     can describe only one counter and one clock. Adjacent padding is joined.
     """
     fields: list[dict[str, Any]] = []
-    roles: list[str] = []
+    channel_count = 0
+    roles = set()
     for part in parts:
-        roles.append(part.role)
-        role_count = roles.count(part.role)  # number of parts with this role so far, including this part
-        is_first_counter_or_clock = part.role in ("seq", "clock") and role_count == 1
         if part.role == "channel":
-            fields.append({"name": f"ch{role_count}", "type": part.type_name})
-        elif is_first_counter_or_clock:
-            field: dict[str, Any] = {"name": part.name, "type": part.type_name}
-            if part.scale != 1.0:  # 1 is the default value of the key
-                field["scale"] = part.scale
-            fields.append(field)
-        elif fields and fields[-1]["type"] == PADDING:  # the part becomes padding and extends the padding before it
-            previous_padding = fields[-1]
-            previous_count = previous_padding.get("count", 1)  # padding without a count is one byte
-            previous_padding["count"] = previous_count + part.size
-        else:  # the part becomes a new field of padding
-            padding: dict[str, Any] = {"type": PADDING}
-            if part.size > 1:
-                padding["count"] = part.size
-            fields.append(padding)
+            channel_count += 1
+            fields.append({"name": f"ch{channel_count}", "type": part.type_name})
+        elif part.role != "pad" and part.role not in roles:
+            roles.add(part.role)
+            scale = {} if part.scale == 1.0 else {"scale": part.scale}  # 1 is the default value of the key
+            fields.append({"name": part.name, "type": part.type_name} | scale)
+        elif fields and fields[-1]["type"] == PADDING:
+            fields[-1]["count"] = fields[-1].get("count", 1) + part.size  # padding without a count is one byte
+        else:
+            fields.append({"type": PADDING} | ({} if part.size == 1 else {"count": part.size}))
     return fields
-
-
-CLEAR_SHARE = 0.4
-"""Smallest share of the bytes that must lie in intact frames if no other format is to be tried.
-
-The share is much less than 1, because the other bytes may be echoes of requests.
-"""
 
 
 TEXT_SHARE = 0.95
@@ -232,7 +195,7 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
         The section as a dictionary; None if no format is recognised.
     """
     binary_frames, binary_share = _parse_all(BinaryParser(), chunks)
-    if len(binary_frames) >= MIN_FRAMES and binary_share > CLEAR_SHARE:
+    if len(binary_frames) >= MIN_FRAMES and binary_share > COVERED_SHARE:
         return {"format": "binary"}
 
     text_section = None
@@ -244,7 +207,7 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     if text_parser.layout is not None and len(text_frames) >= MIN_FRAMES:
         frame_rate_Hz = len(text_frames) / seconds
         text_section = {"format": "text"} | _text_keys(text_parser.layout, text_frames, frame_rate_Hz)
-        if text_share >= CLEAR_SHARE:
+        if text_share >= COVERED_SHARE:
             return text_section
     if is_text(chunks):
         return text_section

@@ -12,14 +12,14 @@ from isocharge.cli.shared.options import DeviceOption, StressLimitOption, worker
 from isocharge.cli.shared.port_hints import no_frames_advice_added
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.probe_option import ProbeOption
-from isocharge.cli.shared.terminal import say, show_json
+from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue
 from isocharge.cli.train.press_events import PressEvents
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError, PressError, error_prefix
 from isocharge.serve import ReadingStream, load_device, open_source
-from isocharge.serve.live.steady_press import PressWatch, SteadyPress
-from isocharge.serve.presses.measured_presses import CONTACT, read_press_list
+from isocharge.serve.live.steady_press import PressWatch
+from isocharge.serve.presses.measured_presses import read_press_list
 from isocharge.serve.signal_chain.thermal import ThermalRule
 from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.train import CalibrationProblem, read_earlier
@@ -92,9 +92,6 @@ def press_command(
         bool,
         typer.Option("--fresh", help="Delete the presses in the output file, and begin again. (default: continue)"),
     ] = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object for each press on stdout. (default: none)")
-    ] = False,
 ) -> None:
     """Record presses on a film at a port, and write them to a file of measured presses.
 
@@ -122,12 +119,6 @@ def press_command(
     if board.rule(ThermalRule) is not None:
         say(f"{device}: [common_mode] is not used for these presses, because it needs a model of the film")
 
-    def on_taken(session: PressSession, press: SteadyPress) -> None:
-        """Print one line of JSON with the last press and, for a person, the proposed press."""
-        if json:
-            is_last = contacts is not None or session.enough
-            show_json(_press_table(session, press) | {"next": None if is_last else vars(session.proposed)})
-
     stds = {"position_std_mm": position_std_mm, "force_std": force_std}
     with (
         open_press_file(output, problem.sensor, problem.probe, fresh=fresh) as press_file,
@@ -149,7 +140,7 @@ def press_command(
                 open_source(port, baud=baud, reconnect=contacts is None, request=board.request) as source,
                 PressEvents(source, stream, PressWatch(problem.electrodes), keyboard) as events,
             ):
-                dialogue = Dialogue(session, events, problem.electrodes, on_taken)
+                dialogue = Dialogue(session, events, problem.electrodes)
                 if contacts is None:
                     dialogue.guide_person(asks=asks_person)
                 else:
@@ -179,29 +170,3 @@ def _keyboard_descriptor() -> int:
             "expected a standard input for the answers about presses, got none; give --yes for presses that are made "
             "where they are proposed, or --press-list FILE for the presses of a machine"
         ) from error
-
-
-def _press_table(session: PressSession, press: SteadyPress) -> dict[str, object]:
-    """Return the values to print as one line of JSON about the last press.
-
-    Some of the values state how accurately the film is known after this press.
-
-    Args:
-        session: The session, which contains the press.
-        press: The steady press, with its charges, duration and flags.
-    """
-    electrodes = session.presses.electrodes
-    result = session.result
-    return {
-        "press": len(session),
-        **dict(zip(CONTACT, session.presses.contact[-1].tolist(), strict=True)),
-        "charge_pC": dict(zip(electrodes, press.charge_pC.tolist(), strict=True)),
-        "scatter_pC": dict(zip(electrodes, press.scatter_pC.tolist(), strict=True)),
-        "held_s": press.held_s,
-        "frames": press.frames,
-        "flags": list(press.flags),
-        "error_left": None if result is None else vars(result.film_error),
-        "left_out": [] if result is None else list(result.bad_lines),
-        "problem": session.refusal or None,
-        "enough": session.enough,
-    }

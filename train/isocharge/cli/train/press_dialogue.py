@@ -4,7 +4,7 @@ If a machine makes the presses of a list, nothing is proposed or asked, and the 
 list.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -30,28 +30,21 @@ QUESTION = '   Was it there, and as hard? Enter: yes; or type "x y force" (? is 
 
 KEYS = "   (type s to skip this place, u to undo the last press, q to quit)"
 
-OnTaken = Callable[[PressSession, SteadyPress], None]
-"""Function that is called after the session has recorded a press. Its arguments are the session and the press."""
-
 
 class Dialogue:
     """Dialogue of one session, from the first press to the last. Its messages are sentences on stderr."""
 
-    def __init__(
-        self, session: PressSession, events: PressEvents, electrodes: Sequence[str], on_taken: OnTaken
-    ) -> None:
+    def __init__(self, session: PressSession, events: PressEvents, electrodes: Sequence[str]) -> None:
         """Set up the dialogue.
 
         Args:
             session: Session that proposes and records presses.
             events: Readings of the port, and lines of the keyboard.
             electrodes: Names of the electrodes, in the order of the charges.
-            on_taken: Function that is called after each press that the session has recorded.
         """
         self._session = session
         self._events = events
         self._electrodes = electrodes
-        self._on_taken = on_taken
         self._said_phase = ""  # the instruction that was printed last, unless a sentence followed
 
     def _say(self, sentence: str) -> None:
@@ -251,7 +244,6 @@ class Dialogue:
         except PressError as error:
             self._say(f"   {error}")
             return False
-        self._on_taken(self._session, press)
         self._say_summary()
         return True
 
