@@ -17,7 +17,7 @@ from isocharge.serve.examination.press_detector import estimate_noise
 from isocharge.serve.frames.binary import FORMAT as BINARY
 from isocharge.serve.live.device import device_from_table
 from isocharge.serve.recognition.recognise import recognise
-from isocharge.serve.signal_chain.channels import Channels, electrode_of, stated_unit
+from isocharge.serve.signal_chain.channels import Channels, stated_unit
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.tare import TareRule
 
@@ -135,9 +135,7 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
     names = capture.names
     candidates = _varying_channels(values)
     if not electrodes:
-        # Without a model, use the names in the channels if they are single letters. Otherwise use A, B, C, ...
-        letters = tuple(electrode_of(names[position]).upper() for position in candidates)
-        electrodes = letters if set(letters) <= set(ELECTRODES) else tuple(ELECTRODES[: len(letters)])
+        electrodes = tuple(ELECTRODES[: len(candidates)])  # A, B, C, ...
     try:
         # A unit in the names does not matter, because the gain is requested if it is missing.
         named_positions = Channels(Setup(electrodes), any_unit=True).named_indices(capture.frames[-1])

@@ -12,27 +12,17 @@ from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, Frame
 from isocharge.serve.signal_chain.gain import GainRule
 from isocharge.serve.signal_chain.stage import Setup, Stage
 
-MAX_CHANNEL_DIGITS = 4
-"""Largest number of digits in a text that is recognised as the number of a channel."""
-
-_UNITS = "|".join(["pC", *OTHER_CHARGE_UNITS])
-
-_UNIT = re.compile(rf"(?:[_\s]({_UNITS})|\s*[\[(]\s*({_UNITS})\s*[\])])$")
-"""Unit at the end of the name of a channel, such as `_nC` or `[nC]`."""
-
-_NUMBERED = re.compile(rf"(\D*)(\d{{1,{MAX_CHANNEL_DIGITS}}})(\D*)", re.ASCII)
-"""Name of a channel that contains one number, such as `ch2` or `adc0_raw`."""
+_CHANNEL_NUMBER = re.compile(r"(?:ch)?([1-9][0-9]{0,3})")
+"""Number of a channel, such as `2` or `ch2`."""
 
 
 class Channels(Stage):
     """Selects the values in a frame that belong to the electrodes.
 
     The section `[channels]` of the device file states the name or the number of the channel of each electrode. If the
-    device file has no section `[channels]`, a channel belongs to the electrode with the same name. The name of a
-    channel may have a unit, as in `A_pC`, may contain further words, as in `charge.A` or `A_raw`, and may differ by
-    case. If no channel has the name of an electrode, or nearly so, the channels are assigned by their order, or by
-    their numbers if the names differ only by a number, as `ch0` and `ch1` do: the first channel belongs to the first
-    electrode, and so on. An assignment by order requires as many channels as electrodes.
+    device file has no section `[channels]`, a channel belongs to the electrode whose name is among the words of the
+    channel's name, as in `A_pC`, `charge.A` or `electrode a`. If no channel has the name of an electrode, the channels
+    are assigned by their order, which requires as many channels as electrodes.
     """
 
     is_required = True
@@ -88,26 +78,30 @@ class Channels(Stage):
             return indices
         if len(frame.values) != len(self._electrodes):
             raise self._assignment_error(frame)
-        return _order_of_channels(channel_names(frame))
+        return tuple(range(len(self._electrodes)))
 
     def named_indices(self, frame: Frame) -> tuple[int, ...] | None:
         """Return, for each electrode, the index of the channel with its name in `frame.values`.
 
-        The result is None if no channel has the name of an electrode, or nearly so.
+        The result is None if no channel has the name of an electrode.
 
         Raises:
-            ChargeError: If the names of the channels are those of some electrodes only, or nearly those of electrodes,
-                or if they state a unit other than pC and the gain is not known.
+            ChargeError: If not exactly one channel has the name of each electrode, or if a channel states a unit other
+                than pC and the gain is not known.
         """
         names = frame.names
         if not names:
             return None
         advice = [] if self._allows_any_unit else _unit_advice(names)
-        indices = [_channels_of_electrode(electrode, names) for electrode in self._electrodes]
+        words = [set(_words_of(name.casefold())) for name in names]
+        indices = [
+            [index for index, channel_words in enumerate(words) if channel_words.issuperset(electrode_words)]
+            for electrode_words in (_words_of(electrode.casefold()) for electrode in self._electrodes)
+        ]
         if all(len(indices_of_electrode) == 1 for indices_of_electrode in indices) and not advice:
             return tuple(indices_of_electrode[0] for indices_of_electrode in indices)
 
-        # Names of which some are those of electrodes, or nearly so, must not be assigned by their order.
+        # Names of which some are those of electrodes must not be assigned by their order.
         if any(indices) or advice:
             raise self._assignment_error(frame, advice)
         return None
@@ -165,82 +159,24 @@ def channel_index(name: str, frame: Frame) -> int | None:
     """
     if name in frame.names:
         return frame.names.index(name)
-    number = channel_number(name)
-    if number is None or number > len(frame.values):
+    match = _CHANNEL_NUMBER.fullmatch(name)
+    if match is None or int(match[1]) > len(frame.values):
         return None
-    return number - 1  # indices begin with 0
+    return int(match[1]) - 1  # indices begin with 0
 
 
-def channel_number(name: str) -> int | None:
-    """Return the channel number in a name such as `2` or `ch2`.
-
-    The channels are counted from 1. The function returns None for the number 0, for a number of more than
-    `MAX_CHANNEL_DIGITS` digits, and for a name of any other form.
-    """
-    digits = name.removeprefix("ch")
-    is_number = digits.isascii() and digits.isdigit() and len(digits) <= MAX_CHANNEL_DIGITS
-    if is_number and int(digits) > 0:
-        return int(digits)
-    return None
-
-
-def _channels_of_electrode(electrode: str, names: tuple[str, ...]) -> list[int]:
-    """Return the indices of the channels whose name is that of an electrode.
-
-    Case matters only if both cases occur. Further words in the names of the channels are ignored only if no channel has
-    the name of the electrode without them.
-
-    Args:
-        electrode: Name of the electrode.
-        names: Names of the channels.
-    """
-    electrodes = [electrode_of(name) for name in names]
-    equal = [index for index, name in enumerate(electrodes) if name == electrode]
-    equal = equal or [index for index, name in enumerate(electrodes) if name.casefold() == electrode.casefold()]
-    required_words = _words_of(electrode)
-    if equal or not required_words:
-        return equal
-    return [index for index, name in enumerate(names) if required_words <= _words_of(name)]
-
-
-def _words_of(text: str) -> set[str]:
-    """Return the words of a text in lower case. All characters except letters and digits separate words."""
-    return {word for word in re.split(r"[\W_]+", text.casefold()) if word}
-
-
-def _order_of_channels(names: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the indices of channels by the numbers in their names, or in their order if there are no such numbers.
-
-    The numbers are used only if the names differ by nothing else.
-
-    Args:
-        names: Names of the channels.
-    """
-    indices = range(len(names))
-    matches = [match for name in names if (match := _NUMBERED.fullmatch(name)) is not None]
-    texts_around_number = {(match[1], match[3]) for match in matches}
-    if len(matches) < len(names) or len(texts_around_number) != 1:
-        return tuple(indices)
-    return tuple(sorted(indices, key=lambda index: int(matches[index][2])))
-
-
-def electrode_of(name: str) -> str:
-    """Extract the name of the electrode from the name of a channel.
-
-    For example, the function returns `A` if the channel is called `A`, `A_pC`, `A [nC]`, `charge.A` or
-    `charge_raw_pC.A`.
-    """
-    _, _, last_part = name.rpartition(".")
-    return _UNIT.sub("", last_part)
+def _words_of(text: str) -> list[str]:
+    """Return the words of a text. All characters except letters and digits separate words."""
+    return [word for word in re.split(r"[\W_]+", text) if word]
 
 
 def stated_unit(name: str) -> str:
-    """Return the unit in the name of a channel, such as nC for `A_nC`; empty if the name states no unit.
+    """Return the unit at the end of the name of a channel, such as nC for `A_nC`; empty if the name states no unit.
 
-    A final `_C` is no unit, because C may be the name of an electrode.
+    A final `C` is no unit, because C may be the name of an electrode.
     """
-    match = _UNIT.search(name)
-    return (match[1] or match[2]) if match is not None and match[1] != "C" else ""
+    *other_words, last_word = _words_of(name) or [""]
+    return last_word if other_words and last_word in {"pC", *OTHER_CHARGE_UNITS} - {"C"} else ""
 
 
 def _unit_advice(names: tuple[str, ...]) -> list[str]:
