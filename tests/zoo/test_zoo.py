@@ -130,7 +130,7 @@ ZOO = {
     "Arduino plotter": Kind(arduino_plotter),
     "a board that is asked": Kind(answer, model=THREE, request=Request(b"?\n", 300.0)),
     "Modbus": Kind(modbus_reply, {"pC_per_unit": 0.0625}),
-    "volts": Kind(volts, {"V_per_unit": -1.0, "feedback_pF": 1000.0}),
+    "volts": Kind(volts, {"pC_per_unit": -1000.0}),
     "structs over UDP": Kind(bare_struct, url="udp://127.0.0.1:9"),
     "JSON over UDP": Kind(other_names, url="udp://127.0.0.1:9"),
     "SLIP": Kind(stuffed_by_slip, model=THREE),

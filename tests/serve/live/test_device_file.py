@@ -21,7 +21,7 @@ from isocharge.serve.frames.frame_layout import SyncParser
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.signal_chain.channels import Channels
-from isocharge.serve.signal_chain.gain import Gain, GainRule
+from isocharge.serve.signal_chain.gain import Gain
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.inflow import LeakSection
 from isocharge.serve.signal_chain.leak import Leak
@@ -112,13 +112,6 @@ def test_offset_is_subtracted_before_the_gain(device):
         np.testing.assert_array_equal(converted(board, np.array(zero) + 10.0), [5.0, -5.0, 10.0])
 
 
-def test_volts_on_a_feedback_capacitance(device):
-    """A voltage of 1 V on a capacitance of 1 nF is a charge of 1 nC."""
-    text = "[gain]\nV_per_unit = -0.001\noffset = 1650\nfeedback_pF = {A = 1000, B = 1000, C = 500}\n"
-    np.testing.assert_allclose(converted(device(text), np.full(3, 1651.0)), [-1.0, -1.0, -0.5])
-    assert device(text).rule(GainRule).charge_pC("C", np.array([1651.0])) == pytest.approx(-0.5)
-
-
 def test_device_file_with_a_request(device):
     assert device("[frames]\n").request is None
     request = device('[frames]\nrequest = "3F 0A"\nrequest_Hz = 50\n').request
@@ -130,11 +123,7 @@ def test_device_file_with_a_request(device):
 WRONG = [
     ('[frames]\nrequest = "hello"\n', r"frames\.request: expected bytes in hexadecimal, as in '20 4E', got 'hello'"),
     ('[frames]\nrequest = "3F"\nrequest_Hz = 0\n', r"frames\.request_Hz: expected a number above 0"),
-    ("[gain]\noffset = 1\n", r"gain\.pC_per_unit: expected .*, or V_per_unit and feedback_pF .*, got \['offset'\]"),
-    ("[gain]\nV_per_unit = 1.0\n", "key 'gain.feedback_pF' is missing"),
-    ("[gain]\nV_per_unit = 1.0\nfeedback_pF = 0\n", r"gain\.feedback_pF: expected a positive number or a table, got 0"),
-    ("[gain]\nV_per_unit = 1.0\npC_per_unit = 1.0\n", r"gain\.V_per_unit: expected either pC_per_unit, or"),
-    ("[gain]\nfeedback_pF = 1.0\npC_per_unit = 1.0\n", r"gain\.feedback_pF: expected no capacitance beside"),
+    ("[gain]\noffset = 1\n", "key 'gain.pC_per_unit' is missing"),
     ("[gane]\n", r"unknown key 'gane'; did you mean 'gain'\? Known are name, front_end, frames, channels, gain"),
     ("[tare]\nframe = 50\n", r"unknown key 'tare.frame'; did you mean 'frames'\? Known are on, frames, noise_limit_pC"),
     ("[tare]\nframes = 50.5\n", r"tare\.frames: expected a whole number from 0 to 1000000000, got 50\.5"),
@@ -146,7 +135,6 @@ WRONG = [
     ("[hum]\nsettle_s = 0\n", r"hum\.settle_s: expected a number from 0\.001 to 1"),
     ("[leak]\ntau_s = 1.0\nrelax_s = 1e-300\n", r"leak\.relax_s: expected a number from 0\.001 to 1"),
     ("[common_mode]\nblind_pC = 1e300\n", r"common_mode\.blind_pC: expected a number from 0 to 1"),
-    ("[gain]\n", r"gain\.pC_per_unit: expected .*, or V_per_unit and feedback_pF .*, got \[\]"),
     (
         "[gain]\npC_per_unit = 0\n",
         r"gain\.pC_per_unit: expected a finite number that is not 0, or one for each electrode, got 0",

@@ -13,9 +13,7 @@
 
     [gain]                         # optional; each setting is a number, or a number for each electrode
     offset = 8388608               # value of the board without charge, in its unit; optional
-    pC_per_unit = {A = 0.0457, B = -0.0459, C = 0.0457}     # negative where the amplifier inverts; or
-    # V_per_unit = 0.000045        # with the amplifier's feedback capacitance:
-    # feedback_pF = 1000.0
+    pC_per_unit = {A = 0.0457, B = -0.0459, C = 0.0457}     # negative where the amplifier inverts
 
     [saturation]
     limit_pC = 1500.0
