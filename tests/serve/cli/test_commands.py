@@ -195,12 +195,11 @@ def test_stream_that_waits_for_its_port_can_be_stopped(models, tmp_path, run, st
 
 def test_stream_keeps_the_policy_the_name_and_the_limit_of_the_tare(board, models, tmp_path, run):
     """And a replay takes them from the recording."""
-    path, words = tmp_path / "touch.rec", ["--policy", "latest", "--name", "left, \u00fc", "--offset-limit-pc", 90]
+    path, words = tmp_path / "touch.rec", ["--policy", "latest", "--name", "left, \u00fc"]
     streamed = run("stream", "linear", "--port", board.url, "--record", path, "--count", 30, "--models", models, *words)
     records = records_of(streamed.stdout)
     assert max(b["seq"] - a["seq"] for a, b in pairwise(records)) > 1
     assert {record["frame_id"] for record in records} == {"left, \u00fc"}
-    assert '"offset_limit_pC": 90' in path.read_text().splitlines()[0]
     began = time.monotonic()
     assert run("replay", path, "--real-time", "--models", models).stdout == streamed.stdout
     assert time.monotonic() - began > 0.2  # 30 chunks of 10 ms

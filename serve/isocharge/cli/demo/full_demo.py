@@ -164,21 +164,23 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
         all_records = (record for chunk in port for record in touch.feed(chunk))
         records = islice(all_records, frame_count)
         for frame_number, record in enumerate(track(records, "following", frame_count), start=1):
-            truth = sensor.truth(record.seq or 0)  # the press that the virtual sensor played in this frame
-            true_contact = (truth.x_mm, truth.y_mm, truth.force_N)
+            # The script that the virtual sensor repeats contains the true press of this frame.
+            row = round(1e-6 * (record.t_device_us or 0) * RATE_HZ) % len(sensor.script)
+            true_force_N = float(sensor.script.force_N[row])
+            true_contact = (float(sensor.script.x_mm[row]), float(sensor.script.y_mm[row]), true_force_N)
             contact = _contact_of(record)
 
             # A press lasts as long as both the virtual sensor and the model have a contact. A new press has a new
             # number.
             was_pressed = is_pressed
-            is_pressed = record.contact and truth.force_N > 0.0
+            is_pressed = record.contact and true_force_N > 0.0
             if is_pressed and not was_pressed:
                 press_number += 1
             if is_pressed:
                 followed.append(FollowedFrame(press_number, *true_contact, *contact))
             if frame_number % print_interval == 0:
                 estimated_columns = _contact_columns(record.contact, contact)
-                true_columns = _contact_columns(truth.force_N > 0.0, true_contact)
+                true_columns = _contact_columns(true_force_N > 0.0, true_contact)
                 say(f"   {estimated_columns}     {true_columns}")
     return np.array(followed), touch.totals()
 

@@ -115,14 +115,6 @@ def stream_command(
     baud: Annotated[
         int, typer.Option("--baud", min=1, help="Speed of the port, bits per second; USB ports ignore it.")
     ] = 115200,
-    offset_limit_pC: Annotated[
-        float | None,
-        typer.Option(
-            "--offset-limit-pc",
-            min=0.0,
-            help="Largest charge at rest that the tare accepts, pC. (default: 100, or as --device says)",
-        ),
-    ] = None,
     track: Annotated[
         bool,
         typer.Option(
@@ -162,8 +154,6 @@ def stream_command(
     # The options take precedence over the settings of the device file.
     predictor = Predictor(model, models=models)
     board = load_device(device)
-    if offset_limit_pC is not None:
-        board = with_settings(board, "tare", offset_limit_pC=offset_limit_pC)
     if track:
         board = with_settings(board, "track", on=True)
     if follow:

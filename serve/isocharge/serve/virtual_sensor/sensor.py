@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 
@@ -52,28 +52,13 @@ MAX_RANDOM_OFFSET_pC = 20.0
 """Largest absolute value of a random constant charge, pC."""
 
 
-class Truth(NamedTuple):
-    """The true press in one frame.
-
-    Attributes:
-        x_mm: Position, mm; NaN if nothing touches.
-        y_mm: Position, mm; NaN if nothing touches.
-        force_N: Force, N; 0 if nothing touches.
-        sent_s: Time at which the frame was written, on the clock `time.perf_counter`, s.
-    """
-
-    x_mm: float
-    y_mm: float
-    force_N: float
-    sent_s: float
-
-
 class VirtualSensor:
     """Context manager that plays a script repeatedly while the context is active.
 
     Readers may open and close the port at any time. Entering the context resets the counters.
 
     Attributes:
+        script: The presses that are played.
         port_path: Path of the pseudo-terminal that was opened first.
         withheld: Number of frames that were discarded because they did not fit into the buffer of the port.
         lost: Number of frames that were not sent because of a fault.
@@ -116,7 +101,7 @@ class VirtualSensor:
             SceneError: If the forward map returns charges of another shape, or charges that are not finite.
         """
         self._rng = np.random.default_rng(seed)
-        self._script = script
+        self.script = script
         self._noise = noise
         self._encode = encode
         self._faults = faults or Faults()
@@ -134,7 +119,6 @@ class VirtualSensor:
         self.paused_s = 0.0
         self._frame_count = 0
         self._first_frame_of_script = 0  # number of the frame with which the script began
-        self._sent_s = np.full(SEQ_MODULUS, np.nan)  # times at which the latest frames were sent, as a ring
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
         self._port: PseudoPort | None = None
@@ -182,10 +166,10 @@ class VirtualSensor:
         self.lost = 0
         self.corrupted = 0
         self._first_frame_of_script = 0
-        block_size = max(1, round(BLOCK_S * self._script.rate_Hz))
+        block_size = max(1, round(BLOCK_S * self.script.rate_Hz))
         for first_frame_of_block in itertools.count(step=block_size):
             if self._next_script is not None:
-                self._script, self._clean_pC = self._next_script
+                self.script, self._clean_pC = self._next_script
                 self._next_script = None
                 self._first_frame_of_script = first_frame_of_block
             first_row = first_frame_of_block - self._first_frame_of_script
@@ -218,7 +202,7 @@ class VirtualSensor:
             The bytes that the sensor sends; empty if the frame is lost because of a fault.
         """
         faults = self._faults
-        time_s = frame_number / self._script.rate_Hz
+        time_s = frame_number / self.script.rate_Hz
         is_lost = faults.is_unplugged(time_s)
         # A random number is drawn only if random frames are to be lost. Otherwise, it would change the noise that
         # belongs to the seed.
@@ -235,29 +219,6 @@ class VirtualSensor:
         if damaged_data != data:
             self.corrupted += 1
         return damaged_data
-
-    def truth(self, seq: int) -> Truth:
-        """Return the true press in the latest frame of the present script that has the given frame counter.
-
-        Args:
-            seq: The frame counter: number of the frame since the start, modulo `SEQ_MODULUS`.
-
-        Raises:
-            SceneError: If no frame with this counter has been played.
-        """
-        # Several frames may have this counter, because the counter wraps. Find the latest of these frames.
-        latest_number = self._frame_count - 1
-        frame_number = latest_number - (latest_number - seq) % SEQ_MODULUS
-        if frame_number < 0 or not 0 <= seq < SEQ_MODULUS:
-            raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest_number, SEQ_MODULUS - 1)}")
-        script = self._script
-        row = (frame_number - self._first_frame_of_script) % len(script)  # the script is repeated without end
-        return Truth(
-            x_mm=float(script.x_mm[row]),
-            y_mm=float(script.y_mm[row]),
-            force_N=float(script.force_N[row]),
-            sent_s=float(self._sent_s[frame_number % SEQ_MODULUS]),
-        )
 
     def __enter__(self) -> Self:
         """Reset the counters, open the port, and start the thread that writes the frames.
@@ -297,7 +258,7 @@ class VirtualSensor:
         """
         start_s = time.perf_counter()
         for frame_number, data in enumerate(self.frames()):
-            due_s = start_s + self.paused_s + frame_number / self._script.rate_Hz
+            due_s = start_s + self.paused_s + frame_number / self.script.rate_Hz
             is_stopped = self._stop.wait(max(0.0, due_s - time.perf_counter()))
             if is_stopped:
                 return
@@ -305,10 +266,7 @@ class VirtualSensor:
             if lateness_s > MAX_LATENESS_S:
                 self.paused_s += lateness_s
 
-            # Count the frame before it is written, because a reader may ask for its truth as soon as it has the frame.
-            self._sent_s[frame_number % SEQ_MODULUS] = time.perf_counter()
             self._frame_count = frame_number + 1
-
             self._plug_or_unplug(frame_number)
             if self._port is not None and data:  # otherwise the frame is discarded because of a fault
                 self._port.discard_received()
@@ -321,7 +279,7 @@ class VirtualSensor:
         Args:
             frame_number: Number of the frame that is due, which determines whether there is an outage.
         """
-        if self._faults.is_unplugged(frame_number / self._script.rate_Hz):
+        if self._faults.is_unplugged(frame_number / self.script.rate_Hz):
             self._close_port()
         elif self._port is None:
             self._open_port()
