@@ -21,14 +21,12 @@ INSIDE = presses(20_000, 0.0, 10.0)
 OUTSIDE = presses(16_000, 10.0, 40.0)
 
 
-def test_the_presses_of_both_groups_have_the_same_density():
+def test_presses_for_training_and_for_measuring_are_different_presses_beyond_the_area():
     """The network has a smaller working area than the dataset. The presses beyond it are outside, too."""
     found = OutsidePresses.of(Domain(5.0, FORCES_N), INSIDE, OUTSIDE)
-    assert len(found.train) == pytest.approx(0.5 * len(OUTSIDE) * (40.0**2 - 5.0**2) / (40.0**2 - 10.0**2), rel=0.01)
     for part in (found.train, found.test):
-        assert part.distance.min() > 5.0
-        share = np.mean(part.distance < 10.0)
-        assert share == pytest.approx((10.0**2 - 5.0**2) / (40.0**2 - 5.0**2), abs=0.01)
+        assert 5.0 < part.distance.min() < 5.1
+        assert part.distance.max() > 39.5
     assert found.test.contact[:, 2].min() >= 0.2
     places = {tuple(contact) for contact in found.train.contact}
     assert not places & {tuple(contact) for contact in found.test.contact}
@@ -52,8 +50,7 @@ def test_unnoticed_shares_are_those_of_the_places():
     )
 
 
-def test_a_narrow_ring_or_few_presses_leave_no_presses_outside():
+def test_few_presses_leave_no_presses_outside():
     assert OutsidePresses.of(Domain(10.0, FORCES_N), INSIDE) is None
-    assert OutsidePresses.of(Domain(39.5, FORCES_N), INSIDE, presses(16_000, 39.5, 40.0)) is None
     for count in (1, 10):
         assert OutsidePresses.of(Domain(10.0, FORCES_N), INSIDE, OUTSIDE[:count]) is None

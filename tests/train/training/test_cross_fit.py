@@ -331,17 +331,13 @@ FAULTY_PRESSES = {
     ),
     "a position in another unit": (with_contact(0, in_eighth_press(1e6, 0)), r"^line 9, column 'x_mm': .* got 1e\+06"),
     "a force of 1e20": (with_contact(2, in_eighth_press(1e20, 2)), r"^line 9, column 'force_N': .* got 1e\+20"),
-    "denormal charges": (
-        with_channel(1, lambda charge: 1e-310 * charge[:, 1]),
-        "channel 'Q2': expected charges in pC, of 1e-30 to 1e.30, got .*e-310 as the median .* check the unit",
-    ),
     "a constant channel": (
         with_channel(2, lambda charge: 0.0 * charge[:, 2]),
-        "channel 'Q3': expected charges that vary, got 0 everywhere; leave the channel out",
+        "channel 'Q3': expected charges that vary, got 0 in all but 0 of 1200 presses; leave the channel out",
     ),
     "a channel that is constant but for rounding": (
         with_channel(2, lambda charge: 5.0 + 1e-12 * charge[:, 2]),
-        "channel 'Q3': expected charges that vary, got 5 everywhere",
+        "channel 'Q3': expected charges that vary, got 5 in all but 0 of 1200",
     ),
     "a channel with a single charge": (
         with_channel(2, lambda _: np.where(np.arange(1_200) == 7, 5.0, 0.0)),

@@ -15,9 +15,6 @@ from isocharge.serve.model.metadata import UnnoticedPresses
 from isocharge.simulate import Domain
 from isocharge.train.data.presses import LabelledPresses
 
-MIN_WIDTH = 1.0
-"""Smallest width of the ring between the working area and the outermost press, mm. A narrower ring is ignored."""
-
 FORCE_RATIO = 10.0
 """Largest ratio of the largest to the smallest force of the presses on which shares are measured, dimensionless."""
 
@@ -33,13 +30,10 @@ N_NEIGHBOURS = 8
 SHARE_DECIMALS = 2
 """Number of decimals to which the measured shares of presses are rounded."""
 
-SEED = 5
-"""Seed of the random choice of the presses for training and of the presses for measuring."""
-
 
 @dataclass(frozen=True)
 class OutsidePresses:
-    """Presses between the working area of a network and the clamp, with the same density everywhere.
+    """Presses between the working area of a network and the clamp.
 
     Attributes:
         domain: Working area and range of forces of the network.
@@ -56,7 +50,7 @@ class OutsidePresses:
 
     @classmethod
     def of(
-        cls, domain: Domain, presses: LabelledPresses, outside: LabelledPresses | None = None
+        cls, domain: Domain, presses: LabelledPresses, outside: LabelledPresses | None = None, seed: int = 0
     ) -> "OutsidePresses | None":
         """Collect the presses outside a working area.
 
@@ -65,27 +59,20 @@ class OutsidePresses:
             presses: Presses of the area for which a network was requested. If the working area is smaller, because the
                 map from contacts to charges folds, the presses beyond the working area are outside.
             outside: Presses farther from the centre than all of `presses`; None if there are none.
+            seed: Seed of the random choice of the presses for training and of the presses for measuring.
 
         Returns:
-            The presses; None if they are too few, or if the ring that contains them is too narrow.
+            The presses; None if they are too few.
         """
-        rng = np.random.default_rng(SEED)
-        beyond = presses[presses.distance > domain.radius]
-        beyond = beyond[rng.permutation(len(beyond))]
-        pool = beyond
-        if outside is not None and len(outside) >= N_NEIGHBOURS:  # the density of fewer presses is unknown
-            # Of the presses beyond the working area, choose as many as make the density of both groups equal.
-            inner, outer = outside.distance.min(), outside.distance.max()
-            density = len(outside) / (outer**2 - inner**2)
-            n_beyond = round(density * (inner**2 - domain.radius**2))
-            pool = beyond[:n_beyond].joined(outside)
-        pool = pool[rng.permutation(len(pool))]
-
+        pool = presses[presses.distance > domain.radius]
+        if outside is not None:
+            pool = pool.joined(outside)
+        pool = pool[np.random.default_rng(seed).permutation(len(pool))]
         train = pool[: len(pool) // 2]
         test = pool[len(pool) // 2 :]
         _, max_force = domain.force_range
         test = test[test.contact[:, 2] >= max_force / FORCE_RATIO]
-        if len(test) < N_NEIGHBOURS or pool.distance.max() < domain.radius + MIN_WIDTH:
+        if len(test) < N_NEIGHBOURS:
             return None
         return cls(domain, train, test, float(pool.distance.max()))
 

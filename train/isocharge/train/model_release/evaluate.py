@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array
 from isocharge.simulate import Dataset, NoiseModel
 from isocharge.train.data.contact_errors import ContactErrorStatistics, position_error
 from isocharge.train.data.misfit_charges import misfit_noise
@@ -25,8 +25,8 @@ FALSE_ALARM_RATE = 0.01
 FORCES_NEAR_1_N = (0.8, 1.25)
 """Smallest and largest force of the presses on which the detection of faults is measured, N."""
 
-N_NOISE_DRAWS = 20
-"""Number of times that noise is drawn for each press in order to compute percentiles of the misfit."""
+N_GOOD_PRESSES = 50_000
+"""Smallest number of presses with noise for the percentiles of the misfit. Fewer presses are repeated."""
 
 HELD_PRESSES = "measured_presses"
 """Name of the error entry that contains the number of measured presses. Errors on simulated presses do not have it."""
@@ -52,7 +52,7 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
         Errors by name. The position errors are in mm, and the force errors are in percent of the force. The coverages
         of the 68 and 95 % intervals are fractions of the coordinates, 0 to 1. If the network always answers the same
         force, there are no errors of the force, and the coverages are those of x and y. Further entries are the misfits
-        that 1 % and, if there are enough presses, 0.1 % of the good presses exceed. For simulated presses, the result
+        that 1 % and 0.1 % of the good presses exceed. For simulated presses, the result
         also contains the errors without noise, and the fractions of faults that cause an alarm. For measured presses,
         the result also contains the number of presses.
     """
@@ -78,37 +78,13 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
         errors |= _coverages(contact[:, :n_plane], std[:, :n_plane], test_presses.contact[:, :n_plane])
         errors = {name: error for name, error in errors.items() if not name.startswith("force_")}
     errors[HELD_PRESSES] = float(len(test_presses))
-    return errors | _good_press_misfits(fitted, seed)
-
-
-def _good_press_misfits(fitted: Fitted, seed: int) -> dict[str, float]:
-    """Compute the misfits that only a few good presses exceed.
-
-    Good presses are presses without faults. There are three cases:
-
-    - The good presses were simulated: noise is added to their charges.
-    - The good presses were measured, and there is a cross-validation: the misfits of the cross-validation are used.
-    - The good presses were measured, and there is no cross-validation: the misfits of the network itself are used. They
-      are too few for the misfit that 0.1 % of the presses exceed.
-
-    Args:
-        fitted: The network, with its good presses.
-        seed: Seed of the noise.
-
-    Returns:
-        Misfits by name, as `evaluate` returns them. For simulated good presses, the result also contains the fractions
-        of faults that cause an alarm.
-    """
     if not fitted.good.measured and isinstance(fitted.noise, NoiseModel):
-        return misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)
-    if fitted.cross_validated is None:
-        _, _, misfit = fitted.predict(fitted.good.charge)
-        return {"misfit_p99": rounded(alarm_threshold(misfit))}
-    misfit = fitted.cross_validated.misfit
-    return {
-        "misfit_p99": rounded(alarm_threshold(misfit)),
-        "misfit_p999": rounded(np.percentile(misfit, 99.9)),
-    }
+        return errors | misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)
+    if fitted.cross_validated is not None:
+        good_misfits = fitted.cross_validated.misfit
+    else:
+        _, _, good_misfits = fitted.predict(fitted.good.charge)
+    return errors | _misfit_percentiles(good_misfits)
 
 
 def simulated_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int = 1) -> dict[str, float]:
@@ -173,20 +149,20 @@ def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel,
         Errors by name, as `evaluate` returns them.
     """
     added_noise = misfit_noise(noise)
-    misfits_by_draw = []
-    for draw in range(N_NOISE_DRAWS):
-        _, _, misfit = predict(presses.noisy(added_noise, seed + draw))
-        misfits_by_draw.append(misfit)
-    all_misfits = np.concatenate(misfits_by_draw)
-    threshold = alarm_threshold(all_misfits)
-
+    _, _, misfits = predict(presses.repeated(N_GOOD_PRESSES).noisy(added_noise, seed))
+    threshold = alarm_threshold(misfits)
+    min_force, max_force = FORCES_NEAR_1_N
     force = presses.contact[:, 2]
-    presses_near_1_N = presses[is_near_1_N(force)]
-    detected_fractions = _measure_detection(predict, presses_near_1_N, added_noise, threshold, seed + N_NOISE_DRAWS)
+    presses_near_1_N = presses[(force >= min_force) & (force <= max_force)]
+    detected_fractions = _measure_detection(predict, presses_near_1_N, added_noise, threshold, seed + 1)
+    return {**_misfit_percentiles(misfits), **detected_fractions}
+
+
+def _misfit_percentiles(good_misfits: Array) -> dict[str, float]:
+    """Return the misfits that 1 % and 0.1 % of good presses exceed."""
     return {
-        "misfit_p99": rounded(threshold),
-        "misfit_p999": rounded(np.percentile(all_misfits, 99.9)),
-        **detected_fractions,
+        "misfit_p99": rounded(alarm_threshold(good_misfits)),
+        "misfit_p999": rounded(np.percentile(good_misfits, 99.9)),
     }
 
 
@@ -199,12 +175,6 @@ def alarm_threshold(good_misfits: Array) -> float:
         good_misfits: Misfits of good presses, array of any shape.
     """
     return float(np.percentile(good_misfits, 100.0 * (1.0 - FALSE_ALARM_RATE)))
-
-
-def is_near_1_N(force: Array) -> Booleans:
-    """Return whether each force, N, is close enough to 1 N for the measurement of the detection of faults."""
-    min_force, max_force = FORCES_NEAR_1_N
-    return np.asarray((force >= min_force) & (force <= max_force))
 
 
 def rounded(value: float | np.floating) -> float:
@@ -230,26 +200,16 @@ def _measure_detection(
     if not len(presses):  # for example, if no force is near 1 N
         return {}
     noisy_charge = presses.noisy(noise, seed)
-    n_electrode = noisy_charge.shape[1]
 
-    def detected_fraction(wrong_gain: float) -> float:
-        """Return the fraction of presses that cause an alarm if one electrode has a wrong gain.
-
-        Each electrode has the wrong gain in turn, and the result is the mean over the electrodes.
-
-        Args:
-            wrong_gain: Gain of the faulty electrode, relative to the true gain; 0 for a dead electrode.
-        """
-        faulty_charges = []
-        for electrode_index in range(n_electrode):
-            gains = np.ones(n_electrode)
-            gains[electrode_index] = wrong_gain
-            faulty_charges.append(noisy_charge * gains)
+    def detected_fraction(*wrong_gains: float) -> float:
+        """Return the mean share of presses that cause an alarm if one electrode in turn has one of some wrong gains."""
+        n_electrode = noisy_charge.shape[1]
+        faulty_charges = [
+            noisy_charge * np.where(np.arange(n_electrode) == electrode, gain, 1.0)
+            for electrode in range(n_electrode)
+            for gain in wrong_gains
+        ]
         _, _, misfit = predict(np.concatenate(faulty_charges))
-        return float(np.mean(misfit > threshold))
+        return rounded(np.mean(misfit > threshold))
 
-    mean_fraction = 0.5 * (detected_fraction(0.8) + detected_fraction(1.2))  # gains 20 % too small and too large
-    return {
-        "found_gain_20_percent": rounded(mean_fraction),
-        "found_dead_electrode": rounded(detected_fraction(0.0)),
-    }
+    return {"found_gain_20_percent": detected_fraction(0.8, 1.2), "found_dead_electrode": detected_fraction(0.0)}

@@ -1,6 +1,7 @@
 """Comparison of an exported ONNX graph with the network from which it was written."""
 
 from collections.abc import Callable, Sequence
+from itertools import product
 
 import numpy as np
 import onnxruntime as ort
@@ -21,16 +22,11 @@ N_GOLDEN = 64
 
 Half of the charges belong to presses without noise, a quarter to presses with noise, and a quarter are extreme."""
 
-TOLERANCES = {
-    "contact": 1e-5,
-    "contact_std": 1e-5,
-    CORRELATION: 2e-4,
-    "misfit": 2e-4,
-}
+TOLERANCES = {"contact": 1e-4, "contact_std": 1e-4, CORRELATION: 2e-3, "misfit": 2e-3}
 """Largest relative difference of each output between the graph (float32) and the network.
 
-Rounding errors grow with the number of layers. With four hidden layers, they change a correlation by up to 1e-4, which
-is much less than the statistical error of the correlation.
+Rounding errors grow with the number of layers. For some presses, the position depends so strongly on the charges that
+float32 has too few digits.
 """
 
 N_COMPARED = 10_000
@@ -43,22 +39,11 @@ EXTREME_CHARGES_pC = (-LARGEST, LOWEST_CHARGE, LARGEST)
 is computed. Therefore, `LOWEST_CHARGE` gives the smallest logarithm.
 """
 
-EXTREME_SEED = 4
-"""Seed of the combinations of extreme charges. Every check of a graph uses the same combinations."""
-
-QUANTILE = 0.999
-"""Fraction of the presses that must meet the tolerances.
-
-For the remaining presses, the position can depend so strongly on the charges that float32 has too few digits."""
-
 STD_FACTOR = 100.0
 """Smallest number by which a difference of a contact is divided, in standard deviations of the contact.
 
-A difference of a thousandth of a standard deviation is negligible. With this divisor, such a difference is within the
+A difference of a hundredth of a standard deviation is negligible. With this divisor, such a difference is within the
 tolerance."""
-
-EXTREME_FACTOR = 10.0
-"""Factor by which the tolerances are multiplied for the remaining presses, and for charges that no film produces."""
 
 
 def check_graph(
@@ -71,7 +56,7 @@ def check_graph(
     """Compare a graph with its network, and choose charges for the golden vectors.
 
     Golden vectors are stored with a model, so that every computer can check its answers. The outputs of the graph and
-    of the network are compared for noisy charges of presses and, with larger tolerances, for extreme charges.
+    of the network are compared for noisy charges of presses and for extreme charges.
 
     Args:
         graph: The ONNX file.
@@ -89,12 +74,8 @@ def check_graph(
     session = open_session(graph, "the exported graph")
     ordinary_charge, extreme_charge = _choose_golden_charges(compute_exact, presses, noise)
     _check_finite_outputs(session, n_electrode=presses.charge.shape[1])
-    _compare(session, compute_exact, extreme_charge, floors, tolerance_factor=EXTREME_FACTOR)
-
-    # If there are fewer than `N_COMPARED` presses, they are repeated.
-    repeated_rows = np.arange(N_COMPARED) % len(presses)
-    noisy_charge = presses[repeated_rows].noisy(noise, seed=3).astype(np.float32)
-    _compare(session, compute_exact, noisy_charge, floors, tolerance_factor=1.0)
+    noisy_charge = presses.repeated(N_COMPARED)[:N_COMPARED].noisy(noise, seed=3).astype(np.float32)
+    _compare(session, compute_exact, np.concatenate([noisy_charge, extreme_charge]), floors)
     return np.concatenate([ordinary_charge, extreme_charge])
 
 
@@ -137,7 +118,7 @@ def _choose_golden_charges(
 
 
 def _check_finite_outputs(session: ort.InferenceSession, n_electrode: int) -> None:
-    """Check that all outputs are finite for random combinations of `EXTREME_CHARGES_pC`.
+    """Check that all outputs are finite for all combinations of `EXTREME_CHARGES_pC`.
 
     The network was not trained with such charges, so its outputs are extrapolations.
 
@@ -148,8 +129,7 @@ def _check_finite_outputs(session: ort.InferenceSession, n_electrode: int) -> No
     Raises:
         TrainingError: If an output is infinite or NaN.
     """
-    rng = np.random.default_rng(EXTREME_SEED)
-    charges = rng.choice(EXTREME_CHARGES_pC, (N_COMPARED, n_electrode)).astype(np.float32)
+    charges = np.array(list(product(EXTREME_CHARGES_pC, repeat=n_electrode)), np.float32)
     for name, output in run(session, charges).items():
         is_finite = np.isfinite(output).all(axis=1)  # one value for each row of charges
         if not is_finite.all():
@@ -161,24 +141,15 @@ def _check_finite_outputs(session: ort.InferenceSession, n_electrode: int) -> No
 
 
 def _compare(
-    session: ort.InferenceSession,
-    compute_exact: OutputFunction,
-    charge: Singles,
-    floors: Sequence[float],
-    tolerance_factor: float,
+    session: ort.InferenceSession, compute_exact: OutputFunction, charge: Singles, floors: Sequence[float]
 ) -> None:
-    """Check that the graph and the network agree.
-
-    The difference of a press is the largest relative difference among the columns of an output. Each output must meet
-    two conditions. For the fraction `QUANTILE` of the presses, the difference must be within `tolerance_factor` times
-    the tolerance of the output. For all presses, it must be within `EXTREME_FACTOR` times this tolerance.
+    """Check that the graph and the network agree within `TOLERANCES` for all presses.
 
     Args:
         session: The graph.
         compute_exact: Function that computes the outputs of the network in double precision.
         charge: Charges, shape (n, n_electrode), pC.
         floors: Values of x and y, mm, and of the force, N, below which differences count as absolute differences.
-        tolerance_factor: Factor of the tolerance for the fraction `QUANTILE` of the presses.
 
     Raises:
         TrainingError: If the graph and the network disagree.
@@ -190,16 +161,9 @@ def _compare(
     for expected, (name, graph_output) in zip(expected_outputs, run(session, charge).items(), strict=True):
         smallest_divisor = smallest_contact_divisor if name in ("contact", "contact_std") else 1.0
         divisor = np.maximum(np.abs(expected), smallest_divisor)
-        relative_difference = np.abs(expected - graph_output) / divisor  # shape (n, number of columns)
-        press_difference = relative_difference.max(axis=1)
-        quantile_difference = float(np.quantile(press_difference, QUANTILE))
-        largest_difference = float(press_difference.max())
-        quantile_tolerance = tolerance_factor * TOLERANCES[name]
-        tolerance = EXTREME_FACTOR * TOLERANCES[name]
-        agrees = quantile_difference <= quantile_tolerance and largest_difference <= tolerance
-        if not agrees:
+        difference = float(np.max(np.abs(expected - graph_output) / divisor))
+        if not difference <= TOLERANCES[name]:
             raise TrainingError(
-                f"the exported graph disagrees with the network on {name}: expected at most {quantile_tolerance:g} for "
-                f"{QUANTILE:.1%} of the charges and {tolerance:g} for all, got {quantile_difference:.3g} and "
-                f"{largest_difference:.3g}"
+                f"the exported graph disagrees with the network on {name}: expected a relative difference of at most "
+                f"{TOLERANCES[name]:g}, got {difference:.3g}"
             )

@@ -13,7 +13,6 @@ training step, random noise with half of the estimated size is added to the char
 """
 
 import logging
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -43,7 +42,6 @@ from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fit import contact_stage, threads_and_seed, train_perceptron
 from isocharge.train.training.fitted import Answers, Fitted, Provenance
-from isocharge.train.training.losses import covariance_loss
 from isocharge.train.training.misfit_training import misfit_stage
 from isocharge.train.training.network import InverseNetwork, Posterior, as_tensor, fold_network
 
@@ -55,12 +53,8 @@ N_FOLDS = 5
 CHANNELS = (3, 8)
 """Smallest and largest number of channels."""
 
-DEFAULT_LARGEST_STEPS = 2_000
-"""Default of the largest number of steps. The default for simulated presses is used instead if it is larger."""
-
-FIRST_STEPS = 1_200
-"""Number of steps of the first training. It is doubled only as long as the validation score improves, because networks
-soon overfit presses with noise."""
+DEFAULT_STEPS = 1_200
+"""Default number of steps of each training of a contact network. Networks soon overfit presses with noise."""
 
 TRAINING_NOISE_FACTOR = 0.5
 """Noise that is added in every step, relative to the noise of the presses. With a larger factor, the network cannot
@@ -98,7 +92,7 @@ def fit_presses(
         presses: At least 500 presses at 50 places. Presses with an unknown place or charge are left out, and presses
             with an unknown force, unless all forces are unknown.
         name: Name of the sensor.
-        config: Settings. The setting `steps` is the largest number of steps. The settings `noise` and `hold_out` are
+        config: Settings. The settings `noise` and `hold_out` are
             not used.
         probes: Notations of the probes.
 
@@ -112,7 +106,7 @@ def fit_presses(
         TrainingError: If the loss is not finite.
     """
     settings = (config or FitConfig()).checked()
-    training = _with_defaults_for_measured(settings.training, presses.charge_pC.shape[1])
+    training = _with_defaults_for_measured(settings.training)
     usable = usable_presses(presses)
     force_std = constant_force_std(usable)  # None if the forces vary
     labelled = LabelledPresses(usable.contact, usable.charge_pC, measured=True)
@@ -126,7 +120,10 @@ def fit_presses(
         )
         # For the cross-validation, train a network for each fold on the presses of all other folds.
         fold_of_press = folds_by_place(labelled.contact, N_FOLDS)
-        steps = _train_fold_networks(fold_networks, labelled, fold_of_press, noise, training)
+        for fold_index, network_of_fold in enumerate(fold_networks):
+            fold_config = structs.replace(training, seed=training.seed + fold_index)
+            train_presses = labelled[fold_of_press != fold_index]
+            contact_stage(network_of_fold, train_presses, noise.scaled(TRAINING_NOISE_FACTOR), fold_config).run()
         contact, std = _cross_validated_contact(fold_networks, labelled.charge, fold_of_press)
         position_factor, force_factor = std_factors(contact, std, labelled.contact)
         if force_std is not None:
@@ -143,7 +140,7 @@ def fit_presses(
         std=std * [position_factor, position_factor, force_factor],
         misfit=_cross_validated_misfit(labelled, domain, noise, fold_of_press),
     )
-    made_with = _made_with(settings, labelled, steps, (position_factor, force_factor))
+    made_with = _made_with(settings, labelled, (position_factor, force_factor))
     if force_std is not None:
         made_with["constant_force"] = {
             "force_N": float(f"{np.exp(domain.centre[2]):.4g}"),
@@ -166,15 +163,12 @@ def fit_presses(
     )
 
 
-def _made_with(
-    settings: FitConfig, presses: LabelledPresses, steps: int, std_factors: tuple[float, float]
-) -> dict[str, object]:
+def _made_with(settings: FitConfig, presses: LabelledPresses, std_factors: tuple[float, float]) -> dict[str, object]:
     """Return the entries that describe the training in the metadata of the network.
 
     Args:
         settings: Settings of the training.
         presses: Presses on which the network was trained.
-        steps: Number of steps with which the networks of the cross-validation were trained.
         std_factors: Factors by which the standard deviations of the position and of the force were multiplied.
     """
     return {
@@ -184,7 +178,6 @@ def _made_with(
             "presses": len(presses),
             "places": len(np.unique(presses.contact[:, :2], axis=0)),
             "folds": N_FOLDS,
-            "steps": steps,
             "std_factors": [float(f"{factor:.4g}") for factor in std_factors],
         },
     }
@@ -286,78 +279,21 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
     return float(position_factor), float(force_factor)
 
 
-def _with_defaults_for_measured(config: TrainingConfig, n_electrode: int) -> TrainingConfig:
+def _with_defaults_for_measured(config: TrainingConfig) -> TrainingConfig:
     """Return a copy of the settings with default numbers of steps and charges for measured presses.
 
     Numbers that are given in the settings are not replaced. Measured presses are few and noisy. Therefore, the default
-    numbers for measured presses are larger than the defaults for simulated presses of a sensor with few electrodes.
+    numbers for the misfit network are larger than the defaults for simulated presses of a sensor with few electrodes.
 
     Args:
         config: Settings in which the numbers may be missing.
-        n_electrode: Number of electrodes.
     """
-    default_steps = max(config.sizes(n_electrode).steps, DEFAULT_LARGEST_STEPS)
     return structs.replace(
         config,
-        steps=config.steps or default_steps,
+        steps=config.steps or DEFAULT_STEPS,
         misfit_steps=config.misfit_steps or MANY_ELECTRODE_SIZES.misfit_steps,
         misfit_charges=config.misfit_charges or MANY_ELECTRODE_SIZES.misfit_charges,
     )
-
-
-def _train_fold_networks(
-    fold_networks: list[InverseNetwork],
-    presses: LabelledPresses,
-    fold_of_press: Integers,
-    noise: ChannelNoise,
-    config: TrainingConfig,
-) -> int:
-    """Train one network for each fold on the presses of all other folds.
-
-    The number of steps is doubled until the loss of the first network on the presses of its own fold no longer
-    decreases. The other networks are then trained with the number of steps that was best for the first network.
-
-    Args:
-        fold_networks: Networks to train, one for each fold.
-        presses: All presses.
-        fold_of_press: Index of the fold of each press, shape (n,).
-        noise: Noise of the charges.
-        config: Largest number of steps, learning rate and seed.
-
-    Returns:
-        Number of steps that was best for the first network.
-    """
-
-    def train(fold_index: int, steps: int) -> float:
-        """Train the network of one fold with a number of steps, and return its loss on the presses of this fold."""
-        network = fold_networks[fold_index]
-        is_validation = fold_of_press == fold_index
-        stage_config = structs.replace(config, steps=steps, seed=config.seed + fold_index)
-        train_presses = presses[~is_validation]
-        contact_stage(network, train_presses, noise.scaled(TRAINING_NOISE_FACTOR), stage_config).run()
-        validation = presses[is_validation]
-        with torch.no_grad():
-            posterior = network.posterior(as_tensor(validation.charge))
-            error = as_tensor(network.domain.to_unit(validation.contact)) - posterior.mean
-            return covariance_loss(posterior, error).mean().item()
-
-    first_network = fold_networks[0].contact
-    initial_weights = deepcopy(first_network.state_dict())
-    largest_steps = config.sizes(fold_networks[0].n_electrode).steps
-    steps = min(FIRST_STEPS, largest_steps)
-    loss = train(0, steps)
-    while 2 * steps <= largest_steps:
-        shorter_weights = deepcopy(first_network.state_dict())
-        first_network.load_state_dict(initial_weights)
-        longer_loss = train(0, 2 * steps)
-        if longer_loss >= loss:
-            first_network.load_state_dict(shorter_weights)
-            break
-        loss = longer_loss
-        steps *= 2
-    for fold_index in range(1, len(fold_networks)):
-        train(fold_index, steps)
-    return steps
 
 
 def _cross_validated_contact(
@@ -390,8 +326,7 @@ def _distillation_stage(
 ) -> TrainingStage:
     """Define the training of a network on the mean outputs of other networks (distillation).
 
-    The inputs are copies of the charges, with noise of several sizes. The training has half as many steps as the
-    settings allow for the contact network.
+    The inputs are copies of the charges, with noise of several sizes.
 
     Args:
         network: Network to train.
@@ -420,7 +355,7 @@ def _distillation_stage(
         squares = 0.5 * mean_difference**2 + (log_std - target.log_std) ** 2 + (turn - target.turn) ** 2
         return squares.sum(dim=1).mean()
 
-    steps = max(config.sizes(network.n_electrode).steps // 2, 1)
+    steps = config.sizes(network.n_electrode).steps
     return TrainingStage("contact", network.contact, loss, steps, config.learning_rate, config.seed)
 
 

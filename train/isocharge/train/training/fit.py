@@ -160,7 +160,11 @@ def train_network(data: TrainingData, config: FitConfig) -> TrainedNetwork:
             _log.warning("%s", caution)
         features = split.features(misfit_noise(training.noise_model))
         network = InverseNetwork(split.domain, features, config.network)
-        outside = None if data.presses.measured else OutsidePresses.of(split.domain, data.presses, data.outside)
+        outside = (
+            None
+            if data.presses.measured
+            else OutsidePresses.of(split.domain, data.presses, data.outside, training.seed)
+        )
 
         def train_misfit() -> None:
             """Train the misfit perceptron on examples from the working area and from the rest of the film."""
