@@ -17,9 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from shared import options, percentiles, print_results
 
+from isocharge.cli.shared.virtual_sensor import film_charges
 from isocharge.common.arrays import Array
 from isocharge.serve import Chunk, Frame, Predictor, Script, TouchStream, device_from_table, encode_frame
 from isocharge.serve.record.record import PredictionRecord
+from isocharge.serve.virtual_sensor.script import VirtualScript
 from isocharge.simulate import Circle, ForwardMap, load_amplifier
 from isocharge.simulate.measuring_chain.amplifier import Amplifier
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
@@ -30,7 +32,6 @@ REST_s = 4.0
 PRESS_s = 1.5
 PAUSE_s = 1.5
 RAMP_s = 0.1
-MIN_FORCE_N = 0.05
 GAIN_ERROR = 0.002
 """Largest relative error of the gains in the device file."""
 
@@ -51,30 +52,26 @@ class Press(NamedTuple):
     begin_s: float
     end_s: float
 
+    def rows(self) -> list[tuple[float, float, float, float]]:
+        """Return the rows (time, x, y, force) of a script, between which the force is linear."""
+        corners = ((self.begin_s, 0.0), (self.begin_s + RAMP_s, 1.0), (self.end_s - RAMP_s, 1.0), (self.end_s, 0.0))
+        return [(time_s, self.position.real, self.position.imag, force_N) for time_s, force_N in corners]
+
 
 def script_of(presses: Sequence[Press], end_s: float) -> Script:
-    """Return the script of presses whose force rises and falls linearly.
-
-    Args:
-        presses: Presses that do not overlap.
-        end_s: Duration of the script, s.
-    """
-    t_s = np.arange(round(end_s * RATE_Hz)) / RATE_Hz
-    position = np.full(t_s.size, complex(np.nan, np.nan))
-    force_N = np.zeros(t_s.size)
-    for press in presses:
-        ramp = np.clip(np.minimum(t_s - press.begin_s, press.end_s - t_s) / RAMP_s, 0.0, 1.0)
-        position[ramp > 0.0] = press.position
-        force_N += ramp
-    force_N = np.where(force_N > 0.0, np.maximum(force_N, MIN_FORCE_N), 0.0)
-    return Script(position.real, position.imag, force_N, RATE_Hz)
+    """Return the script of presses that do not overlap, which ends at a given time, s."""
+    nothing = (0.0, 0.0, 0.0)
+    rows = [(0.0, *nothing), *(row for press in presses for row in press.rows()), (end_s, *nothing)]
+    script = VirtualScript(presses=tuple(rows)).script(RATE_Hz)
+    assert script is not None
+    return script
 
 
 def touch_charges(film: ForwardMap, script: Script) -> Array:
     """Return the touch charges of a script, shape (n_frame, n_electrode), pC."""
     charge = np.zeros((len(script), len(film.electrodes)))
     contact = np.column_stack([script.x_mm, script.y_mm, script.force_N])
-    charge[script.touching] = film.charges(contact[script.touching])
+    charge[script.touching] = film_charges(film)(contact[script.touching])
     return charge
 
 
@@ -131,11 +128,18 @@ def held_presses(predictor: Predictor, amplifier: Amplifier, seed: int) -> dict[
     All electrodes have 400 pC for 8 s and later 300 pC for 10 s. The result has percentiles of the largest error of an
     electrode over both presses and eight boards, pC, for each leak, with and without thermal drift.
     """
-    t_s = np.arange(round(36.0 * RATE_Hz)) / RATE_Hz
     presses = ((6.0, 8.0, 400.0), (20.0, 10.0, 300.0))  # begin and duration, s, and charge, pC
-    total = np.zeros(t_s.size)
-    for begin_s, duration_s, charge_pC in presses:
-        total += charge_pC * np.clip(np.minimum(t_s - begin_s, begin_s + duration_s - t_s) / RAMP_s, 0.0, 1.0)
+    corners = [
+        (6.0, 0.0),
+        (6.1, 400.0),
+        (13.9, 400.0),
+        (14.0, 0.0),
+        (20.0, 0.0),
+        (20.1, 300.0),
+        (29.9, 300.0),
+        (30.0, 0.0),
+    ]
+    total = np.interp(np.arange(round(36.0 * RATE_Hz)) / RATE_Hz, *np.transpose(corners))
     charge = np.repeat(total[:, None], len(predictor.metadata.electrodes), axis=1)
     results = {}
     for tau_s in (10.0, 1.0):

@@ -163,13 +163,6 @@ def contacts_of(readings):
     return [reading.is_contact for reading in readings]
 
 
-def test_smallest_press_is_detected_at_once():
-    """The total charge of the press is 340 pC."""
-    frames_pC = rest(400)
-    frames_pC[200:300] += 340.0 / 3.0
-    assert contacts_of(run(frames_pC)) == [False] * 200 + [True] * 100 + [False] * 100
-
-
 def test_negative_charges_are_no_touch_and_are_flagged():
     """A press increases the charges, because it stretches the film. With an inverting amplifier, they decrease."""
     frames_pC = rest(200)
@@ -181,15 +174,13 @@ def test_negative_charges_are_no_touch_and_are_flagged():
     assert contacts_of(corrected) == [False] * 150 + [True] * 50
 
 
-def test_noise_of_a_minute_gives_no_touch():
-    assert not any(contacts_of(run(rest(12_000, seed=3))))
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.01e9, 1.7e308])
 @pytest.mark.parametrize("gain", [None, 0.5, 2.0])
 def test_invalid_frame_passes_no_stage(value, gain):
     """The readings after the invalid frame are the same as in a chain that did not receive this frame."""
-    sections = {} if gain is None else {"gain": {"pC_per_unit": gain}}
+    sections = {"leak": {"tau_s": 1.0}, "hum": {"frequency_Hz": 50.0}} if gain else {}
+    if gain is not None:
+        sections["gain"] = {"pC_per_unit": gain}
     chain = StageRunner(**sections)
     undisturbed_chain = StageRunner(**sections)
     for number, raw_pC in enumerate(rest(150)):

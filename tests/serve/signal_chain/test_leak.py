@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from isocharge.serve.signal_chain.inflow import Inflow, LeakRule
 from isocharge.serve.signal_chain.leak import Leak
 from stage_runner import StageRunner
 
@@ -117,28 +116,6 @@ def test_slow_common_warming_is_no_touch():
     charge_pC, contact = correct_leak(output_pC)
     assert not contact.any()
     assert np.abs(charge_pC[1000:]).max() < 4.0
-
-
-def settled_inflow():
-    """Return the estimate of the inflow after a long time at rest."""
-    inflow = Inflow(LeakRule(), 3)
-    inflow.learned_s = 10.0
-    return inflow
-
-
-@pytest.mark.parametrize(
-    ("surplus_pC", "noise_pC", "learned_pC"),
-    [(1.0, 1.0, 1.0), (1000.0, 1.0, 4.0 * np.sqrt(2.0)), (-1000.0, 0.0, -0.1)],
-    ids=["small", "large", "without noise"],
-)
-def test_spike_is_clipped_in_learning(surplus_pC, noise_pC, learned_pC):
-    """A surplus changes the inflow by 1/3 of its size, because the time constant of the estimate is 3 s.
-
-    A surplus is clipped to four standard deviations, which are sqrt(2) pC each, or to 0.1 pC without noise.
-    """
-    inflow = settled_inflow()
-    inflow.learn(np.full(3, surplus_pC), np.full(3, noise_pC), 0.005)
-    assert inflow.pC_per_s == pytest.approx(np.full(3, learned_pC / 3.0))
 
 
 def test_learning_pauses_after_a_release():
