@@ -9,7 +9,7 @@ from isocharge.serve import Chunk, Frame, device_from_table, encode_frame
 from isocharge.serve.examination.held_press import find_held_press
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
-from isocharge.serve.signal_chain.inflow import LeakSection
+from isocharge.serve.signal_chain.inflow import LeakRule
 
 T_S = np.arange(0.0, 20.0, 0.005)
 HELD_S = T_S - 5.0
@@ -71,7 +71,7 @@ def test_proposed_file_has_the_leak_and_the_offset_before_the_press():
         frame = Frame(number % 65536, 5000 * number, tuple(row.tolist()))
         chunks.append(Chunk(encode_frame(frame), 1e9 + time_s, 0))
     report = examine_received(ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=20.0))
-    assert device_from_table(report.device, "board").rule(LeakSection).tau_s == pytest.approx(10.0, rel=0.05)
+    assert device_from_table(report.device, "board").rule(LeakRule).tau_s == pytest.approx(10.0, rel=0.05)
     assert max(abs(channel.offset_pC) for channel in report.channels) < 1.0
     assert report.missing == ()
     assert report.missing_for_held_presses == ("put [leak] tau_s = 10 into a device file",)

@@ -23,7 +23,7 @@ from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain
 from isocharge.serve.signal_chain.hum import HumRule
-from isocharge.serve.signal_chain.inflow import LeakSection
+from isocharge.serve.signal_chain.inflow import LeakRule
 from isocharge.serve.signal_chain.leak import Leak
 from isocharge.serve.signal_chain.saturation import SaturationRule
 from isocharge.serve.signal_chain.stage import Setup
@@ -80,7 +80,7 @@ def test_device_file_with_all_sections(device):
     np.testing.assert_array_equal(Leak.c_settings(setup)["tau_s"], [10.0, 10.2, 9.9])
     hum = board.rule(HumRule)
     assert (board.rule(SaturationRule).limit_pC, hum.frequency_Hz, hum.settle_s) == (1500, 60.0, 1.0)
-    assert (board.rule(TareRule).frames, board.rule(LeakSection).settle_s) == (50, 5.0)
+    assert (board.rule(TareRule).frames, board.rule(LeakRule).settle_s) == (50, 5.0)
     assert board.rule(TouchRule).floor_pC == 20.0
     assert isinstance(board.parser(), TextParser)
 
@@ -128,13 +128,10 @@ WRONG = [
     ("[tare]\nframe = 50\n", r"unknown key 'tare.frame'; did you mean 'frames'\? Known are on, frames, noise_limit_pC"),
     ("[tare]\nframes = 50.5\n", r"tare\.frames: expected a whole number from 0 to 1000000000, got 50\.5"),
     ("[tare]\nframes = 3000\n", r"tare\.patience: expected at least the 3000 frames of a tare, or 0 .*, got 2000"),
-    ("[tare]\npatience = 2000000000\n", r"tare\.patience: expected a whole number from 0 to 1000000000"),
     ("[tare]\non = 1\n", r"tare\.on: expected true or false, got 1"),
     ("[touch]\nfloor_pC = -3\n", r"touch\.floor_pC: expected a number from 0 to .*, got -3"),
-    ("[touch]\nfloor_pC = true\n", r"touch\.floor_pC: expected a number from 0 to .*, got True"),
     ("[hum]\nsettle_s = 0\n", r"hum\.settle_s: expected a number from 0\.001 to 1"),
     ("[leak]\ntau_s = 1.0\nrelax_s = 1e-300\n", r"leak\.relax_s: expected a number from 0\.001 to 1"),
-    ("[common_mode]\nblind_pC = 1e300\n", r"common_mode\.blind_pC: expected a number from 0 to 1"),
     (
         "[gain]\npC_per_unit = 0\n",
         r"gain\.pC_per_unit: expected a finite number that is not 0, or one for each electrode, got 0",
@@ -143,7 +140,6 @@ WRONG = [
     ("[gain]\npC_per_unit = 1.0\nlearn = true\n", r"unknown key 'gain\.learn'; known are on, pC_per_unit"),
     ("[leak]\ntau_s = {A = -1.0}\n", r"leak\.tau_s\.A: expected a positive number, got -1\.0"),
     ('[leak]\ntau_s = 1.0\nlearn = "no"\n', r"leak\.learn: expected true or false, got 'no'"),
-    ("[leak]\n", "key 'leak.tau_s' is missing"),
     ("[leak]\non = false\ntau_s = 0\n", r"leak\.tau_s: expected a positive number"),
     ("[saturation]\n", "key 'saturation.limit_pC' is missing"),
     ('[frames]\nformat = "morse"\n', rf"frames\.format: expected one of {FORMATS}, got 'morse'"),

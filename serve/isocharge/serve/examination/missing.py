@@ -13,7 +13,7 @@ from isocharge.serve.examination.listening import Capture
 from isocharge.serve.live.device import Device
 from isocharge.serve.port.serial_line import TELNET_ADVICE
 from isocharge.serve.signal_chain.channels import Channels
-from isocharge.serve.signal_chain.inflow import LeakSection
+from isocharge.serve.signal_chain.inflow import LeakRule
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.tare import TareRule
 
@@ -168,7 +168,7 @@ def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress
         held_press: Press that was held during the check; None if no press was held.
     """
     has_device_clock = capture.frames[0].t_us is not None
-    if device.rule(LeakSection) is not None and not has_device_clock:
+    if device.rule(LeakRule) is not None and not has_device_clock:
         yield (
             "send the time of a device clock in each frame (t_us, t_ms or t_s): without it the leak is corrected with "
             "the arrival times, which jitter"
@@ -176,7 +176,7 @@ def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress
     if held_press is not None:
         if held_press.tau_s is not None and "leak" not in device.table:
             yield f"put [leak] tau_s = {held_press.tau_s:g} into a device file"
-    elif device.rule(LeakSection) is None and device.front_end != "current":
+    elif device.rule(LeakRule) is None and device.front_end != "current":
         yield (
             "state the time constants of the amplifiers in a device file ([leak] tau_s): without them the force of a "
             "held press seems to decrease. The time constants follow from the circuit. To measure them instead, listen "

@@ -14,13 +14,15 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.structs import Positive
-from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
+from isocharge.serve.signal_chain.rule import LARGEST, Rule, Setting, TimeConstant
 
 
 class LeakRule(Rule, frozen=True, kw_only=True):
-    """Settings for the estimate of the inflow, from the section `[leak]` of a device file.
+    """Section `[leak]` of a device file, which describes the leak and the inflow of the amplifiers.
 
     Attributes:
+        tau_s: Time constant of the amplifiers, s, as one number for all electrodes or one number for each electrode. By
+            default, the amplifiers have no leak.
         learn: Whether the inflow b is estimated.
         settle_s: Time constant of the estimate, s.
         hold_off_s: Pause of the estimate after a release, s.
@@ -30,6 +32,7 @@ class LeakRule(Rule, frozen=True, kw_only=True):
         look_back_s: Age of the inflow with which a touch begins, s. The inflow may be up to twice as old.
     """
 
+    tau_s: Positive | dict[str, Positive] = LARGEST
     learn: bool = True
     settle_s: TimeConstant = 3.0
     hold_off_s: Setting = 0.5
@@ -37,16 +40,6 @@ class LeakRule(Rule, frozen=True, kw_only=True):
     clip_pC: Setting = 0.1
     relax_s: TimeConstant = 1.0
     look_back_s: Setting = 0.25
-
-
-class LeakSection(LeakRule, frozen=True, kw_only=True):
-    """Section `[leak]` of a device file, which describes the leak of the charge amplifiers.
-
-    Attributes:
-        tau_s: Time constant of the amplifiers, s, as one number for all electrodes or one number for each electrode.
-    """
-
-    tau_s: Positive | dict[str, Positive]
 
 
 class Inflow:

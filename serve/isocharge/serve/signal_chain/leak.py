@@ -22,7 +22,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.inflow import Inflow, LeakRule, LeakSection
+from isocharge.serve.signal_chain.inflow import Inflow, LeakRule
 from isocharge.serve.signal_chain.stage import OffsetStage, Setup
 
 
@@ -30,16 +30,14 @@ class Leak(OffsetStage):
     """Corrects the leak of the charge amplifiers, and estimates their inflow."""
 
     section = "leak"
-    rule_class = LeakSection
+    rule_class = LeakRule
     c_prefix = "LEAK"
 
     def __init__(self, setup: Setup) -> None:
         """Store the settings. The state begins at the first frame after the tare."""
         super().__init__(setup)
-        rule = setup.rule(LeakSection)
-        self._rule: LeakRule = rule or LeakRule()
-        tau_s = math.inf if rule is None else rule.tau_s
-        self._tau_s = setup.for_each_electrode("leak.tau_s", tau_s)
+        self._rule = setup.rule(LeakRule) or LeakRule()
+        self._tau_s = setup.for_each_electrode("leak.tau_s", self._rule.tau_s)
         self.reset()
 
     @classmethod
