@@ -17,13 +17,10 @@ MAX_ERROR_OF_CERTAIN_FOLD = 3e-4
 MAX_ERROR_WITHOUT_NOISE = 2e-3
 """Relative error of a fit above which the charges probably have noise."""
 
-CREDIBLE_FOLD_RATIO = 0.95
+CREDIBLE_FOLD_RATIO = 0.8
 """Largest ratio of the radius of a fold to the radius of the domain at which a fold of a poor fit counts as real.
 
 Spurious folds lie near the edge of the domain, because there are presses on only one side of the edge."""
-
-CREDIBLE_FOLD_RATIO_WITH_NOISE = 0.8
-"""Ratio that replaces `CREDIBLE_FOLD_RATIO` if the charges have noise, because noise moves spurious folds inwards."""
 
 SEARCHED_RADIUS_RATIO = 0.98
 """Ratio of the radius within which folds are searched for to the radius of the domain.
@@ -71,8 +68,7 @@ def invertible_domain(
     # An inaccurate fit does not prove a fold, so the fold is only reported, and only if it lies well inside the domain.
     certain_fold_radius = fold_radius
     if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
-        credible_ratio = CREDIBLE_FOLD_RATIO if has_little_noise else CREDIBLE_FOLD_RATIO_WITH_NOISE
-        if fold_radius < credible_ratio * requested_domain.radius:
+        if fold_radius < CREDIBLE_FOLD_RATIO * requested_domain.radius:
             return requested_domain, (_uncertain_fold_caution(fold_radius, requested_domain.radius),)
         certain_fold_radius = np.inf  # a fold near the edge is probably not real
 

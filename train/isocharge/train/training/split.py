@@ -1,4 +1,4 @@
-"""Split of presses into three parts: for training, for validation and for the test."""
+"""Split of presses into two parts: for training and for the test."""
 
 from dataclasses import dataclass, replace
 
@@ -14,9 +14,6 @@ from isocharge.train.training.config import TrainingConfig
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.source import TrainingData
 
-VALIDATION_FRACTION = 0.5
-"""Fraction of the positions for validation, relative to the fraction of the positions for the test, dimensionless."""
-
 SIGNED_FEATURE_SCALE = 0.1
 """Charge above which features of charges of both signs are logarithmic, dimensionless.
 
@@ -27,17 +24,15 @@ gave smaller position errors than the value 1.
 
 @dataclass(frozen=True)
 class Split:
-    """Presses that are split by position into presses for training, for validation and for the test.
+    """Presses that are split by position into presses for training and for the test.
 
     In the domain of the presses, the map from contacts to charges can be inverted.
 
     Attributes:
         domain: Contacts for which the network is trained.
         train: Presses for training.
-        validation: Presses that choose the degrees of the charge field.
         test: Presses for measuring errors.
-        field: Map from contacts to charges. It is fitted to the presses of the domain, or to all presses if this fit is
-            more accurate.
+        field: Map from contacts to charges, which is fitted to all presses.
         cautions: Sentences about folds of the map and about contacts with the same charges.
         folded_charges: Approximation of the charges by a series, which includes the region where the map folds; None if
             the map does not fold.
@@ -45,7 +40,6 @@ class Split:
 
     domain: Domain
     train: LabelledPresses
-    validation: LabelledPresses
     test: LabelledPresses
     field: ChargeMap
     cautions: tuple[str, ...]
@@ -53,38 +47,35 @@ class Split:
 
     @classmethod
     def by_position(cls, data: TrainingData, training: TrainingConfig) -> "Split":
-        """Split presses into three parts for training, validation and test, and fit a charge field to them.
+        """Split presses into two parts for training and for the test, and fit a charge field to them.
 
         A charge field is a smooth map from contacts to charges. The map folds where different contacts have the same
-        charges. A first field is fitted to all presses and determines the largest disk in which the map certainly does
-        not fold. Only the presses within this disk are distributed among the three parts. If the map folds or the
-        presses are measured, a second field is fitted to the presses for training.
+        charges. The field is fitted to all presses and determines the largest disk in which the map certainly does not
+        fold. Only the presses within this disk are distributed among the two parts.
 
         Args:
             data: Presses of the sensor.
             training: Fractions of the presses, noise and seed.
         """
-        # Fit the first field, and determine the domain without folds.
+        # Fit the field, and determine the domain without folds.
         presses = data.presses
         electrode_names = data.sensor.electrode_names
         field_train, field_validation = split_by_position(presses, training.hold_out, training.seed)
-        first_field = data.field or fit_charge_series(data.domain, electrode_names, field_train, field_validation)
-        domain, cautions = invertible_domain(first_field, presses, misfit_noise(training.noise_model))
+        whole_field = data.field or fit_charge_series(data.domain, electrode_names, field_train, field_validation)
+        domain, cautions = invertible_domain(whole_field, presses, misfit_noise(training.noise_model))
         is_folded = domain != data.domain  # `invertible_domain` reduces the domain only if the map folds
         used_presses = presses.within(domain.radius) if is_folded else presses
 
-        train, validation, test = _split_presses(used_presses, training)
+        # Positions alone determine which measured presses are used for the test, so that each command uses the same.
+        if presses.measured:
+            is_test = held_out(used_presses.contact)
+            train, test = used_presses[~is_test], used_presses[is_test]
+        else:
+            train, test = split_by_position(used_presses, training.hold_out, training.seed)
 
-        # A second field, without the test presses, is fitted in two cases. If the map folds, the first field was also
-        # fitted to presses beyond the fold. Then the more accurate of both fields is used. If the presses are measured,
-        # the first field was also fitted to test presses.
-        field: ChargeMap = first_field
-        if is_folded or presses.measured:
-            second_field = fit_charge_series(domain, electrode_names, train, validation)
-            is_first_better = is_folded and first_field.charge_std < second_field.charge_std
-            field = within(first_field, domain.radius) if is_first_better else second_field
-        folded_charges = replace(first_field, is_folded=True) if is_folded else None
-        return cls(domain, train, validation, test, field, cautions, folded_charges)
+        field = within(whole_field, domain.radius) if is_folded else whole_field
+        folded_charges = replace(whole_field, is_folded=True) if is_folded else None
+        return cls(domain, train, test, field, cautions, folded_charges)
 
     def features(self, noise: NoiseModel) -> WhitenedFeatures:
         """Fit the input features to the training presses.
@@ -96,7 +87,7 @@ class Split:
             noise: Noise of the charges, which determines the typical charges.
         """
         charge = self.train.charge
-        has_both_signs = self.train.signed or self.validation.signed or self.test.signed
+        has_both_signs = self.train.signed or self.test.signed
         if not has_both_signs:
             return WhitenedFeatures.fit_logarithms(charge)
         channel_noise = ChannelNoise.alike(noise, charge.shape[1])
@@ -104,31 +95,3 @@ class Split:
         # white noise were multiplied by `SIGNED_FEATURE_SCALE`.
         smaller_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
         return WhitenedFeatures.fit_signed(charge, smaller_noise.transition_charge(charge))
-
-
-def _split_presses(
-    presses: LabelledPresses, training: TrainingConfig
-) -> tuple[LabelledPresses, LabelledPresses, LabelledPresses]:
-    """Split presses by position into three parts: for training, for validation and for the test.
-
-    If the presses are measured, their positions alone determine which presses are used for the test (`held_out`).
-    Simulated presses are chosen for the test at random. The presses for validation are always chosen at random.
-
-    Args:
-        presses: Presses to split.
-        training: Fraction of the positions for the test, and the seed. Measured presses do not use this fraction for
-            the test, but half of it for the validation.
-
-    Returns:
-        Presses for training, for validation and for the test.
-    """
-    if presses.measured:
-        is_test = held_out(presses.contact)
-        remaining = presses[~is_test]
-        test = presses[is_test]
-    else:
-        remaining, test = split_by_position(presses, training.hold_out, training.seed)
-    validation_share = VALIDATION_FRACTION * training.hold_out
-    # With another seed, the choice of the validation presses is independent of the choice of the test presses.
-    train, validation = split_by_position(remaining, validation_share, training.seed + 1)
-    return train, validation, test
