@@ -35,6 +35,7 @@ GAIN = {"A": 0.5, "B": -0.5, "C": 0.25, "D": 1.0}
 BOARDS = {
     "any board": {},
     "leak": {"leak": {"tau_s": {"A": 10.0, "B": 7.5, "C": 9.9, "D": 2.0}}},
+    "drift": {"leak": {}},
     "leak, not learned": {"leak": {"tau_s": 3.0, "learn": False}},
     "offset, gain and limit": {
         "gain": {"pC_per_unit": GAIN, "offset": {"A": 8388608.0, "B": -3.5, "C": 0.0, "D": 2048.0}},

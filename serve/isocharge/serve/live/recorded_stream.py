@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from itertools import islice
 
 from isocharge.common.errors import IsochargeError
 from isocharge.serve.live.stream import TouchStream
@@ -49,9 +50,6 @@ class RecordedStream:
         # A chunk and its records that are not recorded yet
         self._current_chunk: tuple[Chunk, list[PredictionRecord]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
-        # The latest request for a recording: its recorder, or None for a request to record nothing. The deque is empty
-        # if there is no request. A deque is used because other threads can safely append to it.
-        self._next_recorder: deque[Recorder | None] = deque(maxlen=1)
         self._next_load: Load | None = None
         self._loading_model: Future[Predictor] | None = None
 
@@ -74,15 +72,13 @@ class RecordedStream:
     def request_recording(self, recorder: Recorder | None) -> None:
         """Request to end the present recording, and to begin another recording unless `recorder` is None.
 
-        The new request replaces an earlier request that was not executed yet. When a recording begins, the stream is
-        restarted and the tare is measured again. A replay can therefore compute the same records from the bytes of the
-        recording alone.
+        When a recording begins, the stream is restarted and the tare is measured again. A replay can therefore compute
+        the same records from the bytes of the recording alone.
 
         Args:
             recorder: Recorder of the next recording, which this object opens and closes. None to record nothing.
         """
-        self._next_recorder.append(recorder)
-        self._requests.append(self._begin_requested_recording)
+        self._requests.append(partial(self._begin_recording, recorder))
 
     def request_marker(self, marker: Marker) -> None:
         """Request to write a marker to the recording. Without a recording, the marker is ignored."""
@@ -146,18 +142,15 @@ class RecordedStream:
             self.recorder.chunk(chunk, [record.to_json() for record in records])
         self._current_chunk = None
 
-    def _begin_requested_recording(self) -> None:
-        """End the present recording, and begin the requested recording if there is one.
+    def _begin_recording(self, recorder: Recorder | None) -> None:
+        """End the present recording, and begin another recording unless `recorder` is None.
 
         When a new recording begins, the stream is restarted. The records of the new recording therefore depend only on
         the bytes in this recording. If the file of the recording cannot be created, an error is logged, and the stream
         continues without a recording.
         """
-        if not self._next_recorder:  # an earlier call of this method has already executed the latest request
-            return
         self._end_recording()
-        recorder = self._next_recorder.pop()
-        if recorder is None:  # the request was only to end the recording
+        if recorder is None:
             return
         try:
             self.recorder = recorder.__enter__()  # opens the file; `_end_recording` closes it
@@ -287,20 +280,8 @@ def replay(
                 if real_time:
                     wait_s = max(0.0, due_s - time.monotonic())
                     time.sleep(min(wait_s, threading.TIMEOUT_MAX))
-                recorded_count = len(latencies_us)  # the recording contains one latency for each recorded record
-                yield from _recorded_part(stream.feed(chunk), recorded_count)
-
-
-def _recorded_part(records: Iterator[PredictionRecord], recorded_count: int) -> Iterator[PredictionRecord]:
-    """Yield the records of a chunk that were recorded, and compute the remaining records without yielding them.
-
-    If the recording program ended within a chunk, only the first records of the chunk were recorded. The remaining
-    records are computed all the same, so that the stream processes the whole chunk.
-
-    Args:
-        records: All records of the chunk. Each record is computed when it is requested from the iterator.
-        recorded_count: Number of records that were recorded.
-    """
-    for index, record in enumerate(records):
-        if index < recorded_count:
-            yield record
+                records = stream.feed(chunk)
+                yield from islice(records, len(latencies_us))  # there is one latency for each recorded record
+                # If the recording program ended within the chunk, its last records were not recorded. The stream
+                # processes the whole chunk all the same.
+                deque(records, maxlen=0)

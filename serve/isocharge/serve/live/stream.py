@@ -332,10 +332,6 @@ class TouchStream(ReadingStream):
     def tare(self) -> None:
         """Discard the tare and the present touch, and measure the tare again from the next quiet frames."""
         super().tare()
-        self._reset_contact()
-
-    def _reset_contact(self) -> None:
-        """Discard the state of the present contact in all stages."""
         for stage in self._contact_stages:
             stage.reset()
 
@@ -354,8 +350,7 @@ class TouchStream(ReadingStream):
         Only the counts that `totals` returns include the time before the restart.
         """
         super().restart()
-        self._reset_contact()
-        self.reset_film()
+        self._set_model(self.predictor)
 
     def feed(self, chunk: Chunk) -> Iterator[PredictionRecord]:
         """Process a chunk, and yield the records of the frames whose last byte is in the chunk.
