@@ -115,8 +115,8 @@ def summary(touch: TouchStream, latencies: deque[float]) -> str:
     counts = touch.counts  # numbers of outages and of skipped frames
     frames_text = (
         f"{totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated, {totals.restarts} restarts; "
-        f"{totals.crc_errors} CRC errors, {totals.malformed} malformed, {totals.bytes_dropped} bytes dropped, "
-        f"{totals.resyncs} resynchronisations; {counts.outages} reconnects, {counts.skipped} skipped"
+        f"{totals.crc_errors} CRC errors, {totals.malformed} malformed, {totals.bytes_dropped} bytes dropped; "
+        f"{counts.outages} reconnects, {counts.skipped} skipped"
     )
     if not latencies:
         return frames_text

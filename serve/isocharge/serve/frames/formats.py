@@ -42,7 +42,7 @@ class AutoParser(Parser):
             return self._feed_recognised(self._candidates[0], data)
         for match in _PIECE.finditer(data):
             piece = match.group()
-            self.counts.count_dropped(len(piece))  # has no effect after recognition, which replaces these counters
+            self.counts.bytes_dropped += len(piece)  # has no effect after recognition, which replaces these counters
             for candidate in self._candidates:
                 frames = candidate.feed(piece)
                 if frames:  # the format is recognised, and the rest of the data is passed to this parser alone

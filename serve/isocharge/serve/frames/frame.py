@@ -181,16 +181,12 @@ class FrameCounts:
         crc_errors: Number of pieces with a wrong checksum.
         malformed: Number of pieces that were rejected for another reason, such as a wrong length.
         bytes_dropped: Number of bytes in the rejected pieces, including their delimiters.
-        resyncs: Number of intact frames that followed dropped bytes.
-        is_out_of_sync: Whether bytes were dropped since the last intact frame.
     """
 
     frames: int = 0
     crc_errors: int = 0
     malformed: int = 0
     bytes_dropped: int = 0
-    resyncs: int = 0
-    is_out_of_sync: bool = False
 
     def count_rejected(self, size: int, *, wrong_checksum: bool = False) -> None:
         """Count bytes that the parser expected to be one frame, but has rejected.
@@ -203,17 +199,7 @@ class FrameCounts:
             self.crc_errors += 1
         else:
             self.malformed += 1
-        self.count_dropped(size)
-
-    def count_dropped(self, size: int) -> None:
-        """Count dropped bytes. If there are any, the next intact frame counts as a resynchronisation.
-
-        Args:
-            size: Number of dropped bytes, which may be 0.
-        """
         self.bytes_dropped += size
-        if size > 0:
-            self.is_out_of_sync = True
 
 
 class ChecksumError(ValueError):
@@ -314,7 +300,7 @@ class Parser(ABC):
 
     def reset(self) -> None:
         """Drop the stored bytes of an unfinished frame, because the next bytes come from another connection."""
-        self.counts.count_dropped(len(self._tail))
+        self.counts.bytes_dropped += len(self._tail)
         self._tail = b""
 
     def _try_decode(self, decode: Callable[[Raw], Frame], raw: Raw, dropped_size: int) -> list[Frame]:
@@ -334,8 +320,6 @@ class Parser(ABC):
             self.counts.count_rejected(dropped_size, wrong_checksum=isinstance(error, ChecksumError))
             return []
         self.counts.frames += 1
-        self.counts.resyncs += self.counts.is_out_of_sync
-        self.counts.is_out_of_sync = False
         return [frame]
 
 

@@ -299,7 +299,7 @@ class SyncParser(Parser):
         parsed_end = 0  # all bytes before this position have been parsed
         start = unparsed.find(sync, parsed_end)  # -1 if the pattern does not occur
         while 0 <= start <= last_complete_start:
-            self.counts.count_dropped(start - parsed_end)  # bytes between the previous frame and the pattern
+            self.counts.bytes_dropped += start - parsed_end  # bytes between the previous frame and the pattern
             # If the bytes are not a frame, one byte is dropped, because a frame may begin at the next byte.
             decoded = self._try_decode(self.layout.decode, unparsed[start : start + length], dropped_size=1)
             frames += decoded
@@ -310,7 +310,7 @@ class SyncParser(Parser):
         tail_start = start  # the beginning of an unfinished frame
         if start < 0:  # no sync pattern was found, but the end of the data may contain the beginning of the pattern
             tail_start = max(parsed_end, len(unparsed) - len(sync) + 1)
-        self.counts.count_dropped(tail_start - parsed_end)
+        self.counts.bytes_dropped += tail_start - parsed_end
         self._tail = unparsed[tail_start:]
         return frames
 

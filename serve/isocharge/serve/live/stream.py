@@ -72,7 +72,6 @@ class StreamTotals(NamedTuple):
     crc_errors: int = 0
     malformed: int = 0
     bytes_dropped: int = 0
-    resyncs: int = 0
 
 
 def stream(chunks: Iterable[Chunk], predictor: Predictor, device: Device = ANY_BOARD) -> Iterator[PredictionRecord]:
@@ -168,7 +167,6 @@ class ReadingStream:
             crc_errors=counts.crc_errors,
             malformed=counts.malformed,
             bytes_dropped=counts.bytes_dropped,
-            resyncs=counts.resyncs,
         )
         return StreamTotals(*map(sum, zip(self._before_restart, since_restart, strict=True)))
 

@@ -19,6 +19,7 @@ import os
 import re
 import select
 import socket
+import termios
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -124,24 +125,10 @@ MAX_READ_BYTES = 65536
 """Largest number of bytes that are read at the same time. No datagram is larger."""
 
 
-def _terminal_errors() -> tuple[type[Exception], ...]:
-    """Return the exception types, other than OSError, that pyserial raises on this system.
-
-    On systems without POSIX terminals, the result is empty.
-    """
-    try:
-        return (importlib.import_module("termios").error,)
-    except ImportError:
-        return ()
-
-
-HAS_POSIX_PORTS = bool(_terminal_errors())
-"""Whether ports have file descriptors for which `select` can wait. Otherwise pyserial reads the ports."""
-
-READ_ERRORS: tuple[type[Exception], ...] = (OSError, *_terminal_errors())
+READ_ERRORS = (OSError, termios.error)
 """Exceptions that reading a line can raise."""
 
-OPEN_ERRORS: tuple[type[Exception], ...] = (ValueError, *READ_ERRORS)
+OPEN_ERRORS = (ValueError, *READ_ERRORS)
 """Exceptions that opening a line can raise."""
 
 
@@ -155,7 +142,6 @@ def _keep_ready_signal(descriptor: int) -> None:
     Args:
         descriptor: File descriptor of the terminal.
     """
-    termios = importlib.import_module("termios")
     attributes = termios.tcgetattr(descriptor)
     control_modes = 2  # index in the attributes
     attributes[control_modes] &= ~termios.HUPCL
@@ -197,9 +183,8 @@ class SerialLine:
             self._serial.set_low_latency_mode(True)
         # Lines that exist only inside pyserial have no file descriptor.
         self._descriptor: int | None = None
-        if HAS_POSIX_PORTS:
-            with suppress(AttributeError, io.UnsupportedOperation):
-                self._descriptor = int(self._serial.fileno())
+        with suppress(AttributeError, io.UnsupportedOperation):
+            self._descriptor = int(self._serial.fileno())
         if self._descriptor is not None and os.isatty(self._descriptor):
             _keep_ready_signal(self._descriptor)
 

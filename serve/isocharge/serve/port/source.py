@@ -32,7 +32,6 @@ from typing import NamedTuple, Protocol, Self
 from isocharge.common.errors import InputError, PortError, PortLost
 from isocharge.serve.port.foreign_files import HEAD_BYTES, refuse_foreign_file
 from isocharge.serve.port.serial_line import (
-    HAS_POSIX_PORTS,
     OPEN_ERRORS,
     READ_ERRORS,
     UDP_SCHEME,
@@ -164,9 +163,8 @@ class Port:
             PortError: If the line cannot be opened.
             InputError: If the port is a file.
         """
-        # On systems without POSIX ports, the name of a port, such as COM3, is not the path of a file.
         is_path = "://" not in self.url
-        if is_path and HAS_POSIX_PORTS and not Path(self.url).exists():
+        if is_path and not Path(self.url).exists():
             raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
         if is_path and Path(self.url).is_file():
             _refuse_file(Path(self.url))

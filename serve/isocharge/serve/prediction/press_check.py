@@ -53,9 +53,6 @@ MISFIT_PROBABILITY = 2e-3
 MIN_COMMON_SIGNIFICANCE = 3.0
 """Significance above which a common shift or a common scale factor is reported, in standard deviations."""
 
-MAX_LISTED_PRESSES = 5
-"""Largest number of presses that a note lists."""
-
 MIN_FIT_PRESSES = 500
 """Smallest number of presses from which `isocharge train fit` trains a model."""
 
@@ -212,10 +209,10 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     # Collect the explanations for the user.
     notes: list[str] = []
     if fits is False:
-        notes += _remedies(metadata, position, force)
+        notes += _remedies(position, force)
     notes += _exclusion_notes(errors, metadata)
     if is_bad.any():
-        bad_lines = row_words(np.array(errors.lines)[is_bad].tolist(), errors.row_noun, MAX_LISTED_PRESSES)
+        bad_lines = row_words(np.array(errors.lines)[is_bad].tolist(), errors.row_noun)
         notes.append(f"{bad_lines}: nothing like the other presses, left out; look at it")
     notes += _common_notes(agreement)
     return PressCheck(
@@ -324,15 +321,13 @@ def _verdict(
     return verdict
 
 
-def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: ErrorSummary | None) -> Iterator[str]:
+def _remedies(position: ErrorSummary | None, force: ErrorSummary | None) -> Iterator[str]:
     """Yield notes about possible remedies for a model that does not fit.
 
     The first note states how large the uncertainty of the rig would have to be to explain the errors. The second note
-    recommends a calibration. If the model was already calibrated, the second note also mentions training with the
-    measured presses.
+    recommends a calibration, or training with the measured presses.
 
     Args:
-        metadata: Metadata of the model, which state whether the model was calibrated.
         position: Errors of the positions; None if no position is known.
         force: Errors of the forces; None if no force is known.
     """
@@ -348,17 +343,9 @@ def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: Err
         options.append(f"--force-std {0.01 * rig_std(force):.2g}")
     yield f"the errors would be the rig's if that were as uncertain as {' '.join(options)}"
 
-    # A sensor that was never calibrated may also have the section `calibration`, but without gains and rotation.
-    calibration = metadata.sensor.get("calibration")
-    is_calibrated = False
-    if isinstance(calibration, dict):
-        is_calibrated = bool(calibration.get("gain") or calibration.get("rotation_deg"))
-    if not is_calibrated:
-        yield "this model is of the film as described: calibrate it (isocharge train calibrate)"
-        return
     yield (
-        "this film is calibrated already: do so again only if it has changed since (isocharge train calibrate --from); "
-        f"what no film explains, `isocharge train fit PRESSES.csv` learns from {MIN_FIT_PRESSES} presses on"
+        "if the film has changed since its calibration, or was never calibrated: isocharge train calibrate; what no "
+        f"film explains, `isocharge train fit PRESSES.csv` learns from {MIN_FIT_PRESSES} presses on"
     )
 
 
@@ -371,37 +358,20 @@ def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[s
         errors: Errors of all presses, with the reason why each press was excluded.
         metadata: Metadata of the model.
     """
-    reason_of_each_press = errors.exclusion_reasons
-    different_reasons = set(reason_of_each_press) - {""}  # a press that is compared has an empty reason
-    for reason in sorted(different_reasons):
-        lines = [
-            line
-            for line, reason_of_press in zip(errors.lines, reason_of_each_press, strict=True)
-            if reason_of_press == reason
-        ]
-        list_of_lines = row_words(lines, errors.row_noun, MAX_LISTED_PRESSES)  # such as "lines 2, 5 and 4 more"
-        explanation = _explain_exclusion(reason, metadata)
-        yield f"{len(lines)} of {len(reason_of_each_press)} presses do not count: {explanation} ({list_of_lines})"
-
-
-def _explain_exclusion(reason: str, metadata: ModelMetadata) -> str:
-    """Return a part of a sentence that explains to the user why presses were excluded.
-
-    If the presses are outside the domain of the model, the text states the limits of the domain.
-
-    Args:
-        reason: Reason why presses were excluded, as in `PressErrors.exclusion_reasons`.
-        metadata: Metadata of the model, which contain the domain of the model.
-    """
-    if reason != NOT_TRAINED:
-        return reason
     min_force_N, max_force_N = metadata.force_range_N
     validity = Validity.of(metadata)
     area = f"{validity.area_text} from the centre" if validity.is_centred else validity.area_text
-    return (
+    domain = (
         f"outside the model's working area ({area}) or forces ({min_force_N:.3g} to {max_force_N:.3g} N); if these "
         "are most, look at the units"
     )
+    reasons = np.array(errors.exclusion_reasons)
+    for reason in sorted(set(errors.exclusion_reasons) - {""}):  # a press that is compared has an empty reason
+        lines = np.array(errors.lines)[reasons == reason].tolist()
+        explanation = domain if reason == NOT_TRAINED else reason
+        yield (
+            f"{len(lines)} of {len(reasons)} presses do not count: {explanation} ({row_words(lines, errors.row_noun)})"
+        )
 
 
 def _common_notes(agreement: Agreement) -> Iterator[str]:

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.common.errors import PressError, error_prefix, shown
+from isocharge.common.errors import PressError, cut, error_prefix, shown
 from isocharge.serve.presses.csv_table import csv_text
 from isocharge.serve.presses.number_table import (
     CHARGE_RULE,
@@ -353,20 +353,15 @@ def presses_text(presses: MeasuredPresses) -> str:
     return csv_text(presses.columns)
 
 
-def row_words(rows: Sequence[int], row_noun: str, max_listed: int = 10) -> str:
-    """List the lines or rows of presses for a message, for example as "line 3" or "rows 3, 4 and 12 more".
+def row_words(rows: Sequence[int], row_noun: str) -> str:
+    """List the lines or rows of presses for a message, for example as "line 3" or "lines 3, 4, 7".
 
     Args:
-        rows: Numbers of the lines or rows of the presses in their file.
+        rows: Numbers of the lines or rows of the presses in their file. Only the first ones are listed.
         row_noun: What the numbers count: "line", "row" or "press".
-        max_listed: Largest number of presses that are listed. If there are more presses, the text counts the others.
     """
-    plural = f"{row_noun}es" if row_noun.endswith("s") else f"{row_noun}s"  # "presses" and "lines"
-    noun = row_noun if len(rows) == 1 else plural
-    listed_numbers = ", ".join(map(str, rows[:max_listed]))
-    if len(rows) <= max_listed:
-        return f"{noun} {listed_numbers}"
-    return f"{noun} {listed_numbers} and {len(rows) - max_listed} more"
+    plural = {"line": "lines", "row": "rows", "press": "presses"}[row_noun]
+    return f"{row_noun if len(rows) == 1 else plural} {cut(', '.join(map(str, rows)))}"
 
 
 def _check_electrodes(electrodes: Collection[str]) -> None:
