@@ -1,4 +1,4 @@
-"""Design cases: distance rules, goals, weight maps, and errors that are raised before the film is solved."""
+"""Design cases: distance rules, and errors that are raised before the film is solved."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 
 from isocharge.common.errors import InputError
 from isocharge.simulate import Calibration, Electrode, NoiseModel
-from isocharge.simulate.layout.case import DesignCase, Nuisances, WeightMap, read_goal
+from isocharge.simulate.layout.case import DesignCase, Nuisances
 from isocharge.simulate.layout.design import design
 
 
@@ -49,11 +49,7 @@ def test_new_squares_are_named_anticlockwise_with_unused_letters(sensor):
         pytest.param({"gap": -1.0}, "gap: expected a length from 0 mm", id="negative gap"),
         pytest.param({"side": 0.0}, "side: expected a length", id="side of zero"),
         pytest.param({"noise": NoiseModel("mine", 0.0, 1e-3)}, "expected white noise above 0", id="no white noise"),
-        pytest.param(
-            {"goal": WeightMap("map.csv", np.array([[20.0, 0.0, 0.0]]))},
-            "no position within the radius",
-            id="weights of zero",
-        ),
+        pytest.param({"goal": "best"}, "goal: expected worst or rms, got 'best'", id="unknown goal"),
         pytest.param(
             {"sensor": {"calibration": Calibration(rotation=0.1)}, "keep": ("A",)},
             "is calibrated",
@@ -83,31 +79,3 @@ def test_squares_that_do_not_fit_raise_input_error_before_the_film_is_solved(sen
     for case in (DesignCase(sensor, 8, 8.0, side=30.0), DesignCase(wall, 4, 8.0, keep=("A",), side=20.0)):
         with pytest.raises(InputError, match="do not fit"):
             design(case)
-
-
-def test_weight_map_interpolates_linearly_and_extrapolates_the_nearest_weight(tmp_path):
-    path = tmp_path / "map.csv"
-    path.write_text("\ufeffx_mm, y_mm, weight\n0,0,1\n10,0,0\n0,10,0\n")
-    goal = read_goal(str(path))
-    assert goal.weigh(np.array([[0.0, 0.0], [5.0, 0.0], [20.0, 0.0]])) == pytest.approx([1.0, 0.5, 0.0])
-    assert goal.name == "map.csv"
-    line = WeightMap("line", np.array([[1.0, 0.0, 2.0], [1.0, 10.0, 3.0]]))
-    assert line.weigh(np.array([[5.0, 4.0], [1.0, 6.0]])).tolist() == [2.0, 3.0]  # points on a line span no triangles
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        pytest.param("x,y,w\n1,2,3\n", id="wrong header"),
-        pytest.param("x_mm,y_mm,weight\n1,2\n", id="missing column"),
-        pytest.param("x_mm,y_mm,weight\n1,2,-1\n", id="negative weight"),
-        pytest.param("x_mm,y_mm,weight\n1,nan,1\n", id="NaN"),
-        pytest.param("", id="empty file"),
-    ],
-)
-def test_read_goal_of_an_invalid_weight_map_raises_input_error(tmp_path, text):
-    path = tmp_path / "map.csv"
-    path.write_text(text)
-    for goal in (str(path), "best"):
-        with pytest.raises(InputError, match=rf"goal '{goal}': expected 'worst', 'rms' or a CSV file x_mm,y_mm,weight"):
-            read_goal(goal)

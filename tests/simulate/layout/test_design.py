@@ -1,5 +1,6 @@
 """Complete design of a small layout with three electrodes for presses within 4 mm."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from isocharge.simulate import Domain, ForwardMap, FunctionMap, limits_at
 from isocharge.simulate.layout import case as case_module
 from isocharge.simulate.layout import design as design_module
 from isocharge.simulate.layout import search as search_module
-from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, WeightMap
+from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase
 from isocharge.simulate.layout.charge_table import ChargeTable
 from isocharge.simulate.layout.design import NOT_SEARCHED, UNAMBIGUOUS, describe_ambiguities, design
 from isocharge.simulate.layout.search import Search, random_layouts
@@ -31,7 +32,7 @@ def _rough(tables, sensor):
             (case_module, "FINE_GRID_STEPS", 10),
             (case_module, "MAX_SEARCH_PRESSES", 60),
             (search_module, "STARTS", 3),
-            (search_module, "GRID_STEPS", 12),
+            (search_module, "ROUNDS", 2),
         ):
             patch.setattr(module, name, value)
         patch.setattr(ChargeTable, "solve", staticmethod(lambda sensor, *_: tables[sensor.name]))
@@ -80,24 +81,19 @@ def test_no_neighbouring_layout_is_better_by_more_than_one_percent(found, centre
     )
 
 
-def test_rms_and_weighted_goals_reduce_their_own_error(centres, sensor, tables, monkeypatch):
-    """The goals are the root mean square over the disk, and over its right half."""
-    monkeypatch.setattr(search_module, "MAX_ROUNDS", 2)
-    right = WeightMap("right", np.array([[-4.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.1, 0.0, 1.0], [4.0, 0.0, 1.0]]))
-    for goal in ("rms", right):
-        search = Search(case_of(sensor, goal=goal), tables["four-25um-biaxial"])
-        start = search.optima(*random_layouts(search.case))[0]
-        value, *numbers = search.refine(start)
-        best = np.reshape(numbers, (-1, 2))
-        assert value == pytest.approx(search.minimised_error(best))
-        assert value < min(0.95 * search.minimised_error(centres), search.minimised_error(start))
-        assert search.case.all_clearances(best).min() > -1e-3
+def test_goal_rms_reduces_the_root_mean_square(centres, sensor, tables):
+    search = Search(case_of(sensor, goal="rms"), tables["four-25um-biaxial"])
+    start = random_layouts(search.case)[0]
+    found = search.refine(search.optimum(start))
+    assert found.error == pytest.approx(search.minimised_error(found.positions))
+    assert found.error <= min(search.minimised_error(centres), search.minimised_error(start))
+    assert search.case.all_clearances(found.positions).min() > -1e-3
 
 
 def test_ambiguous_layout_is_rejected_for_the_next_one(sensor, monkeypatch):
     """If all layouts are ambiguous, the one with the smallest error is returned."""
     answers = iter(["it folds", UNAMBIGUOUS])
-    monkeypatch.setattr(Search, "refine", lambda _, places: np.append(places[0, 0], places))
+    monkeypatch.setattr(Search, "refine", lambda _, layout: layout)
     monkeypatch.setattr(design_module, "describe_ambiguities", lambda *_: next(answers))
     second = design(case_of(sensor))
     monkeypatch.setattr(design_module, "describe_ambiguities", lambda *_: "it folds")
@@ -106,7 +102,7 @@ def test_ambiguous_layout_is_rejected_for_the_next_one(sensor, monkeypatch):
     assert best.minimised_error < second.minimised_error
 
 
-def test_ambiguities_reports_folds_and_pairs(sensor, monkeypatch):
+def test_ambiguities_reports_folds_and_pairs(sensor):
     """The charges of the map fold at x = 3 mm."""
 
     def charges(contact):
@@ -114,10 +110,9 @@ def test_ambiguities_reports_folds_and_pairs(sensor, monkeypatch):
         shapes = np.stack([4.0 + (x - x**2 / 6.0) / 3.0, 4.0 + 0.3 * y, np.full(len(x), 3.0)], axis=1)
         return 300.0 * force[:, None] ** (2.0 / 3.0) * shapes
 
-    monkeypatch.setattr(design_module, "find_ambiguous_pairs", lambda *_: [1, 2])
-    text = "the map folds 3.0 mm from the centre; 6 pairs of contacts have the same charges"
     charge_map = FunctionMap(charges, ("A", "B", "C"), Domain(4.0, (0.05, 2.0)))
-    assert describe_ambiguities(case_of(sensor), charge_map) == text
+    text = describe_ambiguities(case_of(sensor), charge_map)
+    assert re.fullmatch(r"the map folds 3.0 mm from the centre; \d+ pairs of contacts have the same charges", text)
 
 
 def test_design_reports_that_charges_cannot_be_interpolated(sensor, monkeypatch):
@@ -125,20 +120,6 @@ def test_design_reports_that_charges_cannot_be_interpolated(sensor, monkeypatch)
         raise SolveError("rough")
 
     monkeypatch.setattr(ForwardMap, "build", refuse)
-    monkeypatch.setattr(Search, "refine", lambda _, places: np.append(places[0, 0], places))
+    monkeypatch.setattr(Search, "refine", lambda _, layout: layout)
     found = design(case_of(sensor))
     assert (found.summary, found.unambiguous) == (NOT_SEARCHED, False)
-
-
-def test_derivatives_of_the_log_errors_equal_central_differences(sensor, tables):
-    """Each column of the Jacobian integrates only the square that moves."""
-    for goal in ("worst", "rms"):
-        search = Search(case_of(sensor, goal=goal), tables["four-25um-biaxial"])
-        positions = np.array([[9.0, 1.0], [-5.0, 8.0], [-4.0, -7.0]])
-        which = np.arange(0, 60, 7) if goal == "worst" else slice(None)
-        jacobian = search._log_error_jacobian(positions, which)
-        for number in range(6):
-            step = np.zeros(6)
-            step[number] = 2e-3
-            above, below = (search._log_errors(positions + sign * step.reshape(3, 2), which) for sign in (1.0, -1.0))
-            assert jacobian[:, number] == pytest.approx((above - below) / 4e-3, rel=0.05, abs=2e-3)

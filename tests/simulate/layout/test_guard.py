@@ -71,7 +71,7 @@ def test_a_guard_away_from_the_circle_of_the_electrodes_removes_the_mirror_regio
     assert found.region_before.total_share > 0.5
     assert found.region_after.total_share < 0.01
     assert abs(np.hypot(*found.guard.centre) - 10.0) > 2.0
-    assert found.limits_after.rms < found.limits_before.rms
+    assert found.limits_after["rms_mm"] < found.limits_before["rms_mm"]
     assert found.sensor.guard_names == ("E",)
     assert found.sensor.electrodes[:4] == case.sensor.electrodes
 

@@ -1,6 +1,6 @@
 """Command `isocharge simulate design`, which searches for electrode positions with small position errors."""
 
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
@@ -21,7 +21,7 @@ from isocharge.common.files import refuse_existing
 from isocharge.simulate import Circle, load_sensor, noise_model, parse_probe
 from isocharge.simulate.artwork.design_folder import write_design, write_guard_design
 from isocharge.simulate.artwork.leads import straight_leads
-from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Nuisances, read_goal
+from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Goal, Nuisances
 from isocharge.simulate.layout.design import Design, design
 from isocharge.simulate.layout.guard import GuardDesign, design_guard
 
@@ -52,9 +52,8 @@ def design_command(
         str,
         typer.Option(
             "--goal",
-            metavar="worst|rms|MAP",
-            help="Quantity to minimise: the largest error, the root mean square of the errors, or the root mean square "
-            "weighted with a map, a CSV file with the columns x_mm, y_mm, weight.",
+            metavar="worst|rms",
+            help="Quantity to minimise: the largest error, or the root mean square of the errors.",
         ),
     ] = "worst",
     known: Annotated[
@@ -117,7 +116,7 @@ def design_command(
         described_sensor,
         electrodes,
         radius,
-        goal=read_goal(goal),
+        goal=cast(Goal, goal),
         keep=tuple(name for name in kept_names if name),
         probe=footprint,
         force=force,
@@ -140,7 +139,7 @@ def design_command(
     results = result.to_dict()
     del results["case"]
     if isinstance(result, GuardDesign):
-        limits = {"before": result.limits_before.to_dict(), "after": result.limits_after.to_dict()}
+        limits = {"before": result.limits_before, "after": result.limits_after}
         results = {"guard": results["guard"], "position_limit": limits}
     show_result(results, json=False)
     caution = "" if guard or results["unambiguous"] else "caution: "

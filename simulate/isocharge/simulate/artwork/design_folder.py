@@ -33,7 +33,7 @@ def write_design(design: Design, folder: Path) -> None:
     case = design.case
     errors = design.errors_after.to_dict()["with_nuisances"]  # includes the errors by uncertain nuisance parameters
     sensor_comment = [
-        f"Positions searched for {case.electrodes} electrodes over {case.radius:g} mm, goal {case.goal_name}:",
+        f"Positions searched for {case.electrodes} electrodes over {case.radius:g} mm, goal {case.goal}:",
         f"lower limit of the position error {errors['worst_mm']:.3f} mm at worst, {errors['rms_mm']:.3f} mm rms.",
     ]
     pictures = {"design.png": picture_bytes(error_maps_picture(design))}

@@ -1,16 +1,13 @@
 """Design case: the requirements of an electrode layout, and the rules for the electrode positions."""
 
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
-import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import InputError
-from isocharge.common.files import read_whole
 from isocharge.simulate.forward.family import check_family
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import NOISE_LEVELS
@@ -30,14 +27,11 @@ DEFAULT_SIDE = 3.0
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Names of new electrodes. New electrodes get the first of these names that no kept electrode has."""
 
-MAX_SEARCH_PRESSES = 300
-"""Largest number of presses for which the first stage of the search (exchange on a grid) evaluates a layout."""
+MAX_SEARCH_PRESSES = 150
+"""Largest number of presses for which the search evaluates random layouts."""
 
 FINE_GRID_STEPS = 50
 """Number of steps of the fine grid of presses from the centre to the largest distance of a press."""
-
-WEIGHT_MAP_HEADER = "x_mm,y_mm,weight"
-"""First line of the CSV file of a weight map."""
 
 
 @dataclass(frozen=True)
@@ -66,85 +60,8 @@ NO_NUISANCES = Nuisances(probe_radius=0.0, pretension=0.0, gain=0.0)
 """Standard deviations of zero, for a press of which only the position and the force are unknown."""
 
 
-@dataclass(frozen=True)
-class WeightMap:
-    """Weights of the position errors in the goal of a design. The weight depends on the position of the press.
-
-    Attributes:
-        name: Name of the file that contains the weights.
-        table: Rows with x (mm), y (mm) and the weight (dimensionless) of a position, shape (n, 3).
-    """
-
-    name: str
-    table: Array
-
-    def weigh(self, presses: Array) -> Array:
-        """Compute the weights of presses by linear interpolation between the rows of the table.
-
-        Each row contains a position and its weight. If the table does not cover the position of a press, the press has
-        the weight of the nearest row.
-
-        Args:
-            presses: Positions (x, y), shape (n, 2), mm.
-
-        Returns:
-            Weights, shape (n,), dimensionless.
-        """
-        table_positions = self.table[:, :2]
-        table_weights = self.table[:, 2]
-        nearest_weights = scipy.interpolate.NearestNDInterpolator(table_positions, table_weights)(presses)
-
-        # Linear interpolation needs a triangulation of the table, which does not exist if all positions lie on one
-        # line.
-        spans_plane = np.linalg.matrix_rank(table_positions - table_positions[0]) == 2
-        if not spans_plane:
-            return np.asarray(nearest_weights)
-        interpolate = scipy.interpolate.LinearNDInterpolator(table_positions, table_weights)
-        linear_weights = interpolate(presses)  # NaN outside the convex hull of the table
-        return np.asarray(np.where(np.isnan(linear_weights), nearest_weights, linear_weights))
-
-
-NamedGoal = Literal["worst", "rms"]
-
-Goal = NamedGoal | WeightMap
-"""Quantity that a design minimises.
-
-The quantity is the largest position error ("worst"), the root mean square of the position errors ("rms"), or the
-weighted root mean square with the weights of a `WeightMap`.
-"""
-
-
-def read_goal(text: str) -> Goal:
-    """Convert the value of the option `--goal` into the goal of a design, which is the quantity that it minimises.
-
-    Args:
-        text: "worst", "rms", or the path of a CSV file. The file contains the weights of the position errors at several
-            places, below the header `WEIGHT_MAP_HEADER`.
-
-    Returns:
-        The name "worst" or "rms" unchanged, or the weights that the file contains.
-
-    Raises:
-        InputError: If the file cannot be read, or its content is not a weight map.
-    """
-    if text in get_args(NamedGoal):
-        return cast(NamedGoal, text)
-    try:
-        # If the file is empty, the assignment raises a ValueError, because there is no header line.
-        header, *lines = read_whole(Path(text)).decode("utf-8-sig").splitlines()
-        if header.replace(" ", "") != WEIGHT_MAP_HEADER:
-            raise ValueError(f"the columns are {header!r}")
-        table = np.loadtxt(lines, delimiter=",", ndmin=2)
-        has_rows_of_three = len(table) > 0 and table.shape[1] == 3
-        is_valid = has_rows_of_three and np.isfinite(table).all() and table[:, 2].min() >= 0.0
-        if not is_valid:
-            raise ValueError("expected rows of three finite numbers, of which the weight is not negative")
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"goal {text!r}: expected 'worst', 'rms' or a CSV file {WEIGHT_MAP_HEADER}: {error}"
-        ) from error
-    return WeightMap(Path(text).name, table)
-
+Goal = Literal["worst", "rms"]
+"""Quantity that a design minimises: the largest position error, or the root mean square of the position errors."""
 
 DEFAULT_PROBE = Circle(1.0)
 """Default probe of a design case, which has a radius of 1 mm."""
@@ -214,8 +131,8 @@ class DesignCase:
                 f"noise {self.noise.name!r}: expected white noise above 0, because errors have no lower limit "
                 "without noise"
             )
-        if not self.weights(self.search_presses).max() > 0.0:
-            raise InputError(f"goal {self.goal_name}: no position within the radius has a weight above 0")
+        if self.goal not in get_args(Goal):
+            raise InputError(f"goal: expected {' or '.join(get_args(Goal))}, got {self.goal!r}")
         self._check_kept_electrodes()
 
     def _check_kept_electrodes(self) -> None:
@@ -270,13 +187,8 @@ class DesignCase:
         return self.electrodes - len(self.keep)
 
     @property
-    def goal_name(self) -> str:
-        """Name of the goal: "worst", "rms" or the file name of a weight map."""
-        return self.goal.name if isinstance(self.goal, WeightMap) else self.goal
-
-    @property
     def search_presses(self) -> Array:
-        """Positions (x, y) of the presses for which the first stage of the search evaluates layouts.
+        """Positions (x, y) of the presses for which the search evaluates random layouts.
 
         The shape is (n, 2), and the unit is mm.
         """
@@ -290,17 +202,6 @@ class DesignCase:
         The grid is fine because the largest position error mostly occurs in a small region beside an electrode.
         """
         return square_grid(self.radius, self.radius / FINE_GRID_STEPS)
-
-    def weights(self, presses: Array) -> Array:
-        """Return the weight of each press in the quantity that the design minimises.
-
-        Args:
-            presses: Positions (x, y), shape (n, 2), mm.
-
-        Returns:
-            Weights, shape (n,), dimensionless. All weights are 1 if the goal is not a weight map.
-        """
-        return self.goal.weigh(presses) if isinstance(self.goal, WeightMap) else np.ones(len(presses))
 
     def clearance(self, positions: Array) -> Array:
         """Compute the margin with which each square satisfies the distance rules.
@@ -379,11 +280,11 @@ class DesignCase:
         return replace(self.sensor, name=name, electrodes=electrodes, calibration=Calibration())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the requirements as a dictionary for JSON, without the sensor and without the table of weights."""
+        """Return the requirements as a dictionary for JSON, without the sensor."""
         return {
             "electrodes": self.electrodes,
             "radius_mm": self.radius,
-            "goal": self.goal_name,
+            "goal": self.goal,
             "keep": list(self.keep),
             "probe": self.probe.notation,
             "force_N": self.force,

@@ -17,6 +17,7 @@ area times the mean charge per area.
 """
 
 import math
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,7 +37,6 @@ from isocharge.simulate.numerics.interpolation import (
     barycentric_weights,
     chebyshev_nodes,
     cubic_weights,
-    gauss_square,
     lagrange_values,
     periodic_weights,
 )
@@ -88,11 +88,11 @@ N_DISTANCES_WIDE = 8
 """Number of solved distances if the largest distance of a press is above `WIDE_RADIUS`."""
 
 GAUSS_RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
-"""Integration rules of squares in ascending order of the distance between the square and the press.
+"""Integration rules of electrodes in ascending order of the distance between the electrode and the press.
 
-Each rule consists of the largest distance at which it is used, and of the number of Gauss points per side of a square.
-The unit of the distances is the sum of half the diagonal of the square and the probe radius. The kink of the stress
-crosses only squares to which the first rule applies.
+Each rule consists of the largest distance at which it is used, and of the number of Gauss points per side of the
+electrode. The unit of the distances is the sum of the radius of the circle around the electrode and the probe radius.
+The kink of the stress crosses only electrodes to which the first rule applies.
 """
 
 PRESS_CHUNK = 256
@@ -167,33 +167,25 @@ class ChargeTable:
         stress = component_before_node.reshape(3 * len(presses), -1).astype(np.float32)
         return cls(film, probe, (sensor.piezo.d31, sensor.piezo.d32), distance, direction, stress)
 
-    def rows(self, presses: Array, centres: Array, side: float, others: tuple[Electrode, ...] = ()) -> Array:
-        """Compute the charges of square and other electrodes under presses, and the derivatives of these charges.
+    def rows(self, presses: Array, electrodes: Sequence[Electrode]) -> Array:
+        """Compute the charges of electrodes under presses, and the derivatives of these charges.
 
         A row contains the charge of one electrode under one press, followed by the derivatives of this charge. The
         charge per area is averaged over the area of an electrode, even if the sensor has the edge readout.
 
         Args:
             presses: Positions (x, y) of the presses, shape (n, 2), mm.
-            centres: Centres (x, y) of the squares, shape (m, 2), mm.
-            side: Side of the squares, mm.
-            others: Further electrodes of any shape.
+            electrodes: Electrodes of any shape at their nominal positions.
 
         Returns:
-            One row with the columns `COLUMNS` for each press and electrode, shape (n, m + len(others), 6). The squares
-            precede the other electrodes.
+            One row with the columns `COLUMNS` for each press and electrode, shape (n, n_electrode, 6).
         """
-        chunks = []
-        for start in range(0, len(presses), PRESS_CHUNK):
-            pressed = _PressedFilm.interpolate(self, presses[start : start + PRESS_CHUNK])
-            square_rows = pressed.square_rows(centres, side)
-            other_rows = [pressed.electrode_rows(electrode) for electrode in others]
-            chunks.append(np.concatenate([square_rows, *other_rows], axis=1))
-        return np.concatenate(chunks)
+        chunks = np.array_split(presses, math.ceil(len(presses) / PRESS_CHUNK))
+        return np.concatenate([PressedFilm.interpolate(self, chunk).rows(electrodes) for chunk in chunks])
 
 
 @dataclass(frozen=True)
-class _PressedFilm:
+class PressedFilm:
     """Charge per area that several presses cause, at the nodes of the polar grid of each press.
 
     Attributes:
@@ -215,7 +207,7 @@ class _PressedFilm:
     density: np.ndarray
 
     @classmethod
-    def interpolate(cls, table: ChargeTable, presses: Array) -> "_PressedFilm":
+    def interpolate(cls, table: ChargeTable, presses: Array) -> "PressedFilm":
         """Compute the charges per area that several presses cause by interpolating a charge table.
 
         Args:
@@ -247,66 +239,33 @@ class _PressedFilm:
         map_parameter, circle_radius = automorphism_onto(circular_distance / table.film.radius, relative_radius)
         return cls(table, position, direction, map_parameter, circle_radius, density)
 
-    def square_rows(self, centres: Array, side: float) -> Array:
-        """Compute the charges of squares and their derivatives for all presses.
-
-        Squares near a press are integrated with more Gauss points than distant squares; see `GAUSS_RULES`.
-
-        Args:
-            centres: Centres (x, y) of the squares, shape (m, 2), mm.
-            side: Side of the squares, mm.
-
-        Returns:
-            Rows with the columns `COLUMNS`, shape (n, m, 6).
-        """
-        complex_centres = centres @ np.array([1.0, 1j])  # x + iy
-        distance = np.abs(complex_centres - self.presses[:, None])  # shape (n, m)
-        half_diagonal = np.sqrt(0.5) * side
-        relative_distance = distance / (half_diagonal + self.table.probe.radius)
-
-        # Choose the integration rule of each pair of a press and a square: the first rule whose largest distance is not
-        # below the distance of the pair. Then compute all pairs with the same rule together, in chunks that limit the
-        # memory.
-        chosen_rule = np.searchsorted([largest_distance for largest_distance, _ in GAUSS_RULES], relative_distance)
-        rows = np.empty((*distance.shape, len(COLUMNS)))
-        for rule_index, (_, points_per_side) in enumerate(GAUSS_RULES):
-            unit_points, weights = gauss_square(points_per_side)  # on the unit square, with weights that sum to 1
-            press_index, square_index = np.nonzero(chosen_rule == rule_index)
-            chunk_size = POINT_CHUNK // len(unit_points)
-            for start in range(0, len(square_index), chunk_size):
-                press_chunk = press_index[start : start + chunk_size]
-                square_chunk = square_index[start : start + chunk_size]
-                points = centres[square_chunk, None] + side * (unit_points - 0.5)
-                rows[press_chunk, square_chunk] = side**2 * self.mean_rows(press_chunk, points, weights)
+    def rows(self, electrodes: Sequence[Electrode]) -> Array:
+        """Compute the charges of electrodes and their derivatives for all presses; see `ChargeTable.rows`."""
+        rows = np.empty((len(self.presses), len(electrodes), len(COLUMNS)))
+        for index, electrode in enumerate(electrodes):
+            # Choose the integration rule of each press: the first rule whose largest distance is not below the distance
+            # of the press. Then compute all presses with the same rule together, in chunks that limit the memory.
+            corners = np.concatenate(electrode.parts) @ np.array([1.0, 1j])  # x + iy
+            centre = corners.mean()
+            reach = np.abs(corners - centre).max() + self.table.probe.radius
+            limits = [largest_distance for largest_distance, _ in GAUSS_RULES]
+            rule_of_press = np.searchsorted(limits, np.abs(self.presses - centre) / reach)
+            for rule, (_, points_per_side) in enumerate(GAUSS_RULES):
+                presses = np.flatnonzero(rule_of_press == rule)
+                if not presses.size:
+                    continue
+                points, weights = electrode_rule(electrode, "area", points_per_side)
+                for chunk in np.array_split(presses, 1 + presses.size * len(points) // POINT_CHUNK):
+                    # The weights of s11, s22 and s12 are equal.
+                    rows[chunk, index] = electrode.area * self.mean_rows(chunk, points, weights[:, 0])
         return rows
-
-    def electrode_rows(self, electrode: Electrode) -> Array:
-        """For all presses, compute the charge of one electrode of any shape and the derivatives of this charge.
-
-        Args:
-            electrode: Electrode at its nominal position.
-
-        Returns:
-            Rows with the columns `COLUMNS`, shape (n, 1, 6).
-        """
-        _, points_per_side = GAUSS_RULES[0]  # the finest rule
-        points, component_weights = electrode_rule(electrode, "area", points_per_side)
-        weights = component_weights[:, 0]  # the weights of s11, s22 and s12 are equal
-        n_chunk = math.ceil(len(self.presses) * len(points) / POINT_CHUNK)  # the chunks limit the memory
-        means = []
-        for press_chunk in np.array_split(np.arange(len(self.presses)), n_chunk):
-            chunk_points = np.broadcast_to(points, (len(press_chunk), *points.shape))
-            means.append(self.mean_rows(press_chunk, chunk_points, weights))
-        return electrode.area * np.concatenate(means)[:, None]
 
     def mean_rows(self, press_index: Integers, points: Array, weights: Array) -> Array:
         """Compute weighted means of the charge per area and of its derivatives over points on the film.
 
-        Each mean belongs to one press. The values at the points are interpolated from the polar grid of this press.
-
         Args:
-            press_index: Index of the press to which each mean belongs, shape (k,).
-            points: Points (x, y) over which each mean is computed, shape (k, n_point, 2), mm.
+            press_index: Indices of the presses, shape (k,).
+            points: Points (x, y) over which the means are computed, shape (n_point, 2), mm.
             weights: Weights of the points, which add up to one, shape (n_point,).
 
         Returns:
@@ -315,8 +274,7 @@ class _PressedFilm:
         # Rotate the points into the frame of the press, whose x axis is the direction from the centre to the press.
         n_mean = len(press_index)
         direction = self.direction[press_index]
-        complex_points = points @ np.array([1.0, 1j])  # x + iy
-        points_in_press_frame = complex_points / direction[:, None]
+        points_in_press_frame = (points @ np.array([1.0, 1j])) / direction[:, None]
 
         # Each mean is a weighted sum over the nodes of the grid that surround its points.
         nodes, node_weights = self._nodes_around(press_index, points_in_press_frame, weights)

@@ -2,7 +2,7 @@
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,13 +14,11 @@ from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
-from isocharge.simulate.identifiability.folds import find_folds
+from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase
 from isocharge.simulate.layout.charge_table import ChargeTable
 from isocharge.simulate.layout.position_error import ErrorModel
-from isocharge.simulate.layout.search import Search, random_layouts
-from isocharge.simulate.numerics.disk import Rings
+from isocharge.simulate.layout.search import MAX_FINALISTS, MIN_DIFFERENCE, Layout, Search, random_layouts
 from isocharge.simulate.sensor.sensor import Sensor
 
 DECIMALS = 3
@@ -75,8 +73,8 @@ class Design:
     Attributes:
         case: Requirements of the layout.
         sensor: Sensor with the new layout.
-        minimised_error: Value of the minimised quantity for the new layout, mm. It is the largest error or the weighted
-            root mean square of the errors.
+        minimised_error: Value of the minimised quantity for the new layout, mm. It is the largest error or the root
+            mean square of the errors.
         summary: Sentence about folds and ambiguous pairs of the new layout over the default range of forces.
         n_rejected: Number of layouts with a smaller error that were rejected because their charges are ambiguous.
         errors_before: Errors of the initial sensor; None if it has fewer than three electrodes.
@@ -112,25 +110,11 @@ class Design:
         }
 
 
-class _CheckedLayout(NamedTuple):
-    """Refined layout that was searched for folds and ambiguous pairs.
-
-    Attributes:
-        sensor: Sensor with the layout.
-        error: Value of the minimised quantity, mm.
-        summary: Result of the search for folds and ambiguous pairs.
-    """
-
-    sensor: Sensor
-    error: float
-    summary: str
-
-
 def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     """Find the layout that has the smallest position errors among the layouts without folds and ambiguous pairs.
 
-    Random layouts are improved on a grid, and the best layouts are refined. The refined layouts are searched for folds
-    and ambiguous pairs in ascending order of their errors. The first layout without folds and ambiguous pairs is
+    Random layouts are improved, and the best ones are refined. The refined layouts are searched for folds and ambiguous
+    pairs in ascending order of their errors. The first layout without folds and ambiguous pairs is
     returned. If every layout has folds or ambiguous pairs, the layout with the smallest error is returned.
 
     Args:
@@ -145,42 +129,38 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
         InputError: If the electrodes do not fit on the film.
         SolveError: If a press has no equilibrium.
     """
-    # Improve random layouts, and refine the best ones.
-    grid, initial_layouts = random_layouts(case)
+    # Improve random layouts, and refine the best ones that are not rotations of each other.
+    starts = random_layouts(case)
     table = ChargeTable.solve(case.sensor, case.probe, case.force, case.radius, executor)
     search = Search(case, table)
-    optima = search.optima(grid, initial_layouts)
-    # A refined layout is an array that contains its error, followed by the coordinates of its squares.
-    refined_layouts = list(track(in_order(executor, search.refine, optima), "refining", len(optima)))
-    refined_layouts.sort(key=lambda layout: layout[0])
+    optima = list(track(in_order(executor, search.optimum, starts), "improving", len(starts)))
+    finalists: list[Layout] = []
+    for layout in sorted(optima, key=lambda layout: layout.error):
+        if not finalists or layout.error > finalists[-1].error * (1.0 + MIN_DIFFERENCE):
+            finalists.append(layout)
+    finalists = finalists[:MAX_FINALISTS]
+    refined_layouts = list(track(in_order(executor, search.refine, finalists), "refining", len(finalists)))
+    refined_layouts.sort(key=lambda layout: layout.error)
 
     # Check the layouts in the order of their errors, up to the first layout that is not ambiguous. A layout cannot be
     # checked if there is no accurate forward map.
     forward_map = _solve_forward_map(case, executor)
-    checked_layouts: list[_CheckedLayout] = []
-    for layout in track(refined_layouts, "looking for folds and ambiguous pairs"):
-        error = float(layout[0])
-        centres = np.round(layout[1:].reshape(-1, 2), DECIMALS)  # the order is x1, y1, x2, y2, ...
-        sensor = case.layout(centres)
+    summaries: list[str] = []
+    sensors = [case.layout(np.round(layout.positions, DECIMALS)) for layout in refined_layouts]
+    for sensor in track(sensors, "looking for folds and ambiguous pairs"):
         summary = NOT_SEARCHED
         if forward_map is not None:
             summary = describe_ambiguities(case, ChargeSpline.of(replace(forward_map, sensor=sensor)))
-        checked_layouts.append(_CheckedLayout(sensor, error, summary))
+        summaries.append(summary)
         if summary == UNAMBIGUOUS:
             break
 
-    # Only the last layout can be unambiguous. If it is, choose it, and reject all layouts before it. If all layouts are
-    # ambiguous, choose the first layout, which has the smallest error.
-    if checked_layouts[-1].summary == UNAMBIGUOUS:
-        n_rejected = len(checked_layouts) - 1
-        chosen = checked_layouts[-1]
-    else:
-        n_rejected = 0
-        chosen = checked_layouts[0]
-
+    # If all layouts are ambiguous, choose the first layout, which has the smallest error.
+    chosen = summaries.index(UNAMBIGUOUS) if UNAMBIGUOUS in summaries else 0
     errors_before = error_map(case, table, case.sensor) if len(case.sensor.electrodes) >= 3 else None
-    errors_after = error_map(case, table, chosen.sensor)
-    return Design(case, chosen.sensor, chosen.error, chosen.summary, n_rejected, errors_before, errors_after)
+    errors_after = error_map(case, table, sensors[chosen])
+    error = refined_layouts[chosen].error
+    return Design(case, sensors[chosen], error, summaries[chosen], chosen, errors_before, errors_after)
 
 
 def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMap | None:
@@ -207,28 +187,20 @@ def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMa
 def describe_ambiguities(case: DesignCase, charges: ChargeMap) -> str:
     """Search for folds and ambiguous pairs of a layout, and describe them in a short text.
 
-    The search covers three forces: the smallest and the largest force of the charge map, and the force of the case.
-
     Args:
-        case: Requirements of the layout, with the radius, the force and the noise.
+        case: Requirements of the layout, with the noise.
         charges: Charge map of the layout.
 
     Returns:
         `UNAMBIGUOUS` if there are no folds and no ambiguous pairs. Otherwise a text with the smallest distance of a
         fold from the centre and the number of pairs.
     """
-    min_force, max_force = charges.domain.force_range
-    forces = sorted({min_force, case.force, max_force})
-    rings = Rings.spread(case.radius)
-    fold_points = np.concatenate([find_folds(charges, rings, force, case.noise) for force in forces])
-    pair_count = sum(len(find_ambiguous_pairs(charges, case.noise, force)) for force in forces)
-
+    area = working_area(charges, case.noise, error=np.inf)
     findings = []
-    if len(fold_points):
-        x, y = fold_points.T
-        findings.append(f"the map folds {np.hypot(x, y).min():.1f} mm from the centre")
-    if pair_count:
-        findings.append(f"{pair_count} pairs of contacts have the same charges")
+    if len(area.folds):
+        findings.append(f"the map folds {area.fold_radius:.1f} mm from the centre")
+    if len(area.pairs):
+        findings.append(f"{len(area.pairs)} pairs of contacts have the same charges")
     return "; ".join(findings) or UNAMBIGUOUS
 
 
@@ -243,10 +215,7 @@ def error_map(case: DesignCase, table: ChargeTable, sensor: Sensor) -> ErrorMap:
     Returns:
         Position errors for the noise alone, and for the noise together with the nuisances.
     """
-    # The table is evaluated without squares, because all electrodes of the sensor are passed with their shapes.
-    no_squares = np.empty((0, 2))
-    unused_side = 1.0
-    charge_rows = table.rows(case.fine_grid, no_squares, unused_side, sensor.electrodes)
+    charge_rows = table.rows(case.fine_grid, sensor.electrodes)
     error_by_noise = np.sqrt(ErrorModel.of(case.noise, NO_NUISANCES).squared_errors(charge_rows))
     error_with_nuisances = np.sqrt(ErrorModel.of(case.noise, case.nuisances).squared_errors(charge_rows))
     return ErrorMap(case.fine_grid, error_by_noise, error_with_nuisances)

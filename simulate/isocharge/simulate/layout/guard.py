@@ -26,7 +26,7 @@ from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.whole_film import whole_film_map
-from isocharge.simulate.identifiability.cramer_rao import limits_at
+from isocharge.simulate.identifiability.identification import LimitMap
 from isocharge.simulate.identifiability.mirror_region import DETECTABLE_SIGMAS, FORCE_RATIO, MirrorRegion, is_interior
 from isocharge.simulate.identifiability.nearest_contact import explain, search
 from isocharge.simulate.layout.case import NAMES, DesignCase
@@ -60,41 +60,6 @@ LIMIT_ANGLES = 36
 
 
 @dataclass(frozen=True)
-class PositionLimits:
-    """Cramer-Rao limits of the position error for presses in the working area.
-
-    All presses have the force of a design case.
-
-    Attributes:
-        rms: Root mean square of the limits over the working area, mm.
-        worst: Largest limit in the working area, mm.
-    """
-
-    rms: float
-    worst: float
-
-    @classmethod
-    def of(cls, charges: ChargeMap, case: DesignCase) -> "PositionLimits":
-        """Compute the limits of a sensor from its charge map.
-
-        Args:
-            charges: Charge map that covers the working area.
-            case: Design case with the radius of the working area, the force of the presses and the noise.
-        """
-        rings = Rings.spread(case.radius, LIMIT_RINGS, LIMIT_ANGLES)
-        limits = limits_at(charges, rings.contacts(case.force), case.noise).position
-
-        # The weight of a ring is the area that it represents, which is proportional to its radius.
-        mean_square_of_rings = (rings.per_ring(limits) ** 2).mean(axis=1)
-        mean_square = np.average(mean_square_of_rings, weights=rings.distance)
-        return cls(float(np.sqrt(mean_square)), float(limits.max()))
-
-    def to_dict(self) -> dict[str, float]:
-        """Return the limits as a dictionary for JSON."""
-        return {"rms_mm": self.rms, "worst_mm": self.worst}
-
-
-@dataclass(frozen=True)
 class GuardDesign:
     """Result of the search for a guard electrode.
 
@@ -103,16 +68,17 @@ class GuardDesign:
         sensor: Sensor with the guard electrode.
         region_before: Mirror region of the sensor without the guard electrode.
         region_after: Mirror region of the sensor with the guard electrode.
-        limits_before: Position limits of the sensor without the guard electrode.
-        limits_after: Position limits of the sensor with the guard electrode.
+        limits_before: Root mean square and maximum ("rms_mm", "worst_mm") of the Cramer-Rao limits of the position, for
+            presses in the working area with the force of the case, without the guard electrode.
+        limits_after: The same limits with the guard electrode.
     """
 
     case: DesignCase
     sensor: Sensor
     region_before: MirrorRegion
     region_after: MirrorRegion
-    limits_before: PositionLimits
-    limits_after: PositionLimits
+    limits_before: dict[str, float]
+    limits_after: dict[str, float]
 
     @property
     def guard(self) -> Electrode:
@@ -134,8 +100,8 @@ class GuardDesign:
             "case": self.case.to_dict(),
             "sensor": self.sensor.name,
             "guard": {"name": self.guard.name, "centre_mm": np.round(self.guard.centre, DECIMALS).tolist()},
-            "before": {"mirror_region": self.region_before.to_dict(), "position_limit": self.limits_before.to_dict()},
-            "after": {"mirror_region": self.region_after.to_dict(), "position_limit": self.limits_after.to_dict()},
+            "before": {"mirror_region": self.region_before.to_dict(), "position_limit": self.limits_before},
+            "after": {"mirror_region": self.region_after.to_dict(), "position_limit": self.limits_after},
         }
 
 
@@ -182,8 +148,8 @@ def design_guard(case: DesignCase, *, executor: Executor | None = None) -> Guard
     # Select the sensors with nearly the smallest share, and sort them by their position limits.
     accepted_share = shares.min() + SHARE_TOLERANCE
     candidates = [sensors[index] for index in np.flatnonzero(shares <= accepted_share)]
-    limits = [PositionLimits.of(replace(inner_map, sensor=candidate), case) for candidate in candidates]
-    order = np.argsort([limit.rms for limit in limits], kind="stable")
+    limits = [_position_limits(case, replace(inner_map, sensor=candidate)) for candidate in candidates]
+    order = np.argsort([limit["rms_mm"] for limit in limits], kind="stable")
     best_candidates = [candidates[index] for index in order[:MAX_CHECKED]]
 
     # The shares are only estimates. Compute the mirror regions of the best sensors by a full search. Stop at the first
@@ -200,8 +166,8 @@ def design_guard(case: DesignCase, *, executor: Executor | None = None) -> Guard
         sensor,
         region_before=_mirror_region(case, inner_map, outer_map, case.sensor),
         region_after=region_after,
-        limits_before=PositionLimits.of(inner_map, case),
-        limits_after=PositionLimits.of(replace(inner_map, sensor=sensor), case),
+        limits_before=_position_limits(case, inner_map),
+        limits_after=_position_limits(case, replace(inner_map, sensor=sensor)),
     )
 
 
@@ -253,6 +219,13 @@ def _mirror_region(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMa
     """
     charges = ChargeSpline.of(replace(inner_map, sensor=sensor))
     return MirrorRegion.of(charges, case.radius, replace(outer_map, sensor=sensor), case.noise)
+
+
+def _position_limits(case: DesignCase, charges: ChargeMap) -> dict[str, float]:
+    """Compute the root mean square and the maximum of the Cramer-Rao limits of the position in the working area, mm."""
+    rings = Rings.spread(case.radius, LIMIT_RINGS, LIMIT_ANGLES)
+    limits = LimitMap.of(charges, case.noise, case.force, rings).statistics()
+    return {"rms_mm": limits["position_rms_mm"], "worst_mm": limits["position_worst_mm"]}
 
 
 def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMap, sensors: list[Sensor]) -> Array:
