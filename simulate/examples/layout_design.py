@@ -3,7 +3,7 @@ Where should electrodes go?
 ===========================
 
 At the best positions of the electrodes, the largest position error in the working area is smallest. This example
-searches for the best positions of three squares for presses within 8 mm. The search starts from 16 random layouts. The
+searches for the best positions of three squares for presses within 8 mm. The search starts from 24 random layouts. The
 largest error is 0.24 mm with three squares on a circle, and 0.13 mm with the positions that the search found. The film
 and the probe are assumed to be known exactly.
 """

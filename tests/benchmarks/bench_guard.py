@@ -91,7 +91,7 @@ def _print_charges() -> None:
     # 1,296 presses are enough for a comparison of layouts.
     mirror_region.N_RINGS = 18
     mirror_region.N_SECTORS = 24
-    mirror_region.FORCE_COUNT = 3
+    mirror_region.N_FORCES = 3
     film_map = whole_film_map(load_sensor("four-25um-biaxial"), Circle(1.0), FORCE_RANGE)
     print(f"{'sensor':20} {'additional':>12} {'not noticed':>11} {'rms at 1 N, mm':>14} {'worst':>6}")
     for name, radius in WORKING_RADII.items():

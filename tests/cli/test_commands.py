@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pyarrow.parquet import read_table
 
 from isocharge.cli.demo.full_demo import run_demo
 from isocharge.cli.demo.played_area import played_radius_mm
@@ -21,7 +20,7 @@ from isocharge.cli.shared.terminal import shown_progress
 from isocharge.common.progress import report
 from isocharge.common.toml_text import to_toml
 from isocharge.serve import find_model, load_model
-from isocharge.simulate import load_sensor, read_dataset
+from isocharge.simulate import load_sensor
 from isocharge.simulate.dataset.sweep import solve_maps
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from kept import kept
@@ -70,25 +69,6 @@ SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1"]
 """A sweep of a small family."""
 
 
-def test_a_sweep_as_a_table_for_other_programs(command, refused, tmp_path, monkeypatch):
-    """The file is read by pyarrow and compared with the dataset."""
-    assert command(*SMALL, "--samples", "5", "--workers", "1", "-o", tmp_path / "a.parquet")[0] == 0
-    samples, columns = read_dataset(tmp_path / "a").samples, read_table(tmp_path / "a.parquet").to_pydict()
-    assert columns["x_mm"] == samples.x_mm.tolist()
-    assert np.column_stack([columns[name] for name in "ABC"]).tolist() == samples.charge_pC.tolist()
-    two = "--probe", "circle:1.0", "--probe", "circle:2.0"
-    refused(*SMALL, *two, "-o", tmp_path / "c.csv", message="a table of presses has one probe")
-    refused(*SMALL, "-o", tmp_path / "a.csv", message="the dataset that belongs beside", code=1)
-    many = "--samples", "1000001"
-    refused(
-        *SMALL, *many, "-o", tmp_path / "d.csv", message="a table has at most 1,000,000 presses, got --samples 1000001"
-    )
-    refused(*SMALL, "-o", ".", message="is already there", code=1)
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    refused(*SMALL, "-o", tmp_path / "b.parquet", message="pip install 'isocharge[parquet]'", code=1)
-    assert {path.name for path in tmp_path.iterdir()} == {"a", "a.parquet"}  # said before anything is pressed
-
-
 def test_a_stopped_sweep_leaves_no_file_and_no_process(tmp_path):
     """The command is stopped at the first of many shards."""
     process = subprocess.Popen(
@@ -117,11 +97,11 @@ def ends(is_so) -> bool:
     return False
 
 
-def test_sweep_over_a_grid_writes_its_presses_and_warns_of_the_stress(command, tmp_path):
-    words = ["--samples", 300, "--sampling", "grid", "--orientation", "random", "--workers", 1]
+def test_sweep_writes_its_presses_and_warns_of_the_stress(command, tmp_path):
+    words = ["--samples", 300, "--sampling", "random", "--orientation", "random", "--workers", 1]
     code, _, err = command(*SMALL, *words, "-o", tmp_path / "presses")
     assert code == 0
-    assert f"293 presses in {tmp_path / 'presses'}" in err
+    assert f"300 presses in {tmp_path / 'presses'}" in err
     assert "caution: 1 N under circle:1.0 stress the film to 49 MPa, the limit is 45 MPa" in err
 
 

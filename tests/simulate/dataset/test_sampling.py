@@ -1,4 +1,4 @@
-"""Sampling of the presses of a sweep: ranges, uniform distribution, seeds and grids."""
+"""Sampling of the presses of a sweep: ranges, uniform distribution and seeds."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ sweeps = st.builds(
     samples=st.integers(3, 700),
     seed=st.integers(0, 2**40),
     orientation=st.sampled_from(["fixed", "random"]),
-    sampling=st.sampled_from(["sobol", "random", "grid"]),
+    sampling=st.sampled_from(["sobol", "random"]),
 )
 
 
@@ -33,13 +33,8 @@ def test_presses_lie_within_the_ranges_and_have_the_requested_number(sweep, coun
     assert 0.0 <= presses.rotation.min() <= presses.rotation.max() < 2.0 * np.pi
     assert sweep.orientation == "random" or not presses.rotation.any()
     assert len(presses) == len(presses.contact) == len(presses.rotation)
-    per_probe = np.bincount(presses.probe, minlength=count)
-    if sweep.sampling == "grid":
-        assert np.all(per_probe <= sweep.samples // count)
-        assert low == high or np.all(per_probe > sweep.samples // count / 2)
-    else:
-        assert len(presses) == sweep.samples
-        np.testing.assert_array_equal(presses.probe, np.arange(sweep.samples) % count)
+    assert len(presses) == sweep.samples
+    np.testing.assert_array_equal(presses.probe, np.arange(sweep.samples) % count)
 
 
 @pytest.mark.parametrize("sampling", ["sobol", "random"])
@@ -74,26 +69,6 @@ def test_presses_depend_on_seed_and_probe(sampling):
     assert np.all(two[::2] != two[1::2])
 
 
-# Grid
-
-
-def test_grid_has_every_force_and_rotation_at_every_position():
-    sweep = Sweep(samples=3000, orientation="random", sampling="grid")
-    presses = sweep.over(PROBES)
-    for number, probe in enumerate(PROBES):
-        mine = presses[np.flatnonzero(presses.probe == number)]
-        places = np.unique(mine.contact[:, :2], axis=0)
-        forces = np.unique(mine.contact[:, 2])
-        rotations = np.unique(mine.rotation)
-        assert len(np.unique(np.column_stack([mine.contact, mine.rotation]), axis=0)) == len(mine)
-        assert len(places) * forces.size * rotations.size == len(mine)
-        np.testing.assert_allclose(np.diff(np.log(forces)), np.log(40.0) / (forces.size - 1))
-        assert (forces[0], forces[-1]) == pytest.approx(sweep.force_range, rel=1e-14)
-        np.testing.assert_allclose(rotations, probe.period * np.arange(rotations.size) / rotations.size)
-        assert np.hypot(*places.T).max() == pytest.approx(sweep.radius, rel=1e-12)
-    assert not presses.rotation[presses.probe == 0].any()  # a circle would only press the same again
-
-
 # Refused
 
 
@@ -105,12 +80,11 @@ def test_grid_has_every_force_and_rotation_at_every_position():
         ({"samples": 0}, "samples: expected at least 1, got 0"),
         ({"samples": 10_000_001}, "samples: expected at most 10000000, got 10000001"),
         ({"orientation": "Random"}, "orientation: expected 'fixed' or 'random', got 'Random'"),
-        ({"sampling": "polar"}, "sampling: expected 'sobol', 'random' or 'grid', got 'polar'"),
+        ({"sampling": "polar"}, "sampling: expected 'sobol' or 'random', got 'polar'"),
         ({"force_range": (0.0, 1.0)}, "force: expected 0 < smallest <= largest force"),
         ({"force_range": (2.0, 1.0)}, "force: expected 0 < smallest <= largest force"),
         ({"force_range": (1.0, np.inf)}, "force: expected 0 < smallest <= largest force"),
         ({"force_range": (np.nan, 1.0)}, "force: expected 0 < smallest <= largest force"),
-        ({"samples": 2, "sampling": "grid"}, "samples: expected at least one for each of 3 probes, got 2"),
         ({}, "probes: expected at least one, got none"),
     ],
 )

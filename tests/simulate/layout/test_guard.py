@@ -58,10 +58,9 @@ def _closed_form(monkeypatch):
     )
     monkeypatch.setattr(mirror_region, "N_RINGS", 6)
     monkeypatch.setattr(mirror_region, "N_SECTORS", 8)
-    monkeypatch.setattr(mirror_region, "FORCE_COUNT", 2)
-    monkeypatch.setattr(guard, "N_OUTSIDE", 60)
+    monkeypatch.setattr(mirror_region, "N_FORCES", 2)
+    monkeypatch.setattr(guard, "PRESS_COUNTS", (5, 6, 2))
     monkeypatch.setattr(guard, "GRID_STEPS", 3)
-    monkeypatch.setattr(guard, "MAX_CHECKED", 1)
 
 
 @pytest.mark.usefixtures("_closed_form")

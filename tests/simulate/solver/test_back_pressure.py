@@ -221,11 +221,11 @@ def test_a_linear_theory_with_a_closed_back_raises_a_scene_error():
 @pytest.mark.parametrize(
     ("film", "message"),
     [
-        ({"back_volume": 0.0}, "film back volume: expected at least 1 mm"),
-        ({"back_volume": -5.0}, "film back volume: expected at least 1 mm"),
-        ({"back_volume": float("nan")}, "film back volume: expected at least 1 mm"),
-        ({"static_pressure": 1.0}, "film static pressure: expected at most 10000 Pa in size, got 1e"),
-        ({"static_pressure": float("nan")}, "film static pressure: expected"),
+        ({"back_volume": 0.0}, "film back_volume: expected at least 1 mm"),
+        ({"back_volume": -5.0}, "film back_volume: expected at least 1 mm"),
+        ({"back_volume": float("nan")}, "film back_volume: expected at least 1 mm"),
+        ({"static_pressure": 1.0}, "film static_pressure: expected -10000 to 10000 Pa, got 1e"),
+        ({"static_pressure": float("nan")}, "film static_pressure: expected"),
     ],
 )
 def test_invalid_back_pressures_raise_sensor_errors(film, message):

@@ -34,12 +34,6 @@ This layer exists only if the sensor file describes the metal of the back.
 RULER_LENGTH = 50.0
 """Length of the ruler in a drawing, mm. The ruler shows whether a print has the correct scale."""
 
-TICK_DISTANCE = 10.0
-"""Distance between the ticks of the ruler, mm."""
-
-TICK_LENGTH = 1.5
-"""Length of a tick of the ruler, mm."""
-
 RULER_OFFSET = 4.0
 """Distance of the ruler from the rim of the film, mm."""
 
@@ -88,8 +82,13 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
             space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "ELECTRODES"})
         _draw_name(space, electrode)
 
-    ruler_y = -sensor.film.radius - RULER_OFFSET  # below the film
-    _draw_ruler(space, ruler_y)
+    # Draw a ruler below the film, with a label whose letters are below the line.
+    ruler_y = -sensor.film.radius - RULER_OFFSET
+    attributes = {"layer": "RULER"}
+    space.add_line((-0.5 * RULER_LENGTH, ruler_y), (0.5 * RULER_LENGTH, ruler_y), dxfattribs=attributes)
+    text = f"{RULER_LENGTH:g} mm along x, the drawn direction"
+    label = space.add_text(text, height=TEXT_HEIGHT, dxfattribs=attributes)
+    label.set_placement((-0.5 * RULER_LENGTH, ruler_y - 1.5 * TEXT_HEIGHT))
     return document
 
 
@@ -106,30 +105,6 @@ def _draw_name(space: Any, electrode: Electrode) -> None:
     text = space.add_text("".join(letters), height=TEXT_HEIGHT, dxfattribs={"layer": "NAMES"})
     rightmost_corner = max(electrode.corners)  # tuples (x, y) are compared by x first
     text.set_placement(rightmost_corner)
-
-
-def _draw_ruler(space: Any, y: float) -> None:
-    """Draw a horizontal ruler with ticks and a label, centred at x = 0.
-
-    Args:
-        space: Model space of the drawing.
-        y: Coordinate y of the ruler, mm. The ticks and the label are below the ruler.
-    """
-    left_end = -0.5 * RULER_LENGTH
-    right_end = 0.5 * RULER_LENGTH
-    attributes = {"layer": "RULER"}
-    space.add_line((left_end, y), (right_end, y), dxfattribs=attributes)
-    n_ticks = round(RULER_LENGTH / TICK_DISTANCE) + 1  # both ends of the ruler have a tick
-    for tick in range(n_ticks):
-        x = left_end + TICK_DISTANCE * tick
-        space.add_line((x, y), (x, y - TICK_LENGTH), dxfattribs=attributes)
-    label = space.add_text(
-        f"{RULER_LENGTH:g} mm along x, the drawn direction", height=TEXT_HEIGHT, dxfattribs=attributes
-    )
-    # The position of the label is that of its baseline. The gap between the ticks and the letters is half the height of
-    # a letter.
-    label_y = y - TICK_LENGTH - 1.5 * TEXT_HEIGHT
-    label.set_placement((left_end, label_y))
 
 
 def to_dxf(document: Drawing) -> str:

@@ -6,12 +6,10 @@ A lead crosses neither another lead nor another electrode.
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.sensor.sensor import Electrode, Sensor
-
-SAMPLE_DISTANCE = 0.1
-"""Largest distance between neighbouring points of a lead at which the clearance is checked, mm."""
+from isocharge.simulate.sensor.sensor import Sensor
 
 _DEGREES = np.arange(1.0, 90.0)
 
@@ -60,17 +58,24 @@ def straight_leads(sensor: Sensor, width: float = 0.3, clearance: float = 0.3) -
     Returns:
         The leads, and the names of the electrodes for which no straight lead was found.
     """
+    metal = {
+        electrode.name: shapely.MultiPolygon(map(shapely.Polygon, electrode.metal)) for electrode in sensor.electrodes
+    }
     paths: dict[str, Array] = {}
     outermost_first = sorted(sensor.electrodes, key=lambda electrode: float(np.hypot(*electrode.centre)), reverse=True)
     for electrode in outermost_first:
-        other_electrodes = [other for other in sensor.electrodes if other != electrode]
-        placed_leads = list(paths.values())
+        # The distances are measured from the centre lines of the leads.
+        others = shapely.union_all([polygons for name, polygons in metal.items() if name != electrode.name])
+        leads = shapely.MultiLineString(list(paths.values()))
+        possible_paths = _possible_paths(np.array(electrode.centre), sensor.film.radius)
+        lines = shapely.linestrings(possible_paths)
+        # The distance from an empty geometry is NaN.
+        is_too_near = shapely.distance(lines, others) < 0.5 * width + clearance
+        is_too_near |= shapely.distance(lines, leads) < width + clearance
 
         # Use the first path with a sufficient clearance. If there is none, the electrode has no lead.
-        for path in _possible_paths(np.array(electrode.centre), sensor.film.radius):
-            if _clearance(path, width, other_electrodes, placed_leads) >= clearance:
-                paths[electrode.name] = path
-                break
+        if not is_too_near.all():
+            paths[electrode.name] = possible_paths[is_too_near.argmin()]
 
     # Return the leads in the order of the electrodes of the sensor.
     ordered_paths = {name: paths[name] for name in sensor.electrode_names if name in paths}
@@ -102,63 +107,3 @@ def _possible_paths(centre: Array, radius: float) -> Array:
     start = np.broadcast_to(centre, direction.shape)
     end = centre + length[:, None] * direction
     return np.stack([start, end], axis=1)
-
-
-def _clearance(path: Array, width: float, electrodes: list[Electrode], leads: list[Array]) -> float:
-    """Return the smallest gap between a lead and electrodes or other leads.
-
-    An electrode is represented by the bounding boxes of its polygons. The gap may therefore be underestimated.
-
-    Args:
-        path: Start and end (x, y) of the centre line of the lead, shape (2, 2), mm.
-        width: Width of this lead and of the other leads, mm.
-        electrodes: Electrodes to which the lead does not belong.
-        leads: Centre lines of the other leads, each of shape (2, 2), mm.
-
-    Returns:
-        Smallest gap, mm; infinite if there are neither electrodes nor other leads.
-    """
-    # Choose points on the centre line of the lead that are at most `SAMPLE_DISTANCE` apart.
-    start, end = path
-    x_length, y_length = end - start
-    n_points = int(np.ceil(np.hypot(x_length, y_length) / SAMPLE_DISTANCE)) + 1
-    points = start + np.linspace(0.0, 1.0, n_points)[:, None] * (end - start)
-
-    # The distances are measured from the centre lines. Subtract half of the width of this lead, and, for another lead,
-    # also half of the width of the other lead.
-    electrode_clearances = [_distance_from_boxes(points, electrode) - 0.5 * width for electrode in electrodes]
-    lead_clearances = [_distance_from_lead(points, lead) - width for lead in leads]
-    return min([*electrode_clearances, *lead_clearances], default=np.inf)
-
-
-def _distance_from_boxes(points: Array, electrode: Electrode) -> float:
-    """Return the smallest distance between points and the bounding boxes of an electrode, mm.
-
-    Args:
-        points: Points (x, y), shape (n, 2), mm.
-        electrode: Electrode with the bounding boxes.
-    """
-    lower_left, upper_right = (corners[:, None] for corners in electrode.boxes)  # each of shape (n_box, 1, 2)
-
-    # Distances along x and y between each box and each point, shape (n_box, n, 2). A distance is zero if the coordinate
-    # of the point lies within the box.
-    offset = np.maximum(np.maximum(lower_left - points, points - upper_right), 0.0)
-    return float(np.linalg.norm(offset, axis=2).min())
-
-
-def _distance_from_lead(points: Array, lead: Array) -> float:
-    """Return the smallest distance between points and the centre line of a lead, mm.
-
-    Args:
-        points: Points (x, y), shape (n, 2), mm.
-        lead: Start and end (x, y) of the centre line, shape (2, 2), mm.
-    """
-    start, end = lead
-    direction = end - start
-
-    # Find the point of the lead that is nearest to each point, first as a fraction of the length of the lead from 0
-    # (start) to 1 (end).
-    fraction_of_length = np.clip((points - start) @ direction / (direction @ direction), 0.0, 1.0)
-    nearest_points = start + fraction_of_length[:, None] * direction
-    x_distance, y_distance = (points - nearest_points).T
-    return float(np.hypot(x_distance, y_distance).min())

@@ -1,13 +1,12 @@
 """Sampling of the presses of a sweep: their positions, forces, probes and orientations.
 
-There are three kinds of sampling:
+There are two kinds of sampling:
 
     sobol   scrambled Sobol points, which cover the domain more evenly than independent random numbers (Owen 1998), with
             a separate sequence for each probe
     random  independent random numbers
-    grid    every force with every orientation at every position of a square lattice, at most the requested number
 
-The positions of Sobol and random presses are uniformly distributed over the disk, and so are the logarithms of their
+The positions are uniformly distributed over the disk, and so are the logarithms of their
 forces over the range of forces. A sweep is a simulation of many presses. If it has several probes, successive presses
 cycle through the probes.
 """
@@ -19,10 +18,9 @@ from typing import Literal, get_args
 import numpy as np
 import scipy  # loads each of its subpackages on first use
 
-from isocharge.common.arrays import Array, Booleans, Complexes, Integers
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError
-from isocharge.simulate.numerics.disk import lattice
 from isocharge.simulate.sensor.probe import Probe
 
 MAX_SAMPLES = 10_000_000
@@ -34,11 +32,10 @@ FULL_TURN = 2.0 * np.pi
 SAMPLING_DESCRIPTIONS = {
     "sobol": "scrambled Sobol, uniform over the disk, log-uniform in force",
     "random": "independent, uniform over the disk, log-uniform in force",
-    "grid": "grid: square lattice over the disk, forces in equal steps of the logarithm, evenly spread orientations",
 }
 """Description of each kind of sampling in the manifest of a dataset."""
 
-Sampling = Literal["sobol", "random", "grid"]
+Sampling = Literal["sobol", "random"]
 """Name of a kind of sampling."""
 
 OUTSIDE_PROBE = -1
@@ -82,11 +79,11 @@ class Sweep:
     Attributes:
         radius: Largest distance of a press from the centre, mm.
         force_range: Smallest and largest force, N.
-        samples: Number of presses, which are divided equally among the probes. A grid may have fewer presses.
-        seed: Seed of the random numbers. A grid does not depend on the seed.
+        samples: Number of presses, which are divided equally among the probes.
+        seed: Seed of the random numbers.
         orientation: "fixed" if all presses have the orientation of the given probes, "random" for orientations over a
-            full turn. With "random", a grid has equally spaced orientations within the period of the probe.
-        sampling: Kind of sampling: "sobol", "random" or "grid".
+            full turn.
+        sampling: Kind of sampling: "sobol" or "random".
         outside: Number of additional presses between the disk and the clamp; 0 for none.
     """
 
@@ -117,11 +114,11 @@ class Sweep:
         if self.orientation not in get_args(Orientation):
             raise SceneError(f"orientation: expected 'fixed' or 'random', got {self.orientation!r}")
         if self.sampling not in get_args(Sampling):
-            raise SceneError(f"sampling: expected 'sobol', 'random' or 'grid', got {self.sampling!r}")
+            raise SceneError(f"sampling: expected 'sobol' or 'random', got {self.sampling!r}")
 
     def contacts(self) -> Array:
         """Return the contacts (x, y, F) of a sweep with one probe, shape (n, 3), mm and N."""
-        return self._presses_of_probe(0, 1, FULL_TURN).contact
+        return self._draw(self.samples, 0).contact
 
     def outside_presses(self, outer_radius: float) -> SweepPresses:
         """Return presses between the disk of the sweep and a larger circle.
@@ -149,43 +146,24 @@ class Sweep:
             probes: Probes of the sweep.
 
         Raises:
-            SceneError: If there are no probes, or a grid has fewer samples than probes.
+            SceneError: If there are no probes.
         """
         if not probes:
             raise SceneError("probes: expected at least one, got none")
-        if self.sampling == "grid" and self.samples < len(probes):
-            raise SceneError(f"samples: expected at least one for each of {len(probes)} probes, got {self.samples}")
+        # Successive presses belong to successive probes, each of which has a sequence of points of its own.
         n_probe = len(probes)
-        presses_by_probe = [self._presses_of_probe(index, n_probe, probe.period) for index, probe in enumerate(probes)]
-        all_presses = SweepPresses(
-            probe=np.concatenate([presses.probe for presses in presses_by_probe]),
-            contact=np.concatenate([presses.contact for presses in presses_by_probe]),
-            rotation=np.concatenate([presses.rotation for presses in presses_by_probe]),
+        presses = SweepPresses(
+            np.empty(self.samples, dtype=np.intp), np.empty((self.samples, 3)), np.empty(self.samples)
         )
+        for index in range(n_probe):
+            own = slice(index, None, n_probe)
+            drawn = self._draw(len(range(index, self.samples, n_probe)), index)
+            presses.probe[own] = drawn.probe
+            presses.contact[own] = drawn.contact
+            presses.rotation[own] = drawn.rotation
+        return presses
 
-        # Interleave the probes: take the first press of each probe, then the second press of each probe, and so on.
-        index_within_probe = np.concatenate([np.arange(len(presses)) for presses in presses_by_probe])
-        order = np.argsort(index_within_probe, kind="stable")
-        return all_presses[order]
-
-    def _presses_of_probe(self, probe_index: int, n_probe: int, period: float) -> SweepPresses:
-        """Return the presses of one probe of a sweep.
-
-        Args:
-            probe_index: Index of the probe in the sweep.
-            n_probe: Number of probes in the sweep.
-            period: Smallest rotation that maps the probe onto itself, rad; 0 for a circle.
-        """
-        if self.sampling == "grid":
-            position, force, rotation = self._grid(self.samples // n_probe, period)
-        else:
-            # The probe has every n_probe-th press of the sweep, beginning with the press number `probe_index`.
-            count = len(range(probe_index, self.samples, n_probe))
-            position, force, rotation = self._draw(count, probe_index)
-        contact = np.stack([position.real, position.imag, force], axis=1)
-        return SweepPresses(np.full(position.size, probe_index), contact, rotation)
-
-    def _draw(self, count: int, probe_index: int) -> tuple[Complexes, Array, Array]:
+    def _draw(self, count: int, probe_index: int) -> SweepPresses:
         """Draw the presses of one probe with Sobol points or random numbers.
 
         The positions are uniformly distributed over the disk. The logarithms of the forces are uniformly distributed
@@ -195,16 +173,14 @@ class Sweep:
         Args:
             count: Number of presses.
             probe_index: Index of the probe in the sweep.
-
-        Returns:
-            Positions x + iy (mm), forces (N) and rotations (rad), each of shape (count,).
         """
         fractions = self._unit_cube(count, probe_index)
         distance_fraction, angle_fraction, force_fraction, rotation_fraction = fractions.T
         distance = self.radius * np.sqrt(distance_fraction)  # the area within a distance is proportional to its square
         position = distance * np.exp(1j * FULL_TURN * angle_fraction)
         rotation = FULL_TURN * rotation_fraction if self.orientation == "random" else np.zeros(count)
-        return position, self._force(force_fraction), rotation
+        contact = np.stack([position.real, position.imag, self._force(force_fraction)], axis=1)
+        return SweepPresses(np.full(count, probe_index), contact, rotation)
 
     def _unit_cube(self, count: int, *stream: int) -> Array:
         """Draw points that are uniformly distributed over the unit cube in four dimensions.
@@ -240,41 +216,3 @@ class Sweep:
         min_log_force, max_log_force = np.log(self.force_range)
         force = np.exp(min_log_force + (max_log_force - min_log_force) * fraction)
         return np.asarray(np.clip(force, *self.force_range))  # rounding must not move a force out of the range
-
-    def _grid(self, max_count: int, period: float) -> tuple[Complexes, Array, Array]:
-        """Return the presses of a grid with every combination of a position, a force and a rotation.
-
-        The number of steps is at first the same in each dimension of the grid. Then the number of forces is increased
-        as far as the largest number of presses allows.
-
-        Args:
-            max_count: Largest number of presses in the grid.
-            period: Smallest rotation that maps the probe onto itself, rad; 0 for a circle.
-
-        Returns:
-            Positions x + iy (mm), forces (N) and rotations (rad), each of shape (n,).
-        """
-        # The grid has two dimensions for the position, one for the force if it varies, and one for the rotation if it
-        # varies.
-        min_force, max_force = self.force_range
-        is_force_varied = min_force < max_force
-        is_rotation_varied = self.orientation == "random" and period > 0.0
-        n_dimension = 2 + int(is_force_varied) + int(is_rotation_varied)
-        steps_per_dimension = max(1, round(max_count ** (1.0 / n_dimension)))
-        n_rotation = steps_per_dimension if is_rotation_varied else 1
-        initial_n_force = steps_per_dimension if is_force_varied else 1
-
-        # The lattice may have fewer positions than requested. The number of forces is therefore computed from the
-        # actual number of positions.
-        max_positions = max_count // (n_rotation * initial_n_force)
-        positions: Complexes = self.radius * lattice(max_positions)
-        n_force = max_count // (positions.size * n_rotation) if is_force_varied else 1
-        middle_fraction = np.array([0.5])  # a single force is the geometric mean of the range
-        force_fractions = np.linspace(0.0, 1.0, n_force) if n_force > 1 else middle_fraction
-        forces = self._force(force_fractions)
-        rotations: Array = period * np.arange(n_rotation) / n_rotation
-
-        # Return all combinations of the positions, forces and rotations.
-        shape = (positions.size, n_force, n_rotation)
-        position_index, force_index, rotation_index = np.indices(shape).reshape(3, -1)
-        return positions[position_index], forces[force_index], rotations[rotation_index]

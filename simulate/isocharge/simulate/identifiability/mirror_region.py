@@ -28,7 +28,7 @@ DETECTABLE_SIGMAS = 5.0
 The difference is in standard deviations of the noise. It is the smallest limit of the misfit in `isocharge.serve`.
 """
 
-FORCE_COUNT = 5
+N_FORCES = 5
 """Number of forces of the presses at each position."""
 
 FORCE_RATIO = 10.0
@@ -82,23 +82,11 @@ class MirrorRegion:
             whole_film: Charge map of the whole film.
             noise: Noise of the readings.
         """
-        # Choose the forces, and the middles of the rings and sectors between the working area and the edge of the map.
-        min_force, max_force = charges.domain.force_range
-        forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, FORCE_COUNT)
         outer_radius = whole_film.domain.radius
-        ring_edges = np.linspace(radius, outer_radius, N_RINGS + 1)
-        ring_distance = 0.5 * (ring_edges[1:] + ring_edges[:-1])
-        sector_angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
-
-        # Create a press for every combination of ring, sector and force.
-        grids = np.meshgrid(ring_distance, sector_angle, forces, indexing="ij")
-        distance, angle, force = (grid.ravel() for grid in grids)
-        contact = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), force])
-
-        # Find the presses whose charges a press in the working area also has. Then average over the forces.
-        is_mirrored = has_mirror(within(charges, radius), whole_film.charges(contact), noise)
-        share_of_forces = is_mirrored.reshape(N_RINGS, N_SECTORS, FORCE_COUNT).mean(axis=2)
-        return cls(radius, outer_radius, forces, share_of_forces)
+        presses = presses_outside(radius, whole_film.domain, N_RINGS, N_SECTORS, N_FORCES)
+        is_mirrored = has_mirror(within(charges, radius), whole_film.charges(presses.reshape(-1, 3)), noise)
+        share_of_forces = is_mirrored.reshape(N_RINGS, N_SECTORS, N_FORCES).mean(axis=2)
+        return cls(radius, outer_radius, presses[0, 0, :, 2], share_of_forces)
 
     @property
     def distance(self) -> Array:
@@ -139,6 +127,31 @@ class MirrorRegion:
             "by_distance": {"distance_mm": self.distance.tolist(), "share": self.share.mean(axis=1).tolist()},
             "words": self.summary,
         }
+
+
+def presses_outside(radius: float, domain: Domain, n_ring: int, n_sector: int, n_force: int) -> Array:
+    """Return presses in the middles of sectors between the working area and the edge of a domain.
+
+    The rings have equal widths, and the sectors of a ring have equal angles. The ratio of the largest to the smallest
+    force is at most `FORCE_RATIO`.
+
+    Args:
+        radius: Radius of the working area, mm.
+        domain: Positions and forces of a charge map of the whole film.
+        n_ring: Number of rings.
+        n_sector: Number of sectors of each ring.
+        n_force: Number of forces at each position.
+
+    Returns:
+        Presses (x, y, F), shape (n_ring, n_sector, n_force, 3), mm and N.
+    """
+    min_force, max_force = domain.force_range
+    forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, n_force)
+    ring_edges = np.linspace(radius, domain.radius, n_ring + 1)
+    distances = 0.5 * (ring_edges[1:] + ring_edges[:-1])
+    angles = 2.0 * np.pi * (np.arange(n_sector) + 0.5) / n_sector
+    distance, angle, force = np.meshgrid(distances, angles, forces, indexing="ij")
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle), force], axis=-1)
 
 
 def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:

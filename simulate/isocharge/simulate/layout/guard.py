@@ -8,7 +8,7 @@ The search first finds pairs of contacts that have the same charges without the 
 is a press outside the working area, and the other contact is inside the working area. For each possible position of the
 guard electrode, the charge of this electrode is added to the charges of each pair. A least-squares descent then starts
 from the inner contact. If the descent finds a contact with the same charges, the guard electrode does not reveal the
-press outside. For the best positions, the mirror region is computed by a search over the whole working area.
+press outside. For the chosen position, the mirror region is computed by a search over the whole working area.
 """
 
 from concurrent.futures import Executor
@@ -27,30 +27,29 @@ from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.whole_film import whole_film_map
 from isocharge.simulate.identifiability.identification import LimitMap
-from isocharge.simulate.identifiability.mirror_region import DETECTABLE_SIGMAS, FORCE_RATIO, MirrorRegion, is_interior
+from isocharge.simulate.identifiability.mirror_region import (
+    DETECTABLE_SIGMAS,
+    MirrorRegion,
+    is_interior,
+    presses_outside,
+)
 from isocharge.simulate.identifiability.nearest_contact import explain, search
 from isocharge.simulate.layout.case import NAMES, DesignCase
 from isocharge.simulate.layout.design import DECIMALS
-from isocharge.simulate.numerics.disk import Rings, square_grid, sunflower
+from isocharge.simulate.numerics.disk import Rings, square_grid
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
 
 GRID_STEPS = 6
 """Number of steps, from the centre to the rim of the film, of the grid of possible positions of the guard electrode."""
 
-N_OUTSIDE = 200
-"""Approximate number of presses outside the working area with which the possible positions are compared."""
-
-N_FORCES = 3
-"""Number of different forces of the presses outside the working area."""
+PRESS_COUNTS = (8, 8, 3)
+"""Numbers of rings, sectors and forces of the presses outside the working area that the positions are compared with."""
 
 SHARE_TOLERANCE = 0.01
 """Difference between two shares of unnoticeable presses that counts as negligible, dimensionless.
 
 Among the positions whose share exceeds the smallest share by at most this difference, the position errors decide.
 """
-
-MAX_CHECKED = 3
-"""Largest number of positions of the guard electrode for which the mirror region is computed."""
 
 LIMIT_RINGS = 20
 """Number of rings of the presses whose position errors are compared."""
@@ -145,27 +144,15 @@ def design_guard(case: DesignCase, *, executor: Executor | None = None) -> Guard
     outer_map = whole_film_map(case.sensor, case.probe, DEFAULT_FORCE_RANGE, executor=executor)
     shares = _estimated_shares(case, inner_map, outer_map, sensors)
 
-    # Select the sensors with nearly the smallest share, and sort them by their position limits.
-    accepted_share = shares.min() + SHARE_TOLERANCE
-    candidates = [sensors[index] for index in np.flatnonzero(shares <= accepted_share)]
-    limits = [_position_limits(case, replace(inner_map, sensor=candidate)) for candidate in candidates]
-    order = np.argsort([limit["rms_mm"] for limit in limits], kind="stable")
-    best_candidates = [candidates[index] for index in order[:MAX_CHECKED]]
-
-    # The shares are only estimates. Compute the mirror regions of the best sensors by a full search. Stop at the first
-    # sensor whose computed share is accepted, too. Then choose the sensor with the smallest mirror region.
-    results: list[tuple[MirrorRegion, Sensor]] = []
-    for candidate in track(best_candidates, "computing mirror regions"):
-        region = _mirror_region(case, inner_map, outer_map, candidate)
-        results.append((region, candidate))
-        if region.total_share <= accepted_share:
-            break
-    region_after, sensor = min(results, key=lambda result: result[0].total_share)
+    # Among the sensors with nearly the smallest share, choose the sensor with the smallest position limits.
+    candidates = [sensors[index] for index in np.flatnonzero(shares <= shares.min() + SHARE_TOLERANCE)]
+    limits = [_position_limits(case, replace(inner_map, sensor=candidate))["rms_mm"] for candidate in candidates]
+    sensor = candidates[int(np.argmin(limits))]
     return GuardDesign(
         case,
         sensor,
         region_before=_mirror_region(case, inner_map, outer_map, case.sensor),
-        region_after=region_after,
+        region_after=_mirror_region(case, inner_map, outer_map, sensor),
         limits_before=_position_limits(case, inner_map),
         limits_after=_position_limits(case, replace(inner_map, sensor=sensor)),
     )
@@ -247,7 +234,9 @@ def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: Forwar
         Share of the presses for each sensor, shape (n_sensor,), dimensionless.
     """
     # Without a guard electrode, find the contacts in the working area that best explain the charges of the presses.
-    presses = _presses_outside(case, outer_map)
+    presses = presses_outside(case.radius, outer_map.domain, *PRESS_COUNTS)
+    area = np.broadcast_to(np.hypot(presses[..., 0], presses[..., 1]), presses.shape[:3]).ravel()  # of the sectors
+    presses = presses.reshape(-1, 3)
     charge = outer_map.charges(presses)
     inner_charges = ChargeSpline.of(inner_map)
     contact, residual = search(inner_charges, charge, case.noise.sigma(charge))
@@ -268,7 +257,7 @@ def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: Forwar
         sigma = case.noise.sigma(charge_with_guard)
         _, new_residual = explain(map_with_guard, charge_with_guard, sigma, contact[is_mirrored])
         is_unnoticed = np.linalg.norm(new_residual, axis=1) < DETECTABLE_SIGMAS
-        shares.append(np.count_nonzero(is_unnoticed) / len(presses))
+        shares.append(area[is_mirrored][is_unnoticed].sum() / area.sum())
     return np.array(shares)
 
 
@@ -301,29 +290,3 @@ class JoinedMap:
     def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges of all electrodes; see `ChargeMap`."""
         return np.concatenate([self.first.derivatives(contact), self.second.derivatives(contact)], axis=1)
-
-
-def _presses_outside(case: DesignCase, outer_map: ForwardMap) -> Array:
-    """Return presses that are distributed evenly over the film outside the working area.
-
-    Successive presses have different forces. The presses have `N_FORCES` different forces, which cover the same range
-    as the forces of `MirrorRegion`.
-
-    Args:
-        case: Design case with the radius of the working area.
-        outer_map: Forward map whose domain contains the presses.
-
-    Returns:
-        Presses (x, y, F), shape (n, 3), mm and N.
-    """
-    min_force, max_force = outer_map.domain.force_range
-    forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, N_FORCES)
-
-    # Distribute points over the whole disk. Their number is such that about `N_OUTSIDE` points lie outside the working
-    # area.
-    outer_radius = outer_map.domain.radius
-    share_outside = 1.0 - (case.radius / outer_radius) ** 2
-    points = sunflower(round(N_OUTSIDE / share_outside)) * outer_radius  # x + iy, mm
-    position = points[np.abs(points) > case.radius]
-    force_of_press = np.resize(forces, position.size)  # repeats the forces
-    return np.stack([position.real, position.imag, force_of_press], axis=1)

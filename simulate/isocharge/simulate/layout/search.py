@@ -24,11 +24,11 @@ from isocharge.simulate.layout.position_error import ErrorModel
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.sensor import Electrode
 
-STARTS = 16
+STARTS = 24
 """Number of random layouts from which the search starts."""
 
-POWERS = (12.0, 30.0)
-"""Exponents of the power mean on the lattice and on the selected presses if the goal is the largest error."""
+POWER = 12.0
+"""Exponent of the power mean on the lattice if the goal is the largest error. It is doubled in each further round."""
 
 EXTENT = 1.0 / 3.0
 """Distance by which the random squares extend beyond the presses, in film radii, dimensionless.
@@ -36,7 +36,7 @@ EXTENT = 1.0 / 3.0
 The charges of electrodes that are farther out depend little on the position of a press.
 """
 
-ROUNDS = 4
+ROUNDS = 5
 """Number of improvements of a layout for the presses with the largest errors."""
 
 MAX_FINALISTS = 3
@@ -149,7 +149,7 @@ class Search:
         Returns:
             Improved layout, whose error is the power mean.
         """
-        power = POWERS[0] if self.case.goal == "worst" else 2.0
+        power = POWER if self.case.goal == "worst" else 2.0
         return self._lattice.minimise(start, power)
 
     def refine(self, layout: Layout) -> Layout:
@@ -158,18 +158,20 @@ class Search:
         Args:
             layout: Layout for which the power mean on the lattice is small.
         """
-        best = Layout(layout.positions, self.minimised_error(layout.positions))
+        positions = layout.positions
         if self.case.goal != "worst":
-            return best
-        for _ in range(ROUNDS):
-            largest = np.argsort(-self.errors(best.positions))[: len(self.case.search_presses)]
-            pressed = PressedLayout.of(self, np.concatenate([self.case.search_presses, self.case.fine_grid[largest]]))
-            positions = pressed.minimise(best.positions, POWERS[1]).positions
-            changed = Layout(positions, self.minimised_error(positions))
-            if changed.error >= best.error:
-                break
-            best = changed
-        return best
+            return Layout(positions, self.minimised_error(positions))
+        smallest_errors = self.errors(positions)
+        for round_number in range(1, ROUNDS + 1):
+            largest = np.argsort(-smallest_errors)[: len(self.case.search_presses)]
+            presses = np.concatenate([self.case.search_presses, self.case.fine_grid[largest]])
+            pressed = PressedLayout.of(self, presses)
+            changed = pressed.minimise(positions, POWER * 2.0**round_number).positions
+            errors = self.errors(changed)
+            if errors.max() < smallest_errors.max():
+                positions = changed
+                smallest_errors = errors
+        return Layout(positions, float(smallest_errors.max()))
 
 
 @dataclass(frozen=True)

@@ -8,61 +8,45 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SensorError
-from isocharge.simulate.sensor.size_check import check_length, check_stress
+from isocharge.simulate.sensor.size_check import check_range
 
 Surface = Literal["middle", "top", "bottom"]
 """Surface at which the stress of the film is read. The top is the surface that the probe touches."""
 
-MIN_RADIUS = 1.0
-"""Smallest accepted radius of a film, mm. A smaller value was probably given in metres."""
+FILM_LIMITS = {
+    "radius": (1.0, math.inf, "mm"),
+    "thickness": (1e-4, math.inf, "mm"),
+    "young": (1.0, 1e6, "MPa"),  # from a soft rubber to nearly diamond
+    "poisson": (0.0, 0.4999, ""),
+    "pretension": (-10.0, 300.0, "MPa"),  # a slack film wrinkles; stretched PVDF breaks
+    "(T11 - T22) / 2": (-300.0, 300.0, "MPa"),
+    "T12": (-300.0, 300.0, "MPa"),
+    "young, E1 / E2": (0.1, 10.0, ""),  # the solver has been tested in this range
+    "shear": (1.0, 1e6, "MPa"),
+    "axis": (-math.inf, math.inf, "rad"),
+    "oval": (-0.1, 0.1, ""),  # the mesh has been tested in this range
+    "oval_axis": (-math.inf, math.inf, "rad"),
+    "back_volume": (1.0, math.inf, "mm^3"),
+    "static_pressure": (-1e4, 1e4, "Pa"),  # a film of 25 um bulges by several millimetres
+    "expansion": (-1e3, 1e3, "ppm/K"),
+    "ring_expansion": (-1e3, 1e3, "ppm/K"),
+}
+"""Smallest and largest accepted value of each property of a film, and its unit.
 
-MIN_THICKNESS = 1e-4
-"""Smallest accepted thickness of a film, mm. A smaller value was probably given in metres."""
-
-MAX_PIEZO = 1e5
-"""Largest accepted piezoelectric or pyroelectric coefficient, pC/N or pC/(mm^2 K).
-
-This value is thirty times the coefficient of the strongest crystals.
+Smaller lengths and volumes were probably given in metres, and larger stresses in pascals.
 """
 
-MIN_PIEZO = 1e-3
-"""Smallest accepted magnitude of a coefficient d31, d32, d33 or d12 that is not zero, pC/N.
+UNIT_FACTORS = {"Pa": 1e6, "ppm/K": 1e6}
+"""Factors that convert a value in MPa or 1/K into a unit of `FILM_LIMITS`. All other units are those of `Film`."""
 
-A smaller value was probably given in C/N.
+PIEZO_LIMITS = (1e-3, 1e5)
+"""Smallest accepted magnitude of a coefficient that is not zero, and largest magnitude, pC/N or pC/(mm^2 K).
+
+A smaller coefficient was probably given in C/N. The largest is thirty times that of the strongest crystals.
 """
-
-MIN_YOUNG = 1.0
-"""Smallest accepted Young's modulus of a film, MPa. It is that of a soft rubber."""
-
-MAX_YOUNG = 1e6
-"""Largest accepted Young's modulus of a film, MPa. It is nearly that of diamond."""
-
-MAX_PRETENSION = 300.0
-"""Largest accepted pretension of a film, MPa. It is the tensile strength of stretched PVDF."""
-
-MAX_SLACK = 10.0
-"""Largest accepted magnitude of a negative pretension, MPa. A slack film wrinkles under small forces."""
-
-MAX_YOUNG_RATIO = 10.0
-"""Largest ratio E1 / E2 of Young's moduli for which the solver has been tested, dimensionless."""
-
-MAX_OVAL = 0.1
-"""Largest parameter e of an oval clamp for which the mesh has been tested, dimensionless."""
-
-MAX_EXPANSION = 1e-3
-"""Largest accepted magnitude of a thermal expansion coefficient, 1/K. A larger value was probably given in ppm/K."""
 
 ALUMINIUM_EXPANSION = 23e-6
 """Thermal expansion coefficient of aluminium, 1/K. Most rings are made of aluminium."""
-
-MIN_BACK_VOLUME = 1.0
-"""Smallest accepted volume of the cavity behind a film, mm^3. A smaller value was probably given in m^3."""
-
-MAX_STATIC_PRESSURE = 0.01
-"""Largest accepted magnitude of a static pressure, MPa.
-
-A film of 25 um bulges by several millimetres under such a pressure.
-"""
 
 
 @dataclass(frozen=True)
@@ -169,46 +153,15 @@ class Film:
         Raises:
             SensorError: If a property is outside its accepted range.
         """
-        # Most conditions negate an accepted range, so that NaN is rejected as well.
-        check_length("film radius", self.radius, MIN_RADIUS, SensorError)
-        check_length("film thickness", self.thickness, MIN_THICKNESS, SensorError)
-        check_stress("film young", self.young, MIN_YOUNG, MAX_YOUNG, SensorError)
-        check_stress("film pretension", self.pretension, -MAX_SLACK, MAX_PRETENSION, SensorError)
-        if not 0.0 <= self.poisson < 0.5:
-            raise SensorError(f"film poisson: expected 0 <= poisson < 0.5, got {self.poisson}")
-
-        # Check the properties that depend on the direction.
-        for name, value in zip(("(T11 - T22) / 2", "T12"), self.deviator, strict=True):
-            check_stress(f"film pretension, {name}", value, -MAX_PRETENSION, MAX_PRETENSION, SensorError)
-        if self.shear is not None:
-            check_stress("film shear", self.shear, MIN_YOUNG, MAX_YOUNG, SensorError)
-        if not 1.0 / MAX_YOUNG_RATIO <= self.young_ratio <= MAX_YOUNG_RATIO:
-            raise SensorError(
-                f"film young: expected E1 / E2 from 1/{MAX_YOUNG_RATIO:g} to {MAX_YOUNG_RATIO:g}, got "
-                f"{self.young_ratio:g}"
-            )
-        if not abs(self.oval) <= MAX_OVAL:
-            raise SensorError(f"film oval: expected a share up to {MAX_OVAL:g}, got {self.oval}")
-
-        # Check the thermal expansion, the pressure on the back, and the shape.
-        for expansion in (*(self.expansion or ()), self.ring_expansion):
-            if not abs(expansion) <= MAX_EXPANSION:
-                raise SensorError(
-                    f"film expansion: expected at most {1e6 * MAX_EXPANSION:g} ppm/K in size, got "
-                    f"{1e6 * expansion:.6g} ppm/K"
-                )
-        if self.back_volume is not None and not MIN_BACK_VOLUME <= self.back_volume < math.inf:
-            raise SensorError(
-                f"film back volume: expected at least {MIN_BACK_VOLUME:g} mm^3, got {self.back_volume:.6g} mm^3; leave "
-                "it out if the back is vented"
-            )
-        if not abs(self.static_pressure) <= MAX_STATIC_PRESSURE:
-            raise SensorError(
-                f"film static pressure: expected at most {1e6 * MAX_STATIC_PRESSURE:g} Pa in size, got "
-                f"{1e6 * self.static_pressure:.6g} Pa"
-            )
-        if not (math.isfinite(self.axis) and math.isfinite(self.oval_axis)):
-            raise SensorError(f"film axis, oval_axis: expected finite angles, got {self.axis}, {self.oval_axis}")
+        half_difference, shear_tension = self.deviator
+        other_names = {"young, E1 / E2": self.young_ratio, "(T11 - T22) / 2": half_difference, "T12": shear_tension}
+        values = {**vars(self), **other_names}
+        for name, (low, high, unit) in FILM_LIMITS.items():
+            value = values[name]
+            for number in value if isinstance(value, tuple) else (value,):
+                if number is not None:  # an optional property
+                    value_in_unit = number * UNIT_FACTORS.get(unit, 1.0)
+                    check_range(f"film {name}", value_in_unit, (low, high), unit, SensorError)
         if self.thickness > 0.1 * self.radius:
             raise SensorError(
                 f"film thickness: expected at most a tenth of the radius ({self.radius:g} mm), "
@@ -247,10 +200,10 @@ class Piezo:
         Raises:
             SensorError: If a coefficient is outside its accepted range, or if d31, d32 and d12 are all zero.
         """
+        smallest, largest = PIEZO_LIMITS
         for name, coefficient in vars(self).items():
-            if not abs(coefficient) <= MAX_PIEZO:  # NaN is rejected as well
-                raise SensorError(f"piezo {name}: expected a number up to {MAX_PIEZO:g} in size, got {coefficient}")
-            if name != "pyro" and 0.0 < abs(coefficient) < MIN_PIEZO:
+            check_range(f"piezo {name}", coefficient, (-largest, largest), "pC/N", SensorError)
+            if name != "pyro" and 0.0 < abs(coefficient) < smallest:
                 raise SensorError(
                     f"piezo {name}: expected pC/N, got {coefficient:.6g} pC/N; {coefficient:.6g} C/N are "
                     f"{1e12 * coefficient:.6g} pC/N"

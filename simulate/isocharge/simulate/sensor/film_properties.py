@@ -23,7 +23,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import SceneError, SensorError
-from isocharge.simulate.sensor.film import MIN_PIEZO
+from isocharge.simulate.sensor.film import PIEZO_LIMITS
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
@@ -149,7 +149,7 @@ def _increased(size: float, axis: float, addition: complex) -> tuple[float, floa
 def _d12(described: float, value: float) -> float:
     """Return a coefficient d12 that is increased by `value`. A sensor does not accept a tiny one, which is zero."""
     changed = described + value
-    return changed if abs(changed) >= MIN_PIEZO else 0.0
+    return changed if abs(changed) >= PIEZO_LIMITS[0] else 0.0
 
 
 def _shift(axis: int) -> Change:

@@ -18,7 +18,7 @@ from isocharge.common.printable_text import is_printable
 from isocharge.simulate.numerics.polygon import area_of, is_convex, overlap, to_complex, to_corners
 from isocharge.simulate.numerics.polygon_union import is_simple, subdivide, trace_outline, union_parts
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
-from isocharge.simulate.sensor.size_check import check_length
+from isocharge.simulate.sensor.size_check import check_range
 
 Readout = Literal["area", "edge"]
 """Part of an electrode over which the stress is averaged: the area or the edges (Mirbagheri et al. 2007, eq. 2, 3)."""
@@ -439,7 +439,7 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
         if not electrode.collecting_polygons:
             raise SensorError(f"{name}: its front and its back have no area in common, so nothing collects; move one")
         corners = np.array(electrode.corners)
-        check_length(name, float(np.ptp(corners, axis=0).max()), MIN_EXTENT, SensorError)
+        check_range(name, float(np.ptp(corners, axis=0).max()), (MIN_EXTENT, np.inf), "mm", SensorError)
 
         # An electrode that is declared as a square must have the corners of a square, and no further metal.
         lower_left, lower_right, *_ = corners

@@ -28,8 +28,7 @@ from isocharge.common.structs import (
     read_toml,
 )
 from isocharge.common.toml_text import to_toml
-from isocharge.simulate.sensor import film as limits
-from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, Film, Piezo, Surface
+from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, FILM_LIMITS, Film, Piezo, Surface
 from isocharge.simulate.sensor.sensor import Calibration, Corners, Electrode, Readout, Role, Sensor
 from isocharge.simulate.sensor.size_check import tidy
 
@@ -54,10 +53,11 @@ Coordinate = Annotated[float, Meta(ge=-MAX_COORDINATE_mm, le=MAX_COORDINATE_mm)]
 Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm, each at most {MAX_COORDINATE_mm:g}")]
 
 
-MIN_THICKNESS_um = 1e3 * limits.MIN_THICKNESS
+MIN_THICKNESS_um = 1e3 * FILM_LIMITS["thickness"][0]
 THICKNESS = f"at least {MIN_THICKNESS_um:g} um"
-MODULUS = f"a modulus from {1e-3 * limits.MIN_YOUNG:g} to {1e-3 * limits.MAX_YOUNG:g} GPa (PVDF: 1 to 9 GPa)"
-Modulus_GPa = Annotated[float, Meta(ge=1e-3 * limits.MIN_YOUNG, le=1e-3 * limits.MAX_YOUNG, description=MODULUS)]
+MIN_YOUNG_GPa, MAX_YOUNG_GPa = (1e-3 * limit for limit in FILM_LIMITS["young"][:2])
+MODULUS = f"a modulus from {MIN_YOUNG_GPa:g} to {MAX_YOUNG_GPa:g} GPa (PVDF: 1 to 9 GPa)"
+Modulus_GPa = Annotated[float, Meta(ge=MIN_YOUNG_GPa, le=MAX_YOUNG_GPa, description=MODULUS)]
 
 
 class FilmTable(Settings, frozen=True):

@@ -1,7 +1,4 @@
-"""Functions that check lengths and stresses, and a function that rounds numbers for files.
-
-The checks also detect lengths that were given in metres, and stresses that were given in pascals.
-"""
+"""Check of the range of a quantity, and a function that rounds numbers for files."""
 
 import math
 
@@ -13,36 +10,29 @@ def tidy(value: float) -> float:
     return float(f"{value:.12g}")
 
 
-def check_length(what: str, value: float, minimum: float, error: type[InputError]) -> None:
-    """Raise an error if a length is infinite, or so small that it was probably given in metres.
+def check_range(what: str, value: float, allowed: tuple[float, float], unit: str, error: type[InputError]) -> None:
+    """Raise an error if a quantity is infinite or outside its accepted range.
+
+    The message converts a length that was probably given in metres, and a stress that was probably given in pascals.
 
     Args:
-        what: Name of the length in the error message.
-        value: Length to be checked, mm.
-        minimum: Smallest accepted length, mm.
+        what: Name of the quantity in the error message.
+        value: Value to be checked. NaN is outside every range.
+        allowed: Smallest and largest accepted value.
+        unit: Unit of the value, such as "mm" or "MPa".
         error: Class of the error that is raised.
 
     Raises:
-        InputError: If the length is not accepted. The class of the error is `error`.
+        InputError: If the value is not accepted. The class of the error is `error`.
     """
-    if not minimum <= value < math.inf:
-        hint = f"; {value:.6g} m are {1e3 * value:.6g} mm" if 0.0 < value < minimum else ""
-        raise error(f"{what}: expected at least {minimum:g} mm, got {value:.6g} mm{hint}")
-
-
-def check_stress(what: str, value: float, minimum: float, maximum: float, error: type[InputError]) -> None:
-    """Raise an error if a stress is outside the accepted range.
-
-    Args:
-        what: Name of the stress in the error message.
-        value: Stress to be checked, MPa.
-        minimum: Smallest accepted stress, MPa.
-        maximum: Largest accepted stress, MPa.
-        error: Class of the error that is raised.
-
-    Raises:
-        InputError: If the stress is not accepted. The class of the error is `error`.
-    """
-    if not minimum <= value <= maximum:
-        hint = f"; {value:.6g} Pa are {1e-6 * value:.6g} MPa" if maximum < value < math.inf else ""
-        raise error(f"{what}: expected {minimum:g} to {maximum:g} MPa, got {value:.6g} MPa{hint}")
+    low, high = allowed
+    if low <= value <= high and math.isfinite(value):
+        return
+    hint = ""
+    if unit == "mm" and 0.0 < value < low:
+        hint = f"; {value:.6g} m are {1e3 * value:.6g} mm"
+    if unit == "MPa" and high < value < math.inf:
+        hint = f"; {value:.6g} Pa are {1e-6 * value:.6g} MPa"
+    expected = f"at least {low:g}" if high == math.inf else f"{low:g} to {high:g}"
+    space = " " if unit else ""
+    raise error(f"{what}: expected {expected}{space}{unit}, got {value:.6g}{space}{unit}{hint}")

@@ -20,7 +20,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Complexes
 from isocharge.common.errors import SceneError
 from isocharge.simulate.numerics.polygon import shared_area, to_complex
-from isocharge.simulate.sensor.size_check import check_length
+from isocharge.simulate.sensor.size_check import check_range
 
 NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 """Regular expression of a decimal number in the notation of a probe."""
@@ -318,7 +318,7 @@ def check_reach(reach: float, what: str = "probe reach") -> None:
     Raises:
         SceneError: If `reach` is below `MIN_REACH` or infinite.
     """
-    check_length(what, reach, MIN_REACH, SceneError)
+    check_range(what, reach, (MIN_REACH, np.inf), "mm", SceneError)
 
 
 def check_side(what: str, length: float) -> None:
@@ -331,4 +331,4 @@ def check_side(what: str, length: float) -> None:
     Raises:
         SceneError: If `length` is below `MIN_SIDE` or infinite.
     """
-    check_length(what, length, MIN_SIDE, SceneError)
+    check_range(what, length, (MIN_SIDE, np.inf), "mm", SceneError)
