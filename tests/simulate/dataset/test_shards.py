@@ -2,10 +2,8 @@
 
 import errno
 import hashlib
-import io
 import json
 import shutil
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -126,20 +124,6 @@ def test_read_dataset_of_another_sensor_raises_dataset_error(dataset):
             read_dataset(dataset, other)
 
 
-def packed(data: bytes) -> bytes:
-    """Return an npz file whose columns consist of the given bytes."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
-        for name in COLUMNS:
-            file.writestr(f"{name}.npy", data)
-    return buffer.getvalue()
-
-
-def npy(shape: str, dtype: str = "<f8", data: bytes = b"") -> bytes:
-    head = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
-    return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + data
-
-
 def write_shard(folder: Path, data: bytes) -> None:
     """Replace the bytes of the first shard, and write the correct checksum into the manifest."""
     (folder / "shard-00000.npz").write_bytes(data)
@@ -183,17 +167,6 @@ COLUMNS_OF = {
     "outside of numbers": (shard(outside=np.zeros(5)), "column outside: expected truth values, got float64"),
     "probe of numbers": (shard(probe=np.zeros(5)), "column probe: expected text, got float64"),
 }
-FILES = {
-    "empty": lambda: b"",
-    "garbage": lambda: b"garbage",
-    "end of a zip": lambda: packed(b"")[-22:],
-    "no arrays": lambda: packed(b""),
-    "one number": lambda: packed(npy("()", data=bytes(8))),
-    "a trillion numbers": lambda: packed(npy("(1000000000000,)")),
-    "numbers without width": lambda: packed(npy("(99999999999999999999,)", "|V0")),
-    "zeros for ever": lambda: packed(npy("(8750000,)", data=bytes(70_000_000))),
-    "an object": lambda: packed(npy("(1,)", "|O", b"cos\nsystem\n(S'true'\ntR.")),
-}
 DAMAGE = {
     **{
         f"manifest: {text[:20]}": (
@@ -222,13 +195,10 @@ DAMAGE = {
         "the file is missing",
     ),
     **{name: (spoil, rf"shard-00000\.npz: .*{message}") for name, (spoil, message) in COLUMNS_OF.items()},
-    **{
-        f"shard: {name}": (
-            lambda folder, make=make: write_shard(folder, make()),
-            r"shard-00000\.npz: (not a shard with the columns|expected columns)",
-        )
-        for name, make in FILES.items()
-    },
+    "a shard that is no npz file": (
+        lambda folder: write_shard(folder, b"garbage"),
+        r"shard-00000\.npz: not a shard with the columns",
+    ),
 }
 
 

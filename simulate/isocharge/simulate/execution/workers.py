@@ -13,13 +13,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from functools import partial
+from functools import lru_cache, partial
+from importlib.metadata import version
 from typing import Any, TypeVar
 
 from isocharge.common.errors import InputError, WorkersLost
 from isocharge.common.extras import require
 from isocharge.simulate.execution.blas import single_threaded_blas
-from isocharge.simulate.execution.code_version import code_fingerprint
 
 Job = TypeVar("Job")
 
@@ -63,7 +63,7 @@ def in_order(
         return
 
     # The workers run the jobs only if they have the same version of the code as this process.
-    task = partial(run_same_code, code_fingerprint(), function)
+    task = partial(run_same_code, code_versions(), function)
     pending: deque[Future[Result]] = deque()
     try:
         for job in jobs:
@@ -110,11 +110,17 @@ def _executor_errors() -> Iterator[None]:
         raise WorkersLost(f"the Dask cluster stopped the computation: {error}") from error
 
 
-def run_same_code(fingerprint: str, function: Callable[[Job], Result], job: Job) -> Result:
+@lru_cache(maxsize=1)
+def code_versions() -> str:
+    """Return the versions of isocharge and of the numerical libraries that affect the results of a simulation."""
+    return ", ".join(f"{name} {version(name)}" for name in ("isocharge", "numpy", "scipy", "shapely"))
+
+
+def run_same_code(versions: str, function: Callable[[Job], Result], job: Job) -> Result:
     """Run a job in a worker if the worker has the same version of the code as the process that sent the job.
 
     Args:
-        fingerprint: Result of `code_fingerprint` in the process that sent the job.
+        versions: Result of `code_versions` in the process that sent the job.
         function: Function that is called with the job.
         job: Argument of the call.
 
@@ -124,9 +130,9 @@ def run_same_code(fingerprint: str, function: Callable[[Job], Result], job: Job)
     Raises:
         WorkersLost: If the code of the worker differs, because the results might then differ, too.
     """
-    if code_fingerprint() != fingerprint:
+    if code_versions() != versions:
         raise WorkersLost(
-            f"a worker runs {code_fingerprint()}, expected {fingerprint}; install the same versions on all workers"
+            f"a worker runs {code_versions()}, expected {versions}; install the same versions on all workers"
         )
     with single_threaded_blas():
         return function(job)
