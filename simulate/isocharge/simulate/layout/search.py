@@ -210,7 +210,9 @@ class PressedLayout:
         def log_mean(new_rows: Array) -> float:
             """Return the logarithm of the power mean for rows of the new squares, shape (n_press, n_new, 6)."""
             squared_error = self.model.squared_errors(np.concatenate([new_rows, self.kept_rows], axis=1))
-            return float(np.log(np.mean(squared_error ** (0.5 * power))) / power)
+            largest = squared_error.max()  # the powers of the ratios neither overflow nor all underflow
+            mean_power = np.mean((squared_error / largest) ** (0.5 * power))
+            return float(0.5 * np.log(largest) + np.log(mean_power) / power)
 
         def objective(coordinates: Array) -> tuple[float, Array]:
             """Return the logarithm of the power mean, and its derivatives with respect to x1, y1, x2, y2, ..."""
