@@ -19,21 +19,23 @@ from isocharge.serve.model.chebyshev_series import CHUNK_SIZE, chebyshev_terms, 
 from isocharge.train.data.contact_errors import rms
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 
-CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
-"""Degrees in the position and in the force that are tried, in this order, for positive charges."""
+CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = (
+    (6, 1),
+    (6, 4),
+    (10, 2),
+    (10, 4),
+    (16, 2),
+    (16, 4),
+    (24, 2),
+    (30, 2),
+    (24, 4),
+    (36, 2),
+)
+"""Degrees in the position and in the force that are tried, in this order, for positive charges.
 
-TAUT_CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = ((6, 4), (10, 4), (16, 4), (24, 4))
-"""Degrees in the position and in the force that are tried, in this order, for positive charges on taut films.
-
-On taut films, the charges are proportional to the force at small forces, and proportional to the power 2/3 of the force
-at large forces. The logarithm of a charge is therefore not a polynomial of low degree in the logarithm of the force."""
-
-TAUT_ERROR_RATIO = 0.8
-"""Ratio of two errors of the fit below which a film counts as taut.
-
-The ratio is the error with the first of `TAUT_CANDIDATE_DEGREES` divided by the error with the first of
-`CANDIDATE_DEGREES`. On a slack film, a higher degree in the force hardly changes the error, so the ratio is nearly
-one."""
+On a slack film, the logarithm of a charge is nearly a linear function of the logarithm of the force. On taut films, the
+charges are proportional to the force at small forces, and proportional to the power 2/3 of the force at large forces,
+which needs a higher degree."""
 
 SIGNED_CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = (
     (6, 1),
@@ -102,15 +104,6 @@ def fit_charge_series(
     if best_series is None:
         fewest = FEWEST_PER_TERM * series_term_count(*first_degrees)
         raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")
-
-    # A taut film, which has a pretension, needs higher degrees in the force. If the first degrees for taut films have a
-    # clearly smaller error, the film is taut.
-    if not presses.signed and best_series.charge_std > GOOD_ENOUGH:
-        first_taut_degrees, *further_taut_degrees = TAUT_CANDIDATE_DEGREES
-        taut_series = fitter.fit(*first_taut_degrees)
-        if taut_series is not None and taut_series.charge_std < TAUT_ERROR_RATIO * best_series.charge_std:
-            best_series = taut_series
-            further_degrees = further_taut_degrees
 
     # Try the further degrees until the error is small enough, or the presses are too few.
     for degree, force_degree in further_degrees:

@@ -32,9 +32,6 @@ YIELD_FORCE = "yield_force_N"
 FEWEST = 500
 """Smallest number of presses for a fit."""
 
-ROUNDING_RATIO = 1.0 + 1e-9
-"""Largest ratio by which a sample may exceed the ranges of its manifest because of rounding."""
-
 FEWEST_POSITIONS = 50
 """Smallest number of positions for a fit."""
 
@@ -151,17 +148,15 @@ def domain_of(dataset: Dataset) -> Domain:
     except (AttributeError, TypeError, ValueError) as error:
         raise DatasetError(f"manifest ranges: expected radius_mm and force_N [MIN, MAX], got {ranges!r}") from error
 
-    # The comparisons allow for rounding errors.
-    smallest_force, largest_force = sample_forces
-    contains_positions = sample_radius <= radius * ROUNDING_RATIO
-    contains_smallest_force = 0.0 < min_force <= smallest_force * ROUNDING_RATIO
-    contains_largest_force = largest_force <= max_force * ROUNDING_RATIO
-    if not (contains_positions and contains_smallest_force and contains_largest_force):
+    if not (0.0 < min_force <= max_force and radius > 0.0):
+        raise DatasetError(f"manifest ranges: expected positive radius_mm and force_N [MIN, MAX], got {ranges!r}")
+    domain = Domain(radius, (min_force, max_force))
+    if not domain.contains(LabelledPresses.of(dataset).contact).all():
         raise DatasetError(
             f"manifest ranges: radius_mm {radius:g} and force_N [{min_force:g}, {max_force:g}] do not hold the "
-            f"samples, which reach {sample_radius:g} mm and {smallest_force:g} to {largest_force:g} N"
+            f"samples, which reach {sample_radius:g} mm and {sample_forces[0]:g} to {sample_forces[1]:g} N"
         )
-    return Domain(radius, (min_force, max_force))
+    return domain
 
 
 def outside_presses_of(dataset: Dataset) -> LabelledPresses | None:
@@ -262,11 +257,8 @@ def _check_finite(presses: LabelledPresses) -> None:
         )
 
 
-HELD_SHARE = 0.2
-"""Share of the measured presses that are held out for the measurement of errors, dimensionless."""
-
-FEWEST_HELD = 10
-"""Smallest number of presses that are held out, because the errors of fewer presses are too uncertain."""
+HELD_PARTS = 5
+"""Number of parts of measured presses of which one is held out for the measurement of errors."""
 
 FEWEST_MEASURED = 50
 """Smallest number of measured presses for a training, a report or held-out errors."""
@@ -275,11 +267,7 @@ FEWEST_MEASURED = 50
 def held_out(contact: Array) -> Booleans:
     """Determine which measured presses are held out for the measurement of errors.
 
-    The fraction `HELD_SHARE` of the presses is held out, but at least `FEWEST_HELD` presses. Of very few presses, at
-    most half are held out. Presses at one position are held out together, so the number may be slightly larger.
-
-    The positions are chosen in an order that depends only on their coordinates. The order is therefore the same in
-    every subset of the presses.
+    One of `HELD_PARTS` parts is held out. Presses at one position are held out together.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -287,52 +275,34 @@ def held_out(contact: Array) -> Booleans:
     Returns:
         Whether each press is held out, shape (n,).
     """
-    presses_before, count = _count_presses_before(contact, round(1.0 / HELD_SHARE))
-    smallest_held_count = min(FEWEST_HELD, 0.5 * count)
-    held_count = max(HELD_SHARE * count, smallest_held_count)
-    return presses_before < held_count
+    return np.asarray(folds_by_place(contact, HELD_PARTS) == 0)
 
 
 def folds_by_place(contact: Array, count: int) -> Integers:
-    """Return the number of the cross-validation fold of each measured press, from 0 to `count` - 1, shape (n,).
+    """Divide measured presses into parts, and return the number of the part of each press, from 0 to `count` - 1.
 
-    Presses at one place are in the same fold. Places are assigned to the folds in the order in which `held_out` chooses
-    them.
-
-    Args:
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        count: Number of folds.
-    """
-    presses_before, total_count = _count_presses_before(contact, count)
-    return np.asarray(presses_before * count // total_count, dtype=np.intp)
-
-
-def _count_presses_before(contact: Array, part_count: int) -> tuple[Integers, int]:
-    """For each press, count the presses at all positions that are chosen before its own position.
-
-    Positions are chosen in the order of the checksums of their coordinates. This order is random but the same in every
-    run. The presses at one position count as at most one part of all counted presses, so that no part remains empty
-    beside a position with very many presses.
+    Presses at one position are in the same part. The positions are assigned to the parts in the order of the checksums
+    of their coordinates. This order is random but the same in every run. The presses at one position count as at most
+    one part of all counted presses, so that no part remains empty beside a position with very many presses.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        part_count: Number of parts into which the presses are divided.
+        count: Number of parts.
 
     Returns:
-        Number of earlier presses for each press, shape (n,), and number of all counted presses.
+        Number of the part of each press, shape (n,).
     """
     rounded_position = np.round(contact[:, :2], 3) + 0.0  # the addition converts -0.0 into 0.0
     positions, position_of_press, presses_at_position = np.unique(
         rounded_position, axis=0, return_inverse=True, return_counts=True
     )
-    limited_counts = presses_at_position
-    while limited_counts.max() > max(1, limited_counts.sum() // part_count):
-        limited_counts = np.minimum(limited_counts, max(1, limited_counts.sum() // part_count))
+    counts = presses_at_position
+    while counts.max() > max(1, counts.sum() // count):
+        counts = np.minimum(counts, max(1, counts.sum() // count))
     order = np.argsort([sha256_of(position.tobytes()) for position in positions])
-    ordered_counts = limited_counts[order]
-    presses_before = np.empty_like(limited_counts)
-    presses_before[order] = np.cumsum(ordered_counts) - ordered_counts  # the sum without the position itself
-    return np.asarray(presses_before[position_of_press.ravel()]), int(limited_counts.sum())
+    presses_before = np.empty_like(counts)
+    presses_before[order] = np.cumsum(counts[order]) - counts[order]  # the sum without the position itself
+    return np.asarray((presses_before * count // counts.sum())[position_of_press.ravel()], dtype=np.intp)
 
 
 def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Dataset:
