@@ -353,12 +353,12 @@ def bash(script, **environment):
 
 
 @pytest.mark.parametrize("words", ["predict linear {presses}", "stream linear --port {frames} --record {record}"])
-def test_closed_stdout_is_reported(models, presses, frames, tmp_path, words):
-    """And no file that is opened later gets its place."""
+def test_closed_stdout_is_the_null_device(models, presses, frames, tmp_path, words):
+    """No file that is opened later gets its place."""
     record = tmp_path / "touch.rec"
     words = words.format(presses=presses, frames=frames, record=record)
     done = bash(f"{ISOCHARGE} serve {words} --models {models} >&-")
-    assert (done.returncode, "OutputError: stdout is closed" in done.stderr) == (1, True)
+    assert done.returncode == 0
     assert not record.exists() or Recording(record).model == "linear/1"
 
 

@@ -22,47 +22,26 @@ from typing import Any, Self
 
 import typer
 
-from isocharge.common.errors import OutputError
 from isocharge.common.printable_text import printable, printable_lines
 from isocharge.common.progress import Listener, listening
 
 STANDARD_DESCRIPTORS = (STDIN_FILENO, STDOUT_FILENO, STDERR_FILENO)
 """File descriptors of the three standard streams, in increasing order."""
 
-
-class ClosedOutput(io.TextIOBase):
-    """Stream that replaces stdout if stdout was closed when the command started."""
-
-    def write(self, _: str, /) -> int:
-        """Refuse to write.
-
-        Raises:
-            OutputError: Always.
-        """
-        raise OutputError("stdout is closed: expected a place for the results; send them to a file or to /dev/null")
+STREAM_MODES = {"stdin": "r", "stdout": "w", "stderr": "w"}
+"""Mode of each standard stream by its name in the module `sys`, in the order of the descriptors."""
 
 
 def open_closed_streams() -> None:
-    """Replace standard streams that are closed.
+    """Open the null device in place of standard streams that were closed when the command started.
 
     Without this replacement, the next file that is opened would get the file descriptor of stdout, and printed text
     would be written into that file.
     """
-    # Open the null device on each file descriptor that is closed.
-    for descriptor in STANDARD_DESCRIPTORS:
-        try:
-            os.fstat(descriptor)
-        except OSError:
+    for descriptor, (name, mode) in zip(STANDARD_DESCRIPTORS, STREAM_MODES.items(), strict=True):
+        if getattr(sys, name) is None:  # Python found the descriptor closed
             os.open(os.devnull, os.O_RDWR)  # gets the lowest free file descriptor, which is `descriptor`
-
-    # Python sets the stream object to None if its file descriptor was closed when the interpreter started. The new
-    # objects must not close the descriptors when they are destroyed.
-    if sys.stdin is None:
-        sys.stdin = open(STDIN_FILENO, closefd=False)  # noqa: SIM115
-    if sys.stdout is None:
-        sys.stdout = ClosedOutput()
-    if sys.stderr is None:
-        sys.stderr = open(STDERR_FILENO, "w", closefd=False)  # noqa: SIM115
+            setattr(sys, name, open(descriptor, mode, closefd=False))  # noqa: SIM115
 
 
 def discard_output(descriptor: int) -> None:
