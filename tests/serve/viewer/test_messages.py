@@ -22,7 +22,6 @@ from isocharge.serve.viewer.deflection_field import read_deflection_field
 from isocharge.serve.viewer.messages import (
     CONTACT_BIT,
     FLAG_BITS,
-    Back,
     LiveRequest,
     Marker,
     Record,
@@ -49,7 +48,6 @@ def parse(text, kind=LiveRequest | ReplayRequest):
     ("text", "request_"),
     [
         ('{"do": "tare"}', Tare()),
-        ('{"do": "back"}', Back()),
         ('{"do": "record", "on": true}', Record(on=True)),
         ('{"do": "marker", "text": "here"}', Marker("here")),
         ('{"do": "seek", "value": 12.5}', Seek(12.5)),
@@ -82,7 +80,7 @@ def test_invalid_requests_are_refused(content):
 
 
 def test_live_page_refuses_replay_requests():
-    with pytest.raises(RequestError, match="one of tare, back, record, marker"):
+    with pytest.raises(RequestError, match="one of tare, record, marker"):
         parse('{"do": "seek", "value": 1}', LiveRequest)
 
 

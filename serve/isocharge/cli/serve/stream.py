@@ -139,8 +139,8 @@ def stream_command(
     """Follow a sensor live: read its port, and print position (mm) and force (N) for every frame of charges.
 
     The tare (the charges at rest) is measured from the first 100 frames, which take 0.5 s at 200 Hz. Do not touch the
-    film meanwhile. The signal SIGUSR1 starts a new tare. The signal SIGUSR2 discards the estimated changes of the film.
-    The signal SIGHUP loads the latest version of MODEL without losing a frame. Ctrl-C stops the command. If the reader
+    film meanwhile. The signal SIGUSR1 starts a new tare. The signal SIGHUP loads the latest version of MODEL without
+    losing a frame. Ctrl-C stops the command. If the reader
     of stdout is too slow for a sensor, the oldest lines are dropped, and the summary states their number. A recording
     (--record) is complete even if lines are dropped. The exit code is 1 if no frames are recognised within --seconds.
 
@@ -177,7 +177,6 @@ def stream_command(
 
         # The handlers of the signals only request changes, which the stream carries out later.
         stack.enter_context(on_signal(signal.SIGUSR1, stream.request_tare))
-        stack.enter_context(on_signal(signal.SIGUSR2, stream.request_film_reset))
         request_latest_model = partial(stream.request_model, partial(_load_latest, model, models))
         stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(request_latest_model)))
 

@@ -25,7 +25,6 @@ from isocharge.serve.network.address import Address, Tls, check_exposure
 from isocharge.serve.port import recording
 from isocharge.serve.viewer.link import ReaderEnd, make_link
 from isocharge.serve.viewer.messages import (
-    Back,
     LiveRequest,
     Marker,
     Record,
@@ -344,8 +343,6 @@ def _carry_out(request: LiveRequest, link: ReaderEnd, stream: RecordedStream, he
                 link.send_message(recording=None)
         case Tare():
             stream.request_tare()
-        case Back():
-            stream.request_film_reset()
 
 
 def _show_note(link: ReaderEnd, text: str) -> None:

@@ -95,8 +95,3 @@ class FollowFilm(Stage):
     def reset(self) -> None:
         """Discard the state of the present touch. The estimated pretension is not changed."""
         self._follower.discard_touch()
-
-    def reset_film(self) -> None:
-        """Reset the estimate of the pretension to the pretension that the calibration of the film has found."""
-        self._follower.reset()
-        self._setup.predictor = self._follower.predictor

@@ -16,7 +16,7 @@ from itertools import islice
 from isocharge.common.errors import IsochargeError
 from isocharge.serve.live.stream import TouchStream
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.port.recording import Event, FilmReset, Marker, NewModel, RecordedClock, Recorder, Recording
+from isocharge.serve.port.recording import Event, Marker, NewModel, RecordedClock, Recorder, Recording
 from isocharge.serve.port.source import Chunk
 from isocharge.serve.record.record import PredictionRecord
 
@@ -61,13 +61,6 @@ class RecordedStream:
     def request_tare(self) -> None:
         """Request a new measurement of the tare. A signal handler may also call this method."""
         self._requests.append(self._tare)
-
-    def request_film_reset(self) -> None:
-        """Request to reset the estimated pretension of the film to the value of its calibration.
-
-        A signal handler may also call this method.
-        """
-        self._requests.append(self._reset_film)
 
     def request_recording(self, recorder: Recorder | None) -> None:
         """Request to end the present recording, and to begin another recording unless `recorder` is None.
@@ -220,12 +213,6 @@ class RecordedStream:
         if self.recorder is not None:
             self.recorder.tare()
 
-    def _reset_film(self) -> None:
-        """Reset the estimated pretension to the value of the calibration, and write the request to the recording."""
-        self._stream.reset_film()
-        if self.recorder is not None:
-            self.recorder.film_reset()
-
 
 def replay(
     recording: Recording,
@@ -265,8 +252,6 @@ def replay(
             case NewModel(label=label):
                 if load is not None:
                     stream.use(load(label))
-            case FilmReset():
-                stream.reset_film()
             case Event(chunk=None):  # a new tare was requested
                 clock.set(event)
                 stream.tare()

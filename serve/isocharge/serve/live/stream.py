@@ -17,7 +17,6 @@ from isocharge.common.errors import ModelError, NoFramesError, shown
 from isocharge.serve.flags import GAP, RECONNECTED, REPEAT, RESTART, in_order
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, SequenceGaps
-from isocharge.serve.live.contact_stages import FollowFilm
 from isocharge.serve.live.device import ANY_BOARD, Device, create_stages
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.serial_line import TELNET_ADVICE, without_telnet
@@ -332,15 +331,6 @@ class TouchStream(ReadingStream):
         super().tare()
         for stage in self._contact_stages:
             stage.reset()
-
-    def reset_film(self) -> None:
-        """Reset the estimated pretension of the film to the value of its calibration.
-
-        If the pretension is not estimated, nothing changes.
-        """
-        for stage in self._contact_stages:
-            if isinstance(stage, FollowFilm):
-                stage.reset_film()
 
     def restart(self) -> None:
         """Return to the state of a new stream, so that all later records depend only on later bytes.

@@ -7,7 +7,6 @@ object:
     {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
     {"timestamp": ..., ...}                       a record of that chunk
     {"tare": true}                                a request for a new tare
-    {"back": true}                                a request to reset the estimated pretension to its calibration
     {"use": "three/2"}                            the model of all records after this line
     {"marker": [timestamp, "text"]}               a moment that the user has marked
 
@@ -140,10 +139,6 @@ class Recorder:
         """Write a request for a new tare."""
         self._write('{"tare": true}')
 
-    def film_reset(self) -> None:
-        """Write a request to reset the estimated pretension of the film to the value of its calibration."""
-        self._write('{"back": true}')
-
     def model(self, label: str) -> None:
         """Write the label (`name/version`) of the model that computes all records after this line."""
         self._write(json.dumps({"use": label}))
@@ -180,10 +175,6 @@ class Event(NamedTuple):
 
     chunk: Chunk | None
     latencies_us: tuple[float, ...] = ()
-
-
-class FilmReset(NamedTuple):
-    """A recorded request to reset the estimated pretension of the film to the value of its calibration."""
 
 
 class NewModel(NamedTuple):
@@ -242,7 +233,7 @@ class Recording:
         self.device = header.device
         self.name = header.name
 
-    def events(self) -> Iterator[Event | Marker | NewModel | FilmReset]:
+    def events(self) -> Iterator[Event | Marker | NewModel]:
         """Yield all events of the recording in their order.
 
         The records are not yielded. The event of a chunk contains only the latencies of the records that were computed
@@ -338,7 +329,6 @@ class _Entry(Struct):
     timestamp: float | None = None
     latency_us: Latency | None = None
     tare: bool | None = None
-    back: bool | None = None
     use: ModelLabel | None = None
     marker: tuple[Moment, Annotated[str, Meta(max_length=1000)]] | None = None
     chunk: tuple[Moment, Nanoseconds, Annotated[float, Meta(ge=0.0)], bytes] | None = None
@@ -353,7 +343,7 @@ class _Entry(Struct):
         has_latency = self.latency_us is not None
         if has_time != has_latency:  # a record has both keys, and an event has neither
             raise WrongKey("latency_us")
-        known_keys = (self.timestamp, self.tare, self.back, self.use, self.marker, self.chunk)
+        known_keys = (self.timestamp, self.tare, self.use, self.marker, self.chunk)
         if all(key is None for key in known_keys):
             raise WrongKey("chunk")
 
@@ -366,12 +356,10 @@ class _Entry(Struct):
         return Chunk(data, timestamp, clock_ns, outage_s)
 
     @property
-    def other_event(self) -> Event | Marker | NewModel | FilmReset:
+    def other_event(self) -> Event | Marker | NewModel:
         """The event that this line contains. The line must be neither a record nor a chunk."""
         if self.marker is not None:
             return Marker(*self.marker)
-        if self.back is not None:
-            return FilmReset()
         if self.use is not None:
             return NewModel(self.use)
         return Event(None)  # a request for a new tare

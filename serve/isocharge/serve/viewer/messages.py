@@ -244,10 +244,6 @@ class Tare(PageRequest):
     """Request to measure the tare again."""
 
 
-class Back(PageRequest):
-    """Request to reset the estimated pretension of the film to the value of its calibration."""
-
-
 class Record(PageRequest):
     """Request to begin or end a recording.
 
@@ -296,7 +292,7 @@ class Speed(PageRequest):
     value: Annotated[float, Meta(ge=0.01, le=100.0)]
 
 
-LiveRequest = Tare | Back | Record | Marker
+LiveRequest = Tare | Record | Marker
 """Requests that the page of a live stream can send."""
 
 ReplayRequest = Play | Pause | Seek | Speed

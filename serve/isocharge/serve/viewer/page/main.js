@@ -55,7 +55,7 @@ function door(reason) {
 function act(what) {
   if (what === "pause") return page.timeline ? page.timeline.toggle() : pause(!page.isPaused);
   if (what === "record") return connection.request({ do: "record", on: !page.film.state.recording });
-  if (what === "tare" || what === "back" || what === "marker") return connection.request({ do: what });
+  if (what === "tare" || what === "marker") return connection.request({ do: what });
   return undefined;
 }
 
@@ -73,7 +73,7 @@ function key(event) {
   const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   if (name === " " && event.target.closest("button, summary")) return;
   const live = page.timeline === null, action = {
-    t: live && (() => act("tare")), b: live && (() => act("back")), r: live && (() => act("record")), m: live && (() => act("marker")),
+    t: live && (() => act("tare")), r: live && (() => act("record")), m: live && (() => act("marker")),
     " ": () => act("pause"), "?": () => document.getElementById("help").showModal(),
     ArrowLeft: !live && (() => page.timeline.step(-1)), ArrowRight: !live && (() => page.timeline.step(1)),
   }[name];
