@@ -120,7 +120,7 @@ def refined_error(solved: Equilibrium) -> float:
     film = solved.film
     mesh = solved.mesh.resolution
     finer = replace(mesh, order=mesh.order + 2, rings=mesh.rings + 1, rim=mesh.rim + 1)
-    full = Theory(stretching=True, bending=True, pretensioned=film.pretension > 0.0)
+    full = Theory(bending=True)
     refined = press(film, solved.probe, solved.at, solved.force, SolveSettings(theory=full, resolution=finer))
     errors = []
     for sensor in SENSORS:

@@ -39,8 +39,8 @@ from isocharge.simulate.mesh.template import template_for
 SENSORS = [load_sensor(f"{layout}-25um-{kind}") for layout in ("three", "four") for kind in ("biaxial", "uniaxial")]
 FILM = SENSORS[0].film
 PROBE = Circle(1.0)
-MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
-WITH_BENDING = Theory(stretching=True, bending=True, pretensioned=False)
+MEMBRANE = Theory(bending=False)
+WITH_BENDING = Theory(bending=True)
 REFERENCE_MESHES = {MEMBRANE: Resolution(10, 8, 8), WITH_BENDING: Resolution(9, 8, 8, 2)}
 """Meshes of the reference solves."""
 

@@ -28,7 +28,7 @@ from isocharge.simulate.mesh.template import Template
 from kept import kept
 
 TURNED = Polygon.rectangle(4.0, 2.0, 0.3)
-FULL = Theory(stretching=True, bending=True, pretensioned=False)
+FULL = Theory(bending=True)
 
 
 # Films and discrete problems

@@ -26,9 +26,9 @@ ORDERS = (3, 4, 5, 6)
 RECTANGLE = Polygon.rectangle(4.0, 2.0, 0.5)
 PROBES = (RECTANGLE, Circle(1.0), RECTANGLE)
 THEORIES = {
-    "membrane": (0.025, Theory(stretching=True, bending=False, pretensioned=False)),
-    "membrane + bending": (0.11, Theory(stretching=True, bending=True, pretensioned=False)),
-    "plate": (1.0, Theory(stretching=False, bending=True, pretensioned=False)),
+    "membrane": (0.025, Theory(bending=False)),
+    "membrane + bending": (0.11, Theory(bending=True)),
+    "plate": (1.0, Theory(bending=True)),
 }
 PLACES = np.array([(5.0, 3.0), (0.0, 0.0), (-20.0, 10.0), (0.0, 40.0)])
 

@@ -101,7 +101,7 @@ def solve_mesh(
 ) -> tuple[Array, int, float]:
     """Solve one press on one mesh, and return the charges (pC), the number of unknowns and the CPU time (s)."""
     began = process_time()
-    theory = Theory(stretching=True, bending=True, pretensioned=False)
+    theory = Theory(bending=True)
     solved = press(sensor.film, probe, at, FORCE, SolveSettings(theory=theory, resolution=Resolution(*mesh)))
     return touch_charge(sensor, solved), 3 * solved.mesh.template.n_node, process_time() - began
 

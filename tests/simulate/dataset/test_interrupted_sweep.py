@@ -14,7 +14,7 @@ from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, Theory,
 from isocharge.simulate.forward import forward_map
 
 SENSOR = load_sensor("three-25um-biaxial")
-QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
+QUICK = SolveSettings(theory=Theory(bending=False), resolution=Resolution(4, 8, 4))
 SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, outside=15)
 
 
@@ -53,7 +53,7 @@ def killed(title, done, *_):
 
 if __name__ == "__main__":
     forward_map.CHECK_COUNT = {check_count}
-    membrane = Theory(stretching=True, bending=False, pretensioned=False)
+    membrane = Theory(bending=False)
     quick = SolveSettings(theory=membrane, resolution=Resolution(4, 8, 4))
     sweep = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, outside=15)
     with local_workers(2) as executor, listening(killed):

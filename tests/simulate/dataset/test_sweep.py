@@ -28,7 +28,7 @@ from isocharge.simulate.dataset import sweep as sweep_module
 from isocharge.simulate.dataset.sweep import outside_samples, write_sweep
 
 SENSOR = load_sensor("three-25um-biaxial")
-MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+MEMBRANE = Theory(bending=False)
 QUICK = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
 """Membrane theory on a coarse mesh. A small family is solved in half a second."""
 

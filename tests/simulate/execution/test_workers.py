@@ -19,7 +19,7 @@ from isocharge.simulate.execution import workers as module
 from isocharge.simulate.execution.workers import dask_workers, in_order, local_workers
 
 SENSOR = load_sensor("three-25um-biaxial")
-QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
+QUICK = SolveSettings(theory=Theory(bending=False), resolution=Resolution(4, 8, 4))
 SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, orientation="random", outside=15)
 
 

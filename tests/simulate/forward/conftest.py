@@ -31,7 +31,7 @@ def near_electrodes() -> Sensor:
 @pytest.fixture(scope="session")
 def near_map(near_electrodes: Sensor) -> ForwardMap:
     """A forward map of a membrane with few solves. The probe can lie on the electrodes."""
-    theory = Theory(stretching=True, bending=False, pretensioned=False)
+    theory = Theory(bending=False)
     settings = SolveSettings(theory=theory, resolution=Resolution(4, 8, 4))
     return kept(ForwardMap.build, near_electrodes, Circle(1.0), 5.0, (0.3, 1.0), settings)
 

@@ -24,7 +24,7 @@ from isocharge.simulate.forward.family import NODE_COUNTS, Family, NodeCount
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
 
-MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+MEMBRANE = Theory(bending=False)
 QUICK_SETTINGS = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
 QUICK = {"radius": 4.0, "force_range": (0.7, 1.0), "settings": QUICK_SETTINGS}
 """A small family without bending: few and cheap solves."""
@@ -119,8 +119,8 @@ def test_contact_pressure(near_map, oriented_map):
 
 
 FILMS = {
-    "pretension": ({"pretension": 0.5}, "middle", Theory(stretching=True, bending=False, pretensioned=True)),
-    "plate": ({"thickness": 1.0}, "middle", Theory(stretching=False, bending=True, pretensioned=False)),
+    "pretension": ({"pretension": 0.5}, "middle", Theory(bending=False)),
+    "plate": ({"thickness": 1.0}, "middle", Theory(bending=True)),
     "surface": ({}, "top", "auto"),
 }
 

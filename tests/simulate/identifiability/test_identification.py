@@ -24,7 +24,7 @@ from kept import kept
 
 REFERENCE = noise_model("reference")
 SENSOR = load_sensor("three-25um-biaxial")
-MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+MEMBRANE = Theory(bending=False)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from kept import kept
 
 RADIUS = 8.0
 FORCES = (0.2, 2.0)
-QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
+QUICK = SolveSettings(theory=Theory(bending=False), resolution=Resolution(4, 8, 4))
 LAYOUTS = {name: load_sensor(f"{name}-25um-biaxial") for name in ("three", "four")}
 CENTRES = {name: np.array([electrode.centre for electrode in sensor.electrodes]) for name, sensor in LAYOUTS.items()}
 

@@ -17,7 +17,7 @@ from isocharge.simulate.solver.load_case import LoadCase, choose_mesh
 
 RADIUS = 45.0
 FILM = Film(RADIUS, 0.025, 3000.0, 0.34)
-FULL = Theory(stretching=True, bending=True, pretensioned=False)
+FULL = Theory(bending=True)
 COMMON = settings(derandomize=True, deadline=None, max_examples=15)
 
 

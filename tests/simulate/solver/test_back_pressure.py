@@ -10,7 +10,7 @@ from scipy.integrate import cumulative_simpson, solve_bvp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import brentq
 
-from isocharge.common.errors import SceneError, SensorError
+from isocharge.common.errors import SensorError
 from isocharge.simulate import (
     Circle,
     Film,
@@ -36,7 +36,7 @@ CAVITY = 20.0 * np.pi * 45.0**2
 SKFEM_CASES = json.loads((Path(__file__).parents[2] / "data" / "film_cases_air_skfem.json").read_text())
 """Charges by an independent finite-element program; see the entry `method` of the file."""
 
-MEMBRANE = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=True), accuracy=1e-4)
+MEMBRANE = SolveSettings(theory=Theory(bending=False), accuracy=1e-4)
 
 
 def sensor_with(**film: object) -> Sensor:
@@ -210,12 +210,6 @@ def test_forward_map_of_a_film_with_a_closed_back_equals_direct_solves():
     forward_map = ForwardMap.build(sensor, Circle(1.0), 4.0, (0.3, 0.5))
     charge = touch_charge(sensor, press(sensor.film, Circle(1.0), (-2.0, 3.2), 0.35))
     np.testing.assert_allclose(forward_map.charges(np.array([[-2.0, 3.2, 0.35]]))[0], charge, rtol=1e-3)
-
-
-def test_a_linear_theory_with_a_closed_back_raises_a_scene_error():
-    linear = SolveSettings(theory=Theory(stretching=False, bending=True, pretensioned=True))
-    with pytest.raises(SceneError, match="linear theories have no static pressure and no closed back"):
-        press(sensor_with(back_volume=CAVITY).film, Circle(1.0), (0.0, 0.0), 0.01, linear)
 
 
 @pytest.mark.parametrize(

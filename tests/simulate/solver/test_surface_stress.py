@@ -20,8 +20,8 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.mechanics.theory import theory_for
 
-PLATE = Theory(stretching=False, bending=True, pretensioned=False)
-MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+PLATE = Theory(bending=True)
+MEMBRANE = Theory(bending=False)
 FINE = Resolution(7, 8, 6, 2)
 FORCE = 1e-3
 

@@ -1,6 +1,5 @@
 """Command `isocharge simulate point`, which computes the charges and the deflection of one press."""
 
-from dataclasses import replace
 from math import isfinite
 from typing import Annotated
 
@@ -48,7 +47,7 @@ def point_command(
         str,
         typer.Option(
             "--theory",
-            help="'nonlinear membrane + bending', 'linear plate', ...; auto selects the cheapest sufficient one.",
+            help="'nonlinear membrane' or 'nonlinear membrane + bending'; auto selects the cheapest sufficient one.",
         ),
     ] = "auto",
     temperature: Annotated[
@@ -90,16 +89,13 @@ def point_command(
     if theory == "auto":
         selected_theory = theory_for(film_sensor, footprint, (force, force), accuracy)
     else:
-        selected_theory = theory_by_name(theory, film_sensor.film)
+        selected_theory = theory_by_name(theory)
 
     if side_force is not None and friction is not None:
         raise InputError("--side-force and --friction: expected one of them, because friction gives the side force")
     if friction is not None:
         check_friction(friction)
     applied_side_force = (0.0, 0.0) if side_force is None else parse_side_force(side_force)
-    if theory == "auto" and (friction is not None or any(applied_side_force)):
-        # A side force stretches the film, so a linear theory without stretching does not describe it.
-        selected_theory = replace(selected_theory, stretching=True)
 
     settings = SolveSettings(accuracy=accuracy, theory=selected_theory)
     film = film_sensor.film

@@ -80,12 +80,11 @@ def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor
     film = sensor.film
     # Choose the distances and forces of the presses. A circular probe has no orientation.
     family = Family.spread(forward_map.domain, film, forward_map.probe, NODE_COUNT)
-    theory = replace(forward_map.theory, stretching=True)  # `read` needs a theory that includes stretching
-    settings = SolveSettings(theory=theory, resolution=forward_map.resolution, layer=forward_map.layer)
+    settings = SolveSettings(theory=forward_map.theory, resolution=forward_map.resolution, layer=forward_map.layer)
 
     derivatives = family.solve(sensor, forward_map.probe, settings, executor, read)
     table = derivatives.reshape(-1, derivatives.shape[-1])
-    return replace(forward_map, family=family, theory=theory, table=table)
+    return replace(forward_map, family=family, table=table)
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def whole_film_map(
         SceneError: If some presses cannot exist.
         SolveError: If a press has no equilibrium.
     """
-    theory = Theory(stretching=True, bending=True, pretensioned=sensor.film.pretension != 0.0)
+    theory = Theory(bending=True)
     settings = SolveSettings(theory=theory, resolution=COARSE_RESOLUTION)
     domain = Domain(outermost_distance(sensor.film, probe), force_range)
     forward_map = ForwardMap.build_unchecked(sensor, probe, domain, NODE_COUNT, settings, executor=executor)

@@ -182,14 +182,6 @@ class DimensionlessGroups:
         height = float(_root(linear_factor / cubic_factor, abs(self.static_pressure) / cubic_factor))
         return float(np.copysign(height, self.static_pressure))
 
-    @property
-    def induced(self) -> float:
-        """Approximate share of the load that the induced stress carries.
-
-        The share is 0 for a linear film and 1 for a membrane without pretension.
-        """
-        return self.height**3 / self.load
-
     def stiffened(self, added_tension: float) -> "DimensionlessGroups":
         """Return a copy of the groups in which a tension is added to the pretension.
 

@@ -1,23 +1,10 @@
 """Choice of the theory of the film, and estimates of the errors that the omitted terms of a theory cause.
 
-All theories are special cases of one formulation with two optional terms.
-
-The first term is *bending*, the resistance of the film to bending. Bending is important near the rim and near the
-probe, and for the stress at the surfaces of the film. The effect of bending reaches as far as the bending length
-sqrt(D / N), where D is the bending stiffness and N is the tension force per length. If the pretension and the induced
-tension are small, the bending stiffness carries the load.
-
-The second term is *stretching*, the effect of the induced stress on the deflection. Without stretching, the deflection
-is a linear function of the force. In a theory without stretching, the charges are computed from the deflection in a
-second step.
-
-All theories include the pretension. The two terms and the pretension determine the name of a theory::
-
-    stretching  bending   theory
-    no          yes       linear plate, pre-tensioned linear plate
-    no          no        pre-tensioned linear membrane
-    yes         no        nonlinear membrane
-    yes         yes       nonlinear membrane + bending
+Stretching is always geometrically nonlinear and includes the pretension. *Bending*, the resistance of the film to
+bending, is optional. Bending is important near the rim and near the probe, and for the stress at the surfaces of the
+film. The effect of bending reaches as far as the bending length sqrt(D / N), where D is the bending stiffness and N is
+the tension force per length. If the pretension and the induced tension are small, the bending stiffness carries the
+load.
 """
 
 from dataclasses import dataclass
@@ -41,19 +28,6 @@ The strains are of the order A^2.
 
 MIN_FORCE_N = 1e-12
 """Smallest force of a press, N. The dimensionless groups of a press with a far smaller force are not finite numbers."""
-
-LINEAR_WEIGHT = 4.0
-"""Factor in the estimate of the relative error of a charge that is computed with a linear theory.
-
-The factor multiplies the share of the load that the induced stress carries.
-"""
-
-LOCAL_WEIGHT = 0.4
-"""Factor in the estimate of the relative error of a charge that is computed with a linear theory.
-
-The factor multiplies the ratio of the strain that the footprint induces to the strain of the pretension. The ratio is
-estimated for a film with a large pretension.
-"""
 
 BENDING_WEIGHT = 1.5
 """Factor in the estimate of the relative error of a charge that is computed without bending.
@@ -81,22 +55,15 @@ class Theory:
     """Terms that a theory of the film includes.
 
     Attributes:
-        stretching: Whether the induced stress affects the deflection.
         bending: Whether the film resists bending.
-        pretensioned: Whether the film has a pretension.
     """
 
-    stretching: bool
     bending: bool
-    pretensioned: bool
 
     @property
     def name(self) -> str:
-        """Name of the theory in engineering terms, such as "nonlinear membrane + bending"."""
-        if self.stretching:
-            return "nonlinear membrane + bending" if self.bending else "nonlinear membrane"
-        kind = "linear plate" if self.bending else "linear membrane"
-        return f"pre-tensioned {kind}" if self.pretensioned else kind
+        """Name of the theory in engineering terms."""
+        return "nonlinear membrane + bending" if self.bending else "nonlinear membrane"
 
 
 def bending_length(film: Film, force: float) -> float:
@@ -141,37 +108,8 @@ def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
     return PROBE_WEIGHT * float(squared_length_ratio * pretension_share)
 
 
-def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
-    """Estimate the ratio of the strain that the footprint induces in a film to the strain of the pretension.
-
-    For a large pretension T, the slope of the film at the footprint is F / (2 pi R h T). If the bending length exceeds
-    the reach of the footprint, bending reduces the slope. The induced strain is half of the squared slope.
-
-    Args:
-        film: The film, with thickness h.
-        probe: The probe, whose footprint has the reach R.
-        force: Force F, N.
-
-    Returns:
-        Ratio of the strains, dimensionless. The ratio is zero for a film without pretension.
-    """
-    if film.pretension == 0.0:
-        return 0.0
-    pretension_strain = film.pretension / film.young
-    membrane_slope = force / (2.0 * np.pi * probe.reach * film.thickness * film.pretension)
-
-    # Squared ratio of the bending length to the reach of the footprint
-    squared_length_ratio = slenderness(film) / pretension_strain * (film.radius / probe.reach) ** 2
-    slope = membrane_slope / (1.0 + squared_length_ratio)
-    return float(0.5 * slope**2 / pretension_strain)
-
-
 def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
-    """Estimate the relative error that the omitted terms of a theory cause in a charge.
-
-    The error is the sum of an estimate for omitted stretching and an estimate for omitted bending. A theory with
-    neither stretching nor bending cannot describe a film without pretension. A theory without bending cannot describe a
-    thick film.
+    """Estimate the relative error that omitted bending causes in a charge.
 
     Args:
         film: The film.
@@ -180,23 +118,14 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
         theory: The theory.
 
     Returns:
-        The error, which is infinite if the theory cannot describe the film.
+        The error; zero with bending, and infinite for a thick film without bending.
     """
-    stretching_error = 0.0
-    if not theory.stretching:
-        has_no_stiffness = not theory.bending and film.pretension == 0.0
-        if has_no_stiffness:
-            return np.inf
-        induced_share = DimensionlessGroups.of(film, force, bending=theory.bending).induced
-        stretching_error = LINEAR_WEIGHT * induced_share + LOCAL_WEIGHT * induced_at_probe(film, probe, force)
     if theory.bending:
-        return stretching_error
-
+        return 0.0
     length = bending_length(film, force)
     if length > MAX_MEMBRANE_BENDING_LENGTH:  # the film is too thick for a membrane
         return np.inf
-    bending_error = BENDING_WEIGHT * length + bending_at_probe(film, probe, force)
-    return stretching_error + bending_error
+    return BENDING_WEIGHT * length + bending_at_probe(film, probe, force)
 
 
 def check_strains(film: Film, force: float) -> None:
@@ -222,7 +151,7 @@ def check_strains(film: Film, force: float) -> None:
 
 
 def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
-    """Return the cheapest theory that is sufficiently accurate, or the full theory if no cheaper theory is sufficient.
+    """Return the theory without bending if it is sufficiently accurate, or else the theory with bending.
 
     The estimated error of the theory must not exceed half of the required accuracy. The other half is for the mesh.
 
@@ -236,25 +165,11 @@ def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Th
         SceneError: If the strains are too large for Saint-Venant-Kirchhoff elasticity.
     """
     check_strains(film, force)
-    is_pretensioned = film.pretension > 0.0
-    full_theory = Theory(stretching=True, bending=True, pretensioned=is_pretensioned)
     error_estimate_is_valid = film.pretension >= 0.0 and film.is_axisymmetric
-    if not error_estimate_is_valid:
-        return full_theory
-
-    # Both linear theories cost less than the nonlinear theory without bending.
-    cheapest_first = (
-        Theory(stretching=False, bending=False, pretensioned=is_pretensioned),
-        Theory(stretching=False, bending=True, pretensioned=is_pretensioned),
-        Theory(stretching=True, bending=False, pretensioned=is_pretensioned),
-    )
-    for theory in cheapest_first:
-        is_linear = not theory.stretching
-        if film.has_back_pressure and is_linear:  # linear theories omit the pressure on the back
-            continue
-        if modelling_error(film, probe, force, theory) <= 0.5 * accuracy:
-            return theory
-    return full_theory
+    membrane = Theory(bending=False)
+    if error_estimate_is_valid and modelling_error(film, probe, force, membrane) <= 0.5 * accuracy:
+        return membrane
+    return Theory(bending=True)
 
 
 def theory_for(sensor: Sensor, probe: Probe, force_range: tuple[float, float], accuracy: float = ACCURACY) -> Theory:
@@ -270,36 +185,16 @@ def theory_for(sensor: Sensor, probe: Probe, force_range: tuple[float, float], a
     """
     # The largest and the smallest force may require different terms, so the terms of both theories are combined.
     theories = [choose_theory(sensor.film, probe, force, accuracy) for force in force_range]
-    return Theory(
-        stretching=any(theory.stretching for theory in theories),
-        bending=any(theory.bending for theory in theories) or sensor.surface != "middle",
-        pretensioned=theories[0].pretensioned,
-    )
+    return Theory(bending=any(theory.bending for theory in theories) or sensor.surface != "middle")
 
 
-def theory_by_name(name: str, film: Film) -> Theory:
-    """Return the theory with a given name.
-
-    Args:
-        name: "linear plate", "linear membrane", "nonlinear membrane" or "nonlinear membrane + bending". The prefix
-            "pre-tensioned " of a linear theory is optional.
-        film: The film. The theory includes a pretension if the film has one.
+def theory_by_name(name: str) -> Theory:
+    """Return the theory with a given name: "nonlinear membrane" or "nonlinear membrane + bending".
 
     Raises:
-        SceneError: If no theory has this name, or the film has no stiffness in this theory.
+        SceneError: If no theory has this name.
     """
-    is_pretensioned = film.pretension > 0.0
-    theories = [
-        Theory(stretching, bending, is_pretensioned) for stretching in (False, True) for bending in (False, True)
-    ]
-    for theory in theories:
-        short_name = theory.name.removeprefix("pre-tensioned ")
-        if name not in (theory.name, short_name):
-            continue
-        # A linear membrane without the prefix "pre-tensioned " has no pretension, and therefore no stiffness.
-        if theory.name == "linear membrane":
-            raise SceneError(
-                "theory 'linear membrane': a film without pretension has no stiffness in it; set a pretension"
-            )
-        return theory
-    raise SceneError(f"theory: expected one of {[theory.name for theory in theories]}, got {name!r}")
+    theories = {theory.name: theory for theory in (Theory(bending=False), Theory(bending=True))}
+    if name not in theories:
+        raise SceneError(f"theory: expected one of {list(theories)}, got {name!r}")
+    return theories[name]

@@ -45,8 +45,8 @@ class Equilibrium:
         groups: Dimensionless groups of the press.
         status: "converged" or "failed".
         message: Description of the outcome in one sentence.
-        iterations: Number of Newton steps with a new tangent. For a linear theory, the number of linear solves.
-        residual: Out-of-balance force divided by the load. For a linear theory, the energy norm of the last correction.
+        iterations: Number of Newton steps with a new tangent.
+        residual: Out-of-balance force divided by the load.
         seconds: CPU time of the process for meshing and solving, s.
         proven_error: Relative difference of the charges between this mesh and a mesh whose order is lower by one; None
             if only one mesh was solved.

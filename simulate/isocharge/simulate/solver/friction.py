@@ -39,7 +39,7 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
     causes a mean displacement that is equal and opposite to the mean displacement caused by the press.
 
     Args:
-        solved: Press without a side force, solved with a theory that includes stretching.
+        solved: Press without a side force.
 
     Returns:
         Force (Fx, Fy) of the probe on the film, N. The force points inwards if the film would slip outwards.
@@ -83,7 +83,7 @@ def friction_force(solved: Equilibrium, coefficient: float) -> tuple[float, floa
     The docstring of the module describes the model.
 
     Args:
-        solved: Press without a side force, solved with a theory that includes stretching.
+        solved: Press without a side force.
         coefficient: Coefficient of friction, dimensionless.
 
     Returns:

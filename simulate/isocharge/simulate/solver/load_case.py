@@ -240,30 +240,14 @@ class LoadCase:
             side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N.
 
         Raises:
-            SceneError: If the press cannot exist, or if a linear theory is requested for a side force or for a film
-                with a pressure on its back.
+            SceneError: If the press cannot exist.
         """
         began = process_time()
         check_press(film, probe, at, force)
         check_side_force(side_force, force)
-        has_side_force = any(side_force)
-
-        # Linear theories omit the effect of a side force on the deflection.
         theory = settings.theory
         if theory == "auto":
             theory = choose_theory(film, probe, force, settings.accuracy)
-            if has_side_force:
-                theory = replace(theory, stretching=True)
-        elif has_side_force and not theory.stretching:
-            raise SceneError(
-                f"theory {theory.name!r}: a side force changes the deflection through the stress that it induces, "
-                "which a linear theory omits; use 'nonlinear membrane', 'nonlinear membrane + bending' or 'auto'"
-            )
-        if film.has_back_pressure and not theory.stretching:
-            raise SceneError(
-                f"theory {theory.name!r}: linear theories have no static pressure and no closed back; use 'nonlinear "
-                "membrane', 'nonlinear membrane + bending' or 'auto'"
-            )
 
         layer = settings.layer
         if layer == "auto":

@@ -1,4 +1,4 @@
-"""Newton's method for the equilibrium of the film, and direct solution of the linear film theories.
+"""Newton's method for the equilibrium of the film.
 
 A flat film without pretension has no transverse stiffness, so Newton's method fails without modifications. Three
 modifications make the method reliable. First, the iteration starts from a deflection with the shape of Schwerin's
@@ -39,12 +39,6 @@ PATIENCE = 8
 
 The iteration stops if the smallest recent step is not smaller than half of the smallest earlier step.
 """
-
-MAX_REFINEMENTS = 5
-"""Largest number of corrections of a linear solve."""
-
-REFINEMENT_TOLERANCE = 1e-5
-"""Energy norm of a correction of a linear solve at which the solve has converged."""
 
 CHORD_START = 0.15
 """Largest ratio of the residual after a Newton step to the residual before the step at which the tangent is reused."""
@@ -90,9 +84,9 @@ class NewtonResult:
     Attributes:
         field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
         converged: Whether the residual is below the tolerance or at the level of rounding errors.
-        iterations: Number of Newton steps. For a linear theory, the number of linear solves.
+        iterations: Number of Newton steps.
         residual: Larger of two ratios, namely of the transverse residual to the load, and of the in-plane residual to
-            the in-plane forces. For a linear theory, the energy norm of the last correction.
+            the in-plane forces.
         message: Description of the outcome in one sentence.
     """
 
@@ -146,65 +140,6 @@ def parabolic_start(radius: np.ndarray, groups: DimensionlessGroups) -> Array:
     is_on_rim = radius > 1.0 - 1e-9
     field[is_on_rim] = 0.0  # removes rounding errors
     return field
-
-
-def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
-    """Solve a linear theory of the film.
-
-    The first solve computes the deflection W under the load. The deflection causes the in-plane displacement U. In a
-    linear theory, the induced stress does not affect the deflection. The tangent of the flat film does not couple W and
-    U. Each further solve therefore computes the in-plane displacement U and a correction of W (iterative refinement).
-    The energy norm of the correction is a measure of the error of W.
-
-    Args:
-        elastic: Discrete model of the film.
-        assembly: Linear solver for the mesh of the film.
-
-    Returns:
-        The result, which has not converged if the linear system is nearly singular.
-    """
-    # The first solve computes W. All solves use the tangent of the flat film.
-    flat_field = np.zeros((assembly.free.shape[0], 3))
-    factor = assembly.factor(elastic.tangent(flat_field))
-    field = factor.solve(-elastic.residual(flat_field))
-    n_solve = 1
-    correction_size = np.inf
-    for _ in range(MAX_REFINEMENTS):
-        # The in-plane residual includes the stress that W induces. The transverse residual does not include it.
-        residual = elastic.residual(field)
-        residual[:, 2] = _linear_residual(elastic, field)[:, 2]
-        correction = factor.solve(-residual)
-        n_solve += 1
-        correction_size = _step_size(elastic, field, correction[:, 2], residual[:, 2])
-        field = field + correction
-        if correction_size <= REFINEMENT_TOLERANCE:
-            message = f"linear theory, solved to round-off: corrected by {correction_size:.0e}"
-            return NewtonResult(field, converged=True, iterations=n_solve, residual=correction_size, message=message)
-    message = "the linear system is too near to singular"
-    return NewtonResult(field, converged=False, iterations=n_solve, residual=correction_size, message=message)
-
-
-def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
-    """Compute the transverse residual without the transverse forces that the induced stress causes.
-
-    The deflection induces a stress, and this stress causes transverse forces. Without in-plane displacement, these
-    forces are proportional to the third power of the deflection. All other transverse forces are linear functions of
-    the deflection. The two kinds of forces are separated as follows. If the field is multiplied by a small factor a,
-    the residual changes by r(a) = k a + c a^3 relative to the flat film. The changes for the factors a and 2 a
-    determine the linear coefficient k = (8 r(a) - r(2 a)) / (6 a).
-
-    Args:
-        elastic: Discrete model of the film.
-        field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
-
-    Returns:
-        Residual, shape (n_node, 3). Only the last column is meaningful.
-    """
-    small_factor = 0.01  # a; every small factor results in the same coefficient k
-    flat_residual = elastic.residual(np.zeros_like(field))
-    single_change = elastic.residual(small_factor * field) - flat_residual  # r(a)
-    double_change = elastic.residual(2.0 * small_factor * field) - flat_residual  # r(2 a)
-    return flat_residual + (8.0 * single_change - double_change) / (6.0 * small_factor)
 
 
 def solve_newton(

@@ -35,7 +35,6 @@ from isocharge.simulate.solver.newton import (
     NewtonResult,
     parabolic_start,
     schwerin_start,
-    solve_linear,
     solve_newton,
 )
 
@@ -194,10 +193,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
         raise too_near_the_rim(case, mesh.resolution)
     elastic = _elastic_film(case, mesh.geometry, case.force)
     solver = assembly(mesh.template, elastic.unknowns_per_node)
-    if case.theory.stretching:
-        result = _solve_nonlinear(case, elastic, solver, mesh, start)
-    else:
-        result = solve_linear(elastic, solver)
+    result = _solve_nonlinear(case, elastic, solver, mesh, start)
     equilibrium = Equilibrium(
         film=case.film,
         probe=case.probe,

@@ -187,7 +187,7 @@ def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array
     corresponding side force in N.
 
     Args:
-        solved: Press with a circular probe, solved with a theory that includes stretching.
+        solved: Press with a circular probe.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
@@ -204,7 +204,7 @@ def film_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
     tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is the amplitude of the press.
 
     Args:
-        solved: Press with a circular probe, solved with a theory that includes stretching.
+        solved: Press with a circular probe.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
