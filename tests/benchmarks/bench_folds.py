@@ -143,7 +143,8 @@ def examine_frame(
         truth: The true contact (x, y, F), shape (3,), mm and N.
         side: Side of the folds of the true contact.
     """
-    reported = np.array([contact[:3] for contact in (tracked, other) if contact is not None])
+    contacts = [contact for contact in (tracked, other) if contact is not None]
+    reported = np.array([(contact.x_mm, contact.y_mm, contact.force_N) for contact in contacts])
     is_right_side = sides(film, into_map(reported, film)) == side
     true_x, true_y, _ = truth
     error_mm = float(np.hypot(tracked.x_mm - true_x, tracked.y_mm - true_y))

@@ -10,13 +10,14 @@ from msgspec import structs
 from isocharge.serve import Chunk, Contact, Device, Frame, TouchStream, encode_frame
 from isocharge.serve.flags import INVALID
 from isocharge.serve.live.device import device_from_table, with_settings
-from isocharge.serve.tracking.tracker import TrackRule
-from isocharge.serve.tracking.two_mode_filter import (
-    MIN_ACCELERATION_SHARE,
-    MotionModel,
-    NoiseEstimate,
-    TwoModeFilter,
+from isocharge.serve.tracking.motion_filter import (
+    ACCELERATION_DENSITY,
+    HELD_DRIFT,
+    INITIAL_RATE_STD,
+    SPEED_CHANGE_RATE,
+    MotionFilter,
 )
+from isocharge.serve.tracking.tracker import TrackRule
 from stage_runner import new_tracker, track
 
 STD = 0.06
@@ -97,32 +98,30 @@ def slide(speed, rate_Hz=1000.0, direction=0.7):
 def test_moving_mode_equals_the_kalman_filter_with_constant_velocity():
     """The reference has white acceleration (Bar-Shalom, Li and Kirubarajan 2001, 6.2.2), and is written in matrices."""
     dt = 0.01
-    velocity_variance = 400.0
     std = 0.1
-    motion = MotionModel(held_drift=0.0, velocity_variance=velocity_variance, acceleration_density=50.0, dimensions=1)
     measured = RNG.standard_normal(30) * std + np.linspace(0.0, 1.0, 30)
-    two_modes = TwoModeFilter.start(measured[0], std**2, motion)
+    noise = np.diag([std**2, std**2, 1e-4])
+    modes = MotionFilter(np.array([measured[0], 0.0, 0.0]), noise)
 
     transition = np.array([[1.0, dt], [0.0, 1.0]])
     process_noise = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    drift = np.diag([HELD_DRIFT * dt, 0.0])
     mean = np.array([measured[0], 0.0])
-    covariance = np.diag([std**2, velocity_variance])
+    covariance = np.diag([std**2, INITIAL_RATE_STD[0] ** 2])
     for value in measured[1:]:
-        density = motion.acceleration_density * max(mean[1] ** 2 / velocity_variance, MIN_ACCELERATION_SHARE)
+        density = ACCELERATION_DENSITY + SPEED_CHANGE_RATE * mean[1] ** 2
         mean = transition @ mean
-        covariance = transition @ covariance @ transition.T + density * process_noise
+        covariance = transition @ covariance @ transition.T + density * process_noise + drift
         gain = covariance[:, 0] / (covariance[0, 0] + std**2)
         mean = mean + gain * (value - mean[0])
         covariance = covariance - np.outer(gain, covariance[0])
 
-        two_modes.moving_probability = 1.0 - 1e-9
-        two_modes.noise = NoiseEstimate(0.0)
-        two_modes.predict(dt)
-        two_modes.update(value, std**2)
-        filtered = [two_modes.moving_value.real, two_modes.velocity.real]
-        assert filtered == pytest.approx(mean.tolist(), rel=1e-6, abs=1e-6)
-        variances = [two_modes.moving_variance, two_modes.moving_covariance, two_modes.velocity_variance]
-        assert variances == pytest.approx([covariance[0, 0], covariance[0, 1], covariance[1, 1]], rel=1e-6)
+        modes.probability = np.array([0.0, 0.0, 1e-9, 1.0])
+        modes.predict(dt)
+        modes.probability = np.array([0.0, 0.0, 1e-9, 1.0])
+        modes.update(np.array([value, 0.0, 0.0]), noise)
+        assert modes.mean[3, [0, 3]] == pytest.approx(mean, rel=1e-6, abs=1e-6)
+        np.testing.assert_allclose(modes.covariance[3][np.ix_([0, 3], [0, 3])], covariance, rtol=1e-6)
 
 
 @pytest.mark.parametrize("noise_ratio", [0.2, 4.0])
@@ -144,7 +143,7 @@ def test_held_contact_has_little_noise_and_correct_standard_deviations():
     settled = np.concatenate([track_path(np.zeros(400))[0][50:] for _ in range(10)])
     assert np.sqrt(np.mean(settled[:, [X, Y]] ** 2)) < 0.2 * STD
     assert np.mean(np.abs(settled[:, X]) < 1.96 * settled[:, X_STD]) > 0.93
-    np.testing.assert_array_equal(settled[:, Y_STD], settled[:, X_STD])
+    np.testing.assert_allclose(np.median(settled[:, Y_STD]), np.median(settled[:, X_STD]), rtol=0.1)
 
 
 @pytest.mark.parametrize("speed", [5.0, 50.0, 200.0])

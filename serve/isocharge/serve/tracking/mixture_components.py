@@ -1,58 +1,29 @@
-"""Components of the Gaussian mixture that the module `contact_mixture` uses to follow a contact.
-
-The functions predict, prune and combine components.
-"""
+"""Components of the Gaussian mixture that the module `contact_mixture` uses to follow a contact, and their update."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array
+from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.contact import Contact
-from isocharge.serve.tracking.two_mode_filter import MIN_ACCELERATION_SHARE, POSITION_MOTION
+from isocharge.serve.tracking.motion_filter import POSITION, RATES, VALUES, VELOCITY, process_noise
 
-X = 0
-"""Index of the position x in a state, mm."""
-
-Y = 1
-"""Index of the position y in a state, mm."""
-
-LOG_FORCE = 2
-"""Index of ln F in a state, where F is the force in N."""
-
-X_RATE = 3
-"""Index of the velocity along x in a state, mm/s."""
-
-Y_RATE = 4
-"""Index of the velocity along y in a state, mm/s."""
-
-LOG_FORCE_RATE = 5
-"""Index of the rate of ln F in a state, 1/s."""
-
-POSITION = slice(X, LOG_FORCE)
-"""Slice of x and y in a state."""
-
-CONTACT = slice(X, X_RATE)
-"""Slice of x, y and ln F in a state."""
-
-VELOCITY = slice(X_RATE, LOG_FORCE_RATE)
-"""Slice of the velocities along x and y in a state."""
-
-RATES = slice(X_RATE, LOG_FORCE_RATE + 1)
-"""Slice of the rates of x, y and ln F in a state."""
-
-MOTION = slice(X, LOG_FORCE_RATE + 1)
+MOTION = slice(0, 6)
 """Slice of x, y, ln F and their rates in a state."""
 
-N_MOTION = LOG_FORCE_RATE + 1
-"""Number of entries of `MOTION`."""
-
-GAINS = slice(N_MOTION, None)
+GAINS = slice(6, None)
 """Slice of the logarithms of the electrode gains in a state."""
 
+MAX_ITERATION_STEP = np.array([0.5, 0.5, 0.2])
+"""Largest change of x and y (mm) and of ln F in one iteration. The linearisation is inaccurate for larger changes."""
+
 FORCE_ACCELERATION_DENSITY = 2.0
-"""Spectral density of the second derivative of ln F, 1/s^3."""
+"""Spectral density of the second derivative of ln F, 1/s^3.
+
+The density is small, because a wrong contact together with a change of the force may explain the charges.
+"""
 
 MAX_COMPONENTS = 8
 """Largest number of components that are kept after an update."""
@@ -81,49 +52,27 @@ class ContactHypothesis(NamedTuple):
     probability: float
     misfit: float
 
-    def extrapolated(self, dt_s: float) -> "ContactHypothesis":
-        """Return the hypothesis at a later time, extrapolated with constant rates.
-
-        The covariance is not changed, because its growth during the short time is negligible.
+    def contact(self, dt_s: float) -> Contact:
+        """Return the contact, extrapolated with constant rates.
 
         Args:
-            dt_s: Time by which the hypothesis is extrapolated, s.
+            dt_s: Time by which the contact is extrapolated, s. The growth of the covariance in this time is negligible.
         """
-        mean = self.mean.copy()
-        mean[CONTACT] += dt_s * mean[RATES]
-        return self._replace(mean=mean)
-
-    @property
-    def contact(self) -> Contact:
-        """The hypothesis as a `Contact`, which is the type that models use for their predictions.
-
-        The state contains the logarithm of the force. The standard deviation of the force is therefore the force
-        multiplied by the standard deviation of the logarithm.
-        """
-        x_mm, y_mm, log_force = self.mean[CONTACT].tolist()
-        covariance = self.covariance[CONTACT, CONTACT]  # of x, y and ln F, shape (3, 3)
-        std = np.sqrt(covariance.diagonal())
-        correlation = covariance / np.outer(std, std)
+        x_mm, y_mm, log_force = (self.mean[VALUES] + dt_s * self.mean[RATES]).tolist()
+        std = np.sqrt(self.covariance.diagonal()[VALUES])
+        correlation = self.covariance[VALUES, VALUES] / np.outer(std, std)
         x_std_mm, y_std_mm, log_force_std = std.tolist()
         force_N = math.exp(log_force)
         return Contact(
-            x_mm=x_mm,
-            y_mm=y_mm,
-            force_N=force_N,
-            x_std_mm=x_std_mm,
-            y_std_mm=y_std_mm,
-            force_std_N=log_force_std * force_N,
-            misfit=self.misfit,
-            xy_correlation=float(correlation[X, Y]),
-            xF_correlation=float(correlation[X, LOG_FORCE]),
-            yF_correlation=float(correlation[Y, LOG_FORCE]),
+            x_mm,
+            y_mm,
+            force_N,
+            x_std_mm,
+            y_std_mm,
+            log_force_std * force_N,
+            self.misfit,
+            *correlation[np.triu_indices(3, 1)].tolist(),
         )
-
-    @property
-    def velocity_mm_per_s(self) -> tuple[float, float]:
-        """Velocity along x and y, mm/s."""
-        vx_mm_per_s, vy_mm_per_s = self.mean[VELOCITY].tolist()
-        return vx_mm_per_s, vy_mm_per_s
 
     @property
     def moving_probability(self) -> float:
@@ -132,8 +81,7 @@ class ContactHypothesis(NamedTuple):
         The probability is the result of a chi-squared test with two degrees of freedom.
         """
         velocity = self.mean[VELOCITY]
-        covariance = self.covariance[VELOCITY, VELOCITY]
-        squared_distance = float(velocity @ np.linalg.solve(covariance, velocity))
+        squared_distance = float(velocity @ np.linalg.solve(self.covariance[VELOCITY, VELOCITY], velocity))
         return -math.expm1(-0.5 * squared_distance)
 
 
@@ -144,84 +92,112 @@ class Components(NamedTuple):
         mean: Mean of the state of each component, shape (n, 6 + n_electrode).
         covariance: Covariance of the state of each component, shape (n, 6 + n_electrode, 6 + n_electrode).
         log_weight: Logarithm of the weight of each component, shape (n,). Only differences of the logarithms matter.
-        misfit: Distance between the latest charges and the charges of the most probable component, in standard
-            deviations of the noise; NaN before the first update.
     """
 
     mean: Array
     covariance: Array
     log_weight: Array
-    misfit: float = math.nan
 
-    @property
-    def best(self) -> int:
-        """Index of the most probable component."""
-        return int(self.log_weight.argmax())
-
-    def select(self, rows: "list[int] | Integers") -> "Components":
+    def select(self, rows: list[int]) -> "Components":
         """Return only the components with the indices `rows`."""
-        return self._replace(mean=self.mean[rows], covariance=self.covariance[rows], log_weight=self.log_weight[rows])
+        return Components(self.mean[rows], self.covariance[rows], self.log_weight[rows])
 
-    def with_component(self, mean: Array, covariance: Array, log_weight: float) -> "Components":
-        """Return all components and one additional component.
+    def joined(self, other: "Components") -> "Components":
+        """Return the components of both mixtures."""
+        mean, covariance, log_weight = (np.concatenate(arrays) for arrays in zip(self, other, strict=True))
+        return Components(mean, covariance, log_weight)
 
-        Args:
-            mean: Mean of the state of the additional component, shape (6 + n_electrode,).
-            covariance: Covariance of the state, shape (6 + n_electrode, 6 + n_electrode).
-            log_weight: Logarithm of the weight of the additional component.
-        """
-        return self._replace(
-            mean=np.vstack([self.mean, mean]),
-            covariance=np.concatenate([self.covariance, covariance[None]]),
-            log_weight=np.append(self.log_weight, log_weight),
-        )
+
+def film_charges(charges: ChargeSeries, states: Array) -> tuple[Array, Array]:
+    """Compute the charges that the film produces for states, and their derivatives with respect to (x, y, ln F).
+
+    Args:
+        charges: Charges that the film produces for every contact.
+        states: States, shape (n, 6 + n_electrode). Contacts outside the range of forces are allowed.
+
+    Returns:
+        The charges, shape (n, n_electrode), pC, and the derivatives, shape (n, n_electrode, 3).
+    """
+    return charges.linearised(np.column_stack([states[:, POSITION], np.exp(states[:, 2])]))
 
 
 def predict_components(components: Components, dt_s: float) -> Components:
-    """Predict the components at the next step.
-
-    The rates of x, y and the logarithm of the force are assumed to be constant, except for a random white acceleration
-    that increases the covariance.
+    """Predict the components at a later time, with constant rates and a random white acceleration.
 
     Args:
-        components: Components after the update of the previous step.
-        dt_s: Time since the previous step, s.
+        components: Components after an update.
+        dt_s: Time between the update and the prediction, s.
     """
-    # A state contains x, y and ln F, the rates of these three values, and the gains. The gains are constant.
-    mean = components.mean.copy()
-    mean[:, CONTACT] += dt_s * mean[:, RATES]
-
-    transition = np.eye(mean.shape[1])
-    transition[CONTACT, RATES] = dt_s * np.eye(3)
+    transition = np.eye(components.mean.shape[1])
+    transition[VALUES, RATES] = dt_s * np.eye(3)
     covariance = transition @ components.covariance @ transition.T
-
-    # The spectral density of the white acceleration of the position is proportional to the squared speed, because a
-    # fast contact changes its velocity more than a slow contact. The density has a lower limit.
-    squared_speed = (mean[:, VELOCITY] ** 2).sum(axis=1)
-    relative_density = np.maximum(squared_speed / POSITION_MOTION.velocity_variance, MIN_ACCELERATION_SHARE)
-    position_density = POSITION_MOTION.acceleration_density * relative_density
-    _add_process_noise(covariance, X, X_RATE, position_density, dt_s)
-    _add_process_noise(covariance, Y, Y_RATE, position_density, dt_s)
-    _add_process_noise(covariance, LOG_FORCE, LOG_FORCE_RATE, FORCE_ACCELERATION_DENSITY, dt_s)
-    return components._replace(mean=mean, covariance=covariance)
+    covariance[:, MOTION, MOTION] += process_noise(components.mean[:, VELOCITY], FORCE_ACCELERATION_DENSITY, dt_s)
+    return Components(components.mean @ transition.T, covariance, components.log_weight)
 
 
-def _add_process_noise(
-    covariance: Array, value_index: int, rate_index: int, density: Array | float, dt_s: float
-) -> None:
-    """Add the process noise of a white acceleration to covariances (Bar-Shalom, Li and Kirubarajan 2001, 6.2.2).
+class UpdatedComponents(NamedTuple):
+    """Components after an update.
+
+    Attributes:
+        components: The components, in the order before the update.
+        squared_misfit: Squared misfit of the charges of each component relative to the noise, shape (n,).
+        squared_distance: Sum of the squared misfit and the squared change of the state relative to its covariance
+            before the update, shape (n,).
+    """
+
+    components: Components
+    squared_misfit: Array
+    squared_distance: Array
+
+
+def update_components(
+    charges: ChargeSeries, prior: Components, charge_pC: Array, variance_pC2: Array, iterations: int
+) -> UpdatedComponents:
+    """Update components with measured charges by an iterated extended Kalman filter (Bell and Cathey 1993).
+
+    Each iteration linearises the charges about the present state, computes the Kalman update of the prior mean with the
+    linearised charges, and moves the state towards the updated mean. The measured charge of an electrode is the charge
+    that the film produces, multiplied by the gain of the electrode.
+
+    Let J be the Jacobian of the charges, P the prior covariance, and R the covariance of the noise. The covariance of
+    the innovation v is S = J P J^T + R. The likelihood p of a component is given by -2 ln p = squared misfit + squared
+    change of the state + ln det S.
 
     Args:
-        covariance: Covariances of the state, shape (n, 6 + n_electrode, 6 + n_electrode). They are changed in place.
-        value_index: Index of x, y or ln F in the state.
-        rate_index: Index of the rate of the same quantity in the state.
-        density: Spectral density of the acceleration, shape (n,) or a number, in squared units of the value per s^3.
-        dt_s: Time over which the acceleration acts, s.
+        charges: Charges that the film produces for every contact.
+        prior: Predicted components.
+        charge_pC: Measured charges, shape (n_electrode,), pC.
+        variance_pC2: Variances of the noise of the charges, shape (n_electrode,), pC^2.
+        iterations: Number of iterations.
     """
-    covariance[:, value_index, value_index] += density * dt_s**3 / 3.0
-    covariance[:, value_index, rate_index] += density * dt_s**2 / 2.0
-    covariance[:, rate_index, value_index] += density * dt_s**2 / 2.0
-    covariance[:, rate_index, rate_index] += density * dt_s
+    states = prior.mean
+    n_component, n_state = states.shape
+    for iteration in range(iterations + 1):
+        film_charge_pC, film_jacobian = film_charges(charges, states)
+        gains = np.exp(states[:, GAINS])
+        predicted_pC = film_charge_pC * gains
+        jacobian = np.zeros((n_component, charge_pC.size, n_state))
+        jacobian[:, :, VALUES] = film_jacobian * gains[:, :, None]
+        jacobian[:, :, GAINS] = predicted_pC[:, :, None] * np.eye(charge_pC.size)
+
+        cross_covariance = jacobian @ prior.covariance
+        charge_covariance = cross_covariance @ jacobian.swapaxes(1, 2)
+        innovation_covariance = charge_covariance + np.diag(variance_pC2)
+        residual_pC = charge_pC - predicted_pC
+        innovation = residual_pC[:, :, None] - jacobian @ (prior.mean - states)[:, :, None]
+        weighted = np.linalg.solve(innovation_covariance, innovation)  # S^-1 v
+        if iteration < iterations:
+            step = prior.mean + (cross_covariance.swapaxes(1, 2) @ weighted)[:, :, 0] - states
+            relative_length = np.abs(step[:, VALUES]) / MAX_ITERATION_STEP
+            states = states + step / np.maximum(relative_length.max(axis=1, keepdims=True), 1.0)
+
+    squared_misfit = (residual_pC**2 / variance_pC2).sum(axis=1)
+    squared_distance = squared_misfit + (weighted * (charge_covariance @ weighted)).sum(axis=(1, 2))
+    log_weight = prior.log_weight - 0.5 * (squared_distance + np.linalg.slogdet(innovation_covariance).logabsdet)
+    gain = np.linalg.solve(innovation_covariance, cross_covariance).swapaxes(1, 2)
+    covariance = prior.covariance - gain @ cross_covariance
+    covariance = 0.5 * (covariance + covariance.swapaxes(1, 2))  # removes asymmetric rounding errors
+    return UpdatedComponents(Components(states, covariance, log_weight), squared_misfit, squared_distance)
 
 
 def prune_components(components: Components) -> Components:
@@ -232,63 +208,19 @@ def prune_components(components: Components) -> Components:
     remain.
 
     Args:
-        components: Components after an update. The largest logarithm of the weights is 0.
+        components: Components after an update.
     """
-    log_weight = components.log_weight.copy()
-    descending_rows = np.argsort(-log_weight, kind="stable")  # rows of the components, the most probable first
-    probable_rows = descending_rows[log_weight[descending_rows] > MIN_LOG_WEIGHT]
-    remaining_rows: list[int] = []
-    for row in probable_rows.tolist():
-        similar_row = _similar_component(components, row, remaining_rows)
-        if similar_row is None:
-            remaining_rows.append(row)
-        else:
-            log_weight[similar_row] = np.logaddexp(log_weight[similar_row], log_weight[row])  # add the weights
-    return components._replace(log_weight=log_weight).select(remaining_rows[:MAX_COMPONENTS])
-
-
-def _similar_component(components: Components, row: int, candidate_rows: list[int]) -> int | None:
-    """Return the first candidate whose motion is similar to the motion of a given component.
-
-    A motion consists of x, y, ln F and the rates of these three values. Two motions are similar if each value differs
-    by less than `MERGE_DISTANCE` standard deviations of the given component.
-
-    Args:
-        components: All components.
-        row: Row of the given component.
-        candidate_rows: Rows of the candidates.
-
-    Returns:
-        Row of the candidate; None if no candidate has a similar motion.
-    """
+    log_weight = components.log_weight - components.log_weight.max()
     motion = components.mean[:, MOTION]
-    std = np.sqrt(components.covariance[row].diagonal()[MOTION])
-    for candidate_row in candidate_rows:
-        difference = np.abs(motion[row] - motion[candidate_row])
-        if (difference < MERGE_DISTANCE * std).all():
-            return candidate_row
-    return None
-
-
-def combine_components(components: Components, probability: Array) -> ContactHypothesis:
-    """Combine components that describe the same contact into one hypothesis.
-
-    The hypothesis has the mean and the covariance of the mixture of the components.
-
-    Args:
-        components: The n components to combine.
-        probability: Probability of each component, shape (n,).
-
-    Returns:
-        The hypothesis. Its probability is the sum of the probabilities of the components.
-    """
-    total_probability = probability.sum()
-    weight = probability / total_probability  # the weights add up to 1
-    mean = weight @ components.mean
-    deviation = components.mean - mean  # shape (n, n_state)
-
-    # The covariance of a mixture is the mean of the covariances plus the covariance of the means.
-    covariance_within = np.tensordot(weight, components.covariance, 1)
-    covariance_between = (weight[:, None] * deviation).T @ deviation
-    covariance = covariance_within + covariance_between
-    return ContactHypothesis(mean, covariance, float(total_probability), components.misfit)
+    std = np.sqrt(np.diagonal(components.covariance, axis1=1, axis2=2)[:, MOTION])
+    kept: list[int] = []
+    for row in np.argsort(-log_weight, kind="stable").tolist():
+        if log_weight[row] < MIN_LOG_WEIGHT:
+            break
+        is_similar = (np.abs(motion[kept] - motion[row]) < MERGE_DISTANCE * std[row]).all(axis=1)
+        if is_similar.any():
+            first = kept[int(is_similar.argmax())]
+            log_weight[first] = np.logaddexp(log_weight[first], log_weight[row])  # add the weights
+        else:
+            kept.append(row)
+    return components._replace(log_weight=log_weight).select(kept[:MAX_COMPONENTS])

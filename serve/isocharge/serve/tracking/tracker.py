@@ -14,10 +14,10 @@ from isocharge.serve.model.contact import Contact
 from isocharge.serve.record.record import NO_TRACKING, OtherContact, TrackedContact, Tracking
 from isocharge.serve.signal_chain.rule import Rule, Share
 from isocharge.serve.signal_chain.stage import Setup, Stage
-from isocharge.serve.tracking.contact_filter import ContactFilter
 from isocharge.serve.tracking.contact_mixture import ContactMixture
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.mixture_components import ContactHypothesis
+from isocharge.serve.tracking.motion_filter import VELOCITY, ContactFilter
 
 CERTAIN_PROBABILITY = 0.97
 """Probability of a contact above which no other contact is reported."""
@@ -211,11 +211,14 @@ class Tracker(Stage):
                 hypotheses = self._mixture.update(frame.charge_pC, t_s)
             if not hypotheses:  # the frame contains no information, so the previous contact is returned again
                 return None, self._tracked
-            mixture_contact = hypotheses[0].contact
-            frame.set_contact(mixture_contact, self._mixture_validity)
+            contact, *others = [hypothesis.contact(t_s - self._mixture.time_s) for hypothesis in hypotheses]
+            frame.set_contact(contact, self._mixture_validity)
             frame.model_charge_pC = None
-            self._other = _other_contact(hypotheses)
-            tracked = _tracked_contact(hypotheses[0], mixture_contact)
+            self._other = None
+            if hypotheses[0].probability < CERTAIN_PROBABILITY:
+                self._other = OtherContact(*others[0][:3], hypotheses[1].probability)
+            vx_mm_s, vy_mm_s = hypotheses[0].mean[VELOCITY].tolist()
+            tracked = TrackedContact(*contact[:6], vx_mm_s, vy_mm_s, hypotheses[0].moving_probability)
 
         is_new_touch = self._tracked is None
         self._tracked = tracked
@@ -240,38 +243,3 @@ class Tracker(Stage):
         event = self._events.end(t_s)
         self.reset()  # only now, because `reset` also discards the events of the touch
         return event
-
-
-def _tracked_contact(hypothesis: ContactHypothesis, contact: Contact) -> TrackedContact:
-    """Convert a hypothesis of the mixture to a tracked contact.
-
-    Args:
-        hypothesis: Hypothesis that explains the charges, which contains the velocity of the contact.
-        contact: The attribute `contact` of the hypothesis, which is passed because it is expensive to compute again.
-    """
-    vx_mm_s, vy_mm_s = hypothesis.velocity_mm_per_s
-    return TrackedContact(
-        x_mm=contact.x_mm,
-        y_mm=contact.y_mm,
-        force_N=contact.force_N,
-        x_std_mm=contact.x_std_mm,
-        y_std_mm=contact.y_std_mm,
-        force_std_N=contact.force_std_N,
-        vx_mm_s=vx_mm_s,
-        vy_mm_s=vy_mm_s,
-        moving=hypothesis.moving_probability,
-    )
-
-
-def _other_contact(hypotheses: list[ContactHypothesis]) -> OtherContact | None:
-    """Return the second most probable contact, or None if the most probable contact is nearly certain.
-
-    Args:
-        hypotheses: The contacts that explain the charges, at least one, in descending order of their probability.
-    """
-    most_probable = hypotheses[0]
-    if len(hypotheses) == 1 or most_probable.probability > CERTAIN_PROBABILITY:
-        return None
-    second_most_probable = hypotheses[1]
-    contact = second_most_probable.contact
-    return OtherContact(contact.x_mm, contact.y_mm, contact.force_N, second_most_probable.probability)

@@ -1,0 +1,325 @@
+"""Filter that smooths the predicted contacts of successive frames: an interacting multiple model.
+
+The state of a contact consists of x, y and ln F, and the rates of these three values. The position is either held or
+moves, and the force is either held or changes. These four modes have one Kalman filter each (Blom and Bar-Shalom 1988).
+Before each frame, the estimates of the modes are mixed, because the mode may have changed. After each frame, the
+innovation of each mode determines its new probability. The velocity of a held position is zero. When a movement begins,
+its velocity is unknown. A white acceleration changes the velocity later.
+
+The covariance that a model reports applies to the noise with which the model was trained. The actual noise of a board
+may be smaller or larger. The filter estimates the actual noise: noise changes randomly from frame to frame, whereas a
+contact moves smoothly.
+"""
+
+import math
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.serve.flags import BEYOND, MISFIT, SATURATED
+from isocharge.serve.model.contact import Contact
+from isocharge.serve.record.record import TrackedContact
+
+VALUES = slice(0, 3)
+"""Slice of x (mm), y (mm) and ln F in a state."""
+
+POSITION = slice(0, 2)
+"""Slice of x and y in a state."""
+
+RATES = slice(3, 6)
+"""Slice of the rates of x and y (mm/s) and of ln F (1/s) in a state."""
+
+VELOCITY = slice(3, 5)
+"""Slice of the velocities along x and y in a state."""
+
+IS_HELD = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+"""Whether x, y and ln F are held (1) or change (0) in each of the four modes."""
+
+MEAN_MODE_TIME_s = 0.7
+"""Mean time after which a position or a force that is held starts to change, or the reverse, s."""
+
+INITIAL_RATE_STD = np.array([60.0, 60.0, 10.0])
+"""Standard deviations of the rates at the beginning of a movement, mm/s, mm/s and 1/s."""
+
+HELD_DRIFT = 5e-4
+"""Increase of the variance of a held value per second, mm^2/s or 1/s. A held finger drifts by 0.02 mm in a second."""
+
+ACCELERATION_DENSITY = 150.0
+"""Spectral density of the acceleration of a slow contact, mm^2/s^3."""
+
+SPEED_CHANGE_RATE = 0.5
+"""Increase of the spectral density of the acceleration with the squared speed, 1/s."""
+
+FORCE_ACCELERATION_DENSITY = 1e3
+"""Spectral density of the second derivative of a changing ln F, 1/s^3."""
+
+SQUARED_GATE = 30.0
+"""Squared Mahalanobis distance of the innovation above which a frame does not belong to the contact."""
+
+MIN_PROBABILITY = 1e-6
+"""Smallest probability of a mode."""
+
+MAX_GAP_s = 1.0
+"""Time without a frame after which the tracked contact is discarded, s."""
+
+WEAK_FLAGS = frozenset({SATURATED, BEYOND, MISFIT})
+"""Flags of frames whose charges are wrong."""
+
+WEAK_VARIANCE_FACTOR = 100.0
+"""Factor by which the variance of a frame with such a flag is multiplied."""
+
+NOISE_INTERVAL_s = 0.0045
+"""Time after which the noise of two frames is independent, s. Boards filter their charges over shorter times."""
+
+NOISE_FRAMES = 100
+"""Number of frames over which the estimate of the noise is averaged."""
+
+NOISE_PRIOR_FRAMES = 5
+"""Weight of the noise that the model states in this average, as a number of frames."""
+
+MAX_RELATIVE_SQUARE = 6.0
+"""Largest square of a frame, relative to the estimated noise, because a sudden movement is not noise."""
+
+MIN_FORCE_N = 1e-6
+"""Smallest force whose logarithm is computed, N."""
+
+MIN_UNCORRELATED_SHARE = 1e-6
+"""Share of uncorrelated variance that keeps the covariance of a contact invertible."""
+
+
+def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float) -> Array:
+    """Return the covariance that a white acceleration adds to moving states (Bar-Shalom et al. 2001, 6.2.2).
+
+    The spectral density of the acceleration of the position increases with the squared speed, because a fast contact
+    changes its velocity more than a slow contact.
+
+    Args:
+        velocity_mm_per_s: Velocities along x and y, shape (n, 2), mm/s.
+        force_density: Spectral density of the second derivative of ln F, 1/s^3.
+        dt_s: Time over which the acceleration acts, s.
+
+    Returns:
+        Covariances of x, y, ln F and their rates, shape (n, 6, 6).
+    """
+    density = np.full((len(velocity_mm_per_s), 1, 3), force_density)
+    squared_speed = (velocity_mm_per_s**2).sum(axis=1)
+    density[:, 0, POSITION] = (ACCELERATION_DENSITY + SPEED_CHANGE_RATE * squared_speed)[:, None]
+    integrals = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
+    blocks = (integrals[:, None, :, None] * np.eye(3)[:, None]).reshape(6, 6)
+    return np.asarray(blocks * np.concatenate([density, density], axis=2))
+
+
+def mixture_moments(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return the means, shape (m, k), and the covariances, shape (m, k, k), of m mixtures of n Gaussian components.
+
+    Args:
+        weight: Weights of the components in each mixture, shape (m, n). Each row adds up to 1.
+        mean: Means of the components, shape (n, k).
+        covariance: Covariances of the components, shape (n, k, k).
+    """
+    mixed_mean = weight @ mean
+    deviation = mean - mixed_mean[:, None]  # shape (m, n, k)
+    spread = (weight[:, :, None] * deviation).swapaxes(1, 2) @ deviation
+    within = (weight @ covariance.reshape(len(mean), -1)).reshape(spread.shape)
+    return mixed_mean, within + spread
+
+
+class NoiseEstimate:
+    """Estimate of the noise of measured values, relative to the noise that the model states.
+
+    Attributes:
+        relative_variance: Estimated variance of the noise, relative to the variance stated by the model.
+    """
+
+    def __init__(self) -> None:
+        """Start with the noise that the model states."""
+        self.relative_variance = 1.0
+        self._frames = NOISE_PRIOR_FRAMES
+        self._latest: list[Array] = []  # the latest values, at most three
+        self._latest_s = -math.inf
+
+    def update(self, measured: Array, covariance: Array, t_s: float) -> None:
+        """Update the estimate with the second difference of the latest three values.
+
+        Args:
+            measured: Measured x, y and ln F, shape (3,).
+            covariance: Covariance of the measured values as stated by the model, shape (3, 3).
+            t_s: Time of the frame, s. Frames within `NOISE_INTERVAL_s` after the previous one are not used.
+        """
+        if t_s - self._latest_s < NOISE_INTERVAL_s:
+            return
+        self._latest_s = t_s
+        self._latest = [*self._latest[-2:], measured]
+        if len(self._latest) < 3:
+            return
+        (difference,) = np.diff(self._latest, n=2, axis=0)
+        variance_factor = 6.0 * difference.size  # 1 + 2^2 + 1 for each of the values
+        relative_square = float(difference @ np.linalg.solve(covariance, difference)) / variance_factor
+        limited_square = min(relative_square, MAX_RELATIVE_SQUARE * self.relative_variance)
+        self._frames = min(self._frames + 1, NOISE_FRAMES)
+        self.relative_variance += (limited_square - self.relative_variance) / self._frames
+
+
+class MotionFilter:
+    """Interacting multiple model of one contact.
+
+    Attributes:
+        mean: Mean of the state in each mode, shape (4, 6).
+        covariance: Covariance of the state in each mode, shape (4, 6, 6).
+        probability: Probability of each mode, shape (4,).
+    """
+
+    def __init__(self, measured: Array, covariance: Array) -> None:
+        """Start with the first frame of a contact.
+
+        Args:
+            measured: Measured x, y and ln F, shape (3,), mm, mm and dimensionless.
+            covariance: Covariance of the measured values, shape (3, 3).
+        """
+        self.mean = np.zeros((4, 6))
+        self.mean[:, VALUES] = measured
+        self.covariance = np.zeros((4, 6, 6))
+        self.covariance[:, VALUES, VALUES] = covariance
+        self.covariance[:, RATES, RATES] = np.diag(INITIAL_RATE_STD**2)
+        self.probability = np.full(4, 0.25)
+
+    @property
+    def moving_probability(self) -> float:
+        """Probability that the position moves."""
+        return float(self.probability @ (1.0 - IS_HELD[:, 0]))
+
+    def predict(self, dt_s: float) -> None:
+        """Mix the modes, and predict the state of each mode at the next frame.
+
+        Args:
+            dt_s: Time until the next frame, s, not negative.
+        """
+        # Joint probability of each new mode (row) and each previous mode (column)
+        change = min(dt_s / MEAN_MODE_TIME_s, 0.5)
+        one_change = np.array([[1.0 - change, change], [change, 1.0 - change]])
+        both_changes = (one_change[:, None, :, None] * one_change[:, None]).reshape(4, 4)  # of position and force
+        joint = both_changes * self.probability
+        self.probability = joint.sum(axis=1)
+        mean, covariance = mixture_moments(joint / self.probability[:, None], self.mean, self.covariance)
+
+        # The rate of a held value is that of a movement that would begin now: zero on average.
+        held_noise = np.concatenate([np.full((4, 3), HELD_DRIFT * dt_s), IS_HELD * INITIAL_RATE_STD**2], axis=1)
+        is_moving = 1.0 - np.concatenate([IS_HELD, IS_HELD], axis=1)[:, None]
+        noise = is_moving * process_noise(mean[:, VELOCITY], FORCE_ACCELERATION_DENSITY, dt_s)
+        noise += held_noise[:, None] * np.eye(6)
+        transition = np.eye(6) + dt_s * np.eye(6, k=3)
+        transition = transition * np.concatenate([np.ones((4, 3)), 1.0 - IS_HELD], axis=1)[:, None]
+        self.mean = (transition @ mean[:, :, None])[:, :, 0]
+        self.covariance = transition @ covariance @ transition.swapaxes(1, 2) + noise
+
+    def update(self, measured: Array, covariance: Array) -> bool:
+        """Update the predicted modes and their probabilities with the measured values of the frame.
+
+        Args:
+            measured: Measured x, y and ln F, shape (3,).
+            covariance: Covariance of the noise, shape (3, 3).
+
+        Returns:
+            Whether the frame belongs to the contact. Otherwise nothing is updated.
+        """
+        innovation = (measured - self.mean[:, VALUES])[:, :, None]
+        precision = np.linalg.inv(self.covariance[:, VALUES, VALUES] + covariance)
+        squared_distance = (innovation * (precision @ innovation)).sum(axis=(1, 2))
+        smallest = squared_distance.min()
+        if smallest > SQUARED_GATE:
+            return False
+        likelihood = np.exp(0.5 * (smallest - squared_distance)) * np.sqrt(np.linalg.det(precision))
+        posterior = self.probability * likelihood
+        self.probability = np.maximum(posterior / posterior.sum(), MIN_PROBABILITY)
+        self.probability /= self.probability.sum()
+        gain = self.covariance[:, :, VALUES] @ precision
+        self.mean = self.mean + (gain @ innovation)[:, :, 0]
+        self.covariance = self.covariance - gain @ self.covariance[:, VALUES]
+        return True
+
+
+class ContactFilter:
+    """Filter that smooths the position and the force of one contact over successive frames.
+
+    Some errors of a model, such as its approximation error and the errors of the gains, are the same in every frame of
+    a held contact. Smoothing does not reduce these constant errors. The filter therefore uses only the variance of the
+    errors that change from frame to frame. The variance of the constant errors is added to that of the smoothed values.
+    """
+
+    def __init__(self, constant_variance_share: float) -> None:
+        """Start without a tracked contact.
+
+        Args:
+            constant_variance_share: Variance of the errors that are the same in every frame of a held contact, divided
+                by the variance that the model states, 0 to 1.
+        """
+        self._constant_share = constant_variance_share
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard the tracked contact."""
+        self._filter: MotionFilter | None = None
+        self._noise = NoiseEstimate()
+        self._is_outlier = False  # whether the latest frame was ignored
+        self._latest_time_s = 0.0
+
+    def step(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> TrackedContact:
+        """Process the next frame, and return the smoothed contact.
+
+        The standard deviations of the smoothed contact include the constant errors.
+
+        A frame that does not belong to the contact is ignored once. A second such frame in succession begins a new
+        contact. A new contact also begins if the time since the latest frame is longer than `MAX_GAP_s`, or if the
+        clock was set back. Frames may have the same time, for example because they were received together.
+
+        Args:
+            contact: Contact predicted by the model.
+            t_s: Time of the frame on any clock, s.
+            flags: Flags of the frame. Frames with flags in `WEAK_FLAGS` have a small weight.
+        """
+        dt_s = t_s - self._latest_time_s
+        if not 0.0 <= dt_s <= MAX_GAP_s:
+            self.reset()
+        self._latest_time_s = t_s
+        measured, stated_covariance = _measured_values(contact)
+        variance_ratio = 1.0 - self._constant_share
+        if WEAK_FLAGS.intersection(flags):
+            variance_ratio *= WEAK_VARIANCE_FACTOR
+        covariance = variance_ratio * stated_covariance
+
+        belongs = False
+        if self._filter is not None:
+            self._filter.predict(dt_s)
+            belongs = self._filter.update(measured, self._noise.relative_variance * covariance)
+            self._is_outlier = not (belongs or self._is_outlier)
+        if self._filter is None or not (belongs or self._is_outlier):
+            self._filter = MotionFilter(measured, covariance)
+            self._noise = NoiseEstimate()
+        if not self._is_outlier:
+            self._noise.update(measured, covariance, t_s)
+
+        modes = self._filter
+        (mean,), (smoothed_covariance,) = mixture_moments(modes.probability[None], modes.mean, modes.covariance)
+        variance = smoothed_covariance[VALUES, VALUES] + self._constant_share * stated_covariance
+        x_std_mm, y_std_mm, log_force_std = np.sqrt(variance.diagonal()).tolist()
+        x_mm, y_mm, log_force, vx_mm_s, vy_mm_s, _ = mean.tolist()
+        force_N = math.exp(log_force)
+        return TrackedContact(
+            x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_N * log_force_std, vx_mm_s, vy_mm_s, modes.moving_probability
+        )
+
+
+def _measured_values(contact: Contact) -> tuple[Array, Array]:
+    """Return x, y and ln F of a contact, shape (3,), and their covariance, shape (3, 3).
+
+    Correlations of NaN count as 0.
+    """
+    force_N = max(MIN_FORCE_N, contact.force_N)
+    std = np.array([contact.x_std_mm, contact.y_std_mm, contact.force_std_N / force_N])
+    xy, xF, yF = contact.xy_correlation, contact.xF_correlation, contact.yF_correlation
+    correlation = np.array([[1.0, xy, xF], [xy, 1.0, yF], [xF, yF, 1.0]])
+    if math.isnan(xy):
+        correlation = np.eye(3)
+    # Rounding must not make the covariance of fully correlated errors singular.
+    correlation += MIN_UNCORRELATED_SHARE * np.eye(3)
+    return np.array([contact.x_mm, contact.y_mm, math.log(force_N)]), correlation * np.outer(std, std)
