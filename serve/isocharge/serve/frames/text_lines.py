@@ -181,7 +181,7 @@ def parse_line(text: str) -> Line:
             skeleton += _CODES["optional blanks"]
         elif token.is_after_blank:
             skeleton += _CODES["blanks"]
-        if token.kind in ("key", "mark") or token.content in word_names:
+        if token.kind in ("key", "mark") or (token.kind == "word" and token.content in word_names):
             skeleton += token.content
         else:
             skeleton += _CODES[number_kind if token.kind == "number" else token.kind]

@@ -43,6 +43,9 @@ STUFFED_SHARE = 0.9
 COVERED_SHARE = 0.4
 """Smallest share of a stream that frames of one length must cover, dimensionless."""
 
+MAX_CONSTANT_BYTES = 16
+"""Largest number of constant bytes that are tried as the beginning of a frame, or of the bytes under a checksum."""
+
 MAX_FRAME_LENGTHS = 3
 """Number of frame lengths that are tried."""
 
@@ -287,7 +290,7 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     _usual, is_constant = usual_bytes(checked_rows)  # `is_constant` has the shape (length,)
     length = len(is_constant)
     # Number of constant bytes at the beginning of the frames. It is the position of the first False.
-    leading_constant_count = int(np.argmin([*is_constant, False]))
+    leading_constant_count = int(np.argmin([*is_constant[:MAX_CONSTANT_BYTES], False]))
     for size in (4, 3, 2, 1):  # in bytes
         is_too_wide = size + 2 > length  # at least two bytes must remain
         last_bytes_are_constant = is_constant[-size:].all()  # a checksum would differ from frame to frame

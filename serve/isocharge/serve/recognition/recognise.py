@@ -17,6 +17,7 @@ from isocharge.serve.frames.text import Layout, TextParser
 from isocharge.serve.recognition.fields import Part, Weights, identify_clock, possible_parts, split_frame, steady_step
 from isocharge.serve.recognition.framing import (
     COVERED_SHARE,
+    MAX_CONSTANT_BYTES,
     MAX_EXAMINED_BYTES,
     MIN_FRAMES,
     ORDERS,
@@ -90,7 +91,7 @@ def _scored_sections(
     may_be_sync = is_constant & (usual != 0)  # shape (length,); zeros are mostly the high bytes of numbers
     starts = [0]
     if has_sync:
-        starts = np.flatnonzero(may_be_sync).tolist()
+        starts = np.flatnonzero(may_be_sync)[:MAX_CONSTANT_BYTES].tolist()
 
     # Find the possible pairs of a first byte and a checksum.
     starts_and_checks = [(start, check) for start in starts for check in find_checks(rows[:, start : start + length])]
@@ -108,7 +109,7 @@ def _scored_sections(
             parts_from_start = parts_in_window[start:] + parts_in_window[:start]  # from the first byte of the frame
             parts_before_check = parts_from_start[: length - check.size]
             # The sync pattern has at most as many bytes as there are possible sync bytes from its beginning on.
-            max_sync_length = int(np.argmin([*np.roll(may_be_sync, -start), False]))
+            max_sync_length = int(np.argmin([*np.roll(may_be_sync, -start)[:MAX_CONSTANT_BYTES], False]))
             sync_lengths = range(1, max_sync_length + 1) if has_sync else [0]
             score, sync_length, parts = split_frame(parts_before_check, sync_lengths, weights)
             has_channel = any(part.role == "channel" for part in parts)
