@@ -201,6 +201,8 @@ def test_channel_of_each_electrode(names, channels, picked):
         (("A_nC", "B_nC", "C_nC"), {}, "A_nC' is in nC: convert it to pC"),
         (("A_mean", "A_std", "B_mean", "B_std", "C_mean", "C_std"), {}, r"\[channels\] A = "),
         (("A", "B", "z"), {}, r"\[channels\] A = "),
+        (("ch3", "ch2", "ch1"), {}, r"ch3'.*\[channels\] A = "),
+        (("adc1 in2", "adc1 in10", "adc1 in1"), {}, r"\[channels\] A = "),
         (("x", "y", "z"), {"A": "zz"}, r'^board\.toml: \[channels\] A = "zz": no channel .* have x, y, z, or 1 to'),
         *(((), {"A": name}, "no channel is called that") for name in ("0", "4", "ch0", "ch4", "ch", "", "-1")),
         *(((), {"A": name}, "no channel is called that") for name in ("1.0", "99999", "²")),

@@ -22,7 +22,8 @@ class Channels(Stage):
     The section `[channels]` of the device file states the name or the number of the channel of each electrode. If the
     device file has no section `[channels]`, a channel belongs to the electrode whose name is among the words of the
     channel's name, as in `A_pC`, `charge.A` or `electrode a`. If no channel has the name of an electrode, the channels
-    are assigned by their order, which requires as many channels as electrodes.
+    are assigned by their order, which requires as many channels as electrodes. If the channels are numbered, the
+    numbers must increase.
     """
 
     is_required = True
@@ -76,7 +77,7 @@ class Channels(Stage):
         indices = self.named_indices(frame)
         if indices is not None:
             return indices
-        if len(frame.values) != len(self._electrodes):
+        if len(frame.values) != len(self._electrodes) or not _are_in_order(frame.names):
             raise self._assignment_error(frame)
         return tuple(range(len(self._electrodes)))
 
@@ -168,6 +169,13 @@ def channel_index(name: str, frame: Frame) -> int | None:
 def _words_of(text: str) -> list[str]:
     """Return the words of a text. All characters except letters and digits separate words."""
     return [word for word in re.split(r"[\W_]+", text) if word]
+
+
+def _are_in_order(names: tuple[str, ...]) -> bool:
+    """Return whether the last numbers in names, such as `ch1` and `ch2`, increase, or some name has no number."""
+    numbers = [re.findall("[0-9]+", name) for name in names]
+    last_numbers = [int(digits[-1][-9:]) for digits in numbers if digits]
+    return len(last_numbers) < len(names) or last_numbers == sorted(last_numbers)
 
 
 def stated_unit(name: str) -> str:
