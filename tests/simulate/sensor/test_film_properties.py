@@ -14,7 +14,8 @@ from isocharge.simulate.sensor import film_properties
 from isocharge.simulate.sensor.film_properties import FILM_PROPERTIES, LARGEST_PRETENSION, FilmProperty, virtual_film
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
-SENSOR = load_sensor("four-25um-biaxial")
+UNSTRETCHED = load_sensor("four-25um-biaxial")
+SENSOR = replace(UNSTRETCHED, film=replace(UNSTRETCHED.film, pretension=0.5))
 PRIOR = FilmPrior(SENSOR, Circle(1.0))
 
 
@@ -35,8 +36,8 @@ EXPECTED = {
     "shift_x": (0.3, lambda s, _: s.calibration.shift, (0.3, 0.0)),
     "shift_y": (0.3, lambda s, _: s.calibration.shift, (0.0, 0.3)),
     "rotation": (0.02, lambda s, _: s.calibration.rotation, 0.02),
-    "tension_difference": (0.2, lambda s, _: s.film.deviator, (0.2, 0.0)),
-    "tension_shear": (0.2, lambda s, _: s.film.deviator, (0.0, 0.2)),
+    "tension_difference": (0.2, lambda s, _: s.film.deviator, (0.2 * SENSOR.film.pretension, 0.0)),
+    "tension_shear": (0.2, lambda s, _: s.film.deviator, (0.0, 0.2 * SENSOR.film.pretension)),
     "stiffness_x": (-0.2, lambda s, _: (s.film.young_ratio, s.film.axis), (math.exp(0.2), math.pi / 2.0)),
     "stiffness_xy": (0.2, lambda s, _: (s.film.young_ratio, s.film.axis), (math.exp(0.2), math.pi / 4.0)),
     "oval_x": (0.01, lambda s, _: (s.film.oval, s.film.oval_axis), (0.01, 0.0)),

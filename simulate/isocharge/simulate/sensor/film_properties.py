@@ -108,11 +108,12 @@ def _replaced(_: float, value: float) -> float:
 
 
 def _deviator(component: int) -> Change:
-    """Return a function that increases a component of the uneven pretension."""
+    """Return a function that increases a component of the uneven pretension by a share of the mean pretension."""
 
     def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
         difference, shear = sensor.film.deviator
-        deviator = (difference + value, shear) if component == 0 else (difference, shear + value)
+        increase = value * sensor.film.pretension
+        deviator = (difference + increase, shear) if component == 0 else (difference, shear + increase)
         return replace(sensor, film=replace(sensor.film, deviator=deviator)), probe
 
     return change
@@ -180,9 +181,12 @@ def _gain(electrode: str) -> Change:
     return change
 
 
-def _imperfection(name: str, meaning: str, unit: str, std: float, change: Change) -> FilmProperty:
-    """Declare an imperfection, which does not drift."""
-    return FilmProperty(name, meaning, unit, std, change, drift=0.1 * std, is_imperfection=True)
+def _imperfection(
+    name: str, meaning: str, unit: str, std: float, change: Change, largest: float | None = None
+) -> FilmProperty:
+    """Declare an imperfection, which hardly drifts, with its largest magnitude if a film may be very imperfect."""
+    bounds = None if largest is None else (-largest, largest)
+    return FilmProperty(name, meaning, unit, std, change, drift=0.1 * std, bounds=bounds, is_imperfection=True)
 
 
 PRETENSION = FilmProperty(
@@ -213,10 +217,10 @@ FILM_PROPERTIES = (
         _changed("calibration", "rotation", add),
         0.001,
     ),
-    _imperfection("tension_difference", "(T11 - T22) / 2", "MPa", 0.25, _deviator(0)),
-    _imperfection("tension_shear", "T12", "MPa", 0.15, _deviator(1)),
-    _imperfection("stiffness_x", "ln(E1 / E2), times the cosine of twice its angle", "1", 0.15, _stiffness(1.0)),
-    _imperfection("stiffness_xy", "ln(E1 / E2), times the sine of twice its angle", "1", 0.1, _stiffness(1j)),
+    _imperfection("tension_difference", "(T11 - T22) / (T11 + T22)", "1", 0.25, _deviator(0), 0.9),
+    _imperfection("tension_shear", "2 T12 / (T11 + T22)", "1", 0.15, _deviator(1), 0.9),
+    _imperfection("stiffness_x", "ln(E1 / E2), times the cosine of twice its angle", "1", 0.15, _stiffness(1.0), 1.0),
+    _imperfection("stiffness_xy", "ln(E1 / E2), times the sine of twice its angle", "1", 0.1, _stiffness(1j), 1.0),
     _imperfection("oval_x", "e of an oval clamp, times the cosine of twice its angle", "1", 0.006, _oval(1.0)),
     _imperfection("oval_xy", "e of an oval clamp, times the sine of twice its angle", "1", 0.006, _oval(1j)),
     _imperfection("d12", "d12, by axes that are rotated", "pC/N", 0.3, _changed("piezo", "d12", _d12)),
@@ -332,9 +336,10 @@ class FilmPrior:
         The other properties are those of the electrodes and of the piezoelectric coefficients.
         """
         changes = []
+        taut, _ = PRETENSION.change(self.sensor, self.probe, PRETENSION.mean)
         for one in self.properties:
             values = (one.mean, one.mean + one.std)
-            films = [(sensor.film, probe) for sensor, probe in (one.change(self.sensor, self.probe, v) for v in values)]
+            films = [(sensor.film, probe) for sensor, probe in (one.change(taut, self.probe, v) for v in values)]
             changes.append(films[0] != films[1])
         return np.array(changes)
 

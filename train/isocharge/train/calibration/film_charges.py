@@ -23,6 +23,9 @@ SOLVED_STEP = 1.0 / 3.0
 READING_STEP = 0.05
 """Step of the difference quotients for which the solved film is only read again, in prior standard deviations."""
 
+CHARGE_ERROR = 2e-3
+"""Largest relative error of an interpolated charge of a solved film, dimensionless: the noise of a good amplifier."""
+
 MAX_LOG_CHANGE = 1.0
 """Largest change of the logarithm of a charge to which a first-order change is applied."""
 
@@ -124,7 +127,14 @@ class FilmCharges:
             executor: Executor that runs the solves; None for this process.
         """
         sensor, probe = self.prior.film(values)
-        film = ForwardMap.build(sensor, probe, self.domain.radius, self.domain.force_range, executor=executor)
+        film = ForwardMap.build(
+            sensor,
+            probe,
+            self.domain.radius,
+            self.domain.force_range,
+            largest_error=CHARGE_ERROR,
+            executor=executor,
+        )
         return replace(self, values=values, film=film)
 
     @property
@@ -266,12 +276,11 @@ class _Reading:
         derivatives = replace(slopes, film=self._read(slopes.film), fields=self._read(slopes.fields)).jacobian(contact)
         force_slope = self.film.derivatives(contact)[:, :, 2]
         derivatives["thickness"] = -force_slope
-        tension_part = sum(
-            float(value) * derivatives[name]
-            for name, value in zip(self._prior.names, self._charges.values, strict=True)
-            if name in TENSIONS
-        )
-        derivatives["young"] = charge - force_slope - tension_part
+        values = dict(zip(self._prior.names, self._charges.values.tolist(), strict=True))
+        for name in UNEVEN_TENSIONS:  # shares of the pretension
+            derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + values[name] * derivatives[name]
+            derivatives[name] = values[PRETENSION.name] * derivatives[name]
+        derivatives["young"] = charge - force_slope - values[PRETENSION.name] * derivatives[PRETENSION.name]
         same_charge = self._read(self._charges.same_probe).charges(contact)
         for name, increased in self._charges.increased.items():
             step = SOLVED_STEP * self._prior.std[self._prior.index(name)]
@@ -299,8 +308,17 @@ class _Reading:
         return np.asarray((forward - backward) / (2.0 * step))
 
 
-TENSIONS = (PRETENSION.name, "tension_difference", "tension_shear")
-"""Properties that are tensions, MPa."""
+UNEVEN_TENSIONS = ("tension_difference", "tension_shear")
+"""Properties that are uneven parts of the pretension, relative to the pretension."""
 
-KNOWN_DERIVATIVES = (*TENSIONS, "young", "thickness", "stiffness_x", "stiffness_xy", "oval_x", "oval_xy")
+KNOWN_DERIVATIVES = (
+    PRETENSION.name,
+    *UNEVEN_TENSIONS,
+    "young",
+    "thickness",
+    "stiffness_x",
+    "stiffness_xy",
+    "oval_x",
+    "oval_xy",
+)
 """Properties that change the stress, with derivatives that follow from those of the stress."""

@@ -153,15 +153,6 @@ class FilmEstimate:
         covariance[session] = covariance[:, session] = 0.0
         return replace(self, values=values, covariance=covariance)
 
-    def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Draw values of all unknowns, shape (count, n_unknown). The properties of the film stay in their bounds."""
-        eigenvalues, vectors = np.linalg.eigh(self.covariance)
-        root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
-        values = self.values + rng.standard_normal((count, len(self.values))) @ root.T
-        low, high = self.layout.prior.bounds
-        values[:, self.layout.film] = np.clip(values[:, self.layout.film], low, high)
-        return np.asarray(values)
-
     def session_cautions(self, certain: float = 3.0) -> Sequence[str]:
         """Return sentences about unknowns of the session that are certainly not zero.
 
