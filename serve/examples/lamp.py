@@ -22,7 +22,7 @@ HARD_PRESS_N = 0.5
 def simulated_chunks():
     """Yield the bytes of each frame of a simulated board, without waiting for the time of the frame."""
     forward_map = ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0))
-    script = wander(seed=4, rate_Hz=RATE_HZ)
+    script = wander(seed=2, rate_Hz=RATE_HZ)
     sensor = VirtualSensor(forward_map.charges, script, noise=noise_model("reference").add)
     for number, data in enumerate(sensor.frames()):
         yield Chunk(data, number / RATE_HZ, 0)

@@ -5,8 +5,8 @@ meaning; rows above it are ignored. If commas separate the columns, the decimal 
 point or a comma, and the same in the whole file. A number such as `1,064` may then be 1.064 or 1064. A file in which no
 number determines the decimal mark is therefore refused.
 
-A row that begins with # is a comment. Blank rows are ignored. Blanks before and after a name or a number are also
-ignored. The texts `nan` and `inf` are not accepted.
+A row that begins with # is a comment. Blank rows, and a row with the units mm, N and pC below the header, are ignored.
+Blanks before and after a name or a number are also ignored. The texts `nan` and `inf` are not accepted.
 """
 
 import csv
@@ -26,6 +26,9 @@ from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, Numb
 
 _SEPARATORS = ",;\t|"
 """Characters that may separate the columns."""
+
+_UNITS = frozenset({"mm", "N", "pC", "1", "-", ""})
+"""Cells of a row of units below the header."""
 
 _MAX_LINES_TO_HEADER = 100
 """Number of lines at the beginning of a file among which the header is searched."""
@@ -80,7 +83,9 @@ class CsvTable(NumberTable):
         # The arrays of the module `array` need less memory than lists. "q" are 64-bit integers, "d" are 64-bit floats.
         line_numbers = array("q")
         numbers = array("d")  # the numbers of the first row, then the numbers of the second row, and so on
-        for line_number, cells in self._rows:
+        for index, (line_number, cells) in enumerate(self._rows):
+            if index == 0 and _is_row_of_units(cells):
+                continue
             if len(line_numbers) == max_rows:  # this row is one row too many
                 self._refuse_row_count(max_rows)
             self._check_cell_count(line_number, cells)
@@ -157,6 +162,12 @@ def csv_text(columns: Mapping[str, Array]) -> str:
     for row in rows.tolist():
         writer.writerow("" if math.isnan(value) else repr(value) for value in row)
     return buffer.getvalue()
+
+
+def _is_row_of_units(cells: list[str]) -> bool:
+    """Return whether the cells of a row are the units of the columns, with or without brackets."""
+    units = {cell.strip().strip("[]()") for cell in cells} - {"°C"}  # a temperature is not read
+    return "pC" in units and units <= _UNITS
 
 
 def _has_decimal_mark(text: str, mark: str) -> bool:
