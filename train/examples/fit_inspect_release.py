@@ -27,7 +27,7 @@ with tempfile.TemporaryDirectory() as temporary:
     print(f"position {errors['position_rms_mm']:.3f} mm rms, force {errors['force_rms_percent']:.2f} % rms")
     if errors["position_rms_mm"] > 0.5:
         raise SystemExit("the position error is too large to release the model")
-    model = release(fitted, folder / "models" / "mine", errors=errors)
+    model = release(fitted, folder / "models" / "mine")
     predictor = Predictor(model.folder)
 
 samples = presses.samples
