@@ -1,4 +1,4 @@
-"""Contours and triangulation as the paper draws them.
+"""Contours and triangulation in the way in which the paper draws them.
 
 A polynomial is fitted to the charge along each line of a mapping scheme. On each line, the point at which the
 polynomial is equal to the given charge belongs to the contour. A cubic spline with free ends connects the points of all

@@ -88,7 +88,8 @@ def test_the_command_writes_a_sensor_with_a_guard_that_other_commands_read(comma
     results = json.loads((folder / "design.json").read_text())
     assert results["guard"] == {"name": "D", "centre_mm": pytest.approx(sensor.electrodes[-1].centre)}
     assert results["after"]["mirror_region"]["share"] < results["before"]["mirror_region"]["share"]
-    assert f"{100.0 * results['before']['mirror_region']['share']:.1f} %" in out
+    assert f"{100.0 * results['before']['mirror_region']['share']:.2g} % without electrode D" in err
+    assert f"{results['before']['position_limit']['rms_mm']:.5g}" in out
     assert sorted(path.name for path in folder.iterdir()) == [
         *("design.json", "layout.dxf", "layout.svg", "mirror.png", "mirror_before.png", "sensor.toml"),
     ]

@@ -141,7 +141,11 @@ class FilmEstimate:
         return float(np.sqrt(self.covariance[index, index]))
 
     def drifted(self) -> "FilmEstimate":
-        """Return the estimate for a later session, in which the film may have drifted, without the earlier session."""
+        """Return the estimate with which a later session begins.
+
+        The possible drift of the film since then increases the variances. The offset and the other unknowns of the
+        earlier session are removed.
+        """
         prior = self.layout.prior
         drift = np.zeros(len(self.values))
         drift[self.layout.film] = [one.drift for one in prior.properties]

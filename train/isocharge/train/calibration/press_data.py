@@ -14,7 +14,7 @@ UNKNOWN_STD = np.inf
 
 
 class PressErrors(NamedTuple):
-    """Errors of presses beyond the stated ones.
+    """Standard deviations of the errors of presses, which may be larger than the user states.
 
     Attributes:
         noise: Noise of the charges.
