@@ -190,12 +190,11 @@ def test_invalid_domains_raise_error(arguments, message):
 
 
 def test_unreachable_interpolation_error_raises_solve_error(monkeypatch):
+    monkeypatch.setattr("isocharge.simulate.forward.forward_map.INTERPOLATION_ERROR", 1e-13)
     monkeypatch.setattr("isocharge.simulate.forward.family.NODE_COUNTS", NODE_COUNTS[:2])
     settings = replace(QUICK_SETTINGS, resolution=Resolution(3, 8, 2))
     with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to .* only, expected 1e-13"):
-        ForwardMap.build(
-            load_sensor("three-25um-biaxial"), Circle(1.0), **{**QUICK, "settings": settings}, largest_error=1e-13
-        )
+        ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0), **{**QUICK, "settings": settings})
 
 
 UNEVEN_FILMS = {

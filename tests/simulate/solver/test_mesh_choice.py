@@ -15,6 +15,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
+from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.solver.error_estimate import estimated_error, mesh_error
 from isocharge.simulate.solver.load_case import LoadCase, needs_second_mesh
 from isocharge.simulate.solver.press import needed_resolution
@@ -27,6 +28,20 @@ NEAR_THE_RIM = (Circle(2.0), (28.0, 0.0), 0.1)
 @pytest.mark.parametrize("scene", [INNER, NEAR_THE_RIM], ids=["inner", "rim"])
 def test_needed_resolution_is_that_of_the_press(scene):
     assert needed_resolution(FILM, *scene) == press(FILM, *scene).mesh.resolution
+
+
+def test_very_uneven_pretension_has_an_accurate_mesh_under_a_small_force():
+    """The pretension along one axis is three times that along the other, and a small force hardly changes the stress.
+
+    The mesh for comparison is finer in each direction.
+    """
+    sensor = load_sensor("four-25um-biaxial")
+    film = replace(sensor.film, pretension=2.4, deviator=(1.2, 0.0))
+    sensor = replace(sensor, film=film)
+    chosen = touch_charge(sensor, press(film, Circle(1.0), (3.0, 2.0), 0.05))
+    finer = SolveSettings(resolution=Resolution(order=5, around=24, rings=8, rim=3))
+    expected = touch_charge(sensor, press(film, Circle(1.0), (3.0, 2.0), 0.05, finer))
+    np.testing.assert_allclose(chosen, expected, atol=3e-4 * expected.max())
 
 
 # Two meshes

@@ -87,14 +87,12 @@ ASYMMETRIC_NODE_COUNTS = (
     NodeCount(5, 3),
     NodeCount(5, 7),
     NodeCount(8, 7, 2 * ROTATIONS, directions=9),
-    NodeCount(8, 7, 2 * ROTATIONS, directions=15),
-    NodeCount(13, 12, 3 * ROTATIONS, directions=15),
+    NodeCount(13, 12, 3 * ROTATIONS, directions=11),
 )
 """Numbers of nodes that are tried for a film that is not axisymmetric.
 
 Every solve is repeated in several directions. If the first number of forces is not sufficient, only this number is
-increased at first. A film with a pretension starts with the second entry. If a taut film has three times the pretension
-along one axis, each further direction halves the error.
+increased at first. A film with a pretension starts with the second entry.
 """
 
 
@@ -442,7 +440,9 @@ def family_settings(sensor: Sensor, probe: Probe, domain: Domain, settings: Solv
     layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
     settings = replace(settings, theory=theory, layer=layer)
     outermost = nearest_to_clamp(film, domain.radius)
-    resolution = needed_resolution(film, probe, outermost, middle_force, settings)
+    # The smallest force needs the finest mesh if the pretension is uneven.
+    force = middle_force if film.is_axisymmetric else min_force
+    resolution = needed_resolution(film, probe, outermost, force, settings)
     template = template_for(probe, resolution, whole=not film.is_axisymmetric)
     layer = min(layer, widest_smooth_layer(template, probe, domain.radius, film.radius))
     return FamilySettings(theory, resolution, layer)

@@ -51,7 +51,7 @@ CHUNK_SIZE = 256
 """Number of presses that are evaluated at once, which limits the size of the working arrays to about 100 MB."""
 
 INTERPOLATION_ERROR = 5e-4
-"""Largest relative error of a charge, with respect to direct solves, of a forward map for datasets, dimensionless."""
+"""Largest relative error of a charge, with respect to direct solves, that a forward map may have, dimensionless."""
 
 EVEN_FIELD = np.zeros(1, dtype=bool)
 """Value of the argument `is_odd` for a single even field.
@@ -61,7 +61,7 @@ meshed completely.
 """
 
 SKIP_RATIO = 10.0
-"""Ratio of the error to its limit above which the next entry of `node_counts` is skipped, dimensionless.
+"""Ratio of the error to `INTERPOLATION_ERROR` above which the next entry of `node_counts` is skipped, dimensionless.
 
 With such a large error, the next entry would not suffice either.
 """
@@ -104,7 +104,6 @@ class ForwardMap:
         force_range: tuple[float, float] = DEFAULT_FORCE_RANGE,
         settings: SolveSettings = SolveSettings(),
         *,
-        largest_error: float = INTERPOLATION_ERROR,
         executor: Executor | None = None,
     ) -> "ForwardMap":
         """Build a forward map: solve a family of presses, and compare the interpolated charges with direct solves.
@@ -118,12 +117,11 @@ class ForwardMap:
                 the fewest terms that the accuracy allows for all forces. The mesh is as fine as the outermost press
                 requires. The width of the thin rings is that of the geometric mean of the smallest and the largest
                 force.
-            largest_error: Largest relative error of a charge, with respect to direct solves, dimensionless.
             executor: Executor that runs the solves; None for this process. The result does not depend on it.
 
         Raises:
             SceneError: If some presses of the domain cannot exist.
-            SolveError: If a press has no equilibrium, or the interpolation error exceeds `largest_error`.
+            SolveError: If a press has no equilibrium, or the interpolation error exceeds `INTERPOLATION_ERROR`.
         """
         film = sensor.film
         domain = Domain(radius, force_range)
@@ -145,13 +143,13 @@ class ForwardMap:
                 check_charges = list(in_order(executor, solve_directly, checks))
             charges = (forward_map.charges(check.contact, check.rotation)[0] for check in checks)
             error = max(map(relative_error, charges, check_charges))
-            if error <= largest_error:
+            if error <= INTERPOLATION_ERROR:
                 return replace(forward_map, error=error)
-            if error > SKIP_RATIO * largest_error and len(remaining_counts) > 1:
+            if error > SKIP_RATIO * INTERPOLATION_ERROR and len(remaining_counts) > 1:
                 remaining_counts.pop(0)
         raise SolveError(
             f"the forward map of {sensor.name} up to {radius:g} mm and {force_range[1]:g} N interpolates to "
-            f"{error:.2g} only, expected {largest_error:g}; ask for a smaller radius or range of forces"
+            f"{error:.2g} only, expected {INTERPOLATION_ERROR:g}; ask for a smaller radius or range of forces"
         )
 
     @classmethod

@@ -23,9 +23,6 @@ SOLVED_STEP = 1.0 / 3.0
 READING_STEP = 0.05
 """Step of the difference quotients for which the solved film is only read again, in prior standard deviations."""
 
-CHARGE_ERROR = 2e-3
-"""Largest relative error of an interpolated charge of a solved film, dimensionless: the noise of a good amplifier."""
-
 MAX_LOG_CHANGE = 1.0
 """Largest change of the logarithm of a charge to which a first-order change is applied."""
 
@@ -127,14 +124,7 @@ class FilmCharges:
             executor: Executor that runs the solves; None for this process.
         """
         sensor, probe = self.prior.film(values)
-        film = ForwardMap.build(
-            sensor,
-            probe,
-            self.domain.radius,
-            self.domain.force_range,
-            largest_error=CHARGE_ERROR,
-            executor=executor,
-        )
+        film = ForwardMap.build(sensor, probe, self.domain.radius, self.domain.force_range, executor=executor)
         return replace(self, values=values, film=film)
 
     @property
