@@ -35,11 +35,31 @@ VELOCITY = slice(3, 5)
 IS_HELD = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
 """Whether x, y and ln F are held (1) or change (0) in each of the four modes."""
 
+_IS_MOVING = np.tile(1.0 - IS_HELD, 2)[:, None]
+"""Whether each value and its rate change (1) or are held (0) in each mode, shape (4, 1, 6)."""
+
+_CHANGE_COUNT = np.array([[0, 1, 1, 2], [1, 0, 2, 1], [1, 2, 0, 1], [2, 1, 1, 0]])
+"""Number of changes between two modes: the position starts or stops, and the force starts or stops to change."""
+
+_INTEGRATION = np.eye(6, k=3)
+"""Matrix that adds the rates to the values."""
+
+_ACCELERATION_PATTERNS = np.stack(
+    [np.diag([1.0] * 3 + [0.0] * 3), np.eye(6, k=3) + np.eye(6, k=-3), np.diag([0.0] * 3 + [1.0] * 3)]
+)
+"""Covariances of the values, of the values with the rates, and of the rates, shape (3, 6, 6)."""
+
 MEAN_MODE_TIME_s = 0.7
 """Mean time after which a position or a force that is held starts to change, or the reverse, s."""
 
 INITIAL_RATE_STD = np.array([60.0, 60.0, 10.0])
 """Standard deviations of the rates at the beginning of a movement, mm/s, mm/s and 1/s."""
+
+_HELD_RATE_COVARIANCE = np.eye(6) * np.concatenate([np.zeros((4, 3)), IS_HELD * INITIAL_RATE_STD**2], axis=1)[:, None]
+"""Variances of the rates of held values, shape (4, 6, 6). A held value may begin to change at any time."""
+
+_KEPT = np.eye(6) * np.concatenate([np.ones((4, 3)), 1.0 - IS_HELD], axis=1)[:, None]
+"""Matrices that keep the values, and the rates of values that change, shape (4, 6, 6)."""
 
 HELD_DRIFT = 5e-4
 """Increase of the variance of a held value per second, mm^2/s or 1/s. A held finger drifts by 0.02 mm in a second."""
@@ -101,12 +121,12 @@ def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float) -
     Returns:
         Covariances of x, y, ln F and their rates, shape (n, 6, 6).
     """
-    density = np.full((len(velocity_mm_per_s), 1, 3), force_density)
+    density = np.full((len(velocity_mm_per_s), 1, 2, 3), force_density)
     squared_speed = (velocity_mm_per_s**2).sum(axis=1)
-    density[:, 0, POSITION] = (ACCELERATION_DENSITY + SPEED_CHANGE_RATE * squared_speed)[:, None]
-    integrals = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
-    blocks = (integrals[:, None, :, None] * np.eye(3)[:, None]).reshape(6, 6)
-    return np.asarray(blocks * np.concatenate([density, density], axis=2))
+    density[..., POSITION] = (ACCELERATION_DENSITY + SPEED_CHANGE_RATE * squared_speed)[:, None, None, None]
+    integrals = np.array([dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s])
+    unit_covariance = (integrals @ _ACCELERATION_PATTERNS.reshape(3, -1)).reshape(6, 6)
+    return np.asarray(unit_covariance * density.reshape(-1, 1, 6))
 
 
 def mixture_moments(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
@@ -196,19 +216,15 @@ class MotionFilter:
         """
         # Joint probability of each new mode (row) and each previous mode (column)
         change = min(dt_s / MEAN_MODE_TIME_s, 0.5)
-        one_change = np.array([[1.0 - change, change], [change, 1.0 - change]])
-        both_changes = (one_change[:, None, :, None] * one_change[:, None]).reshape(4, 4)  # of position and force
-        joint = both_changes * self.probability
+        by_count = np.array([(1.0 - change) ** 2, change * (1.0 - change), change**2])
+        joint = by_count[_CHANGE_COUNT] * self.probability
         self.probability = joint.sum(axis=1)
         mean, covariance = mixture_moments(joint / self.probability[:, None], self.mean, self.covariance)
 
         # The rate of a held value is that of a movement that would begin now: zero on average.
-        held_noise = np.concatenate([np.full((4, 3), HELD_DRIFT * dt_s), IS_HELD * INITIAL_RATE_STD**2], axis=1)
-        is_moving = 1.0 - np.concatenate([IS_HELD, IS_HELD], axis=1)[:, None]
-        noise = is_moving * process_noise(mean[:, VELOCITY], FORCE_ACCELERATION_DENSITY, dt_s)
-        noise += held_noise[:, None] * np.eye(6)
-        transition = np.eye(6) + dt_s * np.eye(6, k=3)
-        transition = transition * np.concatenate([np.ones((4, 3)), 1.0 - IS_HELD], axis=1)[:, None]
+        noise = _IS_MOVING * process_noise(mean[:, VELOCITY], FORCE_ACCELERATION_DENSITY, dt_s)
+        noise += _HELD_RATE_COVARIANCE + HELD_DRIFT * dt_s * _ACCELERATION_PATTERNS[0]
+        transition = _KEPT + dt_s * _INTEGRATION * _IS_MOVING
         self.mean = (transition @ mean[:, :, None])[:, :, 0]
         self.covariance = transition @ covariance @ transition.swapaxes(1, 2) + noise
 
