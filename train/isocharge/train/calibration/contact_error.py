@@ -25,10 +25,11 @@ from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM,
 from isocharge.simulate import Domain, noise_model
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.solver.stress_limit import force_within_stress
-from isocharge.train.calibration.estimator import Hypothesis, linearise
+from isocharge.train.calibration.estimator import Hypothesis
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate
 from isocharge.train.calibration.press_data import PressData, PressErrors
+from isocharge.train.calibration.press_model import linearise
 from isocharge.train.calibration.problem import CalibrationProblem
 
 N_CONTACTS = 200
