@@ -61,18 +61,18 @@ def test_shares_of_presses_on_the_whole_film_are_those_of_the_page(model):
 
 
 @pytest.mark.slow
-def test_a_trained_model_with_a_guard_electrode_notices_presses_anywhere_on_the_film(tmp_path):
-    """Without a guard electrode, most presses outside the working area are answered wrongly without a flag."""
+def test_a_trained_model_with_an_electrode_in_the_centre_notices_presses_anywhere_on_the_film(tmp_path):
+    """Without this electrode, most presses outside the working area are answered wrongly without a flag."""
     table = sensor_to_dict(load_sensor("four-25um-biaxial"))
-    table["electrodes"]["G"] = [0.0, 0.0]
-    sensor = sensor_from_dict(table | {"name": "guarded", "roles": {"G": "guard"}})
+    table["electrodes"]["E"] = [0.0, 0.0]
+    sensor = sensor_from_dict(table | {"name": "five"})
     dataset = simulated_presses(sensor, [Circle(1.0)], 8.0, (0.05, 2.0))
-    model = release(fit(dataset), tmp_path / "guarded")
+    model = release(fit(dataset), tmp_path / "five")
     rings = WholeFilmStudy(str(model.folder), 500, SEED).rings((8.0, 15.0, 20.0, 30.0, 43.0))
     assert rings["inside the working area"].flagged < 1.0
     assert rings["whole film"].unnoticed < 1.0
-    _, share_without_guard, _ = column("distance", "four-25um-biaxial")["whole film"]
-    assert share_without_guard > 70.0
+    _, share_of_four, _ = column("distance", "four-25um-biaxial")["whole film"]
+    assert share_of_four > 70.0
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from isocharge.simulate import (
     load_sensor,
     write_sensor,
 )
-from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict, sensor_to_toml
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
 WHOLE = """
 name = "mine"
@@ -173,8 +173,6 @@ def test_error_message_names_the_key_of_the_wrong_type(path):
         (("calibration", "gain"), {"Z": 1.0}, "calibration gain: no electrode named"),
         (("surface",), "inside", r"surface: expected one of middle, top, bottom, got 'inside'"),
         (("name",), "", "name: expected a text"),
-        (("roles",), {"A": "watcher"}, "roles.A: expected one of position, guard, got 'watcher'"),
-        (("roles",), {"Z": "guard"}, "roles.Z: expected the name of an electrode of the section `electrodes`, got 'Z'"),
         (
             ("electrodes", "A"),
             {"polygon_mm": [3]},
@@ -228,17 +226,6 @@ def test_too_many_electrodes_raise_error_quickly(tmp_path, count):
 
 
 # Writing
-
-
-def test_the_role_of_a_guard_electrode_is_read_and_written():
-    guarded = sensor_from_dict(whole() | {"roles": {"B": "guard"}})
-    assert guarded.guard_names == ("B",)
-    assert [electrode.role for electrode in guarded.electrodes] == ["position", "guard"]
-    assert '[roles]\nB = "guard"\n' in sensor_to_toml(guarded)
-    assert sensor_from_dict(sensor_to_dict(guarded)) == guarded
-    without_roles = sensor_from_dict(whole())
-    assert without_roles.guard_names == ()
-    assert "roles" not in sensor_to_dict(without_roles)
 
 
 @pytest.mark.parametrize("name", built_in_sensors())

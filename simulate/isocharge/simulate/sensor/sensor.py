@@ -23,13 +23,6 @@ from isocharge.simulate.sensor.size_check import check_range
 Readout = Literal["area", "edge"]
 """Part of an electrode over which the stress is averaged: the area or the edges (Mirbagheri et al. 2007, eq. 2, 3)."""
 
-Role = Literal["position", "guard"]
-"""Purpose of an electrode.
-
-An electrode with the role "position" determines the contact. An electrode with the role "guard" distinguishes presses
-outside the working area from presses inside it. Models use the charges of both kinds in the same way.
-"""
-
 MAX_CORNERS = 256
 """Largest number of corners of a polygon."""
 
@@ -84,7 +77,6 @@ class Electrode:
         square: Whether `of_square` created the electrode. The edge readout accepts only such electrodes.
         more: Further polygons of metal on the front, such as traces. Overlapping areas count once.
         back: Polygons of metal on the back. If there are none, the back is completely covered with metal.
-        role: Purpose of the electrode.
     """
 
     name: str
@@ -92,7 +84,6 @@ class Electrode:
     square: bool = False
     more: tuple[Corners, ...] = ()
     back: tuple[Corners, ...] = ()
-    role: Role = "position"
 
     def __post_init__(self) -> None:
         """Convert the corners into nested tuples, which can be compared and hashed."""
@@ -345,11 +336,6 @@ class Sensor:
     def electrode_names(self) -> tuple[str, ...]:
         """Names of the electrodes, in the order of the charges."""
         return tuple(electrode.name for electrode in self.electrodes)
-
-    @property
-    def guard_names(self) -> tuple[str, ...]:
-        """Names of the electrodes with the role "guard"."""
-        return tuple(electrode.name for electrode in self.electrodes if electrode.role == "guard")
 
     @cached_property
     def part_circles(self) -> tuple[tuple[Complexes, Array], ...]:

@@ -5,7 +5,6 @@ A sensor file is a TOML file whose keys contain the units of the values. Unknown
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,7 +28,7 @@ from isocharge.common.structs import (
 )
 from isocharge.common.toml_text import to_toml
 from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, FILM_LIMITS, Film, Piezo, Surface
-from isocharge.simulate.sensor.sensor import Calibration, Corners, Electrode, Readout, Role, Sensor
+from isocharge.simulate.sensor.sensor import Calibration, Corners, Electrode, Readout, Sensor
 from isocharge.simulate.sensor.size_check import tidy
 
 MAX_COORDINATE_mm = 1e6
@@ -126,16 +125,15 @@ class SensorTable(Settings, frozen=True):
     readout: Readout = "area"
     surface: Surface = "middle"
     calibration: CalibrationTable = CalibrationTable()
-    roles: dict[str, Role] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the section `electrodes` and the names of the section `roles`.
+        """Check the section `electrodes`.
 
         Most keys of the section `electrodes` are the names of the electrodes. The value of the key `SIDE` is a number
         that applies to all squares.
 
         Raises:
-            WrongKey: If a value is not allowed, if a key is missing, or if a role belongs to no electrode.
+            WrongKey: If a value is not allowed, or if a key is missing.
             ValueError: If the section contains the key `COATING`.
         """
         if COATING in self.electrodes:
@@ -160,9 +158,6 @@ class SensorTable(Settings, frozen=True):
         has_squares = any(isinstance(value, tuple) for value in self.electrodes.values())
         if side is None and has_squares:
             raise WrongKey(f"electrodes.{SIDE}")
-        for name in self.roles:
-            if name == SIDE or name not in self.electrodes:
-                raise WrongKey(f"roles.{name}", "the name of an electrode of the section `electrodes`", name)
 
 
 def built_in_sensors() -> tuple[str, ...]:
@@ -220,7 +215,7 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
             name=file.name,
             film=_film(file.film),
             piezo=Piezo(piezo.d31, piezo.d32, piezo.d33, piezo.pyro_uC_per_m2_K, piezo.d12),
-            electrodes=tuple(_electrodes(file.electrodes, file.roles)),
+            electrodes=tuple(_electrodes(file.electrodes)),
             readout=file.readout,
             surface=file.surface,
             calibration=Calibration(
@@ -258,7 +253,6 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
             **({"d12": tidy(piezo.d12)} if piezo.d12 else {}),
         },
         "electrodes": _electrode_tables(sensor),
-        **({"roles": dict.fromkeys(sensor.guard_names, "guard")} if sensor.guard_names else {}),
         "calibration": {
             "gain": dict(calibration.gain),
             "shift_mm": [tidy(value) for value in calibration.shift],
@@ -466,22 +460,20 @@ def _expansion(table: FilmTable) -> tuple[float, float] | None:
     return coefficients / PPM, coefficients / PPM
 
 
-def _electrodes(table: Mapping[str, float | Point | PolygonTable], roles: Mapping[str, Role]) -> Iterator[Electrode]:
+def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:
     """Yield the electrodes that the section `electrodes` of a sensor file describes, one after the other.
 
     A value of the section is a table of polygons, the centre of a square, or the side of all squares.
 
     Args:
         table: Content of the section `electrodes`.
-        roles: Content of the section `roles`. An electrode that it does not contain has the role "position".
     """
     side = table.get(SIDE)  # side of all squares, mm
     for name, value in table.items():  # the value of SIDE is a number and yields no electrode
-        role = roles.get(name, "position")
         if isinstance(value, PolygonTable):
-            electrode = Electrode(name, value.polygon_mm, more=value.more_mm, back=value.back_mm, role=role)
+            electrode = Electrode(name, value.polygon_mm, more=value.more_mm, back=value.back_mm)
             if value.trace_mm:
                 electrode = electrode.with_trace(value.trace_mm, value.width_mm)
             yield electrode
         elif isinstance(value, tuple) and isinstance(side, float):
-            yield replace(Electrode.of_square(name, value, side), role=role)
+            yield Electrode.of_square(name, value, side)
