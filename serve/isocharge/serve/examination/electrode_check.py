@@ -15,7 +15,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressCheckError
 from isocharge.common.printable_text import printable
-from isocharge.serve.examination.press_detector import BLOCK_S, PressDetector, channel_noise
+from isocharge.serve.examination.press_detector import BLOCK_S, CHANGE_BLOCKS, Press, channel_noise, find_press
 from isocharge.serve.live.device import Device
 from isocharge.serve.port.source import Port
 from isocharge.serve.signal_chain.channels import channel_index
@@ -176,7 +176,7 @@ class _PressReader:
     def __init__(
         self, port: Port, device: Device, channels: list[str], ask: Callable[[str], None], timeout_s: float
     ) -> None:
-        """Store the arguments. The rest level is unknown.
+        """Store the arguments.
 
         Args:
             port: The open port.
@@ -185,12 +185,12 @@ class _PressReader:
             ask: Function that is called with a sentence that asks the user to wait or to press.
             timeout_s: Longest time to wait for the rest or for a press, s.
         """
-        self._detector = PressDetector()
         self._port = port
         self._parser = device.parser()
         self._channels = channels
         self._ask = ask
         self._timeout_s = timeout_s
+        self._blocks: list[Array] = []  # values of the blocks since the end of the previous press
 
     def press_near(self, electrode: str) -> Array:
         """Ask for a press, wait until it has begun and ended, and return the change of the channels at its peak.
@@ -205,48 +205,51 @@ class _PressReader:
         Raises:
             PressCheckError: If the rest, or the begin or the end of the press, does not come in time.
         """
-        detector = self._detector
-        if detector.rest is None:
+        if not self._blocks:
             self._ask("wait, and do not touch the film, until the rest level is known")
-        deadline_s = time.monotonic() + self._timeout_s
-        while detector.rest is None and (block := self._next_block(deadline_s)) is not None:
-            detector.feed(*block)
-        if detector.rest is not None:
-            self._ask(f"press near electrode {electrode}, as close to it as you can, and let go")
             deadline_s = time.monotonic() + self._timeout_s
-            while (block := self._next_block(deadline_s)) is not None:
-                if detector.feed(*block):
-                    return detector.change
-        raise PressCheckError(
-            f"electrode {electrode}: no press began and ended within {self._timeout_s:g} s; take the finger away after "
-            "each press, and try again"
-        )
+            while len(self._blocks) <= CHANGE_BLOCKS or self._find_press() is not None:
+                self._blocks = [*self._blocks[-CHANGE_BLOCKS:], self._next_block(deadline_s, electrode)]
+        self._ask(f"press near electrode {electrode}, as close to it as you can, and let go")
+        deadline_s = time.monotonic() + self._timeout_s
+        while True:
+            self._blocks.append(self._next_block(deadline_s, electrode))
+            press = self._find_press()
+            if press is not None and press.end is not None:
+                self._blocks = self._blocks[press.end :]
+                return press.change
 
-    def _next_block(self, deadline_s: float) -> tuple[Array, Array] | None:
-        """Collect the frames of one block of time, and return the median and the noise of each channel.
+    def _find_press(self) -> Press | None:
+        """Return the first press in the blocks; None if no press has begun."""
+        levels = np.array([np.median(block, axis=0) for block in self._blocks])
+        return find_press(levels, channel_noise(np.vstack(self._blocks)))
+
+    def _next_block(self, deadline_s: float, electrode: str) -> Array:
+        """Collect the frames of one block of time, and return their values, shape (frames, channels).
 
         A block lasts for `BLOCK_S`, or longer if no frame has arrived during this time. Frames without a finite number
         for every channel are ignored.
 
         Args:
             deadline_s: Time on the monotonic clock until which the function waits for frames, s.
+            electrode: Electrode near which the press is expected, for the error message.
 
-        Returns:
-            Medians of the block and noise of one frame, each of shape (channels,), in the unit of the board; None if
-            no frames come before the deadline.
+        Raises:
+            PressCheckError: If no frames come before the deadline.
         """
         rows: list[list[float]] = []  # the values of the channels in each frame
         end_s = time.monotonic() + BLOCK_S
         while time.monotonic() < end_s or not rows:
             remaining_s = deadline_s - time.monotonic()
             if remaining_s <= 0.0:
-                return None
+                raise PressCheckError(
+                    f"electrode {electrode}: no press began and ended within {self._timeout_s:g} s; take the finger "
+                    "away after each press, and try again"
+                )
             chunk = self._port.read(min(BLOCK_S, remaining_s))
             for frame in [] if chunk is None else self._parser.feed(chunk.data):
                 positions = [channel_index(channel, frame) for channel in self._channels]  # None for a missing channel
                 values = [math.nan if position is None else frame.values[position] for position in positions]
                 if all(map(math.isfinite, values)):
                     rows.append(values)
-        values_of_block = np.array(rows)  # shape (frames, channels)
-        noise = np.array([channel_noise(column) for column in values_of_block.T])
-        return np.median(values_of_block, axis=0), noise
+        return np.array(rows)

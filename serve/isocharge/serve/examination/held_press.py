@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Reals
-from isocharge.serve.examination.press_detector import BLOCK_S, PressDetector, block_medians, channel_noise
+from isocharge.serve.examination.press_detector import BLOCK_S, block_medians, channel_noise, find_press
 
 MIN_REST_S = 1.0
 """Shortest rest before the press, s."""
@@ -68,17 +68,12 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     levels = block_medians(values, times_s)  # shape (blocks, channels)
     if not np.isfinite(levels).all():
         return None
-    noise = np.array([channel_noise(column) for column in values.T])
-    detector = PressDetector()
-    end_block = len(levels)  # number of blocks before the end of the press
-    for number, level in enumerate(levels):
-        if detector.feed(level, noise):
-            end_block = number - 1  # the force may have begun to fall in the block before
-            break
-    if detector.begin_block is None:
+    press = find_press(levels, channel_noise(values))
+    if press is None:
         return None
 
-    begin_block = detector.begin_block
+    begin_block = press.begin
+    end_block = len(levels) if press.end is None else press.end - 1  # the force may have begun to fall before
     settled_block = begin_block + round(SETTLE_S / BLOCK_S)  # the force is constant from here on
     rest_blocks = begin_block - 1  # the force may have begun to rise in the block before
     has_rest = rest_blocks * BLOCK_S >= MIN_REST_S
