@@ -7,7 +7,7 @@ import numpy as np
 
 from isocharge.train.training.activations import TANH
 from isocharge.train.training.features import logarithmic_features
-from isocharge.train.training.folded_network import COSINES_TO_CORRELATIONS, N_CONTACT_ANSWERS, FoldedNetwork
+from isocharge.train.training.folded_network import ANGLES, FoldedNetwork
 from isocharge.train.training.folding import fold
 from isocharge.train.training.network import LARGEST_INT8
 from isocharge.train.training.perceptron import Layer, Perceptron
@@ -38,7 +38,7 @@ def random_network(n_electrode, hidden, misfit_hidden, *, is_int8=False, activat
         activation: Activation of the hidden layers.
     """
     rng = np.random.default_rng(0)
-    n_contact = N_CONTACT_ANSWERS + len(COSINES_TO_CORRELATIONS)
+    n_contact = ANGLES.stop
     perceptrons = [
         random_perceptron(rng, (n_electrode, *hidden, n_contact), activation),
         random_perceptron(rng, (n_electrode, *misfit_hidden, n_electrode), activation),

@@ -91,18 +91,6 @@ def test_any_width_and_number_of_electrodes(electrodes, hidden, misfit_hidden, i
     assert ("signed char" in exported.source) == is_int8
 
 
-def test_limits_of_the_standard_deviations(build, tmp_path):
-    network = random_network(4, (24, 24), (16, 16))
-    charge_pC = np.random.default_rng(2).uniform(50.0, 5000.0, (500, 4)).astype(np.float32)
-    log_std = np.log(network.predict(charge_pC)[1])
-    limits = np.quantile(log_std, [0.2, 0.7], axis=0)
-    limited = replace(network, log_std_limits=limits)
-    exported = build(write_random_model(tmp_path / "limited", limited))
-    given = exported.predict(charge_pC)
-    check_agreement(given, double_precision_answers(limited, charge_pC))
-    np.testing.assert_allclose(np.log(given[:, 3:6]), np.clip(log_std, *limits), atol=1e-4)
-
-
 def test_signed_charges(build, tmp_path):
     """Features with asinh: against the network in double precision, and against onnxruntime beyond the limits."""
     mean_pC = [0.0, -300.0, 900.0, 5.0]

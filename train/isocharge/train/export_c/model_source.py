@@ -30,6 +30,7 @@ from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_strin
 from isocharge.train.export_c.layer_source import LayerSource, find_blocks
 from isocharge.train.training.charge_features import ChargeFeatures
 from isocharge.train.training.folded_network import (
+    ANGLES,
     COSINES_TO_CORRELATIONS,
     LOG_STD,
     MISFIT_UNIT,
@@ -59,7 +60,6 @@ def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         names=", ".join(map(c_string, metadata.electrodes)),
         fields=", ".join(f'"{name}"' for name in Contact._fields),
         numbers=len(Contact._fields),
-        all=source_text("isocharge_all.h"),
         **_validity_literals(Validity.of(metadata)),
         low=f"{features.low_pC:g}" if is_logarithmic else "LOW",
         high=f"{features.high_pC:g}" if is_logarithmic else "HIGH (isocharge_model.c)",
@@ -112,17 +112,9 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     calls.append(f"last({buffers[-1]}, skipped, answers);")
     hidden_buffers = dict.fromkeys(buffers[1:])  # removes repeated names, and keeps the order
 
-    limits = ""
-    log_std = "answers[i]"
-    if network.log_std_limits is not None:
-        lower, upper = map(_to_single_precision, network.log_std_limits)
-        limits = f"{c_array('LOWEST_LOG_STD', lower)}{c_array('HIGHEST_LOG_STD', upper)}\n"
-        row = f"[i - {LOG_STD.start}]"
-        log_std = f"clip(answers[i], LOWEST_LOG_STD{row}, HIGHEST_LOG_STD{row})"
-
-    # The template of the file contains a placeholder for each of these arguments. The arguments `plane`, `stds`,
-    # `logs` and `known` are the numbers of outputs of the last layer up to the position, up to the force, up to the
-    # standard deviations, and up to the angles of the correlations.
+    # The template of the file contains a placeholder for each of these arguments. The arguments `plane`, `logs`
+    # and `known` are the numbers of outputs of the last layer up to the position, up to the standard deviations, and up
+    # to the angles of the correlations.
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),
@@ -133,13 +125,12 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         calls="\n    ".join(calls),
         electrodes=network.features.n_electrode,
         plane=POSITION.stop,
-        stds=LOG_STD.start,
         logs=LOG_STD.stop,
-        limits=limits,
-        log_std=log_std,
-        known=network.angle_columns.stop,
+        known=ANGLES.stop,
         answers=last.weight.shape[1],
-        all=_correlations_source(network),
+        table=c_array("COSINES", COSINES_TO_CORRELATIONS.astype(np.float32)),
+        cosines=len(COSINES_TO_CORRELATIONS),
+        first=ANGLES.start,
         misfit_unit=c_float(MISFIT_UNIT),
     )
 
@@ -163,7 +154,7 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
     first_layer, *other_layers = perceptron.hidden
     other_weights = [_to_single_precision(layer.weight) for layer in other_layers]
     last_weight = _to_single_precision(perceptron.last.weight)
-    n_contact_output = network.angle_columns.stop
+    n_contact_output = ANGLES.stop
     *other_blocks, last_blocks = find_blocks([*other_weights, last_weight], n_contact_output)
 
     # The hidden layers
@@ -182,18 +173,6 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
     return hidden, skip, last
 
 
-def _correlations_source(network: FoldedNetwork) -> str:
-    """Return the text of the C function that computes the correlations in addition to the other outputs."""
-    text = source_text(
-        "isocharge_all.c",
-        table=c_array("COSINES", COSINES_TO_CORRELATIONS.astype(np.float32)),
-        cosines=network.n_angle,
-        first=network.angle_columns.start,
-        answers=network.layers.skip.shape[1],
-    )
-    return f"\n{text}"
-
-
 def self_test(golden: Golden, metadata: ModelMetadata) -> str:
     """Return the text of `self_test.c`, which contains golden vectors, their tolerances and their flags.
 
@@ -209,7 +188,6 @@ def self_test(golden: Golden, metadata: ModelMetadata) -> str:
         "self_test.c",
         vectors=len(answers),
         numbers=answers.shape[1],
-        function="isocharge_predict_all",
         relative=c_float(golden.relative_tolerance),
         floors=c_array("FLOOR", floors),
         charges=c_array("CHARGE_PC", golden.charge_pC),

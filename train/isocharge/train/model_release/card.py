@@ -57,7 +57,6 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     electrodes = metadata.electrodes
     sensor_name = metadata.sensor["name"]
     is_measured = HELD_PRESSES in metadata.errors
-    correlations = ", `contact_correlation` (xy, xF, yF)" if fitted.network.n_angle > 0 else ""
     noise = zip(electrodes, *metadata.noise.for_each_electrode(len(electrodes)), strict=True)
     noise_text = "; ".join(f"{name} {white:g} pC and {100 * gain:.3g} %" for name, white, gain in noise)
     error_rows = "\n".join(
@@ -72,7 +71,8 @@ Estimates the position and the force of one press from the charges of the sensor
 | | |
 |---|---|
 | input | `charge_pC`, float32 [n, {len(electrodes)}], touch charges of {", ".join(electrodes)} in pC |
-| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlations}, `misfit` |
+| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each), \
+`contact_correlation` (xy, xF, yF), `misfit` |
 | working area | {_area_text(fitted)} |
 | forces | {_forces_text(metadata)} |
 | probes | {", ".join(metadata.probes)} |

@@ -16,13 +16,7 @@ from isocharge.common.errors import ModelError, cut
 from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS
 from isocharge.train.training.activations import ACTIVATIONS
 from isocharge.train.training.charge_features import ChargeFeatures
-from isocharge.train.training.folded_network import (
-    COSINES_TO_CORRELATIONS,
-    LOG_STD,
-    MISFIT_UNIT,
-    POSITION,
-    FoldedNetwork,
-)
+from isocharge.train.training.folded_network import COSINES_TO_CORRELATIONS, MISFIT_UNIT, FoldedNetwork
 from isocharge.train.training.perceptron import Layer, Perceptron
 
 OPSET = 17
@@ -83,7 +77,7 @@ def write_graph(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
 
     Returns:
         The ONNX file. Its input is `charge_pC` [n, n_electrode]. Its outputs are `contact` [n, 3], `contact_std` [n,
-        3], `contact_correlation` [n, 3] if the network has correlations, and `misfit` [n, 1]. All tensors are float32.
+        3], `contact_correlation` [n, 3] and `misfit` [n, 1]. All tensors are float32.
     """
     model = _whole_model(network)
     helper.set_model_props(model, dict(properties))
@@ -95,8 +89,8 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     """Return the ONNX model of a network, without metadata.
 
     The outputs of the perceptron are called answers. The nodes after the perceptron convert the answers into the
-    outputs of the graph: the contact, its standard deviations, the correlations if the network has them, and the
-    misfit. In this function, a tensor is represented by its name.
+    outputs of the graph: the contact, its standard deviations, the correlations and the misfit. In this function, a
+    tensor is represented by its name.
 
     Args:
         network: The network.
@@ -105,40 +99,20 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     n_electrode = network.features.n_electrode
 
     # Split the answers: x and y, the logarithms of the force and of the three standard deviations, the angles that
-    # determine the correlations, and the misfit vector.
-    n_std = LOG_STD.stop - LOG_STD.start
-    widths = {"plane": POSITION.stop, "log_force": 1, "log_std": n_std}
-    if network.log_std_limits is None:
-        widths = {"plane": POSITION.stop, "logs": 1 + n_std}
-    if network.n_angle:
-        widths["angles"] = network.n_angle
-    widths["misfit_vector"] = n_electrode
-    position, *logarithms, misfit_vector = builder.split(_add_answers(builder, network), widths)
-    optional_angles = logarithms[-1:] if network.n_angle else []
-
-    # The exponentials of the logarithms are the force and the standard deviations.
-    if network.log_std_limits is None:
-        # A result of the split has the name of an output of the graph, `contact_std`, so it needs no further node.
-        force, _ = builder.split(builder.add("Exp", logarithms[0]), {"force": 1, "contact_std": n_std})
-    else:
-        lower, upper = network.log_std_limits
-        log_force, log_std = logarithms[:2]
-        force = builder.add("Exp", log_force)
-        limited_below = builder.add("Max", log_std, builder.constant(lower))
-        builder.add("Exp", builder.add("Min", limited_below, builder.constant(upper)), to="contact_std")
+    # determine the correlations, and the misfit vector. The exponentials of the logarithms are the force and the
+    # standard deviations. A result of a split has the name of an output of the graph, so it needs no further node.
+    widths = {"plane": 2, "logs": 4, "angles": len(COSINES_TO_CORRELATIONS), "misfit_vector": n_electrode}
+    position, logarithms, angles, misfit_vector = builder.split(_add_answers(builder, network), widths)
+    force, _ = builder.split(builder.add("Exp", logarithms), {"force": 1, "contact_std": 3})
     builder.add("Concat", position, force, to="contact", axis=1)
-    for angles in optional_angles:  # one tensor, or none if the network has no correlations
-        cosines = builder.add("Cos", angles)
-        builder.add("MatMul", cosines, builder.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
+    cosines = builder.add("Cos", angles)
+    builder.add("MatMul", cosines, builder.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
     # The length of the misfit vector is asinh(misfit / MISFIT_UNIT).
     compressed_misfit = builder.add("ReduceL2", misfit_vector, axes=[1], keepdims=1)
     builder.add("Mul", builder.add("Sinh", compressed_misfit), builder.constant(MISFIT_UNIT), to="misfit")
 
-    outputs = dict(OUTPUTS)
-    if not network.n_angle:
-        del outputs[CORRELATION]
     declared_inputs = _declare({INPUT: n_electrode})
-    graph = helper.make_graph(builder.nodes, "isocharge", declared_inputs, _declare(outputs), builder.constants)
+    graph = helper.make_graph(builder.nodes, "isocharge", declared_inputs, _declare(OUTPUTS), builder.constants)
     opset = helper.make_opsetid("", OPSET)
     return helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="isocharge")
 
@@ -255,7 +229,6 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     activation = activations[operators[operators.index("Gemm") + 1]]
     n_hidden = operators.count(activation.onnx_operator)  # each hidden layer has one activation
     is_signed = operators[0] == "Max"  # the first node of a graph for charges of both signs
-    has_limits = operators.count("Max") > is_signed  # the standard deviations have limits
 
     names = [name for node in graph.node for name in node.input]
     tensors = {tensor.name: numpy_helper.to_array(tensor).astype(float) for tensor in graph.initializer}
@@ -271,7 +244,4 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     # ONNX would also repeat a single number for all columns, C does not.
     if any(layer.bias.shape != layer.weight.shape[1:] for layer in (*hidden, last, Layer(skip, bias))):
         raise ValueError("expected a bias for each column of the weights")
-    layers = Perceptron(tuple(hidden), last, skip, activation)
-    next(constants)  # the widths of the split of the answers
-    limits = np.array([next(constants), next(constants)]) if has_limits else None
-    return FoldedNetwork(features, layers, limits)
+    return FoldedNetwork(features, Perceptron(tuple(hidden), last, skip, activation))

@@ -33,15 +33,10 @@ MEAN = slice(0, 3)
 LOG_STD = slice(3, 6)
 """Columns of the answers with the logarithms of the standard deviations of x and y in mm and of the force in N."""
 
-N_CONTACT_ANSWERS = 6
-"""Number of answers about the contact. They come before the angles of the correlations and before the misfit vector."""
+ANGLES = slice(6, 14)
+"""Columns of the answers with the angles whose cosines determine the correlations, rad.
 
-UNIT_LOG_STD_RANGE = (-10.0, 3.0)
-"""Smallest and largest logarithm of a standard deviation, relative to half of the width of the domain.
-
-The range includes all standard deviations that have a meaning: from a twenty-thousandth of the half width to twenty
-times the half width. Without these limits, charges unlike those of the training could have infinite standard deviations
-or standard deviations of zero, and a training could diverge.
+They come after the other answers about the contact and before the misfit vector.
 """
 
 COSINES_TO_CORRELATIONS = np.array(
@@ -76,37 +71,12 @@ class FoldedNetwork:
     Attributes:
         features: Input features.
         layers: Perceptron that computes the answers from the features. The answers are x and y (2), ln F (1),
-            logarithms of the standard deviations (3), angles of the correlations (8, or 0 without correlations), and
-            the misfit vector (n_electrode).
-        log_std_limits: Smallest and largest logarithms of the standard deviations, shape (2, 3), in the units of the
-            answers (`isocharge.train.training.folding.log_std_limits`). None for a network without limits, as in models
-            of which the graph contains none.
+            logarithms of the standard deviations (3), angles of the correlations (8), and the misfit vector
+            (n_electrode).
     """
 
     features: ChargeFeatures
     layers: Perceptron
-    log_std_limits: Array | None = None
-
-    @property
-    def n_angle(self) -> int:
-        """Number of answers that are angles of the correlations: 8, or 0 if the network estimates no correlations."""
-        return int(self.layers.skip.shape[1]) - N_CONTACT_ANSWERS - self.features.n_electrode
-
-    @property
-    def angle_columns(self) -> slice:
-        """Columns of the answers with the angles of the correlations."""
-        return slice(N_CONTACT_ANSWERS, N_CONTACT_ANSWERS + self.n_angle)
-
-    def answers(self, charge: Array) -> Array:
-        """Compute the answers of the perceptron, which `outputs_from_answers` converts to outputs.
-
-        Args:
-            charge: Charges, shape (n, n_electrode), pC.
-
-        Returns:
-            Answers, shape (n, n_answer).
-        """
-        return np.asarray(self.layers.evaluate(self.features.evaluate(charge)), dtype=float)
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Estimate contacts.
@@ -118,48 +88,27 @@ class FoldedNetwork:
             Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3). Misfits,
             shape (n, 1).
         """
-        contact, std, *_, misfit = self.outputs(charge)
+        contact, std, _, misfit = self.outputs(charge)
         return contact, std, misfit
 
-    def outputs(self, charge: Array) -> tuple[Array, ...]:
+    def outputs(self, charge: Array) -> tuple[Array, Array, Array, Array]:
         """Compute the outputs of the exported graph.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
-            Contacts and standard deviations, as `predict` returns them. Correlations, shape (n, 3), if the network
-            estimates them. Misfits, shape (n, 1).
+            Contacts and standard deviations, as `predict` returns them. Correlations, shape (n, 3). Misfits, shape
+            (n, 1).
         """
-        return self.outputs_from_answers(self.answers(charge))
-
-    def outputs_from_answers(self, answers: Array) -> tuple[Array, ...]:
-        """Compute the outputs of the model from the answers of the perceptron.
-
-        Args:
-            answers: Answers, shape (n, n_answer): x, y and ln F, the logarithms of the standard deviations, the angles
-                of the correlations if the network estimates them, and the misfit vector.
-
-        Returns:
-            Contacts, shape (n, 3), standard deviations, shape (n, 3), correlations, shape (n, 3), if the network
-            estimates them, and misfits, shape (n, 1).
-        """
-        force = np.exp(answers[:, LOG_FORCE])
-        contact = np.concatenate([answers[:, POSITION], force], axis=1)
-        log_std = answers[:, LOG_STD]
-        if self.log_std_limits is not None:
-            log_std = np.clip(log_std, *self.log_std_limits)
-        std = np.exp(log_std)
-        outputs = [contact, std]
-        if self.n_angle > 0:
-            # Each correlation is a weighted sum of the cosines of the eight angles.
-            correlations = np.cos(answers[:, self.angle_columns]) @ COSINES_TO_CORRELATIONS
-            outputs.append(correlations)
+        answers = self.layers.evaluate(self.features.evaluate(charge))
+        contact = np.concatenate([answers[:, POSITION], np.exp(answers[:, LOG_FORCE])], axis=1)
+        std = np.exp(answers[:, LOG_STD])
+        # Each correlation is a weighted sum of the cosines of the eight angles.
+        correlation = np.cos(answers[:, ANGLES]) @ COSINES_TO_CORRELATIONS
         # The misfit vector follows the angles. Its length is asinh(misfit / MISFIT_UNIT).
-        misfit_vector = answers[:, self.angle_columns.stop :]
-        compressed_misfit = np.linalg.norm(misfit_vector, axis=1, keepdims=True)
-        outputs.append(MISFIT_UNIT * np.sinh(compressed_misfit))
-        return tuple(outputs)
+        compressed_misfit = np.linalg.norm(answers[:, ANGLES.stop :], axis=1, keepdims=True)
+        return contact, std, correlation, MISFIT_UNIT * np.sinh(compressed_misfit)
 
     def with_scaled_std(self, position_factor: float, force_factor: float) -> "FoldedNetwork":
         """Return a network whose standard deviations of position and force are multiplied by two given factors.

@@ -19,7 +19,7 @@ can be written as sums of cosines. The correlations are therefore linear in eigh
 In the exported graph, one node computes the cosines, and another node computes their weighted sums.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,20 +27,14 @@ from scipy.linalg import block_diag
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
-from isocharge.train.training.folded_network import (
-    LOG_FORCE,
-    LOG_STD,
-    MEAN,
-    N_CONTACT_ANSWERS,
-    UNIT_LOG_STD_RANGE,
-)
+from isocharge.train.training.folded_network import ANGLES, LOG_FORCE, LOG_STD, MEAN
 from isocharge.train.training.perceptron import Layer, Perceptron
 
-N_CONTACT_OUTPUTS = 9
-"""Number of outputs of the contact perceptron: means, logarithms of the standard deviations, and turns."""
+TURN = slice(6, 9)
+"""Columns of the outputs of the contact perceptron with the turns, which are the angles minus a right angle.
 
-TURN = slice(N_CONTACT_ANSWERS, N_CONTACT_OUTPUTS)
-"""Columns of the outputs of the contact perceptron with the turns, which are the angles minus a right angle."""
+The means and the logarithms of the standard deviations come before the turns.
+"""
 
 ANGLES_TO_COSINE_ARGUMENTS = np.array(
     [
@@ -76,19 +70,20 @@ def fold(perceptrons: Sequence[Perceptron], mean: Array, matrix: Array, answer_m
     Returns:
         Perceptron that computes the answers from the features.
     """
-    joined = _join_perceptrons(perceptrons)
-    first, *other_hidden = joined.hidden
+    first_layers, *later_groups = zip(*(perceptron.hidden for perceptron in perceptrons), strict=True)
+    first = _join_layers(first_layers, np.hstack([layer.weight for layer in first_layers]))
+    later = [_join_blocks(layers) for layers in later_groups]
+    last = _join_blocks([perceptron.last for perceptron in perceptrons])
     # ((features - mean) @ matrix) @ weight + bias  =  features @ (matrix @ weight) + (bias - mean @ matrix @ weight)
     first_weight = matrix @ first.weight
     first_bias = first.bias - mean @ first_weight
-    skip = matrix @ joined.skip @ answer_map.weight
-    last_weight = joined.last.weight @ answer_map.weight
+    skip = matrix @ np.hstack([perceptron.skip for perceptron in perceptrons]) @ answer_map.weight
     # The skip layer has no bias. The term - mean @ skip is therefore added to the bias of the last layer.
-    last_bias = joined.last.bias @ answer_map.weight + answer_map.bias - mean @ skip
+    last_bias = last.bias @ answer_map.weight + answer_map.bias - mean @ skip
     return replace(
-        joined,
-        hidden=(Layer(first_weight, first_bias), *other_hidden),
-        last=Layer(last_weight, last_bias),
+        perceptrons[0],
+        hidden=(Layer(first_weight, first_bias), *later),
+        last=Layer(last.weight @ answer_map.weight, last_bias),
         skip=skip,
     )
 
@@ -107,7 +102,7 @@ def linear_answer_map(domain: Domain, n_electrode: int) -> Layer:
         n_electrode: Number of electrodes, which is also the number of entries of the misfit vector.
     """
     # The identity matrices leave the logarithms of the standard deviations and the misfit vector unchanged.
-    weight = np.asarray(block_diag(np.eye(N_CONTACT_ANSWERS), ANGLES_TO_COSINE_ARGUMENTS, np.eye(n_electrode)))
+    weight = block_diag(np.eye(TURN.start), ANGLES_TO_COSINE_ARGUMENTS, np.eye(n_electrode))
     bias = np.zeros(weight.shape[1])
 
     # Means: u * scale + centre.
@@ -121,53 +116,15 @@ def linear_answer_map(domain: Domain, n_electrode: int) -> Layer:
     bias[LOG_FORCE_STD] += bias[LOG_FORCE]
 
     # The perceptron computes the angles minus a right angle.
-    n_angle = ANGLES_TO_COSINE_ARGUMENTS.shape[1]
-    bias[N_CONTACT_ANSWERS : N_CONTACT_ANSWERS + n_angle] = 0.5 * np.pi * ANGLES_TO_COSINE_ARGUMENTS.sum(axis=0)
+    bias[ANGLES] = 0.5 * np.pi * ANGLES_TO_COSINE_ARGUMENTS.sum(axis=0)
     return Layer(weight, bias)
 
 
-def log_std_limits(domain: Domain) -> Array:
-    """Return the smallest and largest answers for the logarithms of the standard deviations, shape (2, 3).
-
-    The limits are `UNIT_LOG_STD_RANGE` relative to the scale of the domain. The third answer belongs to the absolute
-    standard deviation of the force. Its limits are those of the smallest and of the largest force.
-
-    Args:
-        domain: Domain that defines the centre and the scale of the unit coordinates.
-    """
-    log_force_limits = domain.centre[LOG_FORCE] + domain.scale[LOG_FORCE] * [-1.0, 1.0]
-    limits = np.log(domain.scale) + np.array(UNIT_LOG_STD_RANGE)[:, None]
-    limits[:, LOG_FORCE] += log_force_limits[:, None]
-    return np.asarray(limits)
+def _join_blocks(layers: Sequence[Layer]) -> Layer:
+    """Join layers with different inputs into one layer. Its weights are a block-diagonal matrix."""
+    return _join_layers(layers, block_diag(*[layer.weight for layer in layers]))
 
 
-def _join_perceptrons(perceptrons: Sequence[Perceptron]) -> Perceptron:
-    """Join several perceptrons with the same inputs into one perceptron, which computes all their outputs."""
-    # Group the hidden layers by depth: each group contains one layer of each perceptron.
-    first_layers, *later_groups = zip(*(perceptron.hidden for perceptron in perceptrons), strict=True)
-    first = _join_layers(first_layers, np.hstack)  # the first layers have the same inputs
-    later = [_join_layers(layers, _block_diagonal) for layers in later_groups]  # each layer has its own inputs
-    return Perceptron(
-        hidden=(first, *later),
-        last=_join_layers([perceptron.last for perceptron in perceptrons], _block_diagonal),
-        skip=np.hstack([perceptron.skip for perceptron in perceptrons]),
-        activation=perceptrons[0].activation,
-    )
-
-
-def _join_layers(layers: Sequence[Layer], join_weights: Callable[[Sequence[Array]], Array]) -> Layer:
-    """Join several layers into one layer, which computes the outputs of all these layers in order.
-
-    Args:
-        layers: Layers to join.
-        join_weights: Function that joins the weights, which is `np.hstack` if the layers have the same inputs, and
-            `_block_diagonal` if each layer has its own inputs.
-    """
-    weight = join_weights([layer.weight for layer in layers])
-    bias = np.concatenate([layer.bias for layer in layers])
-    return Layer(weight, bias)
-
-
-def _block_diagonal(matrices: Sequence[Array]) -> Array:
-    """Return a block-diagonal matrix with the given matrices as its blocks."""
-    return np.asarray(block_diag(*matrices))
+def _join_layers(layers: Sequence[Layer], weight: Array) -> Layer:
+    """Return a layer with the given weights, which computes the outputs of all given layers in order."""
+    return Layer(weight, np.concatenate([layer.bias for layer in layers]))

@@ -26,14 +26,8 @@ from isocharge.common.contact_domain import Domain
 from isocharge.train.training.activations import ACTIVATIONS, TANH, Activation
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.features import WhitenedFeatures
-from isocharge.train.training.folded_network import (
-    LOG_FORCE,
-    LOG_STD,
-    MEAN,
-    MISFIT_UNIT,
-    FoldedNetwork,
-)
-from isocharge.train.training.folding import N_CONTACT_OUTPUTS, TURN, fold, linear_answer_map, log_std_limits
+from isocharge.train.training.folded_network import LOG_FORCE, LOG_STD, MEAN, MISFIT_UNIT, FoldedNetwork
+from isocharge.train.training.folding import TURN, fold, linear_answer_map
 from isocharge.train.training.perceptron import Layer, Perceptron
 
 LARGEST_INT8 = 127
@@ -195,13 +189,13 @@ class InverseNetwork(nn.Module):
         n_electrode = self.n_electrode
         activation = ACTIVATIONS[config.activation]
         widths = config.contact_widths(n_electrode)
-        self.contact = TrainablePerceptron(n_electrode, widths, N_CONTACT_OUTPUTS, activation)
+        self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop, activation)
         self.contact.sharpen_first_layer()
         self.misfit_vector = TrainablePerceptron(
             n_electrode, config.misfit_widths(n_electrode), n_electrode, activation
         )
-        self.output_factor = nn.Buffer(torch.ones(N_CONTACT_OUTPUTS))
-        self.output_offset = nn.Buffer(torch.zeros(N_CONTACT_OUTPUTS))
+        self.output_factor = nn.Buffer(torch.ones(TURN.stop))
+        self.output_offset = nn.Buffer(torch.zeros(TURN.stop))
         if force_std is not None:
             self.output_factor[FORCE_OUTPUTS] = 0.0
             self.output_offset[LOG_STD.stop - 1] = np.log(force_std / domain.scale[2])
@@ -232,30 +226,7 @@ class InverseNetwork(nn.Module):
     def posterior(self, charge: Tensor) -> Posterior:
         """Estimate the contacts of n presses from their charges, shape (n, n_electrode), pC."""
         outputs = self.contact(self.inputs(charge)) * self.output_factor + self.output_offset
-        mean = outputs[:, MEAN]
-        return Posterior(mean, limit_log_std(outputs[:, LOG_STD], mean, self.domain), outputs[:, TURN])
-
-
-def limit_log_std(log_std: Tensor, mean: Tensor, domain: Domain) -> Tensor:
-    """Limit the logarithms of the standard deviations as a folded network does (`log_std_limits`).
-
-    Beyond a limit, the gradient of the result is not zero, but the same as within the limits. A training therefore
-    leaves a limit as soon as the errors require it.
-
-    Args:
-        log_std: Logarithms of the standard deviations of the unit coordinates, shape (n, 3).
-        mean: Means of the unit coordinates, shape (n, 3).
-        domain: Domain that defines the unit coordinates.
-
-    Returns:
-        Limited logarithms, shape (n, 3).
-    """
-    # The limits are those of the standard deviations of x, y and F, where the one of F is F times the one of ln F.
-    log_unit = as_tensor(np.log(domain.scale)).repeat(len(mean), 1)
-    log_unit[:, 2] += mean[:, 2].detach() * domain.scale[2] + domain.centre[2]
-    answer = log_std.detach() + log_unit
-    lower, upper = as_tensor(log_std_limits(domain))
-    return log_std + (answer.clamp(lower, upper) - answer)
+        return Posterior(outputs[:, MEAN], outputs[:, LOG_STD], outputs[:, TURN])
 
 
 def compress_length(residual: Tensor) -> Tensor:
@@ -289,7 +260,7 @@ def fold_network(network: InverseNetwork) -> FoldedNetwork:
     perceptrons = [contact, network.misfit_vector.to_numpy()]
     answer_map = linear_answer_map(network.domain, charge_features.n_electrode)
     layers = fold(perceptrons, _to_numpy(network.features_mean), _to_numpy(network.whitening), answer_map)
-    return FoldedNetwork(charge_features, layers, log_std_limits(network.domain))
+    return FoldedNetwork(charge_features, layers)
 
 
 def _to_numpy(tensor: Tensor) -> Array:

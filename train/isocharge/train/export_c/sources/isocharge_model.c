@@ -13,7 +13,7 @@ static float clip(float x, float low, float high)
 
 $features
 $layers
-$limits/* What the last layer gives, still without the functions of `contact_of`. */
+/* What the last layer gives, still without the functions of `contact_of`. */
 static void answers_of(const float charge_pC[ISOCHARGE_ELECTRODES], float answers[$answers])
 {
     float logs[$electrodes], $rows, skipped[$answers];
@@ -28,10 +28,8 @@ static void contact_of(const float answers[$answers], float contact[7])
 
     for (int i = 0; i < $plane; ++i)
         contact[i] = answers[i];
-    for (int i = $plane; i < $stds; ++i)
+    for (int i = $plane; i < $logs; ++i)
         contact[i] = expf(answers[i]);
-    for (int i = $stds; i < $logs; ++i)
-        contact[i] = expf($log_std);
     for (int i = $known; i < $answers; ++i)
         length += answers[i] * answers[i];
     contact[$logs] = sinhf(sqrtf(length)) * $misfit_unit;
@@ -79,4 +77,18 @@ unsigned isocharge_flags(const float contact[7])
         flags |= ISOCHARGE_STRESS;
     return flags;
 }
-$all
+
+/* From cosines to correlations: always those of a valid covariance. */
+$table
+void isocharge_predict_all(const float charge_pC[ISOCHARGE_ELECTRODES], float contact[10])
+{
+    float answers[$answers];
+
+    answers_of(charge_pC, answers);
+    contact_of(answers, contact);
+    for (int i = 0; i < 3; ++i) {
+        contact[7 + i] = 0.0f;
+        for (int k = 0; k < $cosines; ++k)
+            contact[7 + i] += COSINES[3 * k + i] * cosf(answers[$first + k]);
+    }
+}

@@ -46,7 +46,11 @@ void isocharge_predict(const float charge_pC[ISOCHARGE_ELECTRODES], float contac
 
 /* The reasons not to trust a contact of isocharge_predict, as bits; 0 if there is none. */
 unsigned isocharge_flags(const float contact[7]);
-$all
+
+/* The same with xy_correlation, xF_correlation and yF_correlation behind: how the errors of position and force go
+   together, -1 to 1. */
+void isocharge_predict_all(const float charge_pC[ISOCHARGE_ELECTRODES], float contact[10]);
+
 #ifdef __cplusplus
 }
 #endif

@@ -19,7 +19,7 @@ int main(void)
     int row, column, wrong = 0;
 
     for (row = 0; row < VECTORS; ++row) {
-        $function(CHARGE_PC + row * ISOCHARGE_ELECTRODES, contact);
+        isocharge_predict_all(CHARGE_PC + row * ISOCHARGE_ELECTRODES, contact);
         for (column = 0; column < $numbers; ++column) {
             const float expected = CONTACT[row * $numbers + column];
             const float apart = fabsf(contact[column] - expected) / fmaxf(fabsf(expected), FLOOR[column]);
