@@ -25,7 +25,7 @@ from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import Application, HttpServer
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.record.record import field_names
+from isocharge.serve.record.record import selected_fields
 
 NAMES = ("A", "B", "C", "D")
 """Names of the electrodes."""
@@ -251,7 +251,7 @@ def fill_disk(monkeypatch):
 @pytest.fixture
 def contract():
     """Names of the fields of a prediction record, in their order."""
-    return list(field_names())
+    return [field.name for field in selected_fields()]
 
 
 @pytest.fixture

@@ -1,6 +1,4 @@
-"""Export of prediction records to MCAP files with ROS 2 messages, which other tools can read.
-
-MCAP files need the extra `record`.
+"""Conversion of prediction records to ROS 2 messages.
 
 May import: record.
 """

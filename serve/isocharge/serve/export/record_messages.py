@@ -20,7 +20,6 @@ only as a part of a writer that is much slower and cannot write JSON. The tests 
 import math
 import struct
 from collections.abc import Mapping
-from enum import StrEnum
 from typing import Any
 
 from isocharge.common.errors import InputError
@@ -214,10 +213,3 @@ def _string(text: str) -> bytes:
     """Encode a text in CDR: the number of the following bytes, the text in UTF-8, and a zero byte."""
     data = text.encode() + b"\0"
     return struct.pack("<I", len(data)) + data
-
-
-class RecordEncoding(StrEnum):
-    """Encoding of the records in an MCAP file: JSON with a schema, or the same JSON text in ROS 2 messages."""
-
-    json = "json"
-    ros2 = "ros2"

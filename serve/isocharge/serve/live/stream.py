@@ -21,7 +21,8 @@ from isocharge.serve.live.device import ANY_BOARD, Device, create_stages
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.serial_line import TELNET_ADVICE, without_telnet
 from isocharge.serve.port.source import Chunk
-from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord
+from isocharge.serve.record.fields import Charges
+from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, PredictionRecord
 from isocharge.serve.signal_chain.stage import Stage
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule

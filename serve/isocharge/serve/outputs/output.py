@@ -11,11 +11,13 @@ Example of such an entry point in pyproject.toml:
 
 import sys
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 from isocharge.common.errors import IsochargeError, OutputError
+from isocharge.common.files import AtomicWriter, new_file
 from isocharge.serve.record.record import PredictionRecord
 
 
@@ -66,20 +68,38 @@ def is_file_with(suffix: str) -> Callable[[str], bool]:
     return lambda target: target.endswith(suffix) and "://" not in target
 
 
-class _Incomplete(Exception):
-    """Error with which `exit_with_error` leaves contexts."""
+class FileOutput:
+    """Base class of outputs that write to a new file.
 
-
-def exit_with_error(contexts: ExitStack) -> None:
-    """Leave contexts in the same way as after an error in their `with` block.
-
-    A context that has created a file therefore removes this file, because it is incomplete.
-
-    Args:
-        contexts: The contexts that were entered.
+    If the records come from a sensor, the file has its final name from the beginning. In a replay, the file has a
+    temporary name until it is complete.
     """
-    with suppress(_Incomplete), contexts:
-        raise _Incomplete
+
+    def __init__(self, path: Path, *, is_live: bool) -> None:
+        """Create the file.
+
+        Args:
+            path: Path of the file, which must not exist yet.
+            is_live: Whether the records come from a sensor.
+
+        Raises:
+            OutputExists: If the file exists already.
+            OutputError: If the file cannot be created.
+        """
+        self._path = path
+        # When the stack is closed, it closes the file and, in a replay, gives the file its final name.
+        self._stack = ExitStack()
+        written_path = path if is_live else self._stack.enter_context(new_file(path))
+        self._file = AtomicWriter(written_path)
+        self._stack.callback(self._file.close)
+
+    def close(self) -> None:
+        """Close the file. In a replay, also rename the file from its temporary name to its final name."""
+        self._stack.close()
+
+    def discard(self) -> None:
+        """Close the file. In a replay, also remove the file, because it is incomplete."""
+        self._stack.__exit__(EOFError, EOFError(), None)  # `new_file` removes the file after an error
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,15 +3,29 @@
 import logging
 from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any, Self
 
 from isocharge.common.errors import InputError, shown
-from isocharge.serve.outputs.mcap_output import MCAP_FILE, ROS2_MCAP_FILE
-from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, discard, output_error
+from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, discard, is_file_with, output_error
 from isocharge.serve.outputs.queued_output import QueuedOutput
 from isocharge.serve.outputs.text_outputs import CSV_FILE, JSON_FILE, NO_OUTPUT, STDOUT_CSV, STDOUT_JSON
 from isocharge.serve.outputs.udp_output import UDP
 from isocharge.serve.record.record import PredictionRecord
+
+ROS2_SUFFIX = ".ros2.mcap"
+"""End of the name of an MCAP file whose records are ROS 2 messages instead of JSON with a schema."""
+
+
+def _open_mcap(target: str, context: OutputContext) -> Output:
+    from isocharge.serve.outputs.mcap_file import McapFile  # needs the extra `record`
+
+    is_ros2 = target.endswith(ROS2_SUFFIX)
+    return McapFile(Path(target), context.electrodes, is_ros2=is_ros2, is_live=context.is_live)
+
+
+ROS2_MCAP_FILE = OutputKind(form=f"FILE{ROS2_SUFFIX}", accepts=is_file_with(ROS2_SUFFIX), open=_open_mcap)
+MCAP_FILE = OutputKind(form="FILE.mcap", accepts=is_file_with(".mcap"), open=_open_mcap)
 
 OUTPUT_KINDS: tuple[OutputKind, ...] = (
     STDOUT_JSON,

@@ -2,10 +2,9 @@
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from isocharge.serve.record.fields import Field
 from isocharge.serve.record.record import DECIMALS, PredictionRecord, selected_fields
 
 
@@ -19,14 +18,8 @@ def csv_header(electrodes: Sequence[str], *, with_tracking: bool = False, with_f
         with_tracking: Whether the records have the fields of the tracking.
         with_film: Whether the records have the fields of the film follower.
     """
-    columns: list[str] = []
-    for field in selected_fields(with_tracking=with_tracking, with_film=with_film):
-        part_names = _part_names(field, electrodes)
-        if part_names is None:  # the field has one column
-            columns.append(field.name)
-        else:
-            columns += [f"{field.name}.{part_name}" for part_name in part_names]
-    return _line(columns)
+    columns = _columns(electrodes, with_tracking=with_tracking, with_film=with_film)
+    return _line(name if part is None else f"{name}.{part}" for name, part in columns)
 
 
 def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
@@ -38,40 +31,31 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
         record: Record to convert.
         electrodes: Names of the electrodes, in the order of the header.
     """
-    fields = selected_fields(with_tracking=record.tracking is not None, with_film=record.film is not None)
+    has_tracking = record.tracking is not None
+    has_film = record.film is not None
     cells: list[str] = []
-    for field in fields:
-        value = getattr(record, field.name)
-        part_names = _part_names(field, electrodes)
-        if part_names is None:  # the field has one column
-            cells.append(_cell(value))
-        elif value is None:  # the cells of all parts are empty
-            cells += [""] * len(part_names)
-        elif field.kind == "charges":  # a dictionary of the charges by electrode
-            cells += [_cell(value[electrode]) for electrode in electrodes]
-        else:  # an object, whose parts are attributes
-            cells += [_cell(getattr(value, part_name)) for part_name in part_names]
+    for name, part in _columns(electrodes, with_tracking=has_tracking, with_film=has_film):
+        value = getattr(record, name)
+        if part is not None and value is not None:
+            value = value[part] if isinstance(value, dict) else getattr(value, part)
+        cells.append(_cell(value))
     return _line(cells)
 
 
-def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str] | None:
-    """Return the names of the parts of a field that has several columns in a CSV file.
+def _columns(electrodes: Sequence[str], *, with_tracking: bool, with_film: bool) -> Iterator[tuple[str, str | None]]:
+    """Yield the name of the field and the name of its part for each column.
 
-    If the value of the field is a set of charges, the parts are the charges of the electrodes. If the value is an
-    object, the parts are the fields of the object. Each part has one column.
-
-    Args:
-        field: Field of a record.
-        electrodes: Names of the electrodes.
-
-    Returns:
-        The names; None if the field has one column.
+    The parts of charges are the electrodes, and the parts of an object are its fields. The part is None for a field
+    with one column.
     """
-    if field.kind == "charges":
-        return electrodes
-    if field.kind == "object":
-        return [part.name for part in field.parts]
-    return None
+    for field in selected_fields(with_tracking=with_tracking, with_film=with_film):
+        parts: Iterable[str | None] = [None]
+        if field.kind == "charges":
+            parts = electrodes
+        elif field.kind == "object":
+            parts = [part.name for part in field.parts]
+        for part in parts:
+            yield field.name, part
 
 
 def _line(cells: Iterable[str]) -> str:

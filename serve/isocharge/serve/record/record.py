@@ -7,17 +7,15 @@ CSV file.
 """
 
 import json
+from functools import cache
 from typing import Annotated, Any
 
 from msgspec import Struct, structs
 
-from isocharge.serve.record.fields import Field, Meaning, fields_of
+from isocharge.serve.record.fields import Charges, Field, Meaning, fields_of
 
 DECIMALS = 6
 """Number of decimals in JSON and CSV. The last decimal is 1 nm, 1 uN, 1 aC or 1 us, which no sensor resolves."""
-
-Charges = dict[str, float | None]
-"""Charges by the name of the electrode, pC; None if the device sent no number."""
 
 
 class TrackedContact(Struct, frozen=True):
@@ -163,15 +161,15 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
         if self.tracking is not None:
             values |= structs.asdict(self.tracking)
         json_values: dict[str, Any] = {}
-        for name in _NAMES[self.tracking is not None, self.film is not None]:
-            value = values[name]
+        for field in selected_fields(with_tracking=self.tracking is not None, with_film=self.film is not None):
+            value = values[field.name]
             value_class = value.__class__  # comparing the class is faster than a call of `isinstance`
             if value_class is float:
                 value = round(value, DECIMALS)
             elif value_class not in _UNCHANGED:  # the charges by electrode, or a struct of numbers
                 numbers = value if value_class is dict else structs.asdict(value)
                 value = {key: None if number is None else round(number, DECIMALS) for key, number in numbers.items()}
-            json_values[name] = value
+            json_values[field.name] = value
         return json_values
 
     def to_json(self) -> str:
@@ -212,7 +210,8 @@ NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
 """Values of the `CONTACT_FIELDS` if nothing touches."""
 
 
-def selected_fields(*, with_tracking: bool, with_film: bool) -> tuple[Field, ...]:
+@cache
+def selected_fields(*, with_tracking: bool = False, with_film: bool = False) -> tuple[Field, ...]:
     """Return the fields that every record has, and the fields of the selected optional groups.
 
     There are two optional groups. The first group contains the fields that the tracking of contacts adds. The second
@@ -228,26 +227,6 @@ def selected_fields(*, with_tracking: bool, with_film: bool) -> tuple[Field, ...
     if with_film:
         selected_groups.add("film")
     return tuple(field for field in RECORD_FIELDS if field.group in selected_groups)
-
-
-_NAMES = {
-    (with_tracking, with_film): tuple(
-        field.name for field in selected_fields(with_tracking=with_tracking, with_film=with_film)
-    )
-    for with_tracking in (False, True)
-    for with_film in (False, True)
-}
-"""Names of the fields of a record, by whether it has the fields of the tracking and those of the film follower."""
-
-
-def field_names(*, with_tracking: bool = False, with_film: bool = False) -> tuple[str, ...]:
-    """Return the names of the fields of a record.
-
-    Args:
-        with_tracking: Whether the record has the fields of the tracking.
-        with_film: Whether the record has the fields of the film follower.
-    """
-    return _NAMES[with_tracking, with_film]
 
 
 _UNCHANGED = frozenset({str, int, bool, tuple, type(None)})

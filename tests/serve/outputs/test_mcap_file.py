@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from io import BytesIO
 from itertools import pairwise
 
@@ -27,7 +27,6 @@ from rosbags.typesys.msg import get_types_from_msg
 
 from isocharge.common.errors import InputError
 from isocharge.serve import PredictionRecord
-from isocharge.serve.export.mcap_file import McapFile, RecordEncoding
 from isocharge.serve.export.record_messages import (
     POSE,
     POSE_DEFINITION,
@@ -37,9 +36,10 @@ from isocharge.serve.export.record_messages import (
     WRENCH_DEFINITION,
 )
 from isocharge.serve.model.contact import Contact
+from isocharge.serve.outputs.mcap_file import McapFile
 from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.targets import Outputs
-from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking, field_names
+from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking, selected_fields
 from isocharge.serve.record.schema import record_schema
 
 ELECTRODES = ("A", "B", "C")
@@ -81,7 +81,7 @@ def records(draw):
 
 def press(number, **changes):
     """A plain record."""
-    values = dict.fromkeys(field_names()) | {
+    values = dict.fromkeys(field.name for field in selected_fields()) | {
         "timestamp": 1763600000.0 + 0.005 * number,
         "x_mm": 3.0 + 1e-3 * number,
         "y_mm": -2.0,
@@ -99,8 +99,8 @@ def press(number, **changes):
     return PredictionRecord(**(values | changes))
 
 
-def write(path, records, encoding=RecordEncoding.json):
-    with McapFile(path, ELECTRODES, encoding) as file:
+def write(path, records, *, is_ros2=False):
+    with closing(McapFile(path, ELECTRODES, is_ros2=is_ros2, is_live=False)) as file:
         for record in records:
             file.write(record)
     return path
@@ -164,14 +164,14 @@ def vector(value):
     return np.array([value.x, value.y, value.z])
 
 
-@pytest.mark.parametrize("encoding", RecordEncoding)
+@pytest.mark.parametrize("is_ros2", [False, True])
 @pytest.mark.usefixtures("rosbags_knows_json")
 @settings(max_examples=15, deadline=None)
 @given(data=st.data())
-def test_rosbags_reads_every_message_of_an_mcap_file(tmp_path_factory, encoding, data):
+def test_rosbags_reads_every_message_of_an_mcap_file(tmp_path_factory, is_ros2, data):
     written = data.draw(st.lists(records(), max_size=20))
     lines = [record.to_json() for record in written]
-    path = write(tmp_path_factory.mktemp("bag") / "touch.mcap", written, encoding)
+    path = write(tmp_path_factory.mktemp("bag") / "touch.mcap", written, is_ros2=is_ros2)
     topics = read_with_rosbags(path)
     for messages in topics.values():
         messages.sort(key=lambda message: message[0])  # messages of one time may come in any order
@@ -230,7 +230,7 @@ def test_every_record_is_valid_under_its_schema(record):
 def test_schema_refuses_json_that_is_not_a_record():
     valid, record = jsonschema_rs.Draft7Validator(record_schema(ELECTRODES)).is_valid, json.loads(press(0).to_json())
     assert valid(record)
-    for name in field_names():
+    for name in (field.name for field in selected_fields()):
         assert not valid({key: value for key, value in record.items() if key != name}), name
         assert not valid(record | {name: [1.0] if name != "contact" else None}), name
 
@@ -242,7 +242,7 @@ def test_wrench_and_pose_describe_the_tracked_contact(tmp_path):
         press(0, tracking=Tracking(tracked, "slide"), film=film, xy_correlation=0.5),
         press(1, tracking=Tracking(tracked), film=film, x_mm=None, force_N=None, flags=("invalid",)),
     ]
-    topics = read_with_rosbags(write(tmp_path / "a.mcap", records, RecordEncoding.ros2))
+    topics = read_with_rosbags(write(tmp_path / "a.mcap", records, is_ros2=True))
     ((_, wrench),), ((_, pose),) = topics["/isocharge/wrench"], topics["/isocharge/pose"]
     assert (wrench.wrench.force.z, wrench.wrench.torque.x) == pytest.approx((-0.25, 1e-3))
     assert (pose.pose.pose.position.x, pose.pose.pose.position.y) == (1e-3, -4e-3)
@@ -262,15 +262,16 @@ def whole_messages(data):
 def test_killed_process_leaves_a_file_with_all_but_the_last_second(tmp_path):
     path = tmp_path / "touch.mcap"
     code = f"""
-import os, pickle, signal, sys
+import os, pickle, signal, sys, time
 from pathlib import Path
-from isocharge.serve.export.mcap_file import McapFile
+from isocharge.serve.outputs.mcap_file import McapFile
 clock = [0.0]
-with McapFile(Path({str(path)!r}), ("A", "B", "C"), now=lambda: clock[0]) as file:
-    for record in pickle.load(sys.stdin.buffer):
-        file.write(record)
-        clock[0] += 0.02
-    os.kill(os.getpid(), signal.SIGKILL)
+time.monotonic = lambda: clock[0]
+file = McapFile(Path({str(path)!r}), ("A", "B", "C"), is_ros2=False, is_live=True)
+for record in pickle.load(sys.stdin.buffer):
+    file.write(record)
+    clock[0] += 0.02
+os.kill(os.getpid(), signal.SIGKILL)
 """
     written = [press(number) for number in range(120)]
     lines = [record.to_json() for record in written]
@@ -283,7 +284,7 @@ with McapFile(Path({str(path)!r}), ("A", "B", "C"), now=lambda: clock[0]) as fil
 
 def test_full_disk_ends_the_mcap_file_but_not_the_stream(tmp_path, fill_disk, caplog, monkeypatch):
     path = tmp_path / "touch.mcap"
-    monkeypatch.setattr("isocharge.serve.export.mcap_file.FLUSH_INTERVAL_S", 0.01)
+    monkeypatch.setattr("isocharge.serve.outputs.mcap_file.FLUSH_INTERVAL_S", 0.01)
     fill_disk(12000)
     written = [press(number, misfit=np.pi * number) for number in range(2000)]
     outputs = Outputs([str(path)], OutputContext(electrodes=ELECTRODES, is_live=True))
@@ -302,7 +303,7 @@ def test_full_disk_ends_the_mcap_file_but_not_the_stream(tmp_path, fill_disk, ca
 
 @pytest.mark.parametrize("timestamp", [None, -1.0, 2.0**31, 1e11])
 def test_timestamp_outside_the_range_of_ros2_is_refused(tmp_path, timestamp):
-    with McapFile(tmp_path / "touch.mcap", ELECTRODES) as file:
+    with closing(McapFile(tmp_path / "touch.mcap", ELECTRODES, is_ros2=False, is_live=True)) as file:
         with pytest.raises(InputError, match=r"timestamp .*: expected unix seconds from 1970 to 2038"):
             file.write(press(0, timestamp=timestamp))
         file.write(press(1))

@@ -1,0 +1,134 @@
+"""MCAP files that contain prediction records, and the wrench and the pose of each press.
+
+| topic | message | written for |
+|---|---|---|
+| `/isocharge/record` | the record, as JSON with its schema or as a `std_msgs/msg/String` of that JSON | every record |
+| `/isocharge/wrench` | `geometry_msgs/msg/WrenchStamped` | every record with a force, including 0 N out of contact |
+| `/isocharge/pose` | `geometry_msgs/msg/PoseWithCovarianceStamped` | every record with a position |
+
+The log time and the publish time of a message are the `timestamp` of the record. At least once per second, a complete
+chunk of messages is written to the file. If the process is killed, the file has no index. Viewers and the command `mcap
+recover` can nevertheless read all records except the records of the last second.
+"""
+
+import json
+import time
+from pathlib import Path
+
+from isocharge.common.extras import require
+from isocharge.common.files import as_output_errors
+from isocharge.serve.export.record_messages import (
+    POSE,
+    POSE_DEFINITION,
+    STRING,
+    STRING_DEFINITION,
+    WRENCH,
+    WRENCH_DEFINITION,
+    pose_stamped,
+    ros_time_ns,
+    string_message,
+    wrench_stamped,
+)
+from isocharge.serve.outputs.output import FileOutput
+from isocharge.serve.record.record import PredictionRecord
+from isocharge.serve.record.schema import SCHEMA_NAME, record_schema
+
+with require("record"):
+    from mcap.writer import Writer
+
+RECORD_TOPIC = "/isocharge/record"
+WRENCH_TOPIC = "/isocharge/wrench"
+POSE_TOPIC = "/isocharge/pose"
+
+FLUSH_INTERVAL_S = 1.0
+"""Longest time for which records wait in memory, s. These records are lost if the process is killed."""
+
+
+class McapFile(FileOutput):
+    """Output that writes records to a new MCAP file.
+
+    Attributes:
+        records: Number of records written.
+    """
+
+    def __init__(self, path: Path, electrodes: tuple[str, ...], *, is_ros2: bool, is_live: bool) -> None:
+        """Create the file, write its header, and register one channel for each of the three topics.
+
+        Args:
+            path: The file, which must not exist.
+            electrodes: Names of the electrodes, for the schema.
+            is_ros2: Whether the records are ROS 2 messages, for tools that refuse all other messages (`ros2 bag`,
+                rosbags). Otherwise the records are JSON with a schema for viewers.
+            is_live: Whether the records come from a sensor.
+
+        Raises:
+            OutputExists: If the file exists already.
+            OutputError: If the file cannot be created.
+        """
+        super().__init__(path, is_live=is_live)
+        self.records = 0
+        self._is_ros2 = is_ros2
+        self._flush_time_s = time.monotonic()
+        self._writer = Writer(self._file)  # type: ignore[arg-type]  # uses only write, tell and flush
+        with as_output_errors(path):
+            self._writer.start(profile="ros2", library="isocharge")
+            schema_text = json.dumps(record_schema(electrodes))
+            record_channel = (
+                self._add_channel(RECORD_TOPIC, "cdr", STRING, "ros2msg", STRING_DEFINITION)
+                if is_ros2
+                else self._add_channel(RECORD_TOPIC, "json", SCHEMA_NAME, "jsonschema", schema_text)
+            )
+            self._channels = {
+                RECORD_TOPIC: record_channel,
+                WRENCH_TOPIC: self._add_channel(WRENCH_TOPIC, "cdr", WRENCH, "ros2msg", WRENCH_DEFINITION),
+                POSE_TOPIC: self._add_channel(POSE_TOPIC, "cdr", POSE, "ros2msg", POSE_DEFINITION),
+            }
+
+    def _add_channel(self, topic: str, encoding: str, schema_name: str, schema_encoding: str, schema: str) -> int:
+        """Register a channel and the schema of its messages in the file, and return the identifier of the channel.
+
+        Args:
+            topic: Topic of the messages.
+            encoding: Encoding of the messages: `json`, or `cdr` for ROS 2 messages.
+            schema_name: Name of the schema, such as "std_msgs/msg/String".
+            schema_encoding: Notation of the schema: `jsonschema`, or `ros2msg` for ROS 2 messages.
+            schema: Text of the schema.
+        """
+        schema_id = self._writer.register_schema(schema_name, schema_encoding, schema.encode())
+        return self._writer.register_channel(topic, encoding, schema_id)
+
+    def write(self, record: PredictionRecord) -> None:
+        """Write a record, its wrench if the force is known, and its pose if something touches the film.
+
+        Raises:
+            InputError: If a time stamp of ROS 2 cannot represent the time of the record.
+            OutputError: If the disk is full or was removed.
+        """
+        values = record.json_values
+        time_ns = ros_time_ns(values)
+        json_text = record.to_json()
+        messages = {
+            RECORD_TOPIC: string_message(json_text) if self._is_ros2 else json_text.encode(),
+            WRENCH_TOPIC: wrench_stamped(values, time_ns),
+            POSE_TOPIC: pose_stamped(values, time_ns),
+        }
+        sequence = self.records % (1 << 32)  # the number in the file has 32 bits
+        with as_output_errors(self._path):
+            for topic, message in messages.items():
+                if message is not None:
+                    channel = self._channels[topic]
+                    self._writer.add_message(channel, time_ns, message, publish_time=time_ns, sequence=sequence)
+            self.records += 1
+            if time.monotonic() - self._flush_time_s >= FLUSH_INTERVAL_S:
+                self._writer.flush()  # type: ignore[no-untyped-call]
+                self._flush_time_s = time.monotonic()
+
+    def close(self) -> None:
+        """Write the index of the messages, and close the file. In a replay, also rename it to its final name."""
+        with as_output_errors(self._path):
+            try:
+                self._writer.finish()  # type: ignore[no-untyped-call]
+            except BaseException:
+                self.discard()
+                raise
+            super().close()
