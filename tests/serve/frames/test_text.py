@@ -67,6 +67,20 @@ def test_digits_in_words_are_no_numbers(text):
     assert parse_line(text).numbers == ()
 
 
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("A: - 3.5, B: 2.5", (-3.5, 2.5)),
+        ("- 3, -4,- 5", (-3.0, -4.0, -5.0)),
+        ("(- 3.5; 2)", (-3.5, 2.0)),
+        ("A - 3.5 B - 2", (3.5, 2.0)),
+    ],
+)
+def test_sign_with_blanks_before_its_number(text, values):
+    """A minus between a word and a number may also be a dash."""
+    assert names_and_values(text)[1] == values
+
+
 def feed(*lines, parser=None):
     """Return the frames in whole lines. A line feed comes first, because a parser drops an incomplete first line."""
     return (parser or TextParser()).feed("".join(f"\n{line}" for line in lines).encode() + b"\n")
@@ -371,7 +385,8 @@ def test_clock_in_text_that_wraps(name, unit, modulus):
 
 
 @pytest.mark.parametrize(
-    ("begin", "end", "restarts"), [*((modulus - 20, modulus, 0) for modulus in (256, 65536)), (290, 301, 1)]
+    ("begin", "end", "restarts"),
+    [*((modulus - 20, modulus, 0) for modulus in (100, 256, 1000, 10_000, 65536)), (290, 301, 1), (70, 98, 1)],
 )
 def test_frame_counter_in_text_that_wraps_or_restarts(begin, end, restarts):
     parser = TextParser()

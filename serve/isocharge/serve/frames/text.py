@@ -20,8 +20,9 @@ in an otherwise intact line. Lines between the frames that never change, such as
 the recognition of the layout.
 
 A column with the name `seq` is the frame counter. A column with the name `t_us`, `t_ms` or `t_s` is the clock of the
-device. All other columns are channels. A frame counter below 256 is assumed to have 8 bits, and all others to have 16
-bits or more. A clock in us or ms is assumed to have 32 bits, and a clock in s is assumed to be a time of day.
+device. All other columns are channels. A frame counter wraps at one of `SEQ_MODULI`: at 256 until it exceeds 255, and
+then at 65536, unless it returns to a small number after 99, 999 or 9999. A clock in us or ms is assumed to have 32
+bits, and a clock in s is assumed to be a time of day.
 """
 
 from collections import deque
@@ -57,8 +58,8 @@ MAX_VALUES = 256
 MAX_HEADERS = 8
 """Number of lines without numbers that are kept, because one of them may be the header of the following lines."""
 
-SMALL_SEQ_MODULUS = 256
-"""Value at which a frame counter of 8 bits wraps to 0."""
+SEQ_MODULI = (256, SEQ_MODULUS, 100, 1000, 10_000)
+"""Values at which a frame counter in text may wrap to 0: those of 8 and 16 bits, and those of two to four digits."""
 
 DAY_US = 86_400_000_000
 """Value at which a time of day wraps to 0, us."""
@@ -118,7 +119,8 @@ class TextParser(DelimitedParser):
         self._columns = columns
         self._meanings = dict(meanings or {})
         self._headers: deque[str] = deque(maxlen=MAX_HEADERS)  # lines without numbers
-        self.seq_modulus = SMALL_SEQ_MODULUS  # until the counter exceeds it
+        self.seq_modulus = SEQ_MODULI[0]
+        self._last_seq = 0
         self._is_first_line = True  # whether the next line is the first line of a connection
 
         # Lines from which the layout will be recognised, and their sizes in bytes
@@ -320,9 +322,18 @@ class TextParser(DelimitedParser):
             infinite.
         """
         frames = self._try_decode(layout.columns.frame, values, dropped_size=size)
-        if any((frame.seq or 0) >= SMALL_SEQ_MODULUS for frame in frames):
-            self.seq_modulus = SEQ_MODULUS
+        for frame in frames:
+            self._update_seq_modulus(frame.seq or 0)
         return frames
+
+    def _update_seq_modulus(self, seq: int) -> None:
+        """Determine the value at which the counter wraps from its next value."""
+        largest_seq = self._last_seq
+        self._last_seq = seq
+        if seq < largest_seq and largest_seq + 1 in SEQ_MODULI:
+            self.seq_modulus = largest_seq + 1
+        elif seq >= self.seq_modulus:
+            self.seq_modulus = SEQ_MODULI[0] if seq < SEQ_MODULI[0] else SEQ_MODULUS
 
 
 def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:
