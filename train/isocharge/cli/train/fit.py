@@ -87,7 +87,7 @@ def fit_command(
     The presses come from DATASET. With a SENSOR and no DATASET, presses are simulated first. The option --probe states
     the probes of the simulated presses, and --radius states their largest distance from the centre.
 
-    With measured presses, a network is trained on the presses alone. Any sensor with three to eight channels is
+    With measured presses, a network is trained on the presses alone. Any sensor with 3 to 32 channels is
     possible. Each column of the file whose name has no other meaning is a channel. The errors are measured by
     cross-validation, in which all presses at a place are left out together. If a sensor file describes the film,
     `isocharge train calibrate` needs far fewer presses.

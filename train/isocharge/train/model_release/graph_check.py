@@ -1,7 +1,6 @@
 """Comparison of an exported ONNX graph with the network from which it was written."""
 
 from collections.abc import Callable, Sequence
-from itertools import product
 
 import numpy as np
 import onnxruntime as ort
@@ -30,7 +29,7 @@ float32 has too few digits.
 """
 
 N_COMPARED = 10_000
-"""Number of presses with noise on which the graph and the network are compared."""
+"""Number of presses with noise on which the graph and the network are compared, and number of extreme presses."""
 
 EXTREME_CHARGES_pC = (-LARGEST, LOWEST_CHARGE, LARGEST)
 """Charges for which every output must be finite, pC.
@@ -118,7 +117,7 @@ def _choose_golden_charges(
 
 
 def _check_finite_outputs(session: ort.InferenceSession, n_electrode: int) -> None:
-    """Check that all outputs are finite for all combinations of `EXTREME_CHARGES_pC`.
+    """Check that all outputs are finite for random combinations of `EXTREME_CHARGES_pC`.
 
     The network was not trained with such charges, so its outputs are extrapolations.
 
@@ -129,7 +128,8 @@ def _check_finite_outputs(session: ort.InferenceSession, n_electrode: int) -> No
     Raises:
         TrainingError: If an output is infinite or NaN.
     """
-    charges = np.array(list(product(EXTREME_CHARGES_pC, repeat=n_electrode)), np.float32)
+    rng = np.random.default_rng(4)
+    charges = rng.choice(np.array(EXTREME_CHARGES_pC, np.float32), (N_COMPARED, n_electrode))
     for name, output in run(session, charges).items():
         is_finite = np.isfinite(output).all(axis=1)  # one value for each row of charges
         if not is_finite.all():

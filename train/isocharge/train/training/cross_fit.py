@@ -50,7 +50,7 @@ _log = logging.getLogger(__name__)
 N_FOLDS = 5
 """Number of folds of the cross-validation, which is also the number of networks that are trained for it."""
 
-CHANNELS = (3, 8)
+CHANNELS = (3, 32)
 """Smallest and largest number of channels."""
 
 DEFAULT_STEPS = 1_200
@@ -82,7 +82,7 @@ def fit_presses(
     *,
     probes: tuple[str, ...] = ("unknown",),
 ) -> Fitted:
-    """Train a network on measured presses of any sensor with three to eight channels.
+    """Train a network on measured presses of any sensor with 3 to 32 channels.
 
     Several networks are trained for a cross-validation. One further network learns the mean outputs of these networks
     (distillation), and then learns misfits. A warning is logged if presses are left out. Another warning is logged if
@@ -100,7 +100,7 @@ def fit_presses(
         The network that learned the mean outputs, with everything that a release needs.
 
     Raises:
-        PressError: If there are too few presses or places, fewer than three or more than eight channels, or if
+        PressError: If there are too few presses or places, fewer than 3 or more than 32 channels, or if
             `check_measured_presses` finds a fault.
         ConfigError: If a setting is out of its range.
         TrainingError: If the loss is not finite.
@@ -194,7 +194,7 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
         presses: All presses of a file.
 
     Raises:
-        PressError: If there are too few presses or places, fewer than three or more than eight channels, or if
+        PressError: If there are too few presses or places, fewer than 3 or more than 32 channels, or if
             `check_measured_presses` finds a fault.
     """
     channel_names = presses.electrodes
