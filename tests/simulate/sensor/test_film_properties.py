@@ -1,4 +1,4 @@
-"""Tests of the properties of real films: each changes what it names, and a new property is one declaration."""
+"""Tests of the properties of real films: each changes what it names and nothing else."""
 
 import math
 from dataclasses import replace
@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate import Circle, FilmPrior, load_sensor, parse_probe
-from isocharge.simulate.sensor import film_properties
-from isocharge.simulate.sensor.film_properties import FILM_PROPERTIES, LARGEST_PRETENSION, FilmProperty, virtual_film
+from isocharge.simulate.sensor.film_properties import LARGEST_PRETENSION, virtual_film
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
 UNSTRETCHED = load_sensor("four-25um-biaxial")
@@ -89,18 +88,6 @@ def test_draws_have_the_mean_and_the_spread_of_the_prior():
     assert values[:, 0].max() <= LARGEST_PRETENSION
     np.testing.assert_allclose(values.mean(axis=0), PRIOR.mean, atol=0.07 * PRIOR.std.max())
     np.testing.assert_allclose(values.std(axis=0) / PRIOR.std, 1.0, atol=0.1)
-
-
-def test_a_property_is_added_by_one_declaration(monkeypatch):
-    def change(sensor, probe, value):
-        return replace(sensor, film=replace(sensor.film, poisson=sensor.film.poisson + value)), probe
-
-    poisson = FilmProperty("poisson", "Poisson's ratio", "1", 0.02, change, drift=0.0)
-    monkeypatch.setattr(film_properties, "FILM_PROPERTIES", (*FILM_PROPERTIES, poisson))
-    prior = FilmPrior(SENSOR, Circle(1.0))
-    values = prior.described
-    values[prior.index("poisson")] = 0.01
-    assert prior.film(values)[0].film.poisson == pytest.approx(SENSOR.film.poisson + 0.01)
 
 
 def test_only_circular_probes_have_a_radius():

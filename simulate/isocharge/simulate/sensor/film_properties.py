@@ -2,9 +2,9 @@
 
 A sensor file describes a film. The real film differs from it: the properties of the film and its piezoelectric
 coefficients are known only to within some percent, the positions of the electrodes to within tenths of a millimetre,
-and the pretension is almost unknown. `FILM_PROPERTIES` declares these properties. Each of them is declared once, with
-its name, its unit, its prior distribution, and the function that changes a sensor by the property. A calibration
-estimates the properties, and virtual films are drawn from their prior distribution.
+and the pretension is almost unknown. `FILM_PROPERTIES` declares these properties, each with its name, its unit and its
+prior distribution, and `changed_film` changes a sensor by their values. A calibration estimates the properties, and
+virtual films are drawn from their prior distribution.
 
 A value of a property is its deviation from the sensor file. The pretension is an exception: its value is the pretension
 itself. A property that depends on the direction has two components, the size of the property times the cosine and the
@@ -13,19 +13,17 @@ sine of twice the angle of its axis.
 
 import cmath
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import add
-from typing import Any
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import SceneError, SensorError
-from isocharge.simulate.sensor.film import PIEZO_LIMITS
+from isocharge.simulate.sensor.film import PIEZO_LIMITS, Film, Piezo
 from isocharge.simulate.sensor.probe import Circle, Probe
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor import Calibration, Sensor
 
 MAX_DEVIATION = 4.0
 """Largest allowed deviation of a property from its mean, in standard deviations."""
@@ -43,10 +41,6 @@ MAX_RADIUS_DEVIATION = 0.5
 """Largest deviation of the radius of a probe, relative to the described radius."""
 
 
-Change = Callable[[Sensor, Probe, float], tuple[Sensor, Probe]]
-"""Function that changes a sensor and a probe by a value of one property."""
-
-
 @dataclass(frozen=True)
 class FilmProperty:
     """Declaration of one unknown property of a film.
@@ -56,7 +50,6 @@ class FilmProperty:
         meaning: Description of the property, for tables.
         unit: Unit of the value.
         std: Standard deviation of the prior distribution.
-        change: Function that changes a sensor and a probe by a value of the property.
         drift: Standard deviation of the change of the property in the time between two calibrations.
         mean: Mean of the prior distribution.
         bounds: Smallest and largest value; None for `MAX_DEVIATION` standard deviations on both sides of the mean.
@@ -67,7 +60,6 @@ class FilmProperty:
     meaning: str
     unit: str
     std: float
-    change: Change
     drift: float
     mean: float = 0.0
     bounds: tuple[float, float] | None = None
@@ -79,114 +71,10 @@ class FilmProperty:
         return self.bounds or (self.mean - MAX_DEVIATION * self.std, self.mean + MAX_DEVIATION * self.std)
 
 
-def _changed(component: str, attribute: str, function: Callable[[float, float], float]) -> Change:
-    """Return a function that changes one number of a component of a sensor.
-
-    Args:
-        component: Attribute of the sensor: "film", "piezo" or "calibration".
-        attribute: Attribute of the component.
-        function: Function of the described number and of the value of the property. It returns the changed number.
-    """
-
-    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-        described = getattr(sensor, component)
-        number = function(getattr(described, attribute), value)
-        changed: dict[str, Any] = {component: replace(described, **{attribute: number})}
-        return replace(sensor, **changed), probe
-
-    return change
-
-
-def _scaled(described: float, value: float) -> float:
-    """Return a described value whose logarithm is increased by `value`."""
-    return described * math.exp(value)
-
-
-def _replaced(_: float, value: float) -> float:
-    """Return `value` itself, whatever was described."""
-    return value
-
-
-def _deviator(component: int) -> Change:
-    """Return a function that increases a component of the uneven pretension by a share of the mean pretension."""
-
-    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-        difference, shear = sensor.film.deviator
-        increase = value * sensor.film.pretension
-        deviator = (difference + increase, shear) if component == 0 else (difference, shear + increase)
-        return replace(sensor, film=replace(sensor.film, deviator=deviator)), probe
-
-    return change
-
-
-def _stiffness(direction: complex) -> Change:
-    """Return a function that increases a component of the uneven stiffness, which is ln(E1 / E2) exp(2 i axis)."""
-
-    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-        film = sensor.film
-        log_ratio, axis = _increased(math.log(film.young_ratio), film.axis, value * direction)
-        return replace(sensor, film=replace(film, young_ratio=math.exp(log_ratio), axis=axis)), probe
-
-    return change
-
-
-def _oval(direction: complex) -> Change:
-    """Return a function that increases a component of the oval clamp, which is e exp(2 i axis)."""
-
-    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-        film = sensor.film
-        oval, axis = _increased(film.oval, film.oval_axis, value * direction)
-        return replace(sensor, film=replace(film, oval=oval, oval_axis=axis)), probe
-
-    return change
-
-
-def _increased(size: float, axis: float, addition: complex) -> tuple[float, float]:
-    """Add to a quantity size * exp(2 i axis), and return its new size and axis. The new size is not negative."""
-    total = cmath.rect(size, 2.0 * axis) + addition
-    return abs(total), 0.5 * cmath.phase(total)
-
-
-def _d12(described: float, value: float) -> float:
-    """Return a coefficient d12 that is increased by `value`. A sensor does not accept a tiny one, which is zero."""
-    changed = described + value
-    return changed if abs(changed) >= PIEZO_LIMITS[0] else 0.0
-
-
-def _shift(axis: int) -> Change:
-    """Return a function that moves the electrodes along x (0) or y (1)."""
-
-    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-        x, y = sensor.calibration.shift
-        shift = (x + value, y) if axis == 0 else (x, y + value)
-        return replace(sensor, calibration=replace(sensor.calibration, shift=shift)), probe
-
-    return change
-
-
-def _probe_radius(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-    """Increase the radius of a circular probe. Other probes do not have this property."""
-    assert isinstance(probe, Circle)  # see `FilmPrior.properties`
-    return sensor, replace(probe, radius=probe.radius + value)
-
-
-def _gain(electrode: str) -> Change:
-    """Return a function that increases the logarithm of the gain of an electrode."""
-
-    def change(sensor: Sensor, probe: Probe, value: float) -> tuple[Sensor, Probe]:
-        calibration = sensor.calibration
-        gains = calibration.gain | {electrode: _scaled(calibration.gain.get(electrode, 1.0), value)}
-        return replace(sensor, calibration=replace(calibration, gain=gains)), probe
-
-    return change
-
-
-def _imperfection(
-    name: str, meaning: str, unit: str, std: float, change: Change, largest: float | None = None
-) -> FilmProperty:
+def _imperfection(name: str, meaning: str, unit: str, std: float, largest: float | None = None) -> FilmProperty:
     """Declare an imperfection, which hardly drifts, with its largest magnitude if a film may be very imperfect."""
     bounds = None if largest is None else (-largest, largest)
-    return FilmProperty(name, meaning, unit, std, change, drift=0.1 * std, bounds=bounds, is_imperfection=True)
+    return FilmProperty(name, meaning, unit, std, drift=0.1 * std, bounds=bounds, is_imperfection=True)
 
 
 PRETENSION = FilmProperty(
@@ -194,7 +82,6 @@ PRETENSION = FilmProperty(
     "mean pretension",
     "MPa",
     LARGEST_PRETENSION / math.sqrt(12.0),  # that of the uniform distribution
-    _changed("film", "pretension", _replaced),
     drift=0.35,  # creep, and a degree of temperature
     mean=0.5 * LARGEST_PRETENSION,
     bounds=(0.0, 4.0),
@@ -203,32 +90,106 @@ PRETENSION = FilmProperty(
 
 FILM_PROPERTIES = (
     PRETENSION,
-    FilmProperty("young", "ln of Young's modulus", "1", 0.2, _changed("film", "young", _scaled), 0.006),
-    FilmProperty("thickness", "ln of the thickness", "1", 0.05, _changed("film", "thickness", _scaled), 0.002),
-    FilmProperty("d31", "ln of d31", "1", 0.2, _changed("piezo", "d31", _scaled), 0.01),
-    FilmProperty("d32", "ln of d32", "1", 0.2, _changed("piezo", "d32", _scaled), 0.01),
-    FilmProperty("shift_x", "shift of the electrodes along x", "mm", 0.3, _shift(0), 0.01),
-    FilmProperty("shift_y", "shift of the electrodes along y", "mm", 0.3, _shift(1), 0.01),
-    FilmProperty(
-        "rotation",
-        "rotation of the electrodes",
-        "rad",
-        math.radians(2.0),
-        _changed("calibration", "rotation", add),
-        0.001,
-    ),
-    _imperfection("tension_difference", "(T11 - T22) / (T11 + T22)", "1", 0.25, _deviator(0), 0.9),
-    _imperfection("tension_shear", "2 T12 / (T11 + T22)", "1", 0.15, _deviator(1), 0.9),
-    _imperfection("stiffness_x", "ln(E1 / E2), times the cosine of twice its angle", "1", 0.15, _stiffness(1.0), 1.0),
-    _imperfection("stiffness_xy", "ln(E1 / E2), times the sine of twice its angle", "1", 0.1, _stiffness(1j), 1.0),
-    _imperfection("oval_x", "e of an oval clamp, times the cosine of twice its angle", "1", 0.006, _oval(1.0)),
-    _imperfection("oval_xy", "e of an oval clamp, times the sine of twice its angle", "1", 0.006, _oval(1j)),
-    _imperfection("d12", "d12, by axes that are rotated", "pC/N", 0.3, _changed("piezo", "d12", _d12)),
-    _imperfection(
-        "crosstalk", "share of the charge of each other electrode", "1", 0.01, _changed("calibration", "crosstalk", add)
-    ),
+    FilmProperty("young", "ln of Young's modulus", "1", 0.2, 0.006),
+    FilmProperty("thickness", "ln of the thickness", "1", 0.05, 0.002),
+    FilmProperty("d31", "ln of d31", "1", 0.2, 0.01),
+    FilmProperty("d32", "ln of d32", "1", 0.2, 0.01),
+    FilmProperty("shift_x", "shift of the electrodes along x", "mm", 0.3, 0.01),
+    FilmProperty("shift_y", "shift of the electrodes along y", "mm", 0.3, 0.01),
+    FilmProperty("rotation", "rotation of the electrodes", "rad", math.radians(2.0), 0.001),
+    _imperfection("tension_difference", "(T11 - T22) / (T11 + T22)", "1", 0.25, 0.9),
+    _imperfection("tension_shear", "2 T12 / (T11 + T22)", "1", 0.15, 0.9),
+    _imperfection("stiffness_x", "ln(E1 / E2), times the cosine of twice its angle", "1", 0.15, 1.0),
+    _imperfection("stiffness_xy", "ln(E1 / E2), times the sine of twice its angle", "1", 0.1, 1.0),
+    _imperfection("oval_x", "e of an oval clamp, times the cosine of twice its angle", "1", 0.006),
+    _imperfection("oval_xy", "e of an oval clamp, times the sine of twice its angle", "1", 0.006),
+    _imperfection("d12", "d12, by axes that are rotated", "pC/N", 0.3),
+    _imperfection("crosstalk", "share of the charge of each other electrode", "1", 0.01),
 )
 """Properties of every film. The radius of a circular probe and the gains of the electrodes follow them."""
+
+
+def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> tuple[Sensor, Probe]:
+    """Change a sensor and a probe by values of film properties.
+
+    Args:
+        sensor: Sensor that is changed.
+        probe: Probe, which must be circular if its radius is changed.
+        values: Value of each property by its name. Properties without a value remain unchanged.
+
+    Returns:
+        The changed sensor and the changed probe.
+
+    Raises:
+        SensorError: If no such sensor can exist, for example because an electrode lies over the rim.
+    """
+    value = dict.fromkeys((one.name for one in FILM_PROPERTIES), 0.0)
+    value |= {PRETENSION.name: sensor.film.pretension, **values}
+    calibration = sensor.calibration
+    shift_x, shift_y = calibration.shift
+    gains = {
+        name: calibration.gain.get(name, 1.0) * math.exp(value[f"gain {name}"])
+        for name in sensor.electrode_names
+        if value.get(f"gain {name}")
+    }
+    changed_sensor = replace(
+        sensor,
+        film=_changed_mechanics(sensor.film, value),
+        piezo=_changed_piezo(sensor.piezo, value),
+        calibration=Calibration(
+            gain=calibration.gain | gains,
+            shift=(shift_x + value["shift_x"], shift_y + value["shift_y"]),
+            rotation=calibration.rotation + value["rotation"],
+            crosstalk=calibration.crosstalk + value["crosstalk"],
+        ),
+    )
+    if isinstance(probe, Circle):
+        probe = replace(probe, radius=probe.radius + value.get("probe_radius", 0.0))
+    return changed_sensor, probe
+
+
+def _changed_mechanics(film: Film, value: Mapping[str, float]) -> Film:
+    """Change the mechanical properties of a film; see `changed_film`."""
+    pretension = value[PRETENSION.name]
+    difference, shear = film.deviator
+    log_ratio, axis = _increased(
+        math.log(film.young_ratio), film.axis, complex(value["stiffness_x"], value["stiffness_xy"])
+    )
+    oval, oval_axis = _increased(film.oval, film.oval_axis, complex(value["oval_x"], value["oval_xy"]))
+    return replace(
+        film,
+        pretension=pretension,
+        young=film.young * math.exp(value["young"]),
+        thickness=film.thickness * math.exp(value["thickness"]),
+        deviator=(
+            difference + value["tension_difference"] * pretension,
+            shear + value["tension_shear"] * pretension,
+        ),
+        young_ratio=math.exp(log_ratio),
+        axis=axis,
+        oval=oval,
+        oval_axis=oval_axis,
+    )
+
+
+def _increased(size: float, axis: float, addition: complex) -> tuple[float, float]:
+    """Add to a quantity size * exp(2 i axis), and return its new size and axis. The new size is not negative."""
+    if addition == 0.0:  # without rounding errors
+        return size, axis
+    total = cmath.rect(size, 2.0 * axis) + addition
+    return abs(total), 0.5 * cmath.phase(total)
+
+
+def _changed_piezo(piezo: Piezo, value: Mapping[str, float]) -> Piezo:
+    """Change the piezoelectric coefficients of a film; see `changed_film`."""
+    d12 = piezo.d12 + value["d12"]
+    smallest, _ = PIEZO_LIMITS
+    return replace(
+        piezo,
+        d31=piezo.d31 * math.exp(value["d31"]),
+        d32=piezo.d32 * math.exp(value["d32"]),
+        d12=d12 if abs(d12) >= smallest else 0.0,  # a sensor does not accept a tiny coefficient
+    )
 
 
 @dataclass(frozen=True)
@@ -256,10 +217,6 @@ class FilmPrior:
                 "centre, because a real electrode lies beside its place and a real clamp is slightly oval; one reaches "
                 f"{film.inner_radius - self._rim_gap:.4g} mm; move it inwards"
             )
-
-    def __reduce__(self) -> tuple[type["FilmPrior"], tuple[Sensor, Probe]]:
-        """Pickle only the sensor and the probe, because the functions of the properties cannot be pickled."""
-        return FilmPrior, (self.sensor, self.probe)
 
     @cached_property
     def _rim_gap(self) -> float:
@@ -289,12 +246,10 @@ class FilmPrior:
             largest = MAX_RADIUS_DEVIATION * radius
             std = min(0.3, 0.3 * radius)
             probe_properties.append(
-                FilmProperty(
-                    "probe_radius", "radius of the probe", "mm", std, _probe_radius, 0.01, bounds=(-largest, largest)
-                )
+                FilmProperty("probe_radius", "radius of the probe", "mm", std, 0.01, bounds=(-largest, largest))
             )
         gains = [
-            FilmProperty(f"gain {name}", f"ln of the gain of {name}", "1", 0.05, _gain(name), 0.005)
+            FilmProperty(f"gain {name}", f"ln of the gain of {name}", "1", 0.05, 0.005)
             for name in self.sensor.electrode_names
         ]
         return (*film_properties, *probe_properties, *gains)
@@ -336,11 +291,11 @@ class FilmPrior:
         The other properties are those of the electrodes and of the piezoelectric coefficients.
         """
         changes = []
-        taut, _ = PRETENSION.change(self.sensor, self.probe, PRETENSION.mean)
+        taut, _ = changed_film(self.sensor, self.probe, {PRETENSION.name: PRETENSION.mean})
         for one in self.properties:
-            values = (one.mean, one.mean + one.std)
-            films = [(sensor.film, probe) for sensor, probe in (one.change(taut, self.probe, v) for v in values)]
-            changes.append(films[0] != films[1])
+            sensors = [changed_film(taut, self.probe, {one.name: value}) for value in (one.mean, one.mean + one.std)]
+            first, second = ((sensor.film, probe) for sensor, probe in sensors)
+            changes.append(first != second)
         return np.array(changes)
 
     @property
@@ -361,11 +316,7 @@ class FilmPrior:
         """
         if len(values) != len(self.properties):
             raise SceneError(f"expected {len(self.properties)} values ({', '.join(self.names)}), got {len(values)}")
-        sensor, probe = self.sensor, self.probe
-        for one, value in zip(self.properties, np.asarray(values).tolist(), strict=True):
-            if value != 0.0 or one is PRETENSION:
-                sensor, probe = one.change(sensor, probe, value)
-        return sensor, probe
+        return changed_film(self.sensor, self.probe, dict(zip(self.names, np.asarray(values).tolist(), strict=True)))
 
     def draw(self, rng: np.random.Generator, count: int, *, imperfect: bool = False) -> Array:
         """Draw films from the prior distribution.

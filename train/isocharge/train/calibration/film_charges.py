@@ -15,7 +15,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Piezo, Probe, Sensor, SideForceMap
 from isocharge.simulate.forward.derivative_maps import NODE_COUNT
-from isocharge.simulate.sensor.film_properties import PRETENSION, FilmProperty
+from isocharge.simulate.sensor.film_properties import PRETENSION, FilmProperty, changed_film
 
 SOLVED_STEP = 1.0 / 3.0
 """Step of the difference quotients for which a film is solved, in prior standard deviations of the property."""
@@ -293,7 +293,7 @@ class _Reading:
     def _read_difference(self, one: FilmProperty, contact: Array) -> Array:
         """Compute the derivative with respect to a property that does not change the stress, by central differences."""
         step = READING_STEP * one.std
-        sensors = [one.change(self.film.sensor, self.film.probe, sign * step)[0] for sign in (1.0, -1.0)]
+        sensors = [changed_film(self.film.sensor, self.film.probe, {one.name: change})[0] for change in (step, -step)]
         forward, backward = (replace(self.film, sensor=sensor).charges(contact) for sensor in sensors)
         return np.asarray((forward - backward) / (2.0 * step))
 
