@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from isocharge.cli.serve.doctor import brief_report
-from isocharge.common.errors import DeviceError, NoFramesError
+from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text
 from isocharge.serve.examination.channel_health import measure_channel_health
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.live.device import ANY_BOARD
-from isocharge.serve.live.stream import ReadingStream
 from isocharge.serve.port.serial_line import TELNET_ADVICE
 
 RATE_HZ = 200.0
@@ -218,13 +217,6 @@ def test_serial_server_with_the_telnet_protocol_is_recognised(board, table, is_t
     data = replace(received(sent if is_telnet else board), url="tcp://127.0.0.1:4001")
     report = examine_received(data, device=device_from_table(table, "test") if table else ANY_BOARD)
     assert (report.missing == (TELNET_ADVICE,)) == is_telnet
-
-
-def test_stream_states_that_a_serial_server_uses_the_telnet_protocol():
-    frames = [encode_frame(Frame(0xFF00 + number, 0, (1.0, 2.0, 3.0))) for number in range(256)]
-    stream = ReadingStream(("A", "B", "C"), device_from_table({"frames": {"format": "binary"}}, "test"))
-    with pytest.raises(NoFramesError, match="raw TCP"):
-        [list(stream.frames(Chunk(frame.replace(b"\xff", b"\xff\xff"), 0.0, 0))) for frame in frames * 2]
 
 
 def test_offset_drift_hum_and_noise_of_a_channel():

@@ -92,7 +92,7 @@ def test_datagrams_without_a_receiver_are_dropped(record):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as temporary:
         temporary.bind(("127.0.0.1", 0))
         address = temporary.getsockname()
-    with closing(UdpOutput(f"127.0.0.1:{address[1]}")) as output:
+    with closing(UdpOutput(f"udp://127.0.0.1:{address[1]}")) as output:
         for number in range(3):
             output.write(record(seq=number))
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
@@ -111,4 +111,4 @@ def test_datagrams_without_a_receiver_are_dropped(record):
 )
 def test_datagrams_need_an_address(address):
     with pytest.raises(InputError, match=r"expected udp://HOST:PORT, as in udp://127"):
-        UdpOutput(address)
+        UdpOutput(f"udp://{address}")

@@ -20,14 +20,8 @@ from isocharge.serve.live.device import Device
 from isocharge.serve.port.source import Port
 from isocharge.serve.signal_chain.channels import channel_index
 
-NORMALISATION_STEPS = 20
-"""Number of times that the changes are divided by the means of their rows and columns."""
-
 MIN_ADVANTAGE = 1.1
 """Smallest ratio of the largest normalised change under a press to the change of any other channel, dimensionless."""
-
-PRESS_TIMEOUT_S = 60.0
-"""Time to wait for each press, s."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +62,7 @@ def check_electrodes(
     device: Device,
     channels: Mapping[str, str],
     ask: Callable[[str], None],
-    timeout_s: float = PRESS_TIMEOUT_S,
+    timeout_s: float = 60.0,
 ) -> ElectrodeCheck:
     """For each electrode, ask the user for a press near it, and find the channel that changes most under this press.
 
@@ -109,7 +103,7 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
     """For each electrode, find the channel that changes most under the press near the electrode.
 
     The changes depend on the forces of the presses and on the gains of the channels. To remove these effects, the rows
-    and the columns of the matrix of changes are divided alternately by their means (Sinkhorn and Knopp 1967).
+    and the columns of the matrix of changes are divided by their geometric means.
 
     Args:
         changes: Change of each channel under the press near each electrode, shape (electrodes, channels), any unit.
@@ -121,10 +115,10 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
     Raises:
         PressCheckError: If two presses change the same channel most, or a press changes two channels almost equally.
     """
-    normalised = np.abs(changes) + 1e-30  # a channel that never changes must not cause a division by zero
-    for _ in range(NORMALISATION_STEPS):
-        normalised = normalised / normalised.mean(axis=0)  # removes the gain of each channel
-        normalised = normalised / normalised.mean(axis=1, keepdims=True)  # removes the force of each press
+    log_changes = np.log(np.abs(changes) + 1e-30)  # the second term allows a channel that never changes
+    log_changes -= log_changes.mean(axis=0)  # removes the gain of each channel
+    log_changes -= log_changes.mean(axis=1, keepdims=True)  # removes the force of each press
+    normalised = np.exp(log_changes)
 
     # The channel of each electrode is the column with the largest change in its row. Check that the choice is clear.
     columns = [int(column) for column in np.argmax(normalised, axis=1)]

@@ -18,13 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Reals
-from isocharge.serve.examination.press_detector import BLOCK_S, block_medians, channel_noise, find_press
-
-MIN_REST_S = 1.0
-"""Shortest rest before the press, s."""
-
-SETTLE_S = 0.5
-"""Time after the step that is left out, s, because the force is still changing."""
+from isocharge.serve.examination.press_detector import BLOCK_S, CHANGE_BLOCKS, block_medians, channel_noise, find_press
 
 MIN_HELD_S = 4.0
 """Shortest time for which the press must be held afterwards, s."""
@@ -74,9 +68,9 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
 
     begin_block = press.begin
     end_block = len(levels) if press.end is None else press.end - 1  # the force may have begun to fall before
-    settled_block = begin_block + round(SETTLE_S / BLOCK_S)  # the force is constant from here on
+    settled_block = begin_block + CHANGE_BLOCKS  # the force is constant from here on
     rest_blocks = begin_block - 1  # the force may have begun to rise in the block before
-    has_rest = rest_blocks * BLOCK_S >= MIN_REST_S
+    has_rest = rest_blocks >= 2 * CHANGE_BLOCKS
     is_long = (end_block - settled_block) * BLOCK_S >= MIN_HELD_S
     if not (has_rest and is_long):
         return None

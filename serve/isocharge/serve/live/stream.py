@@ -19,7 +19,6 @@ from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, SequenceGaps
 from isocharge.serve.live.device import ANY_BOARD, Device, create_stages
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.port.serial_line import TELNET_ADVICE, without_telnet
 from isocharge.serve.port.source import Chunk
 from isocharge.serve.record.fields import Charges
 from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, PredictionRecord
@@ -132,7 +131,6 @@ class ReadingStream:
             self._setup.has_any_sign = True
         self.counts = StreamCounts()
         self._before_restart = StreamTotals()  # counts of the time before the latest `restart`
-        self._unrecognised = b""  # the bytes before the first frame
         self._begin()
 
     def _begin(self) -> None:
@@ -184,9 +182,7 @@ class ReadingStream:
             self._reconnect()
         parser = self.parser
         frames = parser.feed(chunk.data)
-        if not parser.counts.frames:
-            self._unrecognised += chunk.data
-            self._check_recognised()
+        self._check_recognised()
         self.clock.stamp(chunk, frames, parser.t_us_modulus)
         for frame in frames:
             frame.flags = [*self._pending_flags, *self.gaps.update(frame.seq, parser.seq_modulus)]
@@ -212,13 +208,10 @@ class ReadingStream:
         counts = self.parser.counts
         if counts.frames or counts.bytes_dropped <= max_bytes:
             return
-        unescaped = without_telnet(self._unrecognised)
-        uses_telnet = unescaped != self._unrecognised and self._device.parser().feed(unescaped)
         line = f", such as {shown(self.parser.unread_line)}" if self.parser.unread_line else ""
         raise NoFramesError(
             f"no intact frame among the first {counts.bytes_dropped} bytes ({counts.crc_errors} with a wrong CRC, "
-            f"{counts.malformed} of another form{line}); {self.parser.format}: "
-            f"{TELNET_ADVICE if uses_telnet else 'check baud rate and device'}"
+            f"{counts.malformed} of another form{line}); {self.parser.format}: check baud rate and device"
         )
 
     def _reconnect(self) -> None:

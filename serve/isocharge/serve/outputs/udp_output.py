@@ -8,41 +8,37 @@ every other number as a time series. The name of a time series is the path of th
 
 import socket
 from contextlib import suppress
+from urllib.parse import urlsplit
 
 from isocharge.common.errors import InputError, shown
-from isocharge.serve.outputs.output import Output, OutputContext, OutputKind
+from isocharge.serve.outputs.output import OutputKind
 from isocharge.serve.record.record import PredictionRecord
 
 SCHEME = "udp://"
-
-MAX_PORT = 65535
 
 
 class UdpOutput:
     """Output that sends each record as a datagram, even if no program receives the datagrams."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, target: str) -> None:
         """Resolve the address of the receiver, and open the socket.
 
         Args:
-            address: Address of the receiver in the form `HOST:PORT`.
+            target: Address of the receiver in the form `udp://HOST:PORT`.
 
         Raises:
-            InputError: If the address has another form, or the host is unknown.
+            InputError: If the target has another form, or the host is unknown.
         """
-        host, _, port = address.rpartition(":")
         try:
-            is_valid_port = 0 < int(port) <= MAX_PORT  # int raises ValueError if the text is not a number
-            if not is_valid_port:
-                raise ValueError(f"a port is a number from 1 to {MAX_PORT}")
-            first_address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]  # preferred by the system
+            address = urlsplit(target)
+            if not address.hostname or not address.port or address.path:  # `port` raises ValueError if it is no number
+                raise ValueError("expected a host and a port")
+            first_address = socket.getaddrinfo(address.hostname, address.port, type=socket.SOCK_DGRAM)[0]
         except (OSError, ValueError) as error:  # getaddrinfo raises ValueError if a part of the name is too long
-            example = f"{SCHEME}127.0.0.1:9870"
             raise InputError(
-                f"output {shown(SCHEME + address)}: expected {SCHEME}HOST:PORT, as in {example} ({error})"
+                f"output {shown(target)}: expected {SCHEME}HOST:PORT, as in {SCHEME}127.0.0.1:9870 ({error})"
             ) from error
-        family, _, _, _, socket_address = first_address  # the family is IPv4 or IPv6
-        self._address = socket_address
+        family, _, _, _, self._address = first_address  # the address that the system prefers, IPv4 or IPv6
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)  # a live stream must not wait for the network
 
@@ -56,10 +52,9 @@ class UdpOutput:
         self._socket.close()
 
 
-def _open_udp(target: str, _: OutputContext) -> Output:  # the output does not depend on the stream
-    return UdpOutput(target.removeprefix(SCHEME))
-
-
 UDP = OutputKind(
-    form=f"{SCHEME}HOST:PORT", accepts=lambda target: target.startswith(SCHEME), open=_open_udp, may_block=False
+    form=f"{SCHEME}HOST:PORT",
+    accepts=lambda target: target.startswith(SCHEME),
+    open=lambda target, _: UdpOutput(target),  # the output does not depend on the stream
+    may_block=False,
 )
