@@ -38,7 +38,8 @@ class UdpOutput:
             raise InputError(
                 f"output {shown(target)}: expected {SCHEME}HOST:PORT, as in {SCHEME}127.0.0.1:9870 ({error})"
             ) from error
-        family, _, _, _, self._address = first_address  # the address that the system prefers, IPv4 or IPv6
+        family, _, _, _, socket_address = first_address  # the address that the system prefers, IPv4 or IPv6
+        self._address = socket_address
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)  # a live stream must not wait for the network
 
