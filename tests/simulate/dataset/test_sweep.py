@@ -25,7 +25,7 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.dataset import sweep as sweep_module
-from isocharge.simulate.dataset.sweep import outside_samples, write_sweep
+from isocharge.simulate.dataset.sweep import outside_map, write_sweep
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(bending=False)
@@ -111,7 +111,7 @@ def test_presses_outside_the_radius_reach_up_to_the_clamp(small_dataset):
 @pytest.mark.parametrize("changes", [{"outside": 0}, {"radius": 42.0}])
 def test_a_sweep_without_presses_outside(changes):
     """No presses are requested, or the ring between the radius and the clamp is narrower than a millimetre."""
-    assert outside_samples(SENSOR, (Circle(1.0),), small(**changes)) is None
+    assert outside_map(SENSOR, (Circle(1.0),), small(**changes)) is None
 
 
 def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp_path):
@@ -145,10 +145,9 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path):
     assert read_dataset(tmp_path / "fixed").samples.orientation_deg[:3].tolist() == [30.0, 330.0, 0.0]
 
 
-def test_shards_and_tasks_keep_the_order_of_the_presses(tmp_path, monkeypatch):
-    """The sweep has two shards, and the first shard has several tasks. Each press has its own charges."""
+def test_shards_keep_the_order_of_the_presses(tmp_path, monkeypatch):
+    """The sweep has two shards with several probes. Each press has its own charges."""
     monkeypatch.setattr(sweep_module, "SHARD_SIZE", 600)
-    monkeypatch.setattr(sweep_module, "TASK_SIZE", 150)
     sweep = Sweep(samples=610, orientation="random", outside=0)
     maps = [Spy(Polygon.rectangle(side, 2.0)) for side in (3.0, 4.0, 5.0)]
     read = read_dataset(write_sweep(tmp_path / "large", maps, sweep))

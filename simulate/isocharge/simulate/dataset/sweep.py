@@ -4,20 +4,20 @@ A forward map is built for every probe and evaluated for every press. For the pr
 and the clamp, a coarse map of the whole film is built, with a round probe. Its error of a few percent is acceptable,
 because a network only learns from these presses which charges belong to no contact in its working area.
 
-The division of the work into tasks does not depend on the executor. The files of the dataset are therefore the same for
-every executor. The dataset is written completely or not at all.
+A task of the executor computes the charges of one shard, which is one file of the dataset. The files are therefore the
+same for every executor. The dataset is written completely or not at all.
 """
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from itertools import tee
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.common.files import new_folder, refuse_existing
 from isocharge.common.progress import report, reporting_as, second_thread
@@ -39,14 +39,7 @@ from isocharge.simulate.solver.stress_limit import yield_force
 _log = logging.getLogger(__name__)
 
 SHARD_SIZE = 16384
-"""Default number of samples in a shard."""
-
-TASK_SIZE = 8192
-"""Largest number of presses in a task, which is a call of the executor.
-
-A task of this size takes about a second. This is long compared with the time in which the forward map (12 MB) is sent
-to the worker.
-"""
+"""Default number of samples in a shard, whose charges are computed in about two seconds."""
 
 MIN_RING_WIDTH = 1.0
 """Smallest width of the ring between the radius of a sweep and the clamp, mm. A narrower ring contains no presses."""
@@ -98,7 +91,7 @@ def run_sweep(
         maps = solve_maps(sensor, probes, sweep, settings, executor=executor)
         whole_film = outside_job.result()
         shards = _shards(sweep, presses, shard, whole_film)
-        samples = _with_progress(_samples(maps, whole_film, shards, executor), sum(map(len, shards)))
+        samples = _samples(maps, whole_film, shards, executor)
         write_files(draft, folder.name, sensor, samples, _manifest_entries(maps, whole_film, sweep))
     return folder
 
@@ -153,19 +146,6 @@ def outside_map(
     except (SceneError, SolveError) as error:
         _log.warning("presses outside %g mm are not simulated: %s", sweep.radius, error)
         return None
-
-
-def outside_samples(sensor: Sensor, probes: Sequence[Probe], sweep: Sweep) -> Samples | None:
-    """Simulate only the presses between the radius of a sweep and the clamp. The arguments are those of `outside_map`.
-
-    Returns:
-        The samples; None if there are none.
-    """
-    whole_film = outside_map(sensor, probes, sweep)
-    if whole_film is None:
-        return None
-    (samples,) = _samples((), whole_film, [sweep.outside_presses(whole_film.domain.radius)], None)
-    return samples
 
 
 def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
@@ -230,16 +210,6 @@ def _manifest_entries(maps: Sequence[ForwardMap], whole_film: ForwardMap | None,
     }
 
 
-def _with_progress(shards: Iterable[Samples], n_press: int) -> Iterator[Samples]:
-    """Yield the samples of shards, and report how many of the `n_press` presses are finished."""
-    finished_presses = 0
-    report("pressing", finished_presses, n_press)
-    for samples in shards:
-        finished_presses += len(samples)
-        report("pressing", finished_presses, n_press)
-        yield samples
-
-
 def _shards(sweep: Sweep, presses: SweepPresses, size: int, whole_film: ForwardMap | None) -> list[SweepPresses]:
     """Divide the presses of a sweep into shards.
 
@@ -258,13 +228,10 @@ def _shards(sweep: Sweep, presses: SweepPresses, size: int, whole_film: ForwardM
 def _samples(
     maps: Sequence[ForwardMap],
     whole_film: ForwardMap | None,
-    shards: Iterable[SweepPresses],
+    shards: Sequence[SweepPresses],
     executor: Executor | None,
 ) -> Iterator[Samples]:
-    """Compute the samples of shards, and yield them in the order of the shards.
-
-    A shard is divided into tasks. Each task computes the charges of some rows of the shard. While the samples of one
-    shard are yielded, the workers already compute the tasks of later shards.
+    """Compute the samples of shards, yield them in the order of the shards, and report the number of finished presses.
 
     Args:
         maps: Forward map of each probe.
@@ -274,20 +241,28 @@ def _samples(
     """
     # The index `OUTSIDE_PROBE` selects the last map.
     all_maps = list(maps) if whole_film is None else [*maps, whole_film]
-    # The loop that creates the tasks is ahead of the loop that collects the charges. Each loop therefore has its own
-    # iterator over the shards.
-    shards_for_samples, shards_for_tasks = tee(shards)
-    tasks = (
-        (all_maps[probe], presses.contact[rows], presses.rotation[rows])
-        for presses in shards_for_tasks
-        for probe, rows in _tasks(presses)
-    )
-    charges_of_tasks = in_order(executor, _charges, tasks)
-    for presses in shards_for_samples:
-        charge = np.empty((len(presses), len(all_maps[0].electrodes)))
-        for _, rows in _tasks(presses):  # the tasks in the order in which they were submitted
-            charge[rows] = next(charges_of_tasks)
+    n_press = sum(map(len, shards))
+    finished_presses = 0
+    report("pressing", finished_presses, n_press)
+    charges = in_order(executor, partial(_charges, all_maps), shards)
+    for presses, charge in zip(shards, charges, strict=True):
+        finished_presses += len(presses)
+        report("pressing", finished_presses, n_press)
         yield _samples_of_shard(all_maps, presses, charge)
+
+
+def _charges(maps: Sequence[ForwardMap], presses: SweepPresses) -> Array:
+    """Compute the touch charges of the presses of a shard, shape (n, n_electrode), pC.
+
+    Args:
+        maps: Forward map of each probe, and of the whole film if presses lie outside the radius of the sweep.
+        presses: Presses of the shard.
+    """
+    charge = np.empty((len(presses), len(maps[0].electrodes)))
+    for probe in np.unique(presses.probe).tolist():
+        rows = np.flatnonzero(presses.probe == probe)
+        charge[rows] = maps[probe].charges(presses.contact[rows], presses.rotation[rows])
+    return charge
 
 
 def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses, charge: Array) -> Samples:
@@ -311,34 +286,3 @@ def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses, charge:
         charge_pC=charge,
         outside=presses.is_outside,
     )
-
-
-def _tasks(presses: SweepPresses) -> Iterator[tuple[int, Integers]]:
-    """Divide the presses of a shard into tasks, and yield these tasks.
-
-    All presses of a task have the same probe. A task has at most `TASK_SIZE` presses.
-
-    Args:
-        presses: Presses of the shard, which is one file of the dataset.
-
-    Yields:
-        Index of the probe, and indices of the presses of the task in the shard.
-    """
-    for probe in np.unique(presses.probe).tolist():
-        rows = np.flatnonzero(presses.probe == probe)
-        for start in range(0, rows.size, TASK_SIZE):
-            yield probe, rows[start : start + TASK_SIZE]
-
-
-def _charges(task: tuple[ForwardMap, Array, Array]) -> Array:
-    """Compute the touch charges of the presses of a task.
-
-    Args:
-        task: Forward map of the probe. Contacts (x, y, F), shape (n, 3), mm and N. Rotations of the probe in addition
-            to its own orientation, shape (n,), rad.
-
-    Returns:
-        Charges, shape (n, n_electrode), pC.
-    """
-    forward_map, contact, rotation = task
-    return forward_map.charges(contact, rotation)
