@@ -148,7 +148,7 @@ def film_results(bench: Bench, counts: list[int], frames: int, *, has_all_cases:
         charge = gains * charge
         results[f"not followed, {name}"] = errors([predictor.predict(row) for row in charge], truth)
         observe(follower, predictor, touches)
-        answers = [follower.follow_contact(predictor.predict(row), row).contact for row in charge]
+        answers = [follower.follow_contact(predictor.predict(row), row) for row in charge]
         results[f"followed, {name}"] = errors(answers, truth)
         if change != 0.0:
             problem = replace(bench.problem, earlier=result.film.drifted())

@@ -99,7 +99,7 @@ def followed(model, charge, rng, frames=4) -> FilmFollower:
 
 def force_errors(follower, model, contact, charge):
     """Relative errors of the forces, and errors over the stated standard deviations."""
-    answers = [follower.follow_contact(model.predict(row), row).contact for row in charge]
+    answers = [follower.follow_contact(model.predict(row), row) for row in charge]
     error = np.array([answer.force_N for answer in answers]) - contact[:, 2]
     std = np.array([answer.force_std_N for answer in answers])
     return error / contact[:, 2], error / std
@@ -141,7 +141,7 @@ def test_reset_forgets_the_touches(series, tmp_path):
     follower.reset()
     assert follower.film == FilmFollower(model).film
     raw = model.predict(charge[0])
-    assert follower.follow_contact(raw, charge[0]).contact == raw
+    assert follower.follow_contact(raw, charge[0]) == raw
     assert contact.shape == (20, 3)
 
 

@@ -127,8 +127,6 @@ class Frame:
             not decay.
         contact: The computed contact; None if nothing touches the film, or if the frame is invalid.
         contact_flags: Flags that are the reasons why the contact may be wrong.
-        model_charge_pC: Charges from which the model predicts the contact, shape (n_electrode,), pC. None if the model
-            has not predicted the contact. If the film is followed, they differ from the touch charges.
         film: Estimated film; None if the film is not followed.
         tracking: The tracked contact; None if contacts are not tracked.
         flags: Flags of `isocharge.serve.flags` that do not depend on the contact.
@@ -154,7 +152,6 @@ class Frame:
     is_base_held: bool = False
     contact: Contact | None = None
     contact_flags: tuple[str, ...] = ()
-    model_charge_pC: Array | None = None
     film: FollowedFilm | None = None
     tracking: Tracking | None = None
     flags: list[str] = field(default_factory=list)

@@ -46,11 +46,10 @@ class Prediction(Stage):
         predictor = self._setup.predictor
         assert predictor is not None
         frame.set_contact(predictor.predict(frame.charge_pC), self._validity)
-        frame.model_charge_pC = frame.charge_pC
 
 
 class FollowFilm(Stage):
-    """Estimates the pretension of the film, and uses the model for the estimated pretension."""
+    """Estimates the pretension of the film, and corrects contacts for the estimated pretension."""
 
     section = "follow"
     rule_class = FollowRule
@@ -62,7 +61,6 @@ class FollowFilm(Stage):
         Raises:
             ModelError: If the pretension of this film cannot be estimated with the model.
         """
-        self._setup = setup
         predictor = setup.model
         self._validity = predictor.validity  # of the calibrated film
         self._follower = FilmFollower(predictor, setup.rule(FollowRule), warming_ratios(setup))
@@ -70,25 +68,20 @@ class FollowFilm(Stage):
     def step(self, frame: Frame) -> None:
         """Correct the contact for the estimated pretension of the film, and then update the estimate with the frame.
 
-        An invalid frame does not change the estimate, because it does not show whether the touch has ended.
-
-        The model for the new estimate is used from the next frame on. If the pretension can no longer be estimated,
-        every frame with a contact gets the flag `film`.
+        An invalid frame does not change the estimate, because it does not show whether the touch has ended. If the
+        pretension can no longer be estimated, every frame with a contact gets the flag `film`.
         """
         # Correct the contact with the estimate from the earlier frames. The frame reports this estimate.
         follower = self._follower
         if frame.contact is not None and frame.charge_pC is not None:
-            corrected = follower.follow_contact(frame.contact, frame.charge_pC)
-            frame.set_contact(corrected.contact, self._validity)
-            frame.model_charge_pC = corrected.charge_pC
+            frame.set_contact(follower.follow_contact(frame.contact, frame.charge_pC), self._validity)
         frame.film = follower.film
         if not frame.is_valid:
             return
 
-        # Update the estimate, and use its model for the next frame.
+        # Update the estimate.
         flags = (*frame.flags, *frame.contact_flags)
         follower.observe_frame(frame.charge_pC, frame.contact, flags, frame.clock_s)
-        self._setup.predictor = follower.predictor
         if frame.contact is not None and follower.is_lost:
             frame.flags.append(FILM)
 

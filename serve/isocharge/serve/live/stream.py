@@ -234,8 +234,7 @@ class TouchStream(ReadingStream):
     Each object may be used by only one thread.
 
     Attributes:
-        predictor: The loaded model. If the film is followed, the contacts are predicted with the model of the film at
-            its estimated pretension instead.
+        predictor: The loaded model. If the film is followed, its contacts are then corrected.
         frame_id: Name of the film, which each record contains.
     """
 

@@ -31,14 +31,11 @@ FIRST_DAMPING = 1e-3
 DAMPING_FACTOR = 10.0
 """Factor by which the damping decreases after a successful step, and increases after an unsuccessful one."""
 
-SMALLEST_CONTACT_DAMPING = 1e-9
-"""Smallest damping of the contacts, so that contacts near a fold of the charge map stay finite."""
+RELATIVE_RIDGE = 1e-9
+"""Addition to the diagonal of the normal matrix of a contact, relative to its trace.
 
-RELATIVE_RIDGE = 1e-12
-"""Addition to the diagonal of the normal matrix of a contact, relative to its trace, so that it can be inverted."""
-
-SMALLEST_RIDGE = 1e-300
-"""Addition to the diagonal for contacts on which no charge depends."""
+The matrix can then be inverted near a fold of the charge map.
+"""
 
 MAX_REJECTED_STEPS = 6
 """Number of successive unsuccessful steps after which the search ends."""
@@ -59,19 +56,15 @@ class ModelValues(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """Prior of the state: independent groups of correlated unknowns, some of which may have a heavy-tailed prior.
+    """Gaussian prior of the state.
 
     Attributes:
         mean: Mean of the state, shape (p,).
         covariance: Covariance of the state, shape (p, p).
-        freedom: Degrees of freedom of the Student's t prior of each unknown, shape (p,); infinity for a Gaussian prior,
-            which is used for all unknowns if it is None. The covariance then contains the squared scale. An unknown
-            with a Student's t prior is independent of the others.
     """
 
     mean: Array
     covariance: Array
-    freedom: Array | None = None
 
 
 class MeasuredContacts(NamedTuple):
@@ -95,7 +88,6 @@ class RobustEstimate(NamedTuple):
         contacts: Most probable coordinates of the contacts, shape (n, 3).
         weights: Weight of each press, shape (n,); about 1 for good presses, and small for outliers.
         chi2: Squared residual chi2_i of each press, shape (n,).
-        degrees: Number m_i of residual degrees of freedom of each press, shape (n,).
         cost: Minimised function without constants.
     """
 
@@ -104,7 +96,6 @@ class RobustEstimate(NamedTuple):
     contacts: Array
     weights: Array
     chi2: Array
-    degrees: Array
     cost: float
 
 
@@ -162,14 +153,13 @@ def robust_estimate(
         point = trial
         if improvement < tolerance:
             break
-    normal_matrix, *_ = problem.normal_equations(point, SMALLEST_CONTACT_DAMPING)
+    normal_matrix, *_ = problem.normal_equations(point, damping=0.0)
     return RobustEstimate(
         state=point.state,
         covariance=np.asarray(np.linalg.inv(normal_matrix)),
         contacts=point.contacts,
         weights=point.weights,
         chi2=point.chi2,
-        degrees=problem.degrees,
         cost=point.cost,
     )
 
@@ -237,7 +227,7 @@ class _Problem:
             self._contact_weight[is_measured] = 1.0 / measured.std[is_measured]
             self._measured = np.where(is_measured, measured.coordinates, 0.0)
         measured_count = np.count_nonzero(self._contact_weight, axis=1)
-        self.degrees = n_electrode + measured_count - 3.0
+        self._degrees = n_electrode + measured_count - 3.0
 
     def evaluate(self, state: Array, contacts: Array) -> _Point:
         """Evaluate the model, the residuals and the cost at a state and contacts."""
@@ -248,8 +238,9 @@ class _Problem:
         weights = np.ones(len(chi2))
         press_cost = 0.5 * chi2
         if np.isfinite(self._freedom):
-            weights = (self._freedom + self.degrees) / (self._freedom + chi2)
-            press_cost = 0.5 * (self._freedom + self.degrees) * np.log1p(chi2 / self._freedom)
+            weights = (self._freedom + self._degrees) / (self._freedom + chi2)
+            press_cost = 0.5 * (self._freedom + self._degrees) * np.log1p(chi2 / self._freedom)
+        deviation = state - self._prior.mean
         return _Point(
             state=state,
             contacts=contacts,
@@ -259,30 +250,8 @@ class _Problem:
             contact_residual=contact_residual,
             chi2=chi2,
             weights=weights,
-            cost=float(press_cost.sum()) + self._prior_cost(state),
+            cost=float(press_cost.sum() + 0.5 * deviation @ self._precision @ deviation),
         )
-
-    def _prior_cost(self, state: Array) -> float:
-        """Return the negative logarithm of the prior without its constant."""
-        deviation = state - self._prior.mean
-        if self._prior.freedom is None:
-            return float(0.5 * deviation @ self._precision @ deviation)
-        is_heavy = np.isfinite(self._prior.freedom)
-        gaussian = np.where(is_heavy, 0.0, deviation)
-        freedom = self._prior.freedom[is_heavy]
-        squares = deviation[is_heavy] ** 2 * np.diag(self._precision)[is_heavy]
-        heavy_cost = 0.5 * ((freedom + 1.0) * np.log1p(squares / freedom)).sum()
-        return float(0.5 * gaussian @ self._precision @ gaussian + heavy_cost)
-
-    def _weighted_precision(self, state: Array) -> Array:
-        """Return the precision of the prior, in which unknowns with a heavy-tailed prior have a smaller precision."""
-        if self._prior.freedom is None:
-            return np.asarray(self._precision)
-        is_heavy = np.isfinite(self._prior.freedom)
-        freedom = np.where(is_heavy, self._prior.freedom, 1.0)
-        squares = (state - self._prior.mean) ** 2 * np.diag(self._precision)
-        weights = np.where(is_heavy, (freedom + 1.0) / (freedom + squares), 1.0)
-        return np.asarray(self._precision * np.sqrt(np.outer(weights, weights)))
 
     def normal_equations(self, point: _Point, damping: float) -> tuple[Array, Array, Array, Array]:
         """Compute the normal equations of a step of the state, from which the contacts are eliminated.
@@ -304,7 +273,8 @@ class _Problem:
         diagonal = np.einsum("nkk->nk", contact_matrix)  # a view, through which the matrices are changed
         diagonal += self._contact_weight**2
         diagonal *= 1.0 + damping
-        diagonal += RELATIVE_RIDGE * diagonal.sum(axis=1, keepdims=True) + SMALLEST_RIDGE
+        # The smallest number is for contacts on which no charge depends.
+        diagonal += RELATIVE_RIDGE * diagonal.sum(axis=1, keepdims=True) + np.finfo(float).tiny
         charge_part = (transposed @ point.residual[:, :, None])[:, :, 0]
         right_side = charge_part + self._contact_weight * point.contact_residual
         mixed = transposed @ point.by_state  # shape (n, 3, p)
@@ -316,14 +286,13 @@ class _Problem:
         weighted = point.weights[:, None, None] * point.by_state
         weighted_mixed = point.weights[:, None, None] * mixed
         n_state = point.state.size
-        precision = self._weighted_precision(point.state)
         normal_matrix = (
-            precision
+            self._precision
             + weighted.reshape(-1, n_state).T @ point.by_state.reshape(-1, n_state)
             - weighted_mixed.reshape(-1, n_state).T @ contact_by_state.reshape(-1, n_state)
         )
         gradient = (
-            precision @ (self._prior.mean - point.state)
+            self._precision @ (self._prior.mean - point.state)
             + weighted.reshape(-1, n_state).T @ point.residual.ravel()
             - weighted_mixed.reshape(-1, n_state).T @ contact_shift.ravel()
         )

@@ -37,8 +37,7 @@ class Setup:
         electrodes: Names of the electrodes, in the order of the charges.
         rules: Settings of each stage that the device file switches on, by their class.
         channels: Name or number of the channel by electrode name; empty if the device file assigns no channels.
-        predictor: The present model. If the film is followed, it is the model of the film at its estimated pretension.
-            None if a stream computes only touch charges.
+        predictor: The present model; None if a stream computes only touch charges.
         reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
         where: Name of the device file, for messages.
         offset_stage: Last stage that stores the charge at rest; None until a stage is created.

@@ -1,21 +1,26 @@
 """Correction of contacts for changes of the film. The changes are estimated from ordinary touches.
 
+The state of the film is a vector of these unknowns:
+
+- the change t of the mean pretension, MPa, and the changes z along the uncertain directions of the film
+  (`isocharge.serve.model.charge_series`),
+- the logarithm of the change of the gain of each electrode,
+- a common offset, pC. This charge is added to all electrodes during a touch, for example by a warm finger.
+
 The charges of four electrodes have one degree of freedom more than a contact (x, y, force). If the pretension of a film
-changes, for example because the room becomes warmer by 1 K, no contact explains the charges of touches exactly. The
-module `isocharge.serve.tracking.film_state` estimates the state of the film, with which the latest touches can be
-explained best. Each touch contributes its average charges of the frames with about the largest force.
+changes, for example because the room becomes warmer by 1 K, no contact explains the charges of touches exactly. Each
+touch therefore updates the state: the estimate from the earlier touches is the Gaussian prior, and the most probable
+state and contact of the touch are found together (an iterated extended Kalman filter, whose contact has no prior).
 
 The network was trained for the film as it was calibrated. The charges of a frame are therefore converted into charges
 that the same contact would cause on the calibrated film, and the network computes the contact from the converted
 charges. The conversion depends on the contact, so both are repeated a few times.
 
-The film is considered lost if no state explains the latest touches, if the estimated pretension is at the end of the
-range that the model describes, or if the common offset is larger than the settings allow. While the film is lost, the
-estimate from before is used for contacts.
+The film is considered lost if no state explains the latest touches, or if the estimated pretension or offset is at the
+end of its range. While the film is lost, the estimate from before is used for contacts.
 """
 
 import math
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -25,31 +30,39 @@ from isocharge.common.errors import ModelError
 from isocharge.serve.model.charge_file import FILE, read_charge_map
 from isocharge.serve.model.contact import Contact, is_close
 from isocharge.serve.model.predictor import Predictor
+from isocharge.serve.model.robust_estimate import ModelValues, Prior, robust_estimate
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.rule import Rule, Setting
-from isocharge.serve.tracking.film_state import FilmModel, Touch
 from isocharge.serve.tracking.touch_peak import TouchPeak
-
-MAX_TOUCHES = 64
-"""Number of the latest touches from which the state is estimated."""
-
-RECENT_TOUCHES = 16
-"""Number of the latest touches from which the follower decides whether the film is lost."""
 
 FEWEST_TOUCHES = 8
 """Number of touches before the first correction of contacts."""
 
-LARGEST_SQUARE = 9.0
-"""Upper limit of the squared residual of a touch in the decision whether the film is lost, per degree of freedom."""
+GAIN_STD = 0.01
+"""Standard deviation of the change of a gain before the first touch, relative to the gain."""
 
-EXPLAINED_SQUARE = 3.0
-"""Largest mean of the limited squared residuals, per degree of freedom, at which the latest touches are explained."""
+RELATIVE_OFFSET_STD = 0.1
+"""Standard deviations of the common offset, and of the offset of a touch about it, relative to the largest offset."""
 
-MAX_RELATIVE_OFFSET = 2.0
-"""Magnitude of the common offset, relative to the largest tolerated standard deviation, above which it is too large."""
+SMALLEST_STD = 1e-4
+"""Smallest standard deviation of an unknown, in its unit, so that the covariance can be inverted."""
+
+MAX_DEVIATION = 20.0
+"""Largest magnitude of an unknown, in standard deviations before the first touch."""
+
+FORCE_MARGIN = 1.5
+"""Factor by which the force of a touch may exceed the range of forces of the charge map."""
+
+MAX_MEAN_SQUARE = 3.0
+"""Largest mean squared distance of the latest touches from the predicted touches, for a film that is not lost."""
+
+MEMORY_TOUCHES = 16
+"""Number of touches after which the weight of a touch in this mean has decreased to 1/e."""
 
 CONVERSIONS = 3
 """Number of repetitions of the conversion of charges and of the computation of the contact."""
+
+SECONDS_PER_HOUR = 3600.0
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):
@@ -59,40 +72,24 @@ class FollowRule(Rule, frozen=True, kw_only=True):
         drift_MPa_per_root_hour: Standard deviation of the change of the pretension in an hour, MPa. The standard
             deviation is proportional to the square root of the time. On a ring of aluminium, a change of the
             temperature by 1 K changes the pretension by 0.3 to 0.44 MPa.
-        largest_offset_pC: Largest standard deviation of the charge that warmth may add to all electrodes during a
-            touch, pC. The film is not followed while the mean added charge exceeds twice this value. 0 means that
-            warmth adds no charge.
+        largest_offset_pC: Largest charge that warmth may add to all electrodes during a touch, pC. The film is not
+            followed while the mean added charge exceeds twice this value. 0 means that warmth adds no charge.
     """
 
     drift_MPa_per_root_hour: Setting = 0.35
     largest_offset_pC: Setting = 30.0
 
 
-class FollowedContact(NamedTuple):
-    """A contact after the correction for the estimated changes of the film.
-
-    Attributes:
-        contact: The corrected contact.
-        charge_pC: Charges from which the model predicts this contact, shape (n_electrode,), pC.
-    """
-
-    contact: Contact
-    charge_pC: Array
-
-
 class _Conversion(NamedTuple):
-    """Conversion of charges near one contact into charges of the calibrated film: factor * charge + shift.
+    """Conversion of charges near one contact into charges of the calibrated film.
 
     Attributes:
-        factor: Factors, shape (n_electrode,), dimensionless.
-        shift_pC: Shifts, shape (n_electrode,), pC.
-        contact_shifts: Changes of x (mm), y (mm) and the force (N) by independent errors of the state, shape (3, 3).
-            Each row belongs to one error.
+        shift_pC: Charges that are added, shape (n_electrode,), pC.
+        covariance: Covariance of x (mm), y (mm) and the force (N) because of the errors of the state, shape (3, 3).
     """
 
-    factor: Array
     shift_pC: Array
-    contact_shifts: Array
+    covariance: Array
 
 
 class FilmFollower:
@@ -132,30 +129,51 @@ class FilmFollower:
                 "film is followed from a model that `isocharge train calibrate` made of presses on it: calibrate it, "
                 "or again with this version"
             )
-        rule = rule or FollowRule()
         self.predictor = predictor
+        self._rule = rule or FollowRule()
         self._series = series
-        self._model = FilmModel(
-            series=series,
-            offset_ratio=np.broadcast_to(np.asarray(offset_ratio, dtype=float), (len(electrodes),)),
-            drift_MPa_per_root_hour=rule.drift_MPa_per_root_hour,
-            largest_offset_pC=rule.largest_offset_pC,
+        self._offset_ratio = np.broadcast_to(np.asarray(offset_ratio, dtype=float), (len(electrodes),))
+        self._offset_std_pC = RELATIVE_OFFSET_STD * self._rule.largest_offset_pC
+
+        # The state consists of the state of the charge map, the logarithms of the gains and the common offset.
+        film_size = series.calibrated_state.size
+        self._film = slice(0, film_size)
+        self._gains = slice(film_size, film_size + len(electrodes))
+        self._offset = film_size + len(electrodes)
+        std = np.ones(self._offset + 1)
+        std[0] = series.tension_std_MPa
+        std[self._gains] = GAIN_STD
+        std[self._offset] = self._offset_std_pC
+        self._initial_std = np.maximum(std, SMALLEST_STD)
+        self._highest = MAX_DEVIATION * self._initial_std
+        self._lowest = -self._highest
+        self._lowest[0], self._highest[0] = series.node_MPa[[0, -1]]
+
+        radius_mm = series.domain.radius
+        smallest_N, largest_N = series.domain.force_range
+        self._contact_bounds = (
+            np.array([-radius_mm, -radius_mm, math.log(smallest_N / FORCE_MARGIN)]),
+            np.array([radius_mm, radius_mm, math.log(largest_N * FORCE_MARGIN)]),
         )
         self.reset()
 
     def reset(self) -> None:
         """Discard all touches, and assume again that the film has not changed since the calibration."""
         self.is_lost = False
-        self._touches: deque[Touch] = deque(maxlen=MAX_TOUCHES)
-        self._contacts = np.empty((0, 3))  # estimated contacts (x, y, ln F) of the touches
-        self._state = np.zeros(self._model.size)  # latest estimate, from which the next search starts
-        self._first_touch_s: float | None = None
+        self._mean_square = 1.0  # mean squared distance of the latest touches from the predicted touches
         self._touch_count = 0
+        self._latest_touch_s = math.inf
+        self._start_estimate()
         self._applied_state: Array | None = None  # state that contacts are corrected for; None before the first one
-        self._applied_covariance = self._model.prior(0.0).covariance
+        self._applied_covariance = self._covariance
         self._conversion: _Conversion | None = None  # latest conversion of charges, and its contact
         self._conversion_contact: Contact | None = None
         self.discard_touch()
+
+    def _start_estimate(self) -> None:
+        """Set the state to that of the calibrated film, with the standard deviations before the first touch."""
+        self._state = np.zeros(self._initial_std.size)
+        self._covariance = np.diag(self._initial_std**2)
 
     def discard_touch(self) -> None:
         """Discard the frames of the present touch, for example after an outage or a new tare."""
@@ -188,50 +206,94 @@ class FilmFollower:
         if peak.is_usable:
             frame_variance_pC2 = self.predictor.metadata.noise.variance(peak.mean_charge_pC)
             variance_pC2 = frame_variance_pC2 * peak.relative_noise_variance(frame_variance_pC2)
-            touch_contact = self.predictor.predict(peak.mean_charge_pC)
-            followed = self.follow_contact(touch_contact, peak.mean_charge_pC).contact
-            self.observe_touch(Touch(peak.mean_charge_pC, variance_pC2, np.array(followed[:3]), clock_s))
+            self._observe_touch(peak.mean_charge_pC, variance_pC2, clock_s)
 
-    def observe_touch(self, touch: Touch) -> None:
-        """Update the estimate of the film with a touch, and decide whether the film is lost."""
-        if self._first_touch_s is None:
-            self._first_touch_s = touch.clock_s
-        lowest, highest = self._model.contact_bounds
-        start = np.array(touch.contact, dtype=float)
-        start[2] = math.log(max(start[2], math.exp(lowest[2])))
-        start = np.clip(start, lowest, highest)
-        self._touches.append(touch)
-        self._touch_count += 1
-        self._contacts = np.vstack([self._contacts, start])[-MAX_TOUCHES:]
-        if len(self._touches) < FEWEST_TOUCHES:
-            return
+    def _observe_touch(self, charge_pC: Array, variance_pC2: Array, clock_s: float) -> None:
+        """Update the estimate of the film with a touch, and decide whether the film is lost.
 
-        elapsed_s = max(touch.clock_s - self._first_touch_s, 0.0)
-        estimate = self._model.estimate(self._touches, self._state, self._contacts, elapsed_s)
+        The charges of a touch have three errors: their noise, the part of the charges that the charge map does not
+        describe, and the deviation of the offset of the touch from the common offset.
+
+        Args:
+            charge_pC: Average touch charges near the largest force, shape (n_electrode,), pC.
+            variance_pC2: Variance of the noise of these charges, shape (n_electrode,), pC^2.
+            clock_s: Time of the touch, s.
+        """
+        elapsed_hours = max(clock_s - self._latest_touch_s, 0.0) / SECONDS_PER_HOUR
+        self._latest_touch_s = clock_s
+        self._covariance[0, 0] += self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
+        touch_offset_pC = self._offset_std_pC * self._offset_ratio
+        model_error_pC = self._series.charge_std * charge_pC
+        covariance_pC2 = np.diag(variance_pC2 + model_error_pC**2) + np.outer(touch_offset_pC, touch_offset_pC)
+        start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
+        estimate = robust_estimate(
+            self._values,
+            charge_pC[np.newaxis],
+            covariance_pC2[np.newaxis],
+            Prior(self._state, self._covariance),
+            self._state,
+            start,
+            contact_bounds=self._contact_bounds,
+            state_bounds=(self._lowest, self._highest),
+        )
         self._state = estimate.state
-        self._contacts = estimate.contacts
-        recent_squares = np.minimum(estimate.chi2 / estimate.degrees, LARGEST_SQUARE)[-RECENT_TOUCHES:]
-        is_explained = recent_squares.mean() < EXPLAINED_SQUARE
-        self.is_lost = not is_explained or self._is_out_of_range(estimate.state)
-        if self.is_lost:
-            # The film may have changed suddenly. The earlier touches then do not help to find its state.
-            while len(self._touches) > RECENT_TOUCHES:
-                self._touches.popleft()
-            self._contacts = self._contacts[-RECENT_TOUCHES:]
-        else:
-            state, covariance = self._model.averaged_over_no_change(estimate, elapsed_s)
-            self._applied_state = state
-            self._applied_covariance = self._model.touch_covariance(state, covariance)
-            self._discard_conversion()
+        self._covariance = estimate.covariance
+        self._touch_count += 1
 
-    def _is_out_of_range(self, state: Array) -> bool:
-        """Return whether the pretension is at the end of the range of the model, or the offset is too large."""
-        low_MPa, high_MPa = self._series.node_MPa[[0, -1]]
-        is_pretension_known = low_MPa < state[0] < high_MPa
-        largest_pC = MAX_RELATIVE_OFFSET * self._model.largest_offset_pC
-        return not is_pretension_known or abs(state[self._model.offset]) > max(largest_pC, 1e-3)
+        # Twice the cost is the squared distance, in which large residuals have little weight.
+        self._mean_square += (2.0 * estimate.cost - self._mean_square) / MEMORY_TOUCHES
+        at_end = (estimate.state <= self._lowest) | (estimate.state >= self._highest)
+        was_lost = self.is_lost
+        self.is_lost = self._mean_square > MAX_MEAN_SQUARE or bool(at_end[0] or at_end[self._offset])
+        if self.is_lost and not was_lost:
+            self._start_estimate()  # the film may have changed suddenly, so earlier touches do not help
+        elif not self.is_lost and self._touch_count >= FEWEST_TOUCHES:
+            self._apply_estimate()
+            self._conversion_contact = None  # the stored conversion belongs to the earlier state
 
-    def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
+    def _apply_estimate(self) -> None:
+        """Correct contacts for the mean of the state, if the pretension may not have changed at all.
+
+        Before the touches, the pretension has not changed with a probability of 1/2. The touches change the odds by the
+        ratio of the probability densities of t = 0 after and before them (Savage-Dickey ratio, Dickey 1971).
+        """
+        change_MPa = self._state[0]
+        variance = self._covariance[0, 0]
+        odds = self._initial_std[0] / math.sqrt(variance) * math.exp(-0.5 * change_MPa**2 / variance)
+        probability = odds / (1.0 + odds)
+
+        # Without a change, the other unknowns have their conditional distribution for t = 0.
+        gain = self._covariance[0] / variance
+        shift = change_MPa * gain
+        spread = probability * (1.0 - probability) * np.outer(shift, shift)
+        self._applied_state = self._state - probability * shift
+        self._applied_covariance = self._covariance - probability * variance * np.outer(gain, gain) + spread
+        self._applied_covariance[self._offset, self._offset] += self._offset_std_pC**2
+
+    def _values(self, contacts: Array, state: Array) -> ModelValues:
+        """Compute the charges of touches and their derivatives.
+
+        Args:
+            contacts: Contacts (x, y, ln F), shape (n, 3), mm and the logarithm of N.
+            state: State, shape (n_state,).
+        """
+        film = self._series.changes(_with_force(contacts), state[self._film])
+        gains = np.exp(state[self._gains])
+        film_charge_pC = film.charge_pC * gains
+        by_state = np.zeros((*film_charge_pC.shape, state.size))
+        by_state[:, :, self._film] = film.by_state * gains[:, None]
+        by_state[:, :, self._gains] = film_charge_pC[:, :, None] * np.eye(gains.size)
+        by_state[:, :, self._offset] = self._offset_ratio
+        charge_pC = film_charge_pC + state[self._offset] * self._offset_ratio
+        return ModelValues(charge_pC, film.by_contact * gains[:, None], by_state)
+
+    def _log_contact(self, contact: Contact) -> Array:
+        """Return (x, y, ln F) of a contact, moved into the bounds of the charge map, shape (1, 3)."""
+        lowest, highest = self._contact_bounds
+        log_force = math.log(max(contact.force_N, math.exp(lowest[2])))
+        return np.clip([[contact.x_mm, contact.y_mm, log_force]], lowest, highest)
+
+    def follow_contact(self, contact: Contact, charge_pC: Array) -> Contact:
         """Correct a contact for the estimated changes of the film.
 
         The uncertainty of the state is added to the standard deviations of the contact. Before the first estimate of
@@ -243,24 +305,16 @@ class FilmFollower:
         """
         state = self._applied_state
         if state is None:  # there is no estimate yet
-            return FollowedContact(contact, charge_pC)
+            return contact
         conversion = self._conversion
         if conversion is None or not is_close(contact, self._conversion_contact):
             conversion = self._conversion_at(contact, state)
             for _ in range(CONVERSIONS - 1):
-                corrected = self.predictor.predict(conversion.factor * charge_pC + conversion.shift_pC)
+                corrected = self.predictor.predict(charge_pC + conversion.shift_pC)
                 conversion = self._conversion_at(corrected, state)
             self._conversion = conversion
             self._conversion_contact = contact
-        corrected_pC = conversion.factor * charge_pC + conversion.shift_pC
-        covariance = conversion.contact_shifts.T @ conversion.contact_shifts
-        corrected = self.predictor.predict(corrected_pC).with_covariance(covariance)
-        return FollowedContact(corrected, corrected_pC)
-
-    def _discard_conversion(self) -> None:
-        """Discard the stored conversion, which belongs to an earlier contact or state."""
-        self._conversion = None
-        self._conversion_contact = None
+        return self.predictor.predict(charge_pC + conversion.shift_pC).with_covariance(conversion.covariance)
 
     def _conversion_at(self, contact: Contact, state: Array) -> _Conversion:
         """Return the conversion of charges near a contact.
@@ -269,28 +323,19 @@ class FilmFollower:
             contact: Contact on the calibrated film.
             state: State of the film, shape (n_state,).
         """
-        model = self._model
-        lowest, highest = model.contact_bounds
-        log_force = math.log(max(contact.force_N, math.exp(lowest[2])))
-        log_contact = np.clip([[contact.x_mm, contact.y_mm, log_force]], lowest, highest)
-        present = model.values(log_contact, state)
-        near_contact = log_contact * [1.0, 1.0, 0.0] + [0.0, 0.0, math.exp(log_contact[0, 2])]  # (x, y, F)
-        calibrated_charges_pC, calibrated_slopes_pC = self._series.linearised(near_contact)
-        offset_pC = state[model.offset] * model.offset_ratio
-        calibrated_pC = calibrated_charges_pC[0]
-        if self._series.log_size is None:  # all charges are positive
-            factor = calibrated_pC / (present.charge_pC[0] - offset_pC)
-            shift_pC = -factor * offset_pC
-        else:  # a ratio of charges near zero would be very large or small
-            factor = np.ones_like(calibrated_pC)
-            shift_pC = calibrated_pC - present.charge_pC[0]
+        log_contact = self._log_contact(contact)
+        present = self._values(log_contact, state)
+        (calibrated_pC,), (slopes_pC,) = self._series.linearised(_with_force(log_contact))
 
         # An error of the state shifts the contact whose charges are nearest to the converted charges. The norm is that
         # of the noise of the charges.
-        noise_std_pC = np.sqrt(self.predictor.metadata.noise.variance(calibrated_pC))
-        charge_errors = factor[:, None] * present.by_state[0] @ np.linalg.cholesky(self._applied_covariance)
-        slopes = calibrated_slopes_pC[0] / noise_std_pC[:, None]
-        errors = np.linalg.pinv(slopes) @ (charge_errors / noise_std_pC[:, None])  # shape (3, n_state)
-        errors[2] *= contact.force_N  # from ln F to F
-        # Three independent errors with the same covariance: the rows of R in the decomposition errors' = Q R
-        return _Conversion(factor, shift_pC, np.asarray(np.linalg.qr(errors.T, mode="r")))
+        weight = 1.0 / np.sqrt(self.predictor.metadata.noise.variance(calibrated_pC))[:, None]
+        contact_by_state = np.linalg.pinv(weight * slopes_pC) @ (weight * present.by_state[0])  # shape (3, n_state)
+        contact_by_state[2] *= contact.force_N  # from ln F to F
+        covariance = contact_by_state @ self._applied_covariance @ contact_by_state.T
+        return _Conversion(calibrated_pC - present.charge_pC[0], covariance)
+
+
+def _with_force(contacts: Array) -> Array:
+    """Return contacts (x, y, F) for contacts (x, y, ln F), each of shape (n, 3)."""
+    return np.column_stack([contacts[:, :2], np.exp(contacts[:, 2])])

@@ -213,7 +213,6 @@ class Tracker(Stage):
                 return None, self._tracked
             contact, *others = [hypothesis.contact(t_s - self._mixture.time_s) for hypothesis in hypotheses]
             frame.set_contact(contact, self._mixture_validity)
-            frame.model_charge_pC = None
             self._other = None
             if hypotheses[0].probability < CERTAIN_PROBABILITY:
                 self._other = OtherContact(*others[0][:3], hypotheses[1].probability)
