@@ -4,13 +4,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from axes import finish_axes, new_axes, shades
 from choices import CUBICS, LINEAR_N
 from page import Entry, Row
 from scipy.interpolate import CubicSpline
 from solves import Solves
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.plots.figure import COLOURS, FELT, INK, finish_axes, new_axes, shades
+from isocharge.simulate.plots.figure import COLOURS, FELT, INK
 
 BAND = 0.02
 """Largest difference of normalised charges that count as the same, dimensionless."""

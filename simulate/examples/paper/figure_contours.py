@@ -4,6 +4,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from axes import draw_probe, finish_axes, new_axes
 from choices import ERROR_MM, Choices
 from drawing import DrawnContour, DrawnTriangulation
 from matplotlib.figure import Figure
@@ -14,8 +15,8 @@ from triangulation_errors import BEYOND, Accuracy
 from isocharge.common.arrays import Array
 from isocharge.simulate import ChargeMap, ChargeSpline, Sensor
 from isocharge.simulate.numerics.disk import INNER_RADIUS
-from isocharge.simulate.plots.figure import COLOURS, FELT, INK, finish_axes, new_axes
-from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
+from isocharge.simulate.plots.figure import COLOURS, FELT, INK
+from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
 
 LEVELS = 8
 AREA = 11.5

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from axes import finish_axes, new_axes, shades
 from choices import CONTOUR_PC, FIG_8_DEG
 from drawing import draw_contour
 from mapping import Curves, Mapping
@@ -14,7 +15,7 @@ from solves import FORCE, Solves
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Piezo, Sensor
-from isocharge.simulate.plots.figure import COLOURS, PRESSED, finish_axes, new_axes, shades
+from isocharge.simulate.plots.figure import COLOURS, PRESSED
 
 FROM_A_DEG = {"three": (35.0, 90.0), "four": (110.0, 250.0)}
 """First and last line from A, by layout."""

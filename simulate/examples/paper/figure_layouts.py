@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from axes import draw_probe, finish_axes, new_axes
 from choices import ELEMENTS
 from mapping import Mapping
 from matplotlib.collections import LineCollection
@@ -14,8 +15,8 @@ from isocharge.common.arrays import Array
 from isocharge.simulate import Equilibrium, Sensor
 from isocharge.simulate.forward.readout import contact_charge
 from isocharge.simulate.numerics.interpolation import tensor_values
-from isocharge.simulate.plots.figure import COLOURS, FELT, INK, PRESSED, finish_axes, new_axes
-from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
+from isocharge.simulate.plots.figure import COLOURS, FELT, INK, PRESSED
+from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
 
 FIG_4_DEG = (35.0, 145.0)
 """First and last angle of the lines from A: the half that Fig. 6 shows, and its mirror image."""

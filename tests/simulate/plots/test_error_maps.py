@@ -27,6 +27,7 @@ def test_error_maps_picture_marks_the_position_of_the_largest_error(nuisances, b
     for axes in maps:
         assert [line.get_xydata().tolist() for line in axes.lines] == [[[2.0, 4.0]]]
         assert "worst 3 mm (cross), rms 1.35 mm" in axes.get_title()
-        assert axes.get_xlim() == pytest.approx((-12.5, 12.5))  # a millimetre beyond the electrodes
+        assert axes.get_xlim()[1] > 10.2  # the outermost corners of the electrodes
+        assert axes.get_ylim()[0] < -11.5
         (shades,) = axes.collections
         assert (type(shades.norm), *shades.get_clim()) == (LogNorm, 0.1, 1.0)

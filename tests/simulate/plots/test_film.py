@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from isocharge.simulate import Calibration, Circle, Domain, Electrode, FunctionMap, Polygon, load_sensor, press
-from isocharge.simulate.plots.film import draw_charge_map, draw_electrodes, draw_probe, draw_section
+from isocharge.simulate import Calibration, Circle, Domain, Electrode, FunctionMap, load_sensor, press
+from isocharge.simulate.plots.film import draw_charge_map, draw_electrodes, draw_section
 
 
 def test_draw_electrodes_draws_front_and_back_at_their_positions():
@@ -30,13 +30,6 @@ def test_draw_charge_map_covers_the_whole_disk():
     axes = Figure().subplots()
     draw_charge_map(axes, charge_map, 0)
     assert axes.dataLim.extents == pytest.approx([-8.0, -8.0, 8.0, 8.0], abs=0.02)
-
-
-def test_draw_probe_draws_the_footprint_at_its_position():
-    axes = Figure().subplots()
-    triangle = Polygon.triangle(3.0, 0.3)
-    draw_probe(axes, triangle, (2.0, -1.0))
-    np.testing.assert_allclose(axes.patches[0].get_xy()[:-1] @ [1.0, 1.0j], 2.0 - 1.0j + triangle.outline)
 
 
 @pytest.mark.parametrize(("at", "distance"), [((3.0, -4.0), 5.0), ((0.0, 0.0), 0.0)])

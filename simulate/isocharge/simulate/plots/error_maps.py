@@ -5,39 +5,28 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import ScalarFormatter
 
-from isocharge.simulate.identifiability.identification import Identification, LimitMap
+from isocharge.common.arrays import Array
+from isocharge.simulate.identifiability.identification import Identification
 from isocharge.simulate.layout.case import NO_NUISANCES
-from isocharge.simulate.layout.design import Design, ErrorMap
+from isocharge.simulate.layout.design import Design
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_circle, draw_electrodes, draw_working_area
 from isocharge.simulate.sensor.sensor import Sensor
 
-MIN_ERROR_mm = 0.02
-"""Position error at the lower end of the colour scale, mm. Smaller errors have the colour of this error."""
-
-MAX_ERROR_mm = 5.0
-"""Position error at the upper end of the colour scale, mm. Larger errors have the colour of this error."""
-
-TICKS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
-"""Position errors that are labelled on the colour bar, mm."""
-
 MAX_ERROR_RATIO = 10.0
 """Ratio of the largest to the smallest error of the colour scale in the maps of a design, dimensionless."""
 
-MARGIN = 1.0
-"""Margin around the electrodes in the maps of a design, mm."""
-
-FORCE_COLOURS = ("#8fb8de", "#3a7ca5", INK)
-"""Colours of the curves for ascending forces. The last colour belongs to the largest force."""
+ERROR_LABEL = "lower limit of the position error (rms), mm"
+"""Label of the colour bars and of the axis of the errors."""
 
 
 def identification_picture(identification: Identification) -> Figure:
     """Draw the position errors of an identification.
 
-    Two maps show the errors over the film for the smallest and the largest force. A diagram shows the errors as a
-    function of the distance from the centre.
+    Two maps show the errors over the film for the smallest and the largest force. Their colours end at the allowed
+    error. A diagram shows the errors as a function of the distance from the centre.
 
     Args:
         identification: Result of `identify`.
@@ -45,53 +34,24 @@ def identification_picture(identification: Identification) -> Figure:
     Returns:
         Figure with the two maps and the diagram.
     """
+    area = identification.area
     figure = new_figure(16.0, 5.2)
-    smallest_force_axes, largest_force_axes, distance_axes = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
-    draw_limit_map(smallest_force_axes, identification, identification.maps[0])
-    coloured_areas = draw_limit_map(largest_force_axes, identification, identification.maps[-1])
-    figure.colorbar(  # both maps have the same colour scale
-        coloured_areas,
-        ax=[smallest_force_axes, largest_force_axes],
-        label="lower limit of the position error (rms), mm",
-        ticks=TICKS,
-        format="%g",
-        pad=0.01,
-    )
+    *map_axes, distance_axes = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
+    limit_maps = (identification.maps[0], identification.maps[-1])
+    smallest = min(float(limit_map.position.min()) for limit_map in limit_maps)
+    norm = LogNorm(smallest, max(area.error, 2.0 * smallest))
+    for axes, limit_map in zip(map_axes, limit_maps, strict=True):
+        positions = limit_map.rings.position.reshape(-1, 2)
+        coloured_area = _draw_errors(axes, identification.sensor, positions, limit_map.position.ravel(), norm)
+        axes.plot(*area.folds.T, ".", color=FELT, ms=3)
+        draw_circle(axes, area.radius, ls="--", lw=1.8, color="white")
+        folds = "; red: folds" if len(area.folds) else ""
+        axes.set_title(f"{limit_map.force:g} N; dashed: working area, {area.radius:g} mm{folds}")
+    _add_colour_bar(figure, coloured_area, map_axes)
     _draw_distance(distance_axes, identification)
     title = f"{identification.sensor.name}, {identification.probe.notation}, noise {identification.noise.name}"
     figure.suptitle(title, fontsize=13)
     return figure
-
-
-def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMap) -> Any:
-    """Draw a map of the position errors for one force, with the folds, the working area and the electrodes.
-
-    Args:
-        axes: Axes of matplotlib.
-        identification: Result of `identify`, with the sensor and the working area.
-        limit_map: Lower limits of the position error for one force.
-
-    Returns:
-        The coloured areas of the map, for which a colour bar can be drawn.
-    """
-    # Draw the errors as colours. Errors outside the colour scale get the first or the last colour.
-    x, y = limit_map.rings.position.reshape(-1, 2).T  # mm
-    levels = np.geomspace(MIN_ERROR_mm, MAX_ERROR_mm, 25)
-    errors = np.clip(limit_map.position.ravel(), MIN_ERROR_mm, MAX_ERROR_mm)
-    coloured_areas = axes.tricontourf(x, y, errors, levels, norm=LogNorm(), cmap="viridis")
-
-    # Draw the folds, which are positions (x, y), the working area, and the electrodes.
-    folds = identification.area.folds
-    fold_x, fold_y = folds.T
-    axes.plot(fold_x, fold_y, ".", color=FELT, ms=3)
-    draw_circle(axes, identification.area.radius, ls="--", lw=1.8, color="white")
-    draw_electrodes(axes, identification.sensor)
-    axis_limits = (-identification.area.search_radius, identification.area.search_radius)
-    title = f"{limit_map.force:g} N; dashed: working area, {identification.area.radius:g} mm"
-    if len(folds):
-        title += "; red: folds"
-    axes.set(title=title, xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=axis_limits, ylim=axis_limits)
-    return coloured_areas
 
 
 def _draw_distance(axes: Any, identification: Identification) -> None:
@@ -102,15 +62,10 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
         identification: Result of `identify`, which contains a map of the errors for each force.
     """
     area = identification.area
-
-    # Draw two curves for each force. With fewer forces than colours, the last colours are used.
-    colours = FORCE_COLOURS[len(FORCE_COLOURS) - len(identification.maps) :]
-    for limit_map, colour in zip(identification.maps, colours, strict=True):
+    for limit_map in identification.maps:
         distance = limit_map.rings.distance
-        median_error = np.median(limit_map.position, axis=1)
-        largest_error = limit_map.position.max(axis=1)
-        axes.semilogy(distance, median_error, color=colour, label=f"{limit_map.force:g} N")
-        axes.semilogy(distance, largest_error, ":", color=colour)
+        (curve,) = axes.semilogy(distance, np.median(limit_map.position, axis=1), label=f"{limit_map.force:g} N")
+        axes.semilogy(distance, limit_map.position.max(axis=1), ":", color=curve.get_color())
     axes.plot([], [], ":", color=INK, label="worst of the ring")  # an entry of the legend for all dotted curves
 
     # Mark the allowed error, the working area, and the distance of the nearest fold if there is one.
@@ -118,15 +73,10 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
     axes.axvline(area.radius, ls="--", color=INK, label=f"working area, {area.radius:g} mm")
     if np.isfinite(area.fold_radius):
         axes.axvline(area.fold_radius, color=FELT, label=f"first fold, {area.fold_radius:.1f} mm")
-    axes.set(
-        xlabel="distance from the centre, mm",
-        ylabel="lower limit of the position error (rms), mm",
-        xlim=(0.0, area.search_radius),
-        ylim=(0.005, 20.0),
-    )
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    largest_error = 20.0 * area.error  # near a fold, the error is infinite
+    axes.set(xlabel="distance from the centre, mm", ylabel=ERROR_LABEL, xlim=(0.0, area.search_radius))
+    axes.set_ylim(top=min(axes.get_ylim()[1], largest_error))
     axes.yaxis.set_major_formatter(ScalarFormatter())
-    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, loc="lower right")
 
@@ -147,48 +97,46 @@ def error_maps_picture(design: Design) -> Figure:
     if design.errors_before:
         layouts.insert(0, (case.sensor, design.errors_before))  # the map of the initial layout is on the left
 
-    # Both maps have the same colour scale. Their axes have the same limits and show all electrodes.
+    # Both maps have the same colour scale and the same axes, which show all electrodes.
     smallest = min(float(errors.with_nuisances.min()) for _, errors in layouts)
     norm = LogNorm(smallest, MAX_ERROR_RATIO * smallest)
-    electrodes = [electrode for sensor, _ in layouts for electrode in sensor.electrodes]
-    corners = np.concatenate([polygon for electrode in electrodes for polygon in electrode.front])
-    half_width = float(max(case.radius, np.abs(corners).max())) + MARGIN
-    limits = (-half_width, half_width)
-
     figure = new_figure(6.4 * len(layouts) + 1.0, 6.0)
-    all_axes = figure.subplots(1, len(layouts), squeeze=False)[0]
+    all_axes = figure.subplots(1, len(layouts), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (sensor, errors) in zip(all_axes, layouts, strict=True):
-        coloured_area = _draw_errors(axes, sensor, errors, norm)
+        position_error = errors.with_nuisances  # shape (n_press,), mm
+        coloured_area = _draw_errors(axes, sensor, errors.presses, position_error, norm)
+        worst_x, worst_y = errors.presses[np.argmax(position_error)]
+        axes.plot(worst_x, worst_y, "x", color=FELT, ms=9, mew=2)
         draw_working_area(axes, case.radius)
-        axes.set(xlim=limits, ylim=limits, xlabel="x, mm", ylabel="y, mm", aspect="equal")
+        rms = np.sqrt(np.mean(position_error**2))
+        axes.set_title(f"{sensor.name}\nworst {position_error.max():.3g} mm (cross), rms {rms:.3g} mm")
 
-    # One colour bar is enough for both maps.
-    label = "lower limit of the position error (rms), mm"
-    colour_bar = figure.colorbar(coloured_area, ax=list(all_axes), label=label, shrink=0.85, extend="max")
-    colour_bar.ax.yaxis.set_major_formatter(ScalarFormatter())
-    colour_bar.ax.yaxis.set_minor_formatter(ScalarFormatter())
+    _add_colour_bar(figure, coloured_area, list(all_axes))
     nuisances = "without nuisances" if case.nuisances == NO_NUISANCES else "with nuisances"
     figure.suptitle(f"{case.force:g} N, {case.probe.notation}, noise {case.noise.name}, {nuisances}")
     return figure
 
 
-def _draw_errors(axes: Any, sensor: Sensor, errors: ErrorMap, norm: LogNorm) -> Any:
-    """Draw the position errors of one layout as colours, and mark the largest error and the electrodes.
+def _draw_errors(axes: Any, sensor: Sensor, positions: Array, errors: Array, norm: LogNorm) -> Any:
+    """Draw position errors as colours, and the electrodes.
 
     Args:
         axes: Axes of matplotlib.
-        sensor: Sensor with the electrodes of the layout.
-        errors: Position errors of the layout.
+        sensor: Sensor with the electrodes.
+        positions: Positions (x, y) of the presses, shape (n, 2), mm.
+        errors: Position error of each press, shape (n,), mm.
         norm: Range of the colour scale.
 
     Returns:
         The coloured area of the map, for which a colour bar can be drawn.
     """
     draw_electrodes(axes, sensor)
-    position_error = errors.with_nuisances  # shape (n_press,), mm
-    worst_x, worst_y = errors.presses[np.argmax(position_error)]
-    axes.plot(worst_x, worst_y, "x", color=FELT, ms=9, mew=2)
-    rms = np.sqrt(np.mean(position_error**2))
-    axes.set_title(f"{sensor.name}\nworst {position_error.max():.3g} mm (cross), rms {rms:.3g} mm")
-    x, y = errors.presses.T
-    return axes.tripcolor(x, y, position_error, norm=norm, cmap="viridis", shading="gouraud")
+    axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
+    return axes.tripcolor(*positions.T, errors, norm=norm, cmap="viridis", shading="gouraud")
+
+
+def _add_colour_bar(figure: Figure, coloured_area: Any, axes: list[Any]) -> None:
+    """Add a colour bar for position errors beside axes that have the same colour scale."""
+    colour_bar = figure.colorbar(coloured_area, ax=axes, label=ERROR_LABEL, shrink=0.85, extend="max")
+    colour_bar.ax.yaxis.set_major_formatter(ScalarFormatter())
+    colour_bar.ax.yaxis.set_minor_formatter(ScalarFormatter())

@@ -5,14 +5,11 @@ The figures are not shown in a window. This module imports matplotlib, so only m
 
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from matplotlib import colormaps, rc_context
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing, write_whole
 
@@ -34,12 +31,6 @@ FORMATS = ("png", "svg", "pdf")
 DPI = 130
 """Resolution of PNG files, dots per inch."""
 
-LAST_SHADE = 0.92
-"""Fraction of the colour map `viridis` that `shades` uses, from its dark end.
-
-The remaining colours are hardly visible on white.
-"""
-
 
 def new_figure(width: float, height: float) -> Figure:
     """Create a figure that is not shown in a window.
@@ -51,49 +42,6 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
-
-
-def new_axes(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
-    """Create a figure with axes, like the function `subplots` of matplotlib.
-
-    Args:
-        width: Width of the figure, inches.
-        height: Height of the figure, inches.
-        rows: Number of rows of axes.
-        columns: Number of columns of axes.
-
-    Returns:
-        The figure, and its axes or an array of its axes.
-    """
-    figure = new_figure(width, height)
-    return figure, figure.subplots(rows, columns)
-
-
-def finish_axes(axes: Any, x: str, y: str, title: str = "", **legend: Any) -> None:
-    """Add labels, a title, a grid and a legend to axes.
-
-    Args:
-        axes: Axes of matplotlib.
-        x: Label of the x axis.
-        y: Label of the y axis.
-        title: Title of the axes.
-        **legend: Arguments that are passed to `Axes.legend`.
-    """
-    axes.set(xlabel=x, ylabel=y, title=title)
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(**{"fontsize": 8} | legend)
-
-
-def shades(count: int) -> Array:
-    """Return colours from dark to light for an ordered set of lines.
-
-    Args:
-        count: Number of colours.
-
-    Returns:
-        Red, green, blue and opacity of each colour, from 0 to 1, shape (count, 4).
-    """
-    return np.asarray(colormaps["viridis"](np.linspace(0.0, LAST_SHADE, count)))
 
 
 def check_picture(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Functions that draw parts of a film to scale, such as electrodes, probes, charge maps and deflections."""
+"""Functions that draw parts of a film to scale, such as electrodes, charge maps and deflections."""
 
 from math import atan2, cos, hypot, sin
 from typing import Any
@@ -10,9 +10,7 @@ from matplotlib.patheffects import withStroke
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap
-from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.plots.figure import FELT, INK
-from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
 
@@ -45,19 +43,6 @@ def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool 
         if names:
             centre = sensor.calibration.place(np.array(electrode.centre))
             axes.annotate(electrode.name, centre, ha="center", va="center", color=colour, fontsize=9, path_effects=halo)
-
-
-def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "") -> None:
-    """Draw the footprint of a probe that presses on the film.
-
-    Args:
-        axes: Axes of matplotlib.
-        probe: Probe whose footprint is drawn.
-        at: Position (x, y) of the centroid of the footprint, mm.
-        label: Label of the footprint in the legend; empty for no label.
-    """
-    style: dict[str, Any] = {"fill": True, "fc": FELT, "ec": FELT, "alpha": 0.35, "zorder": 2, "label": label}
-    axes.add_patch(Patch(to_corners(complex(*at) + probe.outline), **style))
 
 
 def draw_circle(axes: Any, radius: float, **style: Any) -> None:
