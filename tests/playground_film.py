@@ -1,17 +1,17 @@
-"""The Chebyshev series of the stress from which the playground computes charges; see `viewer/stress_series.py`.
+"""The Chebyshev series of the stress from which the playground computes charges; see `playground/charges.js`.
 
 python tests/playground_film.py serve/isocharge/serve/viewer/playground/film-25um.json
 """
 
+import base64
+import json
 import sys
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.fft import dctn
 
-from isocharge.serve.viewer.stress_series import StressSeries, Table
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from isocharge.simulate.forward.forward_map import EVEN_FIELD
 from isocharge.simulate.forward.readout import ReadoutPoints
@@ -50,15 +50,15 @@ def stress_series():
             points_mm = radius * (points + shift) / (1.0 + shift * points)
             for j, force_N in enumerate(low_N * (high_N / low_N) ** fraction(COUNTS[1])):
                 stress[i, j] = stress_sum(forward_map, [distance_mm, 0.0, force_N], points_mm)
-    return StressSeries(
-        film=film_to_dict(sensor.film),
-        probe_radius_mm=PROBE.radius,
-        max_distance_mm=MAX_DISTANCE_mm,
-        force_range_N=FORCE_RANGE_N,
-        max_ring=MAX_RING,
-        inner=table(np.log(inner)),
-        outer=table(np.log(outer)),
-    )
+    return {
+        "film": film_to_dict(sensor.film),
+        "probe_radius_mm": PROBE.radius,
+        "max_distance_mm": MAX_DISTANCE_mm,
+        "force_range_N": FORCE_RANGE_N,
+        "max_ring": MAX_RING,
+        "inner": table(np.log(inner)),
+        "outer": table(np.log(outer)),
+    }
 
 
 def stress_sum(forward_map, contact, points_mm):
@@ -74,13 +74,13 @@ def table(values):
     transformed = dctn(np.flip(values), type=2) / values.size  # the cosine transform begins at the largest node
     for axis in range(values.ndim):
         np.moveaxis(transformed, axis, 0)[0] /= 2.0
-    return Table(values.shape, transformed.astype("<f4").tobytes())
+    return {"shape": values.shape, "data": base64.b64encode(transformed.astype("<f4").tobytes()).decode()}
 
 
 def coefficients(stored):
     """Return the coefficients of a table in the file."""
-    return np.frombuffer(stored.data, "<f4").reshape(stored.shape)
+    return np.frombuffer(base64.b64decode(stored["data"]), "<f4").reshape(stored["shape"])
 
 
 if __name__ == "__main__":
-    Path(sys.argv[1]).write_bytes(msgspec.json.encode(stress_series()))
+    Path(sys.argv[1]).write_text(json.dumps(stress_series()))

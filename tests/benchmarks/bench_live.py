@@ -9,29 +9,28 @@ pictures are and how many a second it draws.
     python tests/benchmarks/bench_live.py --rounds 4 --seconds 10 [--browser] [--rate-hz 1000]
 """
 
-import asyncio
+import http.client
 import json
 import multiprocessing
 import re
-import struct
 import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import bench_stream
 import numpy as np
 from shared import arguments, percentiles, print_results
-from websockets.asyncio.client import connect
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from headless_chromium import start_chromium
-from isocharge.serve import Predictor, Recording, Script, wander
-from isocharge.serve.viewer.messages import HEADER, SampleFormat
+from isocharge.serve import Recording, Script, wander
 
 SHARES = (50, 95, 99)
 MODEL = "three-25um-biaxial"
@@ -44,30 +43,25 @@ def presses(rate_Hz):
     return Script(*columns, rate_Hz)
 
 
-def watch(url, electrodes, viewers, seconds, results):
-    """Viewers by the stock client, in a process of their own: ages of the newest sample, s. The first one stalls."""
-    results.send(asyncio.run(_watch_all(url, SampleFormat(electrodes), viewers, seconds)))
+def watch(url, viewers, seconds, results):
+    """Viewers in threads of a process of its own: ages of the newest sample, s. The first one reads no answers."""
+    with ThreadPoolExecutor(viewers) as threads:
+        ages = threads.map(lambda number: _watch(urlsplit(url).netloc, number == 0, seconds), range(viewers))
+        results.send([age for viewer in ages for age in viewer])
 
 
-async def _watch_all(url, form, viewers, seconds):
-    ages = await asyncio.gather(*(_watch(url, form, number == 0, seconds) for number in range(viewers)))
-    return [age for viewer in ages for age in viewer]
-
-
-async def _watch(url, form, stalls, seconds):
-    ages, end = [], time.monotonic() + seconds
-    async with connect(url.replace("http", "ws", 1) + "/live") as client:
+def _watch(place, stalls, seconds):
+    client, ages, first, end = http.client.HTTPConnection(place), [], None, time.monotonic() + seconds
+    while time.monotonic() < end:
+        client.request("POST", "/request", json.dumps({"do": "read", "first": first}))
         if stalls:
-            client.transport.pause_reading()
-            await asyncio.sleep(seconds)
-            client.transport.abort()  # a stalled client would not take part in closing, either
-        while time.monotonic() < end:
-            data = await client.recv()
-            if isinstance(data, bytes):
-                rows = np.frombuffer(data, form.dtype, offset=HEADER.size)
-                ages += [time.time() - stamp for stamp in rows["timestamp"][-1:]]
-                await asyncio.sleep(1 / 60)  # a picture
-                await client.send(struct.pack("<I", HEADER.unpack_from(data)[3]))
+            time.sleep(seconds)
+            break
+        answer = json.load(client.getresponse())
+        first = answer["first"]
+        ages += [time.time() - sample[0] for sample in answer["samples"][-1:]]
+        time.sleep(1 / 60)  # a picture
+    client.close()
     return ages
 
 
@@ -108,12 +102,11 @@ def one_round(port, viewers, seconds, folder, name, in_browser):
     path, (ours, theirs) = folder / f"{name}.rec", multiprocessing.Pipe(duplex=False)
     words = ["--live", "127.0.0.1:0"] if viewers else []
     with following(port, folder, name, "--record", path, *words) as url:
-        wanted = url, Predictor(MODEL).metadata.electrodes, viewers - in_browser, seconds, theirs
-        watching = multiprocessing.Process(target=watch, args=wanted)
-        watching.start()
+        watching = multiprocessing.Process(target=watch, args=(url, viewers - in_browser, seconds, theirs))
+        if viewers:
+            watching.start()
         browsed = browse(url, seconds) if in_browser else time.sleep(seconds)
-        ages = ours.recv()
-        watching.join()
+        ages = ours.recv() if viewers else []
     latencies = np.array([us for event in Recording(path).events() for us in event.latencies_us])
     lines = (json.loads(line) for line in path.open() if line.startswith('{"timestamp"'))
     seq = np.array([line["seq"] for line in lines])

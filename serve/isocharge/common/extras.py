@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from isocharge.common.errors import MissingExtra
 
 SIMULATE = frozenset({"scipy", "threadpoolctl", "matplotlib", "contourpy", "shapely"})
-HTTP = frozenset({"uvicorn", "uvloop", "httptools", "orjson", "prometheus_client", "websockets"})
+HTTP = frozenset({"uvicorn", "uvloop", "httptools", "orjson", "prometheus_client"})
 PACKAGES = {
     "simulate": SIMULATE,
     "train": SIMULATE | {"torch", "onnx", "sklearn"},

@@ -1,13 +1,14 @@
 """Demo of the live page with a virtual sensor and a released model."""
 
 from contextlib import ExitStack, closing
+from functools import partial
 
 from isocharge.cli.demo.played_area import DEFAULT_SENSOR, played_radius_mm
-from isocharge.cli.shared.live_page import PageFeed, RecordingHeader, answering, live_page
+from isocharge.cli.shared.live_page import PageFeed, live_page, warnings_on_page
 from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE
-from isocharge.serve import Port, Predictor, TouchStream, find_model
+from isocharge.serve import Port, Predictor, Recorder, TouchStream
 from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.network.address import Address
 from isocharge.simulate import Circle, ForwardMap, load_sensor
@@ -39,9 +40,7 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
 
         # The page starts before the film is solved, so that the user can open it meanwhile.
         metadata = predictor.metadata
-        link = stack.enter_context(
-            live_page(address, token=None, name=sensor, metadata=metadata, model_folder=find_model(sensor))
-        )
+        page = stack.enter_context(live_page(address, token=None, name=sensor, metadata=metadata))
         with shown_progress():
             radius_mm = played_radius_mm(sensor)
             forward_map = ForwardMap.build(load_sensor(sensor), Circle(1.0), radius_mm, DEFAULT_PLAYED_FORCE_RANGE)
@@ -49,13 +48,12 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
         board = stack.enter_context(virtual_sensor(forward_map, "reference", SEED, RATE_HZ))
         port = stack.enter_context(Port(board.url))
 
-        # Carry out the requests of the page. A recording that the page begins has every frame, and neither a device
-        # file nor a name of the film.
-        header = RecordingHeader(policy="every", device={}, name="")
-        stack.enter_context(answering(link, stream, header))
+        # A recording that the page begins has every frame, and neither a device file nor a name of the film.
+        new_recorder = partial(Recorder, policy="every", device={})
+        stack.enter_context(warnings_on_page(page))
+        feed = PageFeed(page, touch, stream, new_recorder)
 
         say("Ctrl-C stops")
-        feed = PageFeed(link, touch, stream)
         records = stack.enter_context(closing(stream.follow(port)))
         for record in records:
             feed.write(record)

@@ -1,13 +1,14 @@
 """`isocharge serve stream` and `serve replay`: compute prediction records from a live port or from a recording."""
 
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -25,14 +26,13 @@ from isocharge.cli.shared.live_page import (
     AllowHostOption,
     LiveOption,
     PageFeed,
-    RecordingHeader,
     TlsCertOption,
     TlsKeyOption,
     TokenOption,
-    answering,
     live_page,
     page_address,
     page_tls,
+    warnings_on_page,
 )
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.port_hints import no_frames_advice_added, no_frames_hint
@@ -63,7 +63,9 @@ from isocharge.serve import (
 from isocharge.serve.live.device import with_settings
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.outputs.targets import Outputs
-from isocharge.serve.viewer.link import ReaderEnd
+
+if TYPE_CHECKING:
+    from isocharge.serve.viewer.live_page import LivePage
 
 MAX_NAME_CHARACTERS = 100
 """Largest number of characters of a film's name."""
@@ -168,9 +170,8 @@ def stream_command(
         stack.enter_context(until_stopped())
         page = None
         if address is not None:
-            folder = find_model(model, models)
             page = stack.enter_context(
-                live_page(address, token, touch.frame_id, predictor.metadata, folder, tls=tls, allow_host=allow_host)
+                live_page(address, token, touch.frame_id, predictor.metadata, tls=tls, allow_host=allow_host)
             )
         stack.enter_context(timer)
         source = stack.enter_context(open_source(port, baud=baud, reconnect=True, request=board.request, wait=wait))
@@ -184,10 +185,9 @@ def stream_command(
         writers: list[RecordWriter] = [outputs.write]
         if page is not None:
             # The page must not begin a recording if the command itself records the stream.
-            header = None if recorder else RecordingHeader(policy.value, board.table, name)
-            stack.enter_context(answering(page, stream, header))
-            feed = PageFeed(page, touch, stream)
-            writers.append(feed.write)
+            new_recorder = None if recorder else partial(Recorder, policy=policy.value, device=board.table, name=name)
+            stack.enter_context(warnings_on_page(page))
+            writers.append(PageFeed(page, touch, stream, new_recorder).write)
         if recorder:
             stack.enter_context(recorder)
         records = stack.enter_context(closing(stream.follow(source)))  # closed before the recorder
@@ -283,13 +283,12 @@ def replay_command(
                 token,
                 file.name,
                 predictor.metadata,
-                folder,
                 is_recording=True,
                 tls=tls,
                 allow_host=allow_host,
             )
-            with page as link:
-                _play_on_page(play, link, PageFeed(link, touch), outputs, latencies)
+            with page as open_page:
+                _play_on_page(play, open_page, PageFeed(open_page, touch), outputs, latencies)
     say(summary(touch, latencies))
     if outputs.has_incomplete_file:
         incomplete = ", ".join(outputs.not_written)
@@ -299,7 +298,7 @@ def replay_command(
 
 def _play_on_page(
     play: Callable[..., Iterator[PredictionRecord]],
-    link: ReaderEnd,
+    page: "LivePage",
     feed: PageFeed,
     outputs: Outputs,
     latencies: deque[float],
@@ -308,14 +307,13 @@ def _play_on_page(
 
     Args:
         play: Function that yields the records. Its argument `on_marker` is called with each marker of the recording.
-        link: The reader's end of the link to the page.
-        feed: Sender of the records to the page.
+        page: The page.
+        feed: Writer that passes the records to the page.
         outputs: The outputs, which are closed at the end of the recording.
         latencies: Queue to which the latency of each record is added, us.
     """
-    records = play(on_marker=lambda marker: link.send_message(marker=[*marker]))
+    records = play(on_marker=lambda marker: page.add_marker(*marker))
     write_records(records, [outputs.write, feed.write], latencies)
     outputs.close()  # now, because the page stays open until Ctrl-C, which would discard files that are not closed
-    link.send_message(is_complete=True)
-    while link.wait_for_request() is not None:  # keeps the page open until its process ends, or until Ctrl-C
-        pass
+    page.update(is_complete=True)
+    threading.Event().wait()  # sleeps until Ctrl-C, because nothing sets the event

@@ -6,21 +6,12 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from msgspec import json
-
 from isocharge.cli.shared.options import parse_radius_mm, worker_count
-from isocharge.cli.shared.terminal import say, shown_progress
+from isocharge.cli.shared.terminal import say
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
-from isocharge.common.errors import InputError, IsochargeError, SceneError, SolveError
-from isocharge.common.files import write_whole
-from isocharge.serve.viewer.deflection_field import (
-    DEFLECTION_FILE,
-    DeflectionField,
-    included_deflection_field,
-)
-from isocharge.simulate import Circle, Dataset, Film, Probe, Sensor, Sweep, noise_model, read_dataset, working_area
+from isocharge.common.errors import InputError, IsochargeError
+from isocharge.simulate import Dataset, Film, Probe, Sensor, Sweep, noise_model, read_dataset, working_area
 from isocharge.simulate.execution.workers import dask_workers, local_workers
-from isocharge.simulate.sensor.sensor_file import film_to_dict
 
 ROUNDING_MARGIN = 1.0 + 1e-6
 """Factor by which the radius and the largest force of a forward map are increased, because rounding may move the
@@ -89,33 +80,6 @@ def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit:
             caution = stress_caution(film, probe, max_force, limit)
             if caution:
                 say(f"caution: {caution}")
-
-
-def write_deflection(folder: Path, film: Film, probes: Iterable[Probe]) -> None:
-    """Write the file with the deflection of a film, from which the live page draws the film in relief.
-
-    No file is written if isocharge includes the deflection of this film, if the film is not axisymmetric, or if a press
-    cannot be solved. The live page draws only the position of a contact if it has no deflection.
-
-    Args:
-        folder: Folder of a dataset, or version folder of a model.
-        film: The film.
-        probes: Probes that press the film. The deflection is computed for a round probe of the largest reach.
-    """
-    from isocharge.simulate.forward.deflection import deflection_table  # imports the solver
-
-    properties = film_to_dict(film)
-    if not film.is_axisymmetric or included_deflection_field(properties) is not None:
-        return
-    probe = Circle(max(probe.reach for probe in probes))
-    try:
-        with shown_progress():
-            table = deflection_table(film, probe)
-    except (SceneError, SolveError) as error:
-        say(f"caution: the live page cannot draw this film in relief: {error}")
-        return
-    field = DeflectionField.of(properties, **table._asdict())
-    write_whole(folder / DEFLECTION_FILE, json.encode(field))
 
 
 N_SIMULATED_PRESSES = 24_000

@@ -1,41 +1,30 @@
 """Options of commands for the live page, and the exchange of messages between a stream and its page."""
 
 import logging
-import math
 import os
-import threading
 import time
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from msgspec import structs
 
 from isocharge.cli.shared.optional_values import DEFAULT_LIVE_ADDRESS
 from isocharge.cli.shared.terminal import say
-from isocharge.common.errors import InputError, IsochargeError, shown
+from isocharge.common.errors import InputError, shown
 from isocharge.common.extras import require
 from isocharge.serve import PredictionRecord, Recorder, TouchStream
 from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.network.address import Address, Tls, check_exposure
+from isocharge.serve.network.address import Address, Tls, Token, check_exposure
+from isocharge.serve.network.browser_check import BrowserCheck
 from isocharge.serve.port import recording
-from isocharge.serve.viewer.link import ReaderEnd, make_link
-from isocharge.serve.viewer.messages import (
-    LiveRequest,
-    Marker,
-    Record,
-    SampleFormat,
-    Tare,
-    describe_film,
-    find_deflection_field,
-)
+from isocharge.serve.viewer.film_description import describe_film
 
-RATE_RECORDS = 400
-"""Number of the latest records from whose times the frame rate of the board is computed."""
+if TYPE_CHECKING:
+    from isocharge.serve.viewer.live_page import Action, LivePage
 
 LOOPBACK = "127.0.0.1"
 """Host of the page if `--live` contains only a port."""
@@ -45,20 +34,6 @@ MAX_PORT = 65535
 
 STATE_INTERVAL_S = 0.25
 """Time between two messages with the counters, s."""
-
-
-class RecordingHeader(NamedTuple):
-    """Header of a recording that the user begins on the live page.
-
-    Attributes:
-        policy: Value of `Policy`, which states for which frames records are computed.
-        device: Content of the device file.
-        name: Name of the film in the records; None or empty for the name of the sensor of the model.
-    """
-
-    policy: str
-    device: Mapping[str, Any]
-    name: str | None
 
 
 LiveOption = Annotated[
@@ -172,100 +147,87 @@ def live_page(
     token: str | None,
     name: str,
     metadata: ModelMetadata,
-    model_folder: Path,
     *,
     is_recording: bool = False,
     tls: Tls | None = None,
     allow_host: Iterable[str] | None = None,
-) -> Iterator[ReaderEnd]:
-    """Context manager that runs the page of a stream in a separate process, and prints the address of the page.
+) -> Iterator["LivePage"]:
+    """Context manager that serves the page of a stream in a separate thread, and prints the address of the page.
 
     Args:
         address: Address at which the page listens.
         token: Value of `--token`.
         name: Name of the stream, which the page shows.
         metadata: Metadata of the model that estimates the contacts.
-        model_folder: Folder of the version of the model, which may contain a deflection field.
-        is_recording: Whether the stream is a recording. Its replay waits for the page instead of losing records.
+        is_recording: Whether the stream is a recording.
         tls: Certificate and key; None for no TLS.
         allow_host: Values of `--allow-host`; None if the option is not given.
 
-    Yields:
-        The reader's end of the link to the page.
-
     Raises:
         MissingExtra: If the extra `http` is not installed.
-        InputError: If a value of `--allow-host` is not a host name.
+        InputError: If a value of `--allow-host` is not a host name, or the token or a TLS file cannot be used.
         ListenError: If the address is in use or impossible.
     """
     with require("http"):
-        from isocharge.serve.viewer.process import Page, page_process
+        from isocharge.serve.viewer.live_page import LivePage, serve_page
 
-    description = describe_film(name, metadata, find_deflection_field(model_folder, metadata))
-    reader, page_end = make_link()
-    page = Page(page_end, description, address, given_token(token), is_recording, tls, tuple(allow_host or ()))
-    # The process of the page ends when the reader's end of the link is closed. At the end of the block, the contexts
-    # are left in reverse order: the second `closing` closes the reader's end before `page_process` waits for the end of
-    # the process. The first `closing` is needed if the process cannot be started. Closing twice is harmless.
-    with closing(reader), page_process(page) as url, closing(reader):
-        if is_recording:
-            reader.enable_waiting()  # a slow page then delays the replay, instead of losing records
+    text = given_token(token)
+    secret = None if text is None else Token(text)
+    browser_check = BrowserCheck(address.host, allow_host or (), any_host=secret is not None)
+    description = describe_film(name, metadata)
+    page = LivePage(description, is_recording=is_recording, token=secret, browser_check=browser_check)
+    with serve_page(page, address, tls) as url:
         page_name = "replay page" if is_recording else "live page"
         say(f"{page_name}: {url}")
-        yield reader
+        yield page
 
 
 class PageFeed:
-    """Writer that sends the records and, a few times per second, the counters of a stream to its live page."""
+    """Writer that passes the records and, a few times per second, the counters of a stream to its live page."""
 
-    def __init__(self, link: ReaderEnd, touch: TouchStream, stream: RecordedStream | None = None) -> None:
-        """Store the stream and its link. No records have been sent yet.
+    def __init__(
+        self,
+        page: "LivePage",
+        touch: TouchStream,
+        stream: RecordedStream | None = None,
+        new_recorder: Callable[[Path, str], Recorder] | None = None,
+    ) -> None:
+        """Store the stream and its page. The page may change a stream that is given.
 
         Args:
-            link: The reader's end of the link to the page.
-            touch: The stream whose records are sent.
-            stream: The same stream with its recording; None for a replay.
+            page: The page.
+            touch: The stream whose records are passed on.
+            stream: The same stream with its recording, which carries out the requests of the page; None for a replay.
+            new_recorder: Function that creates the recorder of a recording that the page begins, from its path and the
+                label of the model. If it is None, because the command itself records the stream, requests for
+                recordings are refused.
         """
-        self._link = link
+        self._page = page
         self._touch = touch
         self._stream = stream
-        self._pack = SampleFormat(touch.predictor.metadata.electrodes).pack
+        self._new_recorder = new_recorder
         self._last_state_s = 0.0
-        self._timestamps_s: deque[float] = deque(maxlen=RATE_RECORDS)
+        if stream is not None:
+            page.act = self._carry_out
 
     def write(self, record: PredictionRecord) -> None:
-        """Send a record without waiting for the page. From time to time, also send the state of the stream.
-
-        If the process of the page has ended, a message is printed once, and the stream continues.
-        """
-        was_open = self._link.is_open
-        self._link.send_sample(self._pack(record))
-        self._timestamps_s.append(math.nan if record.timestamp is None else record.timestamp)
-        if was_open and not self._link.is_open:  # sending closes the link if the process of the page has ended
-            say("the process of the live page has ended; the stream goes on without it")
+        """Add a record to the page. From time to time, also update the state of the stream."""
+        self._page.add(record)
         now_s = time.monotonic()
         if now_s - self._last_state_s > STATE_INTERVAL_S:
             self._last_state_s = now_s
-            self._send_state(record)
+            self._update_state(record)
 
-    def _rate_Hz(self) -> float | None:
-        """Compute the frame rate (Hz) from the times of the latest records, or return None if the rate is unknown."""
-        elapsed_s = self._timestamps_s[-1] - self._timestamps_s[0]
-        if not elapsed_s > 0.0:  # also if a time is NaN
-            return None
-        return (len(self._timestamps_s) - 1) / elapsed_s
-
-    def _send_state(self, record: PredictionRecord) -> None:
-        """Send the counters and the state of the stream to the page.
+    def _update_state(self, record: PredictionRecord) -> None:
+        """Update the counters and the state of the stream on the page.
 
         Args:
             record: The latest record.
         """
         recorder = self._stream.recorder if self._stream else None
-        page_counters = {"reconnects": self._touch.counts.outages, "not_shown": self._link.dropped}
-        self._link.send_message(
-            counters=self._touch.totals()._asdict() | page_counters,
-            rate_Hz=self._rate_Hz(),
+        self._page.update(
+            counters=self._touch.totals()._asdict() | {"reconnects": self._touch.counts.outages},
+            rate_Hz=self._page.tape.rate_Hz(),
             model=record.model,
             film=None if record.film is None else structs.asdict(record.film),
             tare_pC=record.tare_pC,
@@ -273,78 +235,45 @@ class PageFeed:
             recording_failed=recorder is not None and recorder.failed,
         )
 
+    def _carry_out(self, action: "Action") -> None:
+        """Carry out a request of the page to write a marker, to begin or end a recording, or to measure a new tare.
+
+        Raises:
+            InputError: If the page requests a recording while the command records the stream.
+        """
+        from isocharge.serve.viewer.live_page import Marker, Record
+
+        stream = self._stream
+        if stream is None:
+            return
+        if isinstance(action, Marker):
+            marker = recording.Marker(time.time(), action.text)
+            stream.request_marker(marker)
+            self._page.add_marker(*marker)
+        elif not isinstance(action, Record):
+            stream.request_tare()
+        elif self._new_recorder is None:
+            raise InputError("the command that runs the stream records it already (--record)")
+        elif action.on:
+            model_label = stream.predictor.metadata.label
+            path = Path(f"{model_label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
+            stream.request_recording(self._new_recorder(path, model_label))
+            self._page.update(recording=f"{path.name}, which waits for data")
+        else:
+            stream.request_recording(None)
+            self._page.update(recording=None)
+
 
 @contextmanager
-def answering(link: ReaderEnd, stream: RecordedStream, header: RecordingHeader | None) -> Iterator[None]:
-    """Context manager that carries out the requests of the page, and shows warnings of `isocharge.serve` on the page.
-
-    A separate thread waits for requests and carries them out. The thread ends when the link is closed.
-
-    Args:
-        link: The reader's end of the link to the page.
-        stream: The stream, which carries out the requests.
-        header: Header of the recordings that the page begins. If it is None, because the command itself records the
-            stream, requests for recordings are refused.
-    """
+def warnings_on_page(page: "LivePage") -> Iterator[None]:
+    """Context manager that shows the warnings of `isocharge.serve` on a page for some seconds."""
     handler = logging.Handler()
-    handler.emit = lambda record: _show_note(link, record.getMessage())  # type: ignore[method-assign]
+    handler.emit = lambda record: page.update(  # type: ignore[method-assign]
+        note={"text": record.getMessage(), "at": time.time()}
+    )
     logger = logging.getLogger("isocharge.serve")
     logger.addHandler(handler)
-    request_thread = threading.Thread(
-        target=_answer_requests, args=(link, stream, header), name="page requests", daemon=True
-    )
-    request_thread.start()
     try:
         yield
     finally:
         logger.removeHandler(handler)
-
-
-def _answer_requests(link: ReaderEnd, stream: RecordedStream, header: RecordingHeader | None) -> None:
-    """Carry out requests of the page until the link is closed, and show each error on the page."""
-    while (request := link.wait_for_request()) is not None:
-        try:
-            _carry_out(request, link, stream, header)
-        except IsochargeError as error:
-            _show_note(link, str(error))
-
-
-def _carry_out(request: LiveRequest, link: ReaderEnd, stream: RecordedStream, header: RecordingHeader | None) -> None:
-    """Carry out one request of the page.
-
-    The page can request to write a marker, to begin or end a recording, to measure the tare again, or to reset the
-    estimated pretension of the film to the value of its calibration. The page is informed of markers and recordings.
-
-    Args:
-        request: The request.
-        link: The reader's end of the link to the page.
-        stream: The stream, which carries out the requests.
-        header: Header of the recordings that the page begins; None if the command itself records the stream.
-
-    Raises:
-        InputError: If the page requests a recording while the command records the stream.
-    """
-    match request:
-        case Marker(text=text):
-            marker = recording.Marker(time.time(), text)
-            stream.request_marker(marker)
-            link.send_message(marker=[*marker])
-        case Record(on=must_record):
-            if header is None:
-                raise InputError("the command that runs the stream records it already (--record)")
-            if must_record:
-                model_label = stream.predictor.metadata.label
-                path = Path(f"{model_label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
-                recorder = Recorder(path, model_label, header.policy, header.device, header.name)
-                stream.request_recording(recorder)
-                link.send_message(recording=f"{path.name}, which waits for data")
-            else:
-                stream.request_recording(None)
-                link.send_message(recording=None)
-        case Tare():
-            stream.request_tare()
-
-
-def _show_note(link: ReaderEnd, text: str) -> None:
-    """Show a message on the page for some seconds."""
-    link.send_message(note={"text": text, "at": time.time()})

@@ -1,7 +1,4 @@
-"""Tapes, which store the samples of a stream under consecutive numbers.
-
-A tape contains the latest samples of a live stream, or all samples of a recording.
-"""
+"""Tape, which stores the samples of a stream under consecutive numbers."""
 
 import tempfile
 from bisect import bisect_right
@@ -9,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.serve.viewer.messages import Samples
+from isocharge.serve.viewer.samples import Samples
 
 LIVE_SAMPLES = 1 << 14
 """Number of stored samples of a live stream.
@@ -17,18 +14,17 @@ LIVE_SAMPLES = 1 << 14
 They cover 16 s at 1 kHz. A browser that falls further behind misses samples.
 """
 
-MAX_PIECES = 600
-"""Largest number of pieces in the overview of a recording."""
+RATE_SAMPLES = 400
+"""Number of the latest samples from whose times the frame rate of the board is computed."""
 
-FIRST_PIECE_S = 0.01
-"""Duration of a piece in the overview of a short recording, s.
-
-The duration is doubled until at most `MAX_PIECES` pieces are needed.
-"""
+OVERVIEW_PIECES = 600
+"""Number of pieces of equal duration into which the overview divides a recording."""
 
 
 class Tape:
-    """Ring buffer that stores the latest samples of a stream.
+    """Ring buffer that stores the latest samples of a live stream.
+
+    One thread appends samples. Any other thread may read samples at the same time.
 
     Args:
         dtype: NumPy type of a sample.
@@ -48,19 +44,20 @@ class Tape:
         """Number of the oldest stored sample."""
         return max(0, self.total - len(self._ring))
 
-    def append(self, samples: Samples) -> None:
-        """Append samples, shape (n,). If the buffer is full, the new samples replace the oldest samples."""
-        capacity = len(self._ring)
-        lasting_samples = samples[-capacity:]  # earlier samples would be overwritten at once
-        new_total = self.total + len(samples)
-        sample_numbers = np.arange(new_total - len(lasting_samples), new_total)
-        self._ring[sample_numbers % capacity] = lasting_samples
-        self.total = new_total
+    def append(self, values: tuple[float | None, ...]) -> None:
+        """Append a sample. If the buffer is full, the sample replaces the oldest sample.
+
+        Args:
+            values: The numbers of the sample in the order of its type. None is stored as NaN.
+        """
+        self._ring[self.total % len(self._ring)] = values
+        self.total += 1
 
     def samples(self, start: int, stop: int) -> Samples:
         """Return the samples with the numbers from `start` to `stop` - 1, except those that were overwritten."""
         numbers = np.arange(max(start, self.oldest), stop)
-        return self._ring[numbers % len(self._ring)]
+        samples: Samples = self._ring[numbers % len(self._ring)]
+        return samples[numbers >= self.oldest]  # samples may have been appended while the others were copied
 
     def timestamp(self, number: int) -> float:
         """Return the Unix time of the stored sample that has the given number, s."""
@@ -80,6 +77,13 @@ class Tape:
             return 0.0, 0.0
         return self.timestamp(self.oldest), self.timestamp(self.total - 1)
 
+    def rate_Hz(self) -> float | None:
+        """Compute the frame rate, Hz, from the times of the latest samples. Return None if the rate is unknown."""
+        times_s = self.samples(self.total - RATE_SAMPLES, self.total)["timestamp"]
+        if len(times_s) < 2 or not times_s[-1] > times_s[0]:  # also if a time is NaN
+            return None
+        return float((len(times_s) - 1) / (times_s[-1] - times_s[0]))
+
     def close(self) -> None:
         """Close the file of the samples if the tape has a file."""
 
@@ -87,44 +91,29 @@ class Tape:
 class RecordedTape(Tape):
     """Tape that stores all samples of a recording in a temporary file.
 
-    If the time of a sample is earlier than the time of the previous sample, the previous time is stored instead.
+    If the time of a sample is missing or is earlier than the time of the previous sample, the previous time is stored
+    instead. The stored times therefore never decrease.
     """
 
     def __init__(self, dtype: "np.dtype[Any]") -> None:
-        """Create the temporary file and an empty overview of the forces.
-
-        The overview divides the recording into pieces of equal duration, and contains the largest force in each piece.
+        """Create the temporary file.
 
         Args:
             dtype: NumPy type of a sample.
         """
         super().__init__(dtype)
         self._file = tempfile.TemporaryFile()  # noqa: SIM115
-        self._piece_s = FIRST_PIECE_S  # duration of a piece
-        self._max_force_N: list[float] = []
         self._map_file(LIVE_SAMPLES)
 
-    def append(self, samples: Samples) -> None:
-        """Append samples, and update the overview.
-
-        If a time is missing or is earlier than the previous time, the previous time is stored instead. The stored times
-        therefore never decrease. If the samples do not fit into the mapped file, the capacity of the file is doubled
-        until they fit.
-
-        Args:
-            samples: The samples, shape (n,).
-        """
-        if not len(samples):
-            return
-        ordered = samples.copy()
-        _, latest_stored_s = self.span()  # 0 if no sample is stored yet
-        times_s = np.nan_to_num(samples["timestamp"], nan=0.0)  # a missing time becomes 0, which is never the largest
-        largest_so_far_s = np.maximum.accumulate(times_s)
-        ordered["timestamp"] = np.maximum(largest_so_far_s, latest_stored_s)
-        while self.total + len(ordered) > len(self._ring):
+    def append(self, values: tuple[float | None, ...]) -> None:
+        """Append a sample. If the mapped file is full, its capacity is doubled."""
+        if self.total == len(self._ring):
             self._map_file(2 * len(self._ring))
-        super().append(ordered)
-        self._update_overview(ordered)
+        number = self.total
+        previous_time_s = self.timestamp(number - 1) if number else 0.0
+        self._ring[number] = values
+        self._ring["timestamp"][number] = np.fmax(self._ring["timestamp"][number], previous_time_s)
+        self.total += 1
 
     def close(self) -> None:
         """Close the temporary file, so that the operating system removes it."""
@@ -135,45 +124,11 @@ class RecordedTape(Tape):
         self._ring = np.memmap(self._file, self._ring.dtype, "r+", shape=(capacity,))
 
     def overview(self) -> list[float]:
-        """Return the largest force in each piece of the recording, N. All pieces have the same duration."""
-        return [round(force_N, 3) for force_N in self._max_force_N]
-
-    def _update_overview(self, samples: Samples) -> None:
-        """Update the largest force in each piece of the recording with the forces of new samples.
-
-        The number of pieces is limited to `MAX_PIECES`. When a longer recording needs more pieces, neighbouring pieces
-        are joined in pairs, and the duration of a piece is doubled.
-
-        Args:
-            samples: New samples, shape (n,), whose times do not decrease.
-        """
-        elapsed_s = samples["timestamp"] - self.timestamp(0)  # time since the first sample of the recording
-        while elapsed_s[-1] >= MAX_PIECES * self._piece_s:
-            self._join_pieces()
-
-        # Append new pieces up to the piece that contains the last sample.
-        piece_of_sample = (elapsed_s / self._piece_s).astype(int)  # index of the piece that contains each sample
-        piece_count = int(piece_of_sample[-1]) + 1
-        new_piece_count = piece_count - len(self._max_force_N)  # may be 0
-        self._max_force_N += [0.0] * new_piece_count
-
-        # Compute the largest force of the samples in each piece. These samples are neighbours, because the times do not
-        # decrease. They are called a run here. `reduceat` computes the largest force of every run in one call.
-        force_N = np.nan_to_num(samples["force_N"], nan=0.0)
-        begins_run = np.diff(piece_of_sample, prepend=-1) != 0  # True for the first sample, because no piece is -1
-        run_starts = np.flatnonzero(begins_run)
-        run_pieces = piece_of_sample[run_starts].tolist()
-        run_max_N = np.maximum.reduceat(force_N, run_starts).tolist()
-
-        # A piece may contain earlier samples, so the larger one of the earlier and the new force is stored.
-        for piece, max_force_N in zip(run_pieces, run_max_N, strict=True):
-            self._max_force_N[piece] = max(self._max_force_N[piece], max_force_N)
-
-    def _join_pieces(self) -> None:
-        """Join neighbouring pieces of the overview in pairs, and double the duration of a piece.
-
-        If the number of pieces is odd, the last piece remains alone.
-        """
-        pairs = [self._max_force_N[first : first + 2] for first in range(0, len(self._max_force_N), 2)]
-        self._max_force_N = [max(pair) for pair in pairs]
-        self._piece_s *= 2.0
+        """Return the largest force in each of `OVERVIEW_PIECES` pieces of the recording, N."""
+        samples = self._ring[: self.total]
+        start_s, end_s = self.span()
+        elapsed = (samples["timestamp"] - start_s) / max(end_s - start_s, np.finfo(float).tiny)  # from 0 to 1
+        piece_of_sample = np.minimum(elapsed * OVERVIEW_PIECES, OVERVIEW_PIECES - 1).astype(int)
+        max_force_N = np.zeros(OVERVIEW_PIECES)
+        np.maximum.at(max_force_N, piece_of_sample, np.nan_to_num(samples["force_N"], nan=0.0))
+        return max_force_N.round(3).tolist()

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from isocharge.cli.shared.forward_maps import executor_for, sweep_radius, warn_of_stress, write_deflection
+from isocharge.cli.shared.forward_maps import executor_for, sweep_radius, warn_of_stress
 from isocharge.cli.shared.options import (
     ClusterOption,
     ForceRangeOption,
@@ -67,6 +67,5 @@ def sweep_command(
         largest_distance = sweep_radius(radius, film_sensor, probes, force)
         sweep = Sweep(largest_distance, force, samples, seed, orientation, sampling)
         run_sweep(output, film_sensor, probes, sweep, executor=executor)
-    write_deflection(output, film_sensor.film, probes)
     manifest = json_module.loads((output / "manifest.json").read_text())
     say(f"{manifest['samples']} presses in {output}")

@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import write_deflection
 from isocharge.cli.shared.options import JsonOption, StressLimitOption, refuse, worker_count
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.probe_option import ProbeOption
@@ -173,8 +172,6 @@ def _write(result: CalibrationResult, folder: Path, executor: Executor | None) -
     """Write the model of a calibrated film, and print the name of its version folder."""
     say("training the network of this film")
     version = write_calibration(result, folder, this_command(), executor=executor)
-    sensor, probe = result.sensor_and_probe
-    write_deflection(version, sensor.film, [probe])
     say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
 
 

@@ -130,7 +130,7 @@ def fit_command(
     with shown_progress():
         data = _read_or_simulate_data(dataset, sensor, notations, radius)
     version_folder = check_target(output, version, data.sensor.electrode_names)
-    train_and_release(partial(fit, data, fit_config), version_folder, json=json, dataset=dataset)
+    train_and_release(partial(fit, data, fit_config), version_folder, json=json)
 
 
 def _is_sensor(argument: Path) -> bool:

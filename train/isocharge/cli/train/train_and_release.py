@@ -5,16 +5,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from msgspec.json import encode
 
-from isocharge.cli.shared.forward_maps import write_deflection
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
-from isocharge.common.files import write_whole
 from isocharge.serve import ModelMetadata
-from isocharge.serve.viewer.deflection_field import DEFLECTION_FILE, read_deflection_field
-from isocharge.simulate import parse_probe
-from isocharge.simulate.sensor.sensor_file import sensor_from_dict
-from isocharge.train import Fitted, Release, release
+from isocharge.train import Fitted, release
 
 ModelFolderOption = Annotated[
     Path,
@@ -32,40 +26,19 @@ VersionOption = Annotated[
 ]
 
 
-def train_and_release(
-    train: Callable[[], Fitted], version_folder: Path, *, json: bool, dataset: Path | None = None
-) -> None:
+def train_and_release(train: Callable[[], Fitted], version_folder: Path, *, json: bool) -> None:
     """Train a network, release it as a version folder, and print its errors.
 
     Args:
         train: Function that trains the network.
         version_folder: Folder to write, as `check_target` returned it.
         json: Whether to print the folder and the errors as one JSON object, too.
-        dataset: Dataset folder of the training, whose file with the deflection of the film is copied if there is one.
-            If it is None, the deflection is computed.
     """
     with shown_progress():
         released = release(train(), version_folder.parent, version=int(version_folder.name), command=this_command())
-    _add_deflection(released, dataset)
     if json:
         show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})
     say(f"{released.folder}: {_errors_sentence(released.metadata)}")
-
-
-def _add_deflection(released: Release, dataset: Path | None) -> None:
-    """Add the file with the deflection of the film to a released model, unless its sensor has no description.
-
-    Args:
-        released: The released model.
-        dataset: Dataset folder of the training; None to compute the deflection.
-    """
-    if dataset is not None:
-        path = dataset / DEFLECTION_FILE
-        if path.is_file():
-            write_whole(released.folder / DEFLECTION_FILE, encode(read_deflection_field(path)))
-    elif "film" in released.metadata.sensor:
-        probes = [parse_probe(notation) for notation in released.metadata.probes]
-        write_deflection(released.folder, sensor_from_dict(released.metadata.sensor).film, probes)
 
 
 def _errors_sentence(metadata: ModelMetadata) -> str:

@@ -7,23 +7,40 @@ framework would only be called in addition.
 
 import asyncio
 from collections.abc import Awaitable, Callable, MutableMapping
-from typing import Any
+from typing import Any, Protocol
 
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.address import ServerLimits
+from isocharge.serve.network.protocol.handler import Headers
+from isocharge.serve.network.protocol.response import Response
+from isocharge.serve.network.traffic import Client
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 
 
+class RequestHandler(Protocol):
+    """Object that computes the responses: the handler of models or the live page."""
+
+    @property
+    def limits(self) -> ServerLimits:
+        """Limits of the requests."""
+
+    def may_block(self, path: str) -> bool:
+        """Return whether computing the response for a path may take a long time."""
+
+    def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client) -> Response:
+        """Answer one request."""
+
+
 class Application:
-    """ASGI application that answers requests with a `Handler`. It can be mounted under any path of another program.
+    """ASGI application that answers requests with a handler. It can be mounted under any path of another program.
 
     Attributes:
         handler: Handler that computes the answers.
     """
 
-    def __init__(self, handler: Handler) -> None:
+    def __init__(self, handler: RequestHandler) -> None:
         """Store the handler."""
         self.handler = handler
 

@@ -7,7 +7,6 @@ which compares the deadlines with the present time, because a timer for each req
 """
 
 import math
-from abc import ABC, abstractmethod
 from typing import Any, NoReturn
 
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
@@ -21,19 +20,7 @@ class RequestRefused(Exception):
     """Exception that stops the parser after a request was refused."""
 
 
-class TimedConnection(ABC):
-    """Connection that the server regularly asks to compare its deadlines with the present time."""
-
-    @abstractmethod
-    def close_if_overdue(self, now: float) -> None:
-        """End the connection if a deadline has passed.
-
-        Args:
-            now: Present time on the clock of the event loop, s.
-        """
-
-
-class Connection(HttpToolsProtocol, TimedConnection):
+class Connection(HttpToolsProtocol):
     """One connection of the server.
 
     Attributes:

@@ -14,7 +14,7 @@ import uvicorn
 import uvloop
 
 from isocharge.serve.network.address import Address, ServerLimits, Tls
-from isocharge.serve.network.http.connection import Connection, TimedConnection
+from isocharge.serve.network.http.connection import Connection
 from isocharge.serve.network.traffic import Traffic
 
 
@@ -36,7 +36,6 @@ class HttpServer:
         traffic: Traffic | None = None,
         *,
         tls: Tls | None = None,
-        **uvicorn_options: Any,
     ) -> None:
         """Open the socket on which the server listens.
 
@@ -46,7 +45,6 @@ class HttpServer:
             limits: Limits of the connections. By default, the limits of `ServerLimits`.
             traffic: Counters of refused requests and of open connections. By default, nothing is counted.
             tls: Certificate and private key for TLS, or None for a server without TLS.
-            uvicorn_options: Further options of `uvicorn.Config`. By default, the server accepts no WebSockets.
 
         Raises:
             InputError: If a TLS file cannot be used.
@@ -60,6 +58,7 @@ class HttpServer:
             application,
             http=connection,
             lifespan="off",
+            ws="none",
             log_config=None,
             log_level="critical",  # errors that a client causes are counted, and are sent to this client
             access_log=False,
@@ -69,7 +68,6 @@ class HttpServer:
             timeout_keep_alive=math.ceil(limits.idle_seconds),
             timeout_graceful_shutdown=math.ceil(limits.grace_seconds),
             ssl_context_factory=(lambda *_: tls_context) if tls_context else None,
-            **{"ws": "none"} | uvicorn_options,
         )
         self._server = _Server(config)
         self._address = address
@@ -112,6 +110,6 @@ class _Server(uvicorn.Server):
         """End overdue connections. uvicorn calls this method ten times per second until the server is stopped."""
         now = asyncio.get_running_loop().time()
         for connection in list(self.server_state.connections):
-            if isinstance(connection, TimedConnection):
+            if isinstance(connection, Connection):
                 connection.close_if_overdue(now)
         return await super().on_tick(counter)

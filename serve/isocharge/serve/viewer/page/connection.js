@@ -1,9 +1,11 @@
-// The session over HTTP, the samples over a WebSocket that is opened again whenever it breaks.
+// The session, and then the samples that are new since the last answer, again and again, all over HTTP.
 
-const PROTOCOL = "isocharge.live.1", FIRST_PAUSE_MS = 300, LONGEST_PAUSE_MS = 4000, KEY = "isocharge token";
+import { decode } from "./decode.js";
+
+const FIRST_PAUSE_MS = 300, LONGEST_PAUSE_MS = 4000, IDLE_MS = 40, RATE_PER_MS = 0.24, MOST = 600, KEY = "isocharge token";
 
 export class Connection {
-  /** @param on {{session, samples, message, state, door}} functions that are called with what comes */
+  /** @param on {{session, samples, state, error, position, link, door}} functions that are called with what comes */
   constructor(on) {
     this.on = on;
     this.pause = FIRST_PAUSE_MS;
@@ -12,44 +14,39 @@ export class Connection {
   }
 
   async open() {
-    this.on.state("waiting", this.id === null ? "connecting" : "connecting again");
+    this.on.link("waiting", this.id === null ? "connecting" : "connecting again");
     try {
-      const headers = this.token ? { Authorization: `Bearer ${this.token}` } : {};
-      const answer = await fetch("session.json", { headers, cache: "no-store" });
-      if (answer.status === 401) return this.on.door(this.token ? "The server knows another one." : "");
-      if (!answer.ok) throw new Error((await answer.json()).error ?? answer.statusText);
-      const session = await answer.json();
+      const session = await this.fetch("session.json");
       this.on.session(session, session.id !== this.id);
       this.id = session.id;
+      await this.follow(session);
     } catch (error) {
-      return this.tryAgain(error.name === "TypeError" ? "no answer" : error.message);
+      if (error.status === 401) return this.on.door(this.token ? "The server knows another one." : "");
+      this.on.link("lost", `${error instanceof TypeError ? "no answer" : error.message}; trying again`);
+      setTimeout(() => this.open(), this.pause);
+      this.pause = Math.min(2 * this.pause, LONGEST_PAUSE_MS);
     }
-    this.follow();
+    return undefined;
   }
 
-  follow() {
-    const url = new URL("live", location.href);
-    url.protocol = url.protocol.replace("http", "ws");
-    url.hash = "";
-    const bearer = this.token ? [`bearer.${base64url(this.token)}`] : [];
-    const socket = new WebSocket(url, [PROTOCOL, ...bearer]);
-    this.socket = socket;
-    socket.binaryType = "arraybuffer";
-    socket.onopen = () => { this.pause = FIRST_PAUSE_MS; this.on.state("live", "live"); };
-    socket.onmessage = ({ data }) => {
-      if (typeof data !== "string") return this.on.samples(data);
-      let message;
-      try { message = JSON.parse(data); } catch { return undefined; }
-      return this.on.message(message);
-    };
-    socket.onclose = ({ code }) => { if (this.socket === socket) this.tryAgain(code === 1012 ? "the stream has ended" : "lost"); };
-  }
-
-  tryAgain(reason) {
-    this.socket = null;
-    this.on.state("lost", `${reason}; trying again`);
-    setTimeout(() => this.open(), this.pause);
-    this.pause = Math.min(2 * this.pause, LONGEST_PAUSE_MS);
+  /** Ask for what is new whenever a picture was drawn, until an answer fails. A recording may be shown from another position. */
+  async follow({ columns }) {
+    let first = null, version = -1, askedMs = performance.now();
+    for (;;) {
+      const nowMs = performance.now(), elapsedMs = nowMs - askedMs, { isElsewhere, until_s } = this.on.position(elapsedMs / 1000);
+      askedMs = nowMs;
+      const beginsAnew = first === null || isElsewhere;
+      const most = beginsAnew ? MOST : Math.min(Math.max(Math.ceil(RATE_PER_MS * elapsedMs), 1), MOST);
+      const answer = await this.post({ do: "read", first: beginsAnew ? null : first, until_s, version, most });
+      first = Math.max(answer.first, beginsAnew ? 0 : first);
+      this.pause = FIRST_PAUSE_MS;
+      this.on.link("live", "live");
+      if (answer.state) { version = answer.version; this.on.state(answer.state); }
+      const samples = answer.samples.map((row) => decode(row, columns));
+      this.on.samples({ samples, beginsAnew, missed: answer.missed, sent_s: answer.sent_s });
+      if (!samples.length) await new Promise((resolve) => setTimeout(resolve, IDLE_MS));
+      await new Promise(requestAnimationFrame);
+    }
   }
 
   enter(token) {
@@ -58,11 +55,19 @@ export class Connection {
     this.open();
   }
 
-  request(content) { this.send(JSON.stringify(content)); }
+  async request(content) {
+    try { await this.post(content); } catch (error) { this.on.error(error.message); }
+  }
 
-  confirm(number) { this.send(new Uint32Array([number])); }
+  post(content) { return this.fetch("request", { method: "POST", body: JSON.stringify(content) }); }
 
-  send(data) { if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(data); }
+  async fetch(path, options = {}) {
+    const headers = this.token ? { Authorization: `Bearer ${this.token}` } : {};
+    const answer = await fetch(path, { headers, cache: "no-store", ...options });
+    const content = await answer.json();
+    if (!answer.ok) throw Object.assign(new Error(content.error ?? answer.statusText), { status: answer.status });
+    return content;
+  }
 }
 
 /** The token in the address after #, which is taken out of it and never sent as part of it. */
@@ -73,8 +78,4 @@ function takeToken() {
     if (given) history.replaceState(null, "", location.pathname);
     return given || sessionStorage.getItem(KEY) || "";
   } catch { return given; }
-}
-
-function base64url(text) {
-  return btoa(text).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
 }

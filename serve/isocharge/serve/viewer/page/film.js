@@ -41,15 +41,15 @@ export class FilmView {
   refresh() { this.plan.refresh(); this.traces.build(); this.isNew = true; }
 
   take(message, nowMs) {
-    if (message.beginsAnew) this.history.clear();
+    if (message.beginsAnew) { this.history.clear(); Object.assign(this, { missed: 0, isNew: true }); }
     for (const sample of message.samples) {
       this.history.add(sample);
       if (sample.latency !== null) this.latencies.push(sample.latency);
       for (const [word, { bit }] of this.words) if (sample.bits & bit) this.recent.set(word, nowMs);
     }
     this.history.trim();
-    if (message.samples.length) this.arrivedMs = nowMs;
-    Object.assign(this, { missed: message.missed, sent_s: message.sent_s, receivedMs: nowMs, isNew: true });
+    this.missed += message.missed;
+    if (message.samples.length) Object.assign(this, { arrivedMs: nowMs, sent_s: message.sent_s, receivedMs: nowMs, isNew: true });
   }
 
   update(state) {
@@ -63,7 +63,6 @@ export class FilmView {
 
   kind(nowMs) {
     const { latest } = this.history, has = (word) => latest && (latest.bits & (this.words.get(word)?.bit ?? 0));
-    if (this.state.has_ended) return "ended";
     if (!this.isReplay && nowMs - this.arrivedMs > SILENT_MS) return "silent";
     if (!latest) return "none";
     if (has("tare")) return "tare";
@@ -75,7 +74,7 @@ export class FilmView {
   /** @param heavy which of the costly parts to draw: {traces, relief} */
   draw(nowMs, heavy) {
     const kind = this.kind(nowMs), { history } = this, sample = history.latest;
-    const word = { tare: "taring: leave the film alone", none: sample ? "no touch" : "", silent: "no data", ended: "ended" }[kind];
+    const word = { tare: "taring: leave the film alone", none: sample ? "no touch" : "", silent: "no data" }[kind];
     if (this.isNew || kind !== this.drawnKind) {
       this.plan.draw({ sample, kind, trail: history.trail, now: sample?.t ?? 0, word });
       this.showValues(sample, kind);
@@ -96,7 +95,7 @@ export class FilmView {
       contact: "touch", none: this.history.latest ? "no touch" : "waiting for the first frame", tare: "taring: leave the film alone",
       outside: "outside the area or the forces that the model knows: place and force are guesses",
       misfit: "no single contact fits these charges: two touches, or another film? The place means little",
-      silent: Number.isFinite(this.arrivedMs) ? "no frame comes: is the sensor plugged in?" : "waiting for the first frame", ended: this.state.reason ?? "the stream has ended",
+      silent: Number.isFinite(this.arrivedMs) ? "no frame comes: is the sensor plugged in?" : "waiting for the first frame",
     }[kind];
     verdict.dataset.kind = kind;
     setText(verdict.querySelector(".text"), words);
@@ -139,7 +138,7 @@ export class FilmView {
     const followed = film ? `film at ${film.pretension_MPa.toFixed(2)} ± ${film.pretension_std_MPa.toFixed(2)} MPa` : "";
     const recording = this.state.recording ? `recording ${this.state.recording}` : followed;
     setText(this.find(".note"), failed ? "recording stopped: the disk is full" : fresh || recording);
-    if (counters && this.find("details").open) this.showCounters({ ...counters, not_shown: counters.not_shown + this.missed });
+    if (counters && this.find("details").open) this.showCounters({ ...counters, not_shown: this.missed });
   }
 
   showCounters(counters) {

@@ -1,14 +1,13 @@
 // The page: connects, hands samples to the film, draws, and takes keys and buttons.
 
 import { Connection } from "./connection.js";
-import { decode } from "./decode.js";
 import { FilmView, percentile, setText } from "./film.js";
 import { onTheme } from "./theme.js";
 import { Timeline } from "./timeline.js";
 
 const SLOW_MS = 500, PACE_MS = 20, RAREST = 8, LONGEST_MS = 80;
-const page = { film: null, timeline: null, isPaused: false, unconfirmed: null, pictures: 0, cost: 0, pace: 16, every: 1, ages: [], starts: [] };
-const connection = new Connection({ session, samples, message, state, door });
+const page = { film: null, timeline: null, isPaused: false, isNew: false, pictures: 0, cost: 0, pace: 16, every: 1, ages: [], starts: [] };
+const connection = new Connection({ session, samples, state, error, position, link, door });
 const nowMs = () => performance.now();
 
 function session(content, isNew) {
@@ -17,26 +16,24 @@ function session(content, isNew) {
   page.film = new FilmView(content, act);
   document.getElementById("film").replaceChildren(page.film.root);
   page.film.start();
-  if (content.is_replay && !page.timeline) page.timeline = new Timeline(document.getElementById("timeline"), (request) => connection.request(request));
+  if (content.is_replay && !page.timeline) page.timeline = new Timeline(document.getElementById("timeline"));
   if (page.isPaused) pause(false);
   document.title = `${content.film.name} · isocharge ${content.is_replay ? "replay" : "live"}`;
 }
 
-function samples(buffer) {
-  const message = page.film && decode(buffer, page.film.description.sample, page.film.description.electrodes.length);
-  if (!message) return;
-  page.unconfirmed = message.number;
+function samples(message) {
+  page.isNew = message.samples.length > 0;
   page.film.take(message, nowMs());
-  if (page.timeline && message.samples.length) page.timeline.at(message.samples.at(-1).t);
 }
 
-function message({ state: changed, play, error }) {
-  if (changed && page.film) { page.film.update(changed); page.timeline?.update(changed); }
-  if (play) page.timeline?.play(play);
-  if (error) setText(page.film.find(".note"), error);
-}
+function state(changed) { page.film.update(changed); page.timeline?.update(changed); }
 
-function state(kind, words) {
+function error(text) { page.film.update({ ...page.film.state, note: { text, at: Date.now() / 1000 } }); }
+
+/** The position in a recording after some more seconds, s; nothing for a live stream. */
+function position(elapsed_s) { return page.timeline?.advance(elapsed_s) ?? {}; }
+
+function link(kind, words) {
   const shown = kind === "live" && page.isPaused ? ["paused", "paused"] : kind === "live" && page.timeline ? ["live", "replay"] : [kind, words];
   const pill = document.getElementById("link");
   page.link = [kind, words];
@@ -49,7 +46,7 @@ function door(reason) {
   form.hidden = false;
   setText(form.querySelector(".reason"), reason);
   form.querySelector("input").focus();
-  state("waiting", "a token, please");
+  link("waiting", "a token, please");
 }
 
 function act(what) {
@@ -65,7 +62,7 @@ function pause(isPaused) {
     button.setAttribute("aria-pressed", String(isPaused));
     button.firstChild.textContent = isPaused ? "Go on " : "Pause ";
   }
-  state(...page.link);
+  link(...page.link);
 }
 
 function key(event) {
@@ -95,7 +92,7 @@ function picture() {
   };
   if (heavy.traces) heavyMs = began;
   if (!page.isPaused) page.film?.draw(began, heavy);
-  if (page.unconfirmed !== null) noteAge();
+  if (page.isNew) noteAge();
   if (began - slowMs > SLOW_MS) showSlow(began);
   page.cost += 0.1 * (nowMs() - began - page.cost);
 }
@@ -108,10 +105,9 @@ function showSlow(began) {
   if (!page.isPaused) page.film?.showSlow(began);
 }
 
-/** What was drawn is confirmed, which asks for more; its age, where both clocks are the same machine's, is for tests. */
+/** The age of what was drawn, where both clocks are the same machine's, is for tests. */
 function noteAge() {
-  connection.confirm(page.unconfirmed);
-  page.unconfirmed = null;
+  page.isNew = false;
   const { latest } = page.film.history;
   if (!latest || page.timeline) return;
   const channel = new MessageChannel();

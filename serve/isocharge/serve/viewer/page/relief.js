@@ -16,13 +16,14 @@ void main() {
   float contour = lit * smoothstep(0.44, 0.5, abs(fract(d * 8.0) - 0.5)) * step(0.02, d);
   gl_FragColor = vec4(colour * shade * (1.0 - 0.10 * contour), 1.0);
 }`;
-const STRETCH = 4, FINER = 3, FLAT_ANGLES = 17, FLAT_RINGS = [0, 0.25, 0.5, 0.75, 1];
+const STRETCH = 4, AROUND = 72, FLAT_AROUND = 32, FLAT_RINGS = [0, 0.25, 0.5, 0.75, 1];
 
 export class Relief {
   constructor(canvas, caption, film) {
     Object.assign(this, { canvas, caption, film, yaw: -0.55, pitch: 0.62, isStale: true });
     this.radius = film.radius_mm ?? 45;
-    this.deflection = film.deflection ? new Deflection(film.deflection) : null;
+    const probe = /^circle:([\d.]+)/.exec(film.probes[0] ?? ""), isDescribed = film.film?.radius_mm && film.film.thickness_um && film.film.young_GPa;
+    this.deflection = isDescribed ? new Deflection(film.film, Number(probe?.[1] ?? 1), film.force_range_N[1]) : null;
     [this.gl, this.finest] = isDrawnByProcessor() ? [canvas.getContext("webgl", { antialias: false }), 1] : [canvas.getContext("webgl", { antialias: true }), 1.5];
     if (!this.gl) { canvas.hidden = true; caption.textContent = "This browser has no WebGL: no 3D view."; return; }
     this.prepare();
@@ -51,7 +52,7 @@ export class Relief {
 
   layOutSheet() {
     const { gl } = this, d = this.deflection;
-    [this.rings, this.around] = d ? [d.rings.length, 2 * FINER * (d.angles - 1)] : [FLAT_RINGS.length, 2 * (FLAT_ANGLES - 1)];
+    [this.rings, this.around] = d ? [d.rings.length, AROUND] : [FLAT_RINGS.length, FLAT_AROUND];
     this.nodes = new Float32Array(this.rings * this.around * 7);
     const triangles = [];
     for (let i = 0; i + 1 < this.rings; i++) for (let j = 0; j < this.around; j++) {
@@ -116,8 +117,9 @@ export class Relief {
   drawSheet() {
     const { gl, nodes, rings, around, deflection } = this, places = [];
     for (let i = 0; i < rings; i++) for (let j = 0; j < around; j++) {
-      if (deflection) { const [x, y, w] = deflection.node(i, j / FINER); places.push([x, y, -STRETCH * w]); } else {
-        const phi = 2 * Math.PI * j / around, s = FLAT_RINGS[i] * this.radius; places.push([s * Math.cos(phi), s * Math.sin(phi), 0]);
+      const phi = 2 * Math.PI * j / around;
+      if (deflection) { const [x, y, w] = deflection.node(i, phi); places.push([x, y, -STRETCH * w]); } else {
+        const s = FLAT_RINGS[i] * this.radius; places.push([s * Math.cos(phi), s * Math.sin(phi), 0]);
       }
     }
     const deepest = STRETCH * (deflection?.largest ?? 1);
@@ -180,8 +182,8 @@ export class Relief {
 
   sayCaption(touch) {
     const words = this.deflection
-      ? `${touch ? `${this.deflection.at(touch.x, touch.y).toFixed(2)} mm deep under the probe; ` : ""}depth drawn ${STRETCH} times`
-      : "No deflection.json beside this model: the place alone.";
+      ? `${touch ? `about ${this.deflection.at(touch.x, touch.y).toFixed(1)} mm deep under the probe; ` : ""}depth drawn ${STRETCH} times`
+      : "The model does not describe its film: the place alone.";
     if (this.caption.textContent !== words) this.caption.textContent = words;
   }
 }

@@ -5,29 +5,40 @@ import { fit, theme } from "./theme.js";
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10, 24], STEP_S = 5;
 
 export class Timeline {
-  constructor(root, send) {
-    Object.assign(this, { root, send, canvas: root.querySelector("canvas"), slider: root.querySelector("input"), button: root.querySelector(".play"), length: 0, place: 0, isPlaying: true, state: {} });
+  constructor(root) {
+    Object.assign(this, { root, canvas: root.querySelector("canvas"), slider: root.querySelector("input"), button: root.querySelector(".play"), length: 0, place: 0, speed: 1, isPlaying: true, isElsewhere: true, state: {} });
     this.select = root.querySelector("select");
     this.select.replaceChildren(...SPEEDS.map((speed) => new Option(`${speed} ×`, speed, speed === 1, speed === 1)));
-    this.select.addEventListener("change", () => send({ do: "speed", value: Number(this.select.value) }));
+    this.select.addEventListener("change", () => { this.speed = Number(this.select.value); });
     this.button.addEventListener("click", () => this.toggle());
     this.slider.addEventListener("input", () => this.seek(Number(this.slider.value)));
     root.hidden = false;
   }
 
-  toggle() { this.send({ do: this.isPlaying ? "pause" : "play" }); }
+  toggle() {
+    if (!this.isPlaying && this.place >= this.length) this.seek(0);
+    this.play(!this.isPlaying);
+  }
 
   step(direction) { this.seek(this.place + direction * STEP_S); }
 
   seek(place) {
-    this.place = Math.min(Math.max(place, 0), this.length);
-    this.send({ do: "seek", value: this.place });
+    Object.assign(this, { place: Math.min(Math.max(place, 0), this.length), isElsewhere: true });
     this.show();
   }
 
-  play({ at_s: at, speed, is_playing: isPlaying }) {
-    Object.assign(this, { place: at, isPlaying });
-    this.select.value = String(speed);
+  /** Move on by the seconds that have passed. While the recording is still being read, wait at its end. */
+  advance(elapsed_s) {
+    if (this.isPlaying) this.place = Math.min(this.place + this.speed * elapsed_s, this.length);
+    if (this.isPlaying && this.state.is_complete && this.place >= this.length) this.play(false);
+    const { isElsewhere } = this;
+    this.isElsewhere = false;
+    this.show();
+    return { until_s: this.place, isElsewhere };
+  }
+
+  play(isPlaying) {
+    this.isPlaying = isPlaying;
     this.button.textContent = isPlaying ? "Pause" : "Play";
     this.button.setAttribute("aria-pressed", String(isPlaying));
     this.show();
@@ -40,9 +51,6 @@ export class Timeline {
     this.drawTrack();
     this.show();
   }
-
-  /** A sample that is now shown. */
-  at(timestamp) { if (this.state.span) { this.place = Math.min(Math.max(timestamp - this.start, 0), this.length); this.show(); } }
 
   show() {
     if (document.activeElement !== this.slider || !this.slider.matches(":active")) this.slider.value = this.place;

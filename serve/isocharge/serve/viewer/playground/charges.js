@@ -1,4 +1,17 @@
-// Charges of a press, from the Chebyshev series of the stress that isocharge/serve/viewer/stress_series.py describes.
+// Charges of a press, from a Chebyshev series of the stress. An electrode of area A on a film with d31 = d32 collects
+// the charge d31 A mean(s11 + s22), where s11 and s22 are the normal stresses.
+//
+// The film is round and elastically isotropic, so every press is a rotated press on the x axis. A disk automorphism maps
+// rings around the origin to rings around the probe, z -> (z + c) / (1 + c z). In film radii, p is the distance of the
+// probe from the centre and r is its radius; c = tanh((atanh(p + r) + atanh(p - r)) / 2), and the ring of the radius
+// s0 = tanh((atanh(p + r) - atanh(p - r)) / 2) is mapped to the edge of the probe. One series describes the smooth
+// function ln(s11 + s22) under the probe, and another series describes it outside:
+//
+//     ln(s11 + s22) = sum c_ijkm T_i(p') T_j(l') T_k(u) T_m(cos(arg z)).
+//
+// Here p' is the distance, and l' is the logarithm of the force, both scaled to [-1, 1]. Under the probe, u is
+// 2 (|z| / s0)^2 - 1. Outside, u is a linear function of ln|z| that is -1 at s0 and 1 at max_ring. The coefficients are
+// little-endian float32 numbers in base64, shape (distances, forces, rings, angles).
 
 const NEAR_MM = 2.0, NEAR_POINTS = 8, FAR_POINTS = 4;
 

@@ -1,0 +1,100 @@
+"""Description of the film, the electrodes and the model, which a page reads before the first sample."""
+
+import math
+from typing import Any
+
+import numpy as np
+from msgspec import to_builtins
+
+from isocharge.serve.model.metadata import ModelMetadata
+
+
+def describe_film(name: str, metadata: ModelMetadata) -> dict[str, Any]:
+    """Return the description of a film and its electrodes as a JSON object for the page.
+
+    If the metadata of the model do not describe a part of the film, the page does not draw this part.
+
+    Args:
+        name: Name of the stream, which the page shows.
+        metadata: Metadata of the model.
+    """
+    film = metadata.sensor.get("film")
+    outlines_mm = {}
+    leads_mm = {}
+    for electrode, polygons in _electrode_polygons(metadata.sensor, metadata.electrodes).items():
+        pad, *leads = polygons  # the first polygon is the pad; most electrodes have no leads
+        outlines_mm[electrode] = pad
+        if leads:
+            leads_mm[electrode] = leads
+
+    description = {
+        "name": name,
+        "model": metadata.label,
+        "sensor": metadata.frame_id,
+        "electrodes": list(metadata.electrodes),
+        "outlines_mm": outlines_mm,
+        "film": film,
+        "radius_mm": film.get("radius_mm") if isinstance(film, dict) else None,
+        "working_area_mm": [[float(x), float(y)] for x, y in metadata.working_area_mm],
+        "force_range_N": list(metadata.force_range_N),
+        "probes": list(metadata.probes),
+        "unnoticed": to_builtins(metadata.unnoticed),
+    }
+    if leads_mm:
+        description["more_mm"] = leads_mm
+    return description
+
+
+Polygon = list[list[float]]
+"""Corners (x, y) of a polygon, mm."""
+
+
+def _electrode_polygons(sensor: dict[str, Any], electrodes: tuple[str, ...]) -> dict[str, list[Polygon]]:
+    """Return the polygons of each electrode at the place that a calibration has determined, if there is one.
+
+    The first polygon of an electrode is its pad. All further polygons describe additional metal that belongs to the
+    electrode, such as leads.
+
+    Args:
+        sensor: Description of the sensor in the metadata of the model, which may be incomplete.
+        electrodes: Names of the electrodes.
+
+    Returns:
+        List of polygons by electrode name. It is empty if the description of the sensor has an unknown form.
+    """
+    try:
+        calibration = sensor.get("calibration") or {}
+        shift_mm = np.array(calibration.get("shift_mm", (0.0, 0.0)), float)
+        angle = math.radians(calibration.get("rotation_deg", 0.0))
+        rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        return {
+            name: [
+                (np.array(corners, float) @ rotation.T + shift_mm).tolist()  # corners of shape (n, 2)
+                for corners in _designed_polygons(sensor["electrodes"], name)
+            ]
+            for name in electrodes
+        }
+    except (TypeError, ValueError, KeyError, AttributeError):  # the description has an unknown form
+        return {}
+
+
+def _designed_polygons(parts: dict[str, Any], name: str) -> list[Polygon]:
+    """Return the polygons of an electrode according to its design, before a calibration has corrected them.
+
+    If the design contains only a point for the electrode, the electrode is a square around this point.
+
+    Args:
+        parts: Section `electrodes` of a sensor file: a point (x, y) or polygons for each electrode name, and the side
+            of the squares under the key `side_mm`.
+        name: Name of the electrode.
+    """
+    part = parts[name]
+    if isinstance(part, dict):
+        return [part["polygon_mm"], *part.get("more_mm", [])]
+    x_mm, y_mm = part
+    half_side_mm = 0.5 * parts["side_mm"]
+    left = x_mm - half_side_mm
+    right = x_mm + half_side_mm
+    bottom = y_mm - half_side_mm
+    top = y_mm + half_side_mm
+    return [[[left, bottom], [right, bottom], [right, top], [left, top]]]

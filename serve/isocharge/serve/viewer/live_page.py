@@ -1,0 +1,289 @@
+"""Live page, which shows the samples of a stream in browsers.
+
+The page is an HTTP server in a thread of the program that reads the stream. The server sends the files of the page
+and, under `SESSION_PATH`, the description of the film. A browser regularly posts a request to `REQUEST_PATH`. A request
+is a JSON object, such as {"do": "marker", "text": "here"}. Each kind of request is a class in this module. The value of
+`do` is the class name in lower case.
+
+The request `Read` asks for the samples that the browser does not have yet. If there are more samples than a browser can
+show, several samples are coalesced into one sample. A slow browser therefore receives fewer samples, and no queue of
+messages for a slow browser exists.
+"""
+
+import secrets
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Annotated, Any
+
+from msgspec import Meta, Struct
+
+from isocharge.common.errors import RequestError, UnknownPath, WrongMethod
+from isocharge.common.printable_text import is_printable
+from isocharge.common.structs import Finite, WrongKey, parse_json
+from isocharge.serve.flags import MEANINGS
+from isocharge.serve.network.address import Address, ServerLimits, Tls, Token
+from isocharge.serve.network.browser_check import BrowserCheck, header_values
+from isocharge.serve.network.http import Application, HttpServer
+from isocharge.serve.network.protocol.handler import Headers
+from isocharge.serve.network.protocol.response import (
+    PAGE_HEADERS,
+    Response,
+    error_response,
+    json_response,
+    response_of,
+)
+from isocharge.serve.network.traffic import Client
+from isocharge.serve.record.record import PredictionRecord
+from isocharge.serve.viewer.samples import FLAG_BITS, coalesce, sample_type, sample_values
+from isocharge.serve.viewer.tape import RecordedTape, Tape
+
+SESSION_PATH = "/session.json"
+"""Path of the description of the stream and its film."""
+
+REQUEST_PATH = "/request"
+"""Path to which a browser posts its requests."""
+
+PAGE_LIMITS = ServerLimits(body_bytes=1 << 12, connections=64)
+"""Limits of the server of the page. A browser uses one or two connections, and its requests are short."""
+
+HISTORY_S = 10.0
+"""Time span of the earlier samples that a new browser receives, s. The traces of the page have this length."""
+
+MAX_READ_SAMPLES = 600
+"""Largest number of samples in the response to one request."""
+
+MAX_MARKERS = 200
+"""Number of the latest markers that the page shows."""
+
+MAX_MARKER_CHARACTERS = 80
+"""Largest number of characters in the text of a marker."""
+
+
+class Read(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
+    """Request for samples.
+
+    Attributes:
+        first: Number of the first sample that the browser does not have. By default, the samples of the last
+            `HISTORY_S` seconds are returned.
+        until_s: Time since the start of a recording, s. Later samples are not returned.
+        version: Version of the state that the browser has.
+        most: Largest number of samples to return.
+    """
+
+    first: Annotated[int, Meta(ge=0, le=1 << 53)] | None = None
+    until_s: Finite | None = None
+    version: int = -1
+    most: Annotated[int, Meta(ge=1, le=MAX_READ_SAMPLES)] = MAX_READ_SAMPLES
+
+
+class Tare(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
+    """Request to measure the tare again."""
+
+
+class Record(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
+    """Request to begin or end a recording.
+
+    Attributes:
+        on: True to begin a recording, and False to end the present recording.
+    """
+
+    on: bool
+
+
+class Marker(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
+    """Request to add a marker with a text at the present time of the stream."""
+
+    text: str = ""
+
+    def __post_init__(self) -> None:
+        if len(self.text) > MAX_MARKER_CHARACTERS or not is_printable(self.text):
+            raise WrongKey("text", f"at most {MAX_MARKER_CHARACTERS} printable characters", self.text)
+
+
+Action = Tare | Record | Marker
+"""Requests that change the stream."""
+
+
+class LivePage:
+    """Live page of one stream, which stores the samples and answers the requests of browsers.
+
+    The thread that reads the stream calls `add`. The thread of the server calls `answer`. Any thread may call `update`.
+
+    Attributes:
+        tape: The stored samples of the stream.
+        act: Function that carries out the requests that change the stream. None if such requests are refused.
+    """
+
+    limits = PAGE_LIMITS
+
+    def __init__(
+        self,
+        description: dict[str, Any],
+        *,
+        is_recording: bool = False,
+        token: Token | None = None,
+        browser_check: BrowserCheck | None = None,
+    ) -> None:
+        """Create a page without samples.
+
+        For a recording, all samples are stored, and each browser may select a position in the recording. For a live
+        stream, only the latest samples are stored.
+
+        Args:
+            description: Description of the film, as `describe_film` returns it.
+            is_recording: Whether the stream is a recording.
+            token: Token that requests must contain, or None if requests need no token.
+            browser_check: Check that refuses requests from web pages of other sites. By default, it accepts requests
+                for IP addresses and for `localhost`.
+        """
+        self._electrodes = tuple(description["electrodes"])
+        dtype = sample_type(self._electrodes)
+        self.tape: Tape = RecordedTape(dtype) if is_recording else Tape(dtype)
+        self.act: Callable[[Action], None] | None = None
+        self._token = token
+        self._browser_check = browser_check or BrowserCheck(any_host=token is not None)
+        self._markers: deque[tuple[float, str]] = deque(maxlen=MAX_MARKERS)
+        self._state: dict[str, Any] = {}
+        self._state_lock = Lock()  # the thread of the stream and the thread of the server change the state
+        self._version = 0  # number of times that the state has changed
+        self._files = _page_files()
+        self._session = {
+            "id": secrets.token_hex(8),  # a browser that connects again recognises another stream
+            "is_replay": is_recording,
+            "film": description,
+            "columns": dtype.names,
+            "flags": [{"word": flag, "bit": FLAG_BITS[flag], "says": meaning} for flag, meaning in MEANINGS.items()],
+        }
+
+    def add(self, record: PredictionRecord) -> None:
+        """Store the sample of a record."""
+        self.tape.append(sample_values(record, self._electrodes))
+
+    def update(self, **values: Any) -> None:
+        """Replace values of the state, which the page shows beside the samples, such as counters."""
+        with self._state_lock:
+            self._state = self._state | values
+            self._version += 1
+
+    def add_marker(self, time_s: float, text: str) -> None:
+        """Add a marker at a Unix time, s, to the markers that the page shows."""
+        self._markers.append((time_s, text))
+        self.update(markers=list(self._markers))
+
+    def may_block(self, _path: str) -> bool:
+        """Return whether computing the response for a path may take a long time."""
+        return False
+
+    def answer(self, method: str, path: str, headers: Headers, body: bytes, _client: Client = None) -> Response:
+        """Answer one request. The arguments are those of `isocharge.serve.network.protocol.Handler.answer`."""
+        try:
+            return self._check_and_answer(method, path, header_values(headers), body)
+        except Exception as error:  # every error is sent to the client
+            return error_response(error)
+
+    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
+        """Check whether a request is allowed, and return the response. The files of the page need no token.
+
+        Raises:
+            IsochargeError: If the request is refused.
+        """
+        if path in self._files:
+            return self._files[path]
+        self._browser_check.check(method, headers)
+        if self._token is not None:
+            self._token.check(headers.get(b"authorization", b""))
+        if path == SESSION_PATH:
+            return json_response(self._session)
+        if path != REQUEST_PATH:
+            raise UnknownPath(f"nothing is served under {path[:200]!r}; the page is /")
+        if method != "POST":
+            raise WrongMethod(f"{path}: expected the method POST, got {method[:20]}", "POST")
+        self.limits.check_body(len(body))
+        request = parse_json(body, "", RequestError, Read | Action)  # type: ignore[arg-type]
+        if isinstance(request, Read):
+            return json_response(self._read(request))
+        if self.act is None:
+            raise RequestError("expected the request read, because a recording cannot be changed")
+        self.act(request)
+        return json_response({})
+
+    def _read(self, request: Read) -> dict[str, Any]:
+        """Return the samples that a browser does not have yet and, if it has changed, the state of the stream."""
+        tape = self.tape
+        version = self._version
+        stop = tape.total
+        start_s, shown_until_s = tape.span()
+        if request.until_s is not None:
+            shown_until_s = start_s + request.until_s
+            stop = tape.first_number_after(shown_until_s)
+        first = tape.first_number_after(shown_until_s - HISTORY_S) if request.first is None else request.first
+        samples = coalesce(tape.samples(first, stop), request.most)
+        content: dict[str, Any] = {
+            "first": stop,
+            "missed": max(tape.oldest - first, 0),
+            "sent_s": time.time(),
+            "samples": [list(sample) for sample in samples.tolist()],
+        }
+        if version != request.version:
+            extent: dict[str, Any] = {}
+            if isinstance(tape, RecordedTape):
+                extent = {"span": tape.span(), "samples": tape.total, "overview": tape.overview()}
+            content |= {"version": version, "state": self._state | extent}
+        return content
+
+
+@contextmanager
+def serve_page(page: LivePage, address: Address, tls: Tls | None = None) -> Iterator[str]:
+    """Context manager that serves a page in a separate thread, and yields the URL of the page.
+
+    Args:
+        page: The page.
+        address: Address on which the server listens.
+        tls: Certificate and private key for TLS, or None to serve the page without TLS.
+
+    Raises:
+        InputError: If the TLS files cannot be used.
+        ListenError: If the address is in use or cannot be used.
+    """
+    with closing(page.tape), closing(HttpServer(Application(page), address, page.limits, tls=tls)) as server:
+        thread = Thread(target=server.run, name="live page", daemon=True)
+        thread.start()
+        try:
+            yield server.url
+        finally:
+            server.stop()
+            thread.join()
+
+
+CONTENT_TYPES = {
+    ".html": b"text/html; charset=utf-8",
+    ".css": b"text/css; charset=utf-8",
+    ".js": b"text/javascript; charset=utf-8",
+    ".svg": b"image/svg+xml",
+    ".LICENSE": b"text/plain; charset=utf-8",
+}
+"""Content type by the suffix of a file name."""
+
+CONTENT_SECURITY_POLICY = (
+    b"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
+    b"base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""Content security policy of the page. With this policy, a browser loads only files of this server."""
+
+
+def _page_files() -> dict[str, Response]:
+    """Return the response for each file of the page, by the path of the file. The path `/` is the HTML file."""
+    folder = Path(__file__).with_name("page")
+    responses = {}
+    for path in folder.rglob("*"):
+        if path.is_file():
+            response = response_of(200, CONTENT_TYPES[path.suffix], path.read_bytes())
+            policy = [(b"content-security-policy", CONTENT_SECURITY_POLICY), (b"cache-control", b"no-cache")]
+            response.headers.extend([*policy, *PAGE_HEADERS])
+            responses[f"/{path.relative_to(folder).as_posix()}"] = response
+    responses["/"] = responses["/index.html"]
+    return responses

@@ -1,0 +1,233 @@
+"""Live page: samples and state for browsers, hostile clients, and access by the token and by pages of the server."""
+
+import json
+import re
+import socket
+import struct
+import time
+from contextlib import suppress
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from isocharge.common.errors import InputError
+from isocharge.serve.network.browser_check import BrowserCheck
+from isocharge.serve.viewer.film_description import describe_film
+from isocharge.serve.viewer.live_page import MAX_READ_SAMPLES, LivePage, Marker, Record, Tare
+from isocharge.serve.viewer.tape import LIVE_SAMPLES
+
+
+def put(client, record, count, **changes):
+    """Add records at intervals of 5 ms, the last of which has the present time."""
+    end_s = time.time()
+    for number in range(count):
+        client.page.add(record(timestamp=end_s - 0.005 * (count - 1 - number), **changes))
+
+
+def record_count(client, answer):
+    """Return the number of records that the samples of an answer represent."""
+    columns = json.loads(client.send("GET", "/session.json")[2])["columns"]
+    return sum(sample[columns.index("records")] for sample in answer["samples"])
+
+
+def test_new_browser_receives_the_last_ten_seconds_and_then_each_record_once(client, record):
+    put(client, record, 3000)
+    answer = client.ask("read")
+    assert len(answer["samples"]) == MAX_READ_SAMPLES
+    assert record_count(client, answer) == pytest.approx(2000, abs=2)
+    assert client.ask("read", first=answer["first"])["samples"] == []
+    put(client, record, 100)
+    answer = client.ask("read", first=answer["first"], most=7)
+    assert (len(answer["samples"]), record_count(client, answer), answer["missed"]) == (7, 100, 0)
+
+
+def test_records_that_a_slow_browser_misses_are_counted(client, record):
+    put(client, record, LIVE_SAMPLES + 250)
+    answer = client.ask("read", first=0)
+    assert (answer["missed"], record_count(client, answer)) == (250, LIVE_SAMPLES)
+
+
+def test_browser_that_reads_no_answers_delays_neither_the_stream_nor_others(client, record):
+    put(client, record, 2000)
+    request = b'POST /request HTTP/1.1\r\nHost: localhost\r\nContent-Length: 13\r\n\r\n{"do": "read"}'
+    with socket.create_connection((client.place.hostname, client.place.port), timeout=20) as stalled:
+        stalled.settimeout(0.5)
+        with suppress(TimeoutError, ConnectionError):
+            for _ in range(50):
+                stalled.sendall(request)
+        start_s = time.perf_counter()
+        put(client, record, 1000)
+        assert client.ask("read")["samples"]
+        assert time.perf_counter() - start_s < 5.0
+
+
+def test_position_in_a_recording_limits_the_samples(start_page, record):
+    client = start_page(is_recording=True)
+    put(client, record, 4000)
+    answer = client.ask("read", until_s=12.0)
+    times = [sample[0] for sample in answer["samples"]]
+    start_s, end_s = answer["state"]["span"]
+    assert times[-1] == pytest.approx(start_s + 12.0, abs=0.0051)
+    assert times[0] == pytest.approx(start_s + 2.0, abs=0.1)
+    rest = client.ask("read", first=answer["first"], until_s=1e9)
+    assert record_count(client, rest) == 4000 - answer["first"]
+    assert rest["samples"][-1][0] == end_s
+
+
+def test_state_is_sent_if_it_has_changed(client):
+    client.page.update(counters={"frames": 7}, recording="x.rec")
+    client.page.add_marker(1.0, "")
+    client.page.add_marker(2.0, "b")
+    answer = client.ask("read")
+    assert answer["state"] == {"counters": {"frames": 7}, "recording": "x.rec", "markers": [[1.0, ""], [2.0, "b"]]}
+    assert "state" not in client.ask("read", version=answer["version"])
+
+
+@pytest.mark.parametrize(
+    ("content", "action"),
+    [
+        ({"do": "tare"}, Tare()),
+        ({"do": "record", "on": True}, Record(on=True)),
+        ({"do": "marker", "text": "here"}, Marker("here")),
+    ],
+)
+def test_actions_reach_the_stream_and_its_errors_reach_the_browser(client, content, action):
+    received = []
+    client.page.act = received.append
+    client.ask(**content)
+    assert received == [action]
+
+    def refuse(_):
+        raise InputError("not now")
+
+    client.page.act = refuse
+    status, _, body = client.send("POST", "/request", content)
+    assert (status, json.loads(body)) == (400, {"error": "not now"})
+
+
+def test_a_recording_cannot_be_changed(start_page):
+    status, _, body = start_page(is_recording=True).send("POST", "/request", {"do": "tare"})
+    assert (status, "recording cannot be changed" in body.decode()) == (400, True)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"do": "shutdown"},
+        {"do": "record"},
+        {"do": "record", "on": 1},
+        {"do": "marker", "text": "x" * 81},
+        {"do": "marker", "text": "a\nb"},
+        {"do": "read", "first": -1},
+        {"do": "read", "first": 10**30},
+        {"do": "read", "most": 601},
+        {"do": "read", "until_s": 1e999},
+        {"do": "tare", "path": "/etc/passwd"},
+        [],
+        "",
+        "[" * 4000,
+        b"\0" * 100,
+    ],
+)
+def test_wrong_request_is_refused_with_the_reason(client, content):
+    status, _, body = client.send("POST", "/request", content)
+    assert status == 400
+    assert json.loads(body)["error"]
+    assert client.ask("read")["samples"] == []
+
+
+@settings(max_examples=20)
+@given(st.text() | st.recursive(st.none() | st.text() | st.floats(), st.lists, max_leaves=5).map(json.dumps))
+@example('{"do": "read", "until_s": NaN}')
+@example('{"do": "read", "until_s": 1' + "0" * 4000 + "}")
+def test_any_other_text_is_refused(film, text):
+    page = LivePage(describe_film("a film", film.metadata()))
+    headers = [(b"host", b"localhost")]
+    assert page.answer("POST", "/request", headers, text.encode("utf-8", "surrogatepass")).status == 400
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        b"GET / HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n" + b"a: b\r\n" * 500_000,
+        b"GET /" + b"a" * 3_000_000 + b" HTTP/1.1\r\n\r\n",
+        b"POST /request HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3000000\r\n\r\n" + bytes(3_000_000),
+        struct.pack("<1000d", *range(1000)),
+    ],
+    ids=["trailers", "address", "body", "noise"],
+)
+def test_wrong_http_request_is_refused(client, request_):
+    """A request of any length is refused or answered before it has been read completely."""
+    with socket.create_connection((client.place.hostname, client.place.port), timeout=20) as connection:
+        with suppress(OSError):
+            connection.sendall(request_)
+            connection.shutdown(socket.SHUT_WR)
+        answer = b""
+        with suppress(ConnectionResetError):
+            while piece := connection.recv(1 << 16):
+                answer += piece
+    assert not answer or re.match(rb"HTTP/1\.1 (200|4\d\d) ", answer)
+    assert client.send("GET", "/")[0] == 200
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Host": "192.168.1.7"}, 200),
+        ({"Host": "[::1]:8001", "Origin": "http://[::1]:8001"}, 200),
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"Sec-Fetch-Site": "cross-site"}, 403),
+        ({"Host": "evil.example:8001", "Origin": "http://evil.example:8001"}, 403),  # after DNS rebinding
+    ],
+)
+def test_requests_of_pages_of_other_sites_are_refused(client, headers, status):
+    assert client.send("POST", "/request", {"do": "read"}, **headers)[0] == status
+
+
+def test_host_name_of_the_page_may_be_allowed(start_page):
+    client = start_page(browser_check=BrowserCheck("127.0.0.1", ["proxy.example"]))
+    headers = {"Host": "proxy.example", "Origin": "http://proxy.example"}
+    assert client.send("POST", "/request", {"do": "read"}, **headers)[0] == 200
+
+
+def test_description_and_samples_need_the_token(start_page):
+    client = start_page(token="s3cret")
+    assert client.send("GET", "/")[0] == 200  # the page itself contains nothing about the film
+    for method, path in (("GET", "/session.json"), ("POST", "/request"), ("GET", "/unknown")):
+        assert client.send(method, path, {"do": "read"})[0] == 401
+        assert client.send(method, path, {"do": "read"}, Authorization="Bearer other")[0] == 401
+    # The page of a reverse proxy may have any name, because pages of other sites do not know the token.
+    headers = {"Host": "proxy.example", "Authorization": "Bearer s3cret"}
+    assert client.send("POST", "/request", {"do": "read"}, **headers)[0] == 200
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [
+        ("GET", "/etc/passwd", 404),
+        ("GET", "/../live_page.py", 404),
+        ("GET", "/vendor", 404),
+        ("GET", "/request", 405),
+        ("PUT", "/request", 405),
+    ],
+)
+def test_unknown_path_and_wrong_method_are_refused(client, method, path, status):
+    assert client.send(method, path)[0] == status
+
+
+def test_files_of_the_page_are_served(client):
+    """Each file that the page names is served. The headers forbid the browser to load files from other servers."""
+    status, headers, body = client.send("GET", "/")
+    assert status == 200
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    assert headers["Referrer-Policy"] == "no-referrer"
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "script-src 'self'" in policy
+    for name in re.findall(rb'(?:href|src)="([^"]+)"', body):
+        assert client.send("GET", f"/{name.decode()}")[0] == 200
+    session = json.loads(client.send("GET", "/session.json")[2])
+    assert session["film"]["electrodes"] == ["A", "B", "C"]
+    assert not session["is_replay"]

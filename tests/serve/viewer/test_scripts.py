@@ -1,0 +1,131 @@
+"""The description of the film, and the scripts of the page that draw it, run by Node.js."""
+
+import json
+import shutil
+import subprocess
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from isocharge.serve import find_model, load_model
+from isocharge.serve.viewer.film_description import describe_film
+from isocharge.serve.viewer.samples import sample_type, sample_values
+from isocharge.simulate import Circle, Film, deflection, press
+from isocharge.simulate.sensor.sensor_file import film_to_dict
+
+VIEWER = Path(str(files("isocharge.serve.viewer")))
+
+
+def test_electrode_polygons_include_the_calibration(film):
+    """A released model has squares. The other film has polygons with traces, turned by a right angle and shifted."""
+    described = describe_film("left", load_model(find_model("three-25um-biaxial")).metadata)
+    squares = np.array([described["outlines_mm"][name] for name in "ABC"])
+    angle = np.radians([-90.0, 30.0, 150.0])
+    np.testing.assert_allclose(squares.mean(axis=1), 10.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=1e-6)
+    np.testing.assert_allclose(np.ptp(squares, axis=1), 3.0)
+    assert "more_mm" not in described
+    assert described["unnoticed"]["to_mm"] == pytest.approx(0.95 * 45.0, abs=0.05)  # near the clamp
+    assert described["unnoticed"]["share"][8] == (1.0,) * 36  # 20 mm from the centre
+    trace = {"more_mm": [[[2, 0], [2, -9], [3, -9]]], "back_mm": [[[2, 0], [3, 0], [2, 1]]]}
+    electrodes = {name: {"polygon_mm": [[2, 0], [3, 0], [2, 1]]} | trace for name in "ABC"}
+    turned = {"name": "mine", "electrodes": electrodes, "calibration": {"rotation_deg": 90.0, "shift_mm": [0.5, 0.25]}}
+    described = describe_film("left", film.metadata(sensor=turned))
+    np.testing.assert_allclose(described["outlines_mm"]["C"], [[0.5, 2.25], [0.5, 3.25], [-0.5, 2.25]], atol=1e-12)
+    np.testing.assert_allclose(described["more_mm"]["C"], [[[0.5, 2.25], [9.5, 2.25], [9.5, 3.25]]], atol=1e-12)
+
+
+def node(script):
+    """Run a script by Node.js, and return the JSON value that it prints."""
+    if shutil.which("node") is None:
+        pytest.skip("needs Node.js, which reads the page's modules as a browser does")
+    command = ["node", "--input-type=module", "-e", script]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
+    return json.loads(finished.stdout)
+
+
+@pytest.mark.parametrize(("radius_mm", "middle"), [(None, [30.0, 0.0]), (45.0, [0.0, 0.0])])
+def test_page_shows_the_whole_area_of_a_film_whose_corner_is_the_origin(radius_mm, middle):
+    """The area has x from 0 to 60 mm. It is in the middle of the view unless the film has a radius."""
+    film = {
+        "working_area_mm": [[0, -15], [60, -15], [60, 15], [0, 15]],
+        "outlines_mm": {},
+        "force_range_N": [0.2, 5.0],
+        "radius_mm": radius_mm,
+        "electrodes": [],
+    }
+    at, reach, on_pad, beyond = node(
+        f"""globalThis.document = {{ createElement: () => ({{}}), documentElement: {{}} }};
+        globalThis.getComputedStyle = () => ({{ getPropertyValue: () => "" }});
+        globalThis.matchMedia = () => ({{ addEventListener() {{}} }});
+        const {{ Plan }} = await import("{(VIEWER / "page/plan.js").as_uri()}");
+        const plan = new Plan({{ width: 400, height: 400, clientWidth: 400 }}, {json.dumps(film)});
+        const shown = (x, y) => {{ const place = plan.inView({{ x, y }}); return [place.x, place.y]; }};
+        console.log(JSON.stringify([[plan.middle.x, plan.middle.y], plan.reach, shown(50, 0), shown(500, 0)]));"""
+    )
+    assert at == middle
+    assert reach == pytest.approx(1.16 * np.hypot(60.0 - middle[0], 15.0))
+    assert on_pad == [50.0, 0.0]
+    assert middle[0] + 0.9 * reach < beyond[0] < middle[0] + reach
+
+
+def test_page_decodes_the_samples_of_the_server(record):
+    electrodes = ("A", "B", "C")
+    values = sample_values(record(charge_pC={"A": 1.5, "B": None, "C": -3.0}, latency_us=9.0), electrodes)
+    got = node(
+        f"""import {{ decode }} from "{(VIEWER / "page/decode.js").as_uri()}";
+        console.log(JSON.stringify(decode({json.dumps(values)}, {json.dumps(sample_type(electrodes).names)})));"""
+    )
+    expected = {"charges": [1.5, None, -3.0], "contact": True, "y": None, "t": 1763600000.1234567, "latency": 9.0}
+    assert (expected | {"x": 1.23456789, "records": 1}).items() <= got.items()
+
+
+@pytest.mark.parametrize(
+    ("film", "largest_error"),
+    [
+        (Film(radius=45.0, thickness=0.025, young=3000.0, poisson=0.34), 0.1),
+        (Film(radius=45.0, thickness=0.025, young=3000.0, poisson=0.34, pretension=1.5), 0.13),
+        (Film(radius=45.0, thickness=0.11, young=3000.0, poisson=0.34), 0.15),
+        (Film(radius=45.0, thickness=1.0, young=3000.0, poisson=0.34), 0.3),
+    ],
+)
+def test_deflection_that_the_page_draws_is_near_that_of_the_solver(film, largest_error):
+    """The error is compared with the largest deflection of each press."""
+    rng = np.random.default_rng(0)
+    for distance_mm, force_N in ((0.0, 0.3), (12.0, 2.0), (20.0, 0.05)):
+        radius_mm = 44.0 * np.sqrt(rng.random(200))
+        points_mm = radius_mm * np.exp(2j * np.pi * rng.random(200))
+        points_mm[0] = distance_mm
+        places = np.stack([points_mm.real, points_mm.imag], axis=1)
+        expected = deflection(press(film, Circle(1.0), (distance_mm, 0.0), force_N), places)
+        got = node(
+            f"""import {{ Deflection }} from "{(VIEWER / "page/deflection.js").as_uri()}";
+            const field = new Deflection({json.dumps(film_to_dict(film))}, 1.0, 2.0);
+            field.press({distance_mm}, 0, {force_N});
+            console.log(JSON.stringify({places.tolist()}.map(([x, y]) => field.at(x, y))));"""
+        )
+        assert np.abs(np.array(got) - expected).max() < largest_error * expected.max()
+
+
+def test_sheet_of_the_page_has_the_deflection_of_its_places():
+    film = {
+        "radius_mm": 45.0,
+        "thickness_um": 25.0,
+        "young_GPa": 3.0,
+        "poisson": 0.34,
+        "pretension_MPa": [1.0, 2.0, 0.1],
+    }
+    got = node(
+        f"""import {{ Deflection }} from "{(VIEWER / "page/deflection.js").as_uri()}";
+        const field = new Deflection({json.dumps(film)}, 1.0, 2.0), flat = field.at(1, 1);
+        field.press(-12, 9, 0.4);
+        const nodes = field.rings.map((_, ring) => field.node(ring, 0.3 * ring));
+        console.log(JSON.stringify({{ flat, nodes, at: nodes.map(([x, y]) => field.at(x, y)) }}));"""
+    )
+    nodes = np.array(got["nodes"])
+    assert got["flat"] == 0.0
+    assert got["at"] == pytest.approx(nodes[:, 2], abs=1e-9)
+    assert np.hypot(nodes[:, 0] + 12.0, nodes[:, 1] - 9.0)[0] < 0.1  # the first ring is the centre of the probe
+    assert np.hypot(*nodes[-1, :2]) == pytest.approx(45.0)
