@@ -17,13 +17,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.frames.frame_field import ByteOrder
-from isocharge.serve.recognition.framing import Bytes, usual_bytes
-
-COUNTING_SHARE = 0.9
-"""Smallest share of the steps of a counter or clock that must be regular.
-
-The share is less than 1, because frames may be lost and counters may restart.
-"""
+from isocharge.serve.recognition.framing import INTACT_SHARE, Bytes, usual_bytes
 
 STEADY_SPREAD = 0.7
 """Largest deviation of a regular step of a counter or clock from the median step, relative to the median step."""
@@ -55,7 +49,7 @@ def steady_step(steps: Array) -> float:
     median_step = np.median(steps)
     is_regular = np.abs(steps - median_step) <= STEADY_SPREAD * median_step
     regular_steps = steps[is_regular]
-    if len(regular_steps) < COUNTING_SHARE * len(steps):
+    if len(regular_steps) < INTACT_SHARE * len(steps):
         return 0.0
     return float(regular_steps.mean())
 

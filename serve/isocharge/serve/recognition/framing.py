@@ -37,8 +37,8 @@ MIN_FRAMES = 5
 MAX_EXAMINED_BYTES = 1 << 16
 """Largest number of bytes of a stream that are examined."""
 
-STUFFED_SHARE = 0.9
-"""Smallest share of the frames between delimiters that must have the same length, dimensionless."""
+INTACT_SHARE = 0.75
+"""Smallest share of frames, steps or bytes that must agree with a description, because some frames may be damaged."""
 
 COVERED_SHARE = 0.4
 """Smallest share of a stream that frames of one length must cover, dimensionless."""
@@ -48,12 +48,6 @@ MAX_CONSTANT_BYTES = 16
 
 MAX_FRAME_LENGTHS = 3
 """Number of frame lengths that are tried."""
-
-CONSTANT_SHARE = 0.98
-"""Smallest share of the frames that have the same byte at a position, if this byte counts as constant.
-
-The share is less than 1, because some frames may be damaged.
-"""
 
 
 class FrameDivision(NamedTuple):
@@ -98,7 +92,7 @@ def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
     """
     usual = np.array([np.bincount(column).argmax() for column in rows.T], np.uint8)
     share_of_frames = (rows == usual).mean(axis=0)
-    return usual, share_of_frames >= CONSTANT_SHARE
+    return usual, share_of_frames >= INTACT_SHARE
 
 
 def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[FrameDivision]:
@@ -156,7 +150,7 @@ def _stuffed_frames(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Fram
             decoded_frames.append(stuffing.decode(encoded_frame))
     length, count = _most_common_length(decoded_frames)
     has_frame_length = MIN_FRAME_BYTES <= length <= MAX_FRAME_BYTES
-    if count < STUFFED_SHARE * len(encoded_frames) or not has_frame_length:
+    if count < INTACT_SHARE * len(encoded_frames) or not has_frame_length:
         return
 
     # If the lengths are as regular without decoding, there is no stuffing, and the delimiter is a byte that only
@@ -251,9 +245,6 @@ def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray
 
 MAX_CHECKED_FRAMES = 24
 """Largest number of different frames from which a checksum is recognised."""
-
-FITTING_SHARE = 0.75
-"""Smallest share of the frames that a checksum must fit. It is less than 1, because some frames may be damaged."""
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
 """Byte orders that are tried."""
@@ -358,6 +349,6 @@ def _fits(compute: Callable[[bytes], int], frames: list[bytes], start: int, size
     wrong_count = 0
     for frame in frames:
         wrong_count += compute(frame[start:-size]) != int.from_bytes(frame[-size:], order)
-        if wrong_count > (1.0 - FITTING_SHARE) * len(frames):
+        if wrong_count > (1.0 - INTACT_SHARE) * len(frames):
             return False
     return True

@@ -170,15 +170,17 @@ def _field_tables(parts: Sequence[Part]) -> list[dict[str, Any]]:
     return fields
 
 
-TEXT_SHARE = 0.95
-"""Smallest share of printable characters in text. The other bytes may be damaged, or letters that are not ASCII."""
+def is_text(chunks: Sequence[bytes], min_share: float = 0.95) -> bool:
+    """Return whether bytes are text, which is never a binary format.
 
-
-def is_text(chunks: Sequence[bytes]) -> bool:
-    """Return whether bytes are text, which is never a binary format."""
+    Args:
+        chunks: The bytes.
+        min_share: Smallest share of printable characters in text. The other bytes may be damaged, or letters that are
+            not ASCII.
+    """
     data = np.frombuffer(b"".join(chunks), np.uint8)
     is_printable = ((data >= ord(" ")) & (data <= ord("~"))) | np.isin(data, list(b"\t\r\n\x1b"))
-    return len(data) > 0 and bool(is_printable.mean() >= TEXT_SHARE)
+    return len(data) > 0 and bool(is_printable.mean() >= min_share)
 
 
 def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False) -> dict[str, Any] | None:
