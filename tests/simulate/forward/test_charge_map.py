@@ -5,13 +5,7 @@ import pytest
 
 from isocharge.common.errors import ChargeError, SceneError
 from isocharge.simulate import ChargeMap, Domain, FunctionMap
-from isocharge.simulate.forward.charge_map import (
-    as_charges,
-    check_forces,
-    check_radius,
-    one_sided_differences,
-    within,
-)
+from isocharge.simulate.forward.charge_map import as_charges, check_radius, within
 from isocharge.simulate.numerics.disk import sunflower
 
 DOMAIN = Domain(5.0, (0.1, 2.0))
@@ -64,17 +58,6 @@ def test_maps_implement_the_charge_map_protocol(charge_map):
         np.testing.assert_allclose(slope[..., axis], expected, atol=5e-4 * np.abs(expected).max())
 
 
-def test_one_sided_differences_are_exact_for_linear_charges_and_nearly_exact_for_products():
-    """The charges are x + 2 y + 3 ln F and x y, so that the derivatives are known."""
-    contact = contacts(DOMAIN)
-    x, y, _ = contact.T
-    zero = np.zeros(len(contact))
-    charge, slope = one_sided_differences(linear, contact)
-    np.testing.assert_array_equal(charge, linear(contact))
-    np.testing.assert_allclose(slope[:, 0], np.tile([1.0, 2.0, 3.0], (len(contact), 1)), atol=1e-9)
-    np.testing.assert_allclose(slope[:, 1], np.column_stack([y, x, zero]), atol=1e-9)
-
-
 @pytest.mark.parametrize("charge_map", CHECKED, indirect=True)
 def test_contacts_outside_the_domain_raise_error_with_the_limits(charge_map):
     radius = charge_map.domain.radius
@@ -96,15 +79,12 @@ def test_domain_to_unit_and_to_contact_are_inverse_and_accept_the_edge():
     np.testing.assert_allclose(DOMAIN.to_contact(unit), contact, rtol=1e-12)
     for rounding in (1.0 - 1e-12, 1.0 + 1e-12):
         DOMAIN.check(np.array([[3.0, 4.0, 2.0], [0.0, 0.0, 0.1]]) * rounding, "map")
-        check_forces(np.array(DOMAIN.force_range) * rounding, DOMAIN.force_range, "map")
         check_radius(5.0 * rounding, 5.0, "map")
 
 
 @pytest.mark.parametrize(
     ("check", "message"),
     [
-        (lambda: check_forces(3.0, (0.1, 2.0), "map"), r"^force: expected 0\.1 to 2 N, which the map covers, got 3 N$"),
-        (lambda: check_forces(np.array([1.0, 3.0]), (0.1, 2.0), "map"), r"^force of press 1: .* got 3 N$"),
         (lambda: as_charges(np.ones(3), ("A", "B", "C")), r"shape \(n, 3\) for .'A', 'B', 'C'., got shape \(3,\)"),
         (lambda: as_charges(np.array([[1, np.nan]]), ("A", "B")), "charge of 'B' in press 0: expected a finite number"),
     ],

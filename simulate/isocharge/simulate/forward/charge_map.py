@@ -10,17 +10,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.contact_domain import LIMIT_TOLERANCE, Domain, are_within
+from isocharge.common.contact_domain import LIMIT_TOLERANCE, Domain
 from isocharge.common.errors import ChargeError, SceneError
 
 STEPS = (0.05, 0.05, 1e-3)
 """Steps of the central differences in x and y (mm) and in ln F (dimensionless), where F is the force."""
-
-ONE_SIDED_STEPS = (0.01, 0.01, 1e-3)
-"""Steps of the one-sided differences in x and y (mm) and in ln F (dimensionless).
-
-They are smaller than `STEPS`, because the error of a one-sided difference decreases only linearly with the step.
-"""
 
 
 class ChargeMap(Protocol):
@@ -173,32 +167,6 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
     return np.moveaxis(derivatives, 0, 2)
 
 
-def one_sided_differences(function: Callable[[Array], Array], contact: Array) -> tuple[Array, Array]:
-    """Compute a function of contacts, and approximate its derivatives by one-sided differences.
-
-    One-sided differences need four values of the function. Central differences need six values, but are more accurate.
-    The errors of one-sided differences are proportional to the steps `ONE_SIDED_STEPS`. These errors are small enough
-    for a search that uses the derivatives only to choose its steps.
-
-    Args:
-        function: Function of contacts (x, y, F), shape (n, 3), mm and N, that returns values, shape (n, k). The
-            function is called once, because one call is faster than four.
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-
-    Returns:
-        Values, shape (n, k), and derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values
-        per mm, per mm and per 1.
-    """
-    contact = np.asarray(contact, dtype=float)
-    steps = np.array(ONE_SIDED_STEPS)
-    stepped_contacts = _step_each_variable(contact, steps)  # shape (3, n, 3), one block per stepped variable
-    all_contacts = np.concatenate([contact[None], stepped_contacts])
-    all_values = np.asarray(function(all_contacts.reshape(-1, 3))).reshape(4, len(contact), -1)
-    values = all_values[0]
-    derivatives = (all_values[1:] - values) / steps[:, None, None]  # shape (3, n, k)
-    return values, np.moveaxis(derivatives, 0, 2)
-
-
 def _step_each_variable(contact: Array, steps: Array) -> Array:
     """Return three copies of the contacts: one shifted in x, one shifted in y, and one shifted in ln F.
 
@@ -217,28 +185,6 @@ def _step_each_variable(contact: Array, steps: Array) -> Array:
     force_stepped = contact.copy()
     force_stepped[:, 2] *= np.exp(log_force_step)
     return np.stack([x_stepped, y_stepped, force_stepped])
-
-
-def check_forces(force: Array | float, force_range: tuple[float, float], source: str) -> None:
-    """Raise an error if a force lies outside the range of forces for which a map is valid.
-
-    Args:
-        force: Forces, a number or shape (n,), N.
-        force_range: Smallest and largest allowed force, N.
-        source: Name of the map in the error message, such as "forward map".
-
-    Raises:
-        SceneError: If a force lies outside the range or is NaN.
-    """
-    forces = np.atleast_1d(force)
-    is_inside = are_within(forces, force_range)
-    if not is_inside.all():
-        low, high = force_range
-        first_outside = int(np.argmin(is_inside))  # index of the first False
-        name = f"force of press {first_outside}" if forces.size > 1 else "force"
-        raise SceneError(
-            f"{name}: expected {low:g} to {high:g} N, which the {source} covers, got {forces[first_outside]:g} N"
-        )
 
 
 def check_radius(radius: float, largest: float, source: str) -> None:

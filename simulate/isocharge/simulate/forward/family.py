@@ -15,11 +15,9 @@ from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.readout import touch_charge
 from isocharge.simulate.mechanics.stress import rotate_stress
-from isocharge.simulate.mechanics.theory import Theory, theory_for
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
-from isocharge.simulate.mesh.placement import widest_smooth_layer
-from isocharge.simulate.mesh.template import Template, template_for
+from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import (
     barycentric_weights,
     chebyshev_nodes,
@@ -402,50 +400,26 @@ def nearest_to_clamp(film: Film, distance: float) -> tuple[float, float]:
     return distance * math.cos(angle), distance * math.sin(angle)
 
 
-@dataclass(frozen=True)
-class FamilySettings:
-    """Settings that are the same for all solves of a forward map.
-
-    Attributes:
-        theory: Terms of the film theory.
-        resolution: Fineness of the mesh.
-        layer: Width of the thin rings of the mesh at the rim, in film radii.
-    """
-
-    theory: Theory
-    resolution: Resolution
-    layer: float
-
-    @property
-    def to_solve(self) -> SolveSettings:
-        """The settings in the form that the solver expects."""
-        return SolveSettings(theory=self.theory, resolution=self.resolution, layer=self.layer)
-
-
-def family_settings(sensor: Sensor, probe: Probe, domain: Domain, settings: SolveSettings) -> FamilySettings:
-    """Choose the settings that are the same for all presses of a domain.
+def family_mesh(film: Film, probe: Probe, domain: Domain, settings: SolveSettings) -> tuple[Resolution, float]:
+    """Choose the mesh that is the same for all presses of a domain.
 
     Args:
-        sensor: Sensor with the film.
+        film: Film of the forward map.
         probe: Probe that presses the film.
         domain: Presses of the forward map.
-        settings: Required accuracy, and settings that are not chosen here; see `ForwardMap.build`.
+        settings: Required accuracy, theory, and parts of the mesh that are not chosen here; see `ForwardMap.build`.
+
+    Returns:
+        Fineness of the mesh, and total width of the thin rings at the rim, in film radii.
     """
-    film = sensor.film
     min_force, max_force = domain.force_range
     middle_force = float(np.sqrt(min_force * max_force))
-    theory = settings.theory
-    if theory == "auto":
-        theory = theory_for(sensor, probe, domain.force_range, settings.accuracy)
     layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
-    settings = replace(settings, theory=theory, layer=layer)
-    outermost = nearest_to_clamp(film, domain.radius)
     # The smallest force needs the finest mesh if the pretension is uneven.
     force = middle_force if film.is_axisymmetric else min_force
-    resolution = needed_resolution(film, probe, outermost, force, settings)
-    template = template_for(probe, resolution, whole=not film.is_axisymmetric)
-    layer = min(layer, widest_smooth_layer(template, probe, domain.radius, film.radius))
-    return FamilySettings(theory, resolution, layer)
+    outermost = nearest_to_clamp(film, domain.radius)
+    resolution = needed_resolution(film, probe, outermost, force, replace(settings, layer=layer))
+    return resolution, layer
 
 
 def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check: CheckPress) -> Array:

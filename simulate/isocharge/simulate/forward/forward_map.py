@@ -25,11 +25,10 @@ from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.forward.family import (
     Family,
-    FamilySettings,
     NodeCount,
     check_family,
     direct_charges,
-    family_settings,
+    family_mesh,
     node_counts,
     relative_error,
     spread_check_presses,
@@ -113,10 +112,9 @@ class ForwardMap:
             probe: Probe that presses the film.
             radius: Largest distance of a press from the centre, mm.
             force_range: Smallest and largest force, N.
-            settings: Accuracy, theory and mesh. A setting that is "auto" is chosen once for all presses. The theory has
-                the fewest terms that the accuracy allows for all forces. The mesh is as fine as the outermost press
-                requires. The width of the thin rings is that of the geometric mean of the smallest and the largest
-                force.
+            settings: Accuracy, theory and mesh. A setting that is "auto" is chosen once for all presses. The mesh is as
+                fine as the outermost press requires. The width of the thin rings is that of the geometric mean of the
+                smallest and the largest force.
             executor: Executor that runs the solves; None for this process. The result does not depend on it.
 
         Raises:
@@ -126,7 +124,7 @@ class ForwardMap:
         film = sensor.film
         domain = Domain(radius, force_range)
         check_family(film, probe, domain)
-        map_settings = family_settings(sensor, probe, domain, settings)
+        mesh = family_mesh(film, probe, domain, settings)
 
         # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared at
         # the check presses, which are solved directly in the first pass of the loop. If the error is very large, the
@@ -137,7 +135,8 @@ class ForwardMap:
         remaining_counts = list(node_counts(film))
         while remaining_counts:
             count = remaining_counts.pop(0)
-            forward_map = cls._solve(sensor, probe, domain, map_settings, count, executor)
+            family = Family.spread(domain, film, probe, count)
+            forward_map = cls._solve(sensor, probe, family, settings.theory, mesh, executor)
             if not check_charges:
                 solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
                 check_charges = list(in_order(executor, solve_directly, checks))
@@ -178,24 +177,35 @@ class ForwardMap:
             SolveError: If a press has no equilibrium.
         """
         check_family(sensor.film, probe, domain)
-        map_settings = family_settings(sensor, probe, domain, settings)
-        return cls._solve(sensor, probe, domain, map_settings, count, executor)
+        mesh = family_mesh(sensor.film, probe, domain, settings)
+        family = Family.spread(domain, sensor.film, probe, count)
+        return cls._solve(sensor, probe, family, settings.theory, mesh, executor)
 
     @classmethod
     def _solve(
         cls,
         sensor: Sensor,
         probe: Probe,
-        domain: Domain,
-        settings: FamilySettings,
-        count: NodeCount,
+        family: Family,
+        theory: Theory,
+        mesh: tuple[Resolution, float],
         executor: Executor | None,
     ) -> "ForwardMap":
-        """Solve a family of presses with given settings. The error of the map is infinite, because it is not known."""
-        family = Family.spread(domain, sensor.film, probe, count)
-        template = template_for(probe, settings.resolution, whole=not sensor.film.is_axisymmetric)
-        table = family.unfold(family.solve(sensor, probe, settings.to_solve, executor), template)
-        return cls(sensor, probe, family, settings.theory, settings.resolution, settings.layer, table, np.inf)
+        """Solve a family of presses. The error of the map is infinite, because it is not known.
+
+        Args:
+            sensor: Sensor whose charges the map computes.
+            probe: Probe that presses the film.
+            family: Presses to be solved.
+            theory: Terms of the film theory.
+            mesh: Fineness of the mesh, and total width of the thin rings at the rim, in film radii.
+            executor: Executor that runs the solves; None for this process.
+        """
+        resolution, layer = mesh
+        settings = SolveSettings(theory=theory, resolution=resolution, layer=layer)
+        template = template_for(probe, resolution, whole=not sensor.film.is_axisymmetric)
+        table = family.unfold(family.solve(sensor, probe, settings, executor), template)
+        return cls(sensor, probe, family, theory, resolution, layer, table, np.inf)
 
     @property
     def domain(self) -> Domain:

@@ -43,9 +43,6 @@ COARSE = 4
 FAR = 2
 """Number of Gauss points per side of an electrode far from the probe, for many presses."""
 
-LINE_POINTS = 8
-"""Number of Gauss points on a straight line of metal, such as a trace."""
-
 NEAR = 1.0
 """Distance between the footprint and an electrode below which the fine rule is used, mm.
 
@@ -88,35 +85,6 @@ class ReadoutPoints:
         charge_per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
         weights = sensor.gains[:, None, None] * layout_points.weights * charge_per_stress
         return cls(sensor.calibration.place(layout_points.points), weights, layout_points.count)
-
-    @classmethod
-    def along(cls, sensor: Sensor, lines: Array) -> "ReadoutPoints":
-        """Return the integration points on straight lines of metal that belong to the electrodes, such as traces.
-
-        Args:
-            sensor: Sensor whose piezoelectric coefficients, gains and calibration are used.
-            lines: Start and end points (x, y) of the lines in the layout, shape (n_electrode, n_line, 2, 2), mm.
-
-        Returns:
-            Integration points of n_electrode * n_line lines, ordered by electrode. A weight is the charge per stress
-            and per width of the line, pC/(MPa mm).
-        """
-        # Relative positions of the Gauss points, from the start of a line (0) to its end (1), and their weights
-        relative_position, line_weights = gauss_line(LINE_POINTS)
-        start = lines[:, :, :1]  # shape (n_electrode, n_line, 1, 2)
-        start_to_end = lines[:, :, 1:] - start
-        points = start + relative_position[:, None] * start_to_end  # shape (n_electrode, n_line, LINE_POINTS, 2)
-        placed_points = sensor.calibration.place(points.reshape(-1, LINE_POINTS, 2))
-
-        # The weight of a point is the product of the gain, the length that the point represents, and the charge per
-        # area and stress (s11, s22, s12). The factor 2 accounts for s12 and s21, which contribute equally.
-        length = np.linalg.norm(start_to_end, axis=3)  # shape (n_electrode, n_line, 1)
-        point_length = length * line_weights  # shape (n_electrode, n_line, LINE_POINTS)
-        amplified_length = sensor.gains[:, None, None] * point_length
-        charge_per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
-        weights = amplified_length.reshape(-1, LINE_POINTS, 1) * charge_per_stress
-        point_counts = np.full(len(placed_points), LINE_POINTS)
-        return cls(placed_points, weights, point_counts)
 
     def charge(self, stress: Array) -> Array:
         """Compute charges from the stress at the points.
@@ -178,7 +146,7 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
     if sensor.surface != "middle" and not equilibrium.theory.bending:
         raise SensorError(
             f"surface {sensor.surface!r} needs bending, but the film was solved as a {equilibrium.theory.name}; solve "
-            "it with SolveSettings(theory=theory_for(sensor, probe, (force, force)))"
+            "it with SolveSettings(theory=Theory(bending=True))"
         )
     # Compute the stress at the integration points of all electrodes. `touch_stress` expects one list of points.
     readout = ReadoutPoints.of(sensor, DIRECT)

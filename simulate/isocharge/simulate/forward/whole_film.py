@@ -11,7 +11,6 @@ from dataclasses import replace
 from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
@@ -72,8 +71,7 @@ def whole_film_map(
         SceneError: If some presses cannot exist.
         SolveError: If a press has no equilibrium.
     """
-    theory = Theory(bending=True)
-    settings = SolveSettings(theory=theory, resolution=COARSE_RESOLUTION)
+    settings = SolveSettings(resolution=COARSE_RESOLUTION)
     domain = Domain(outermost_distance(sensor.film, probe), force_range)
     forward_map = ForwardMap.build_unchecked(sensor, probe, domain, NODE_COUNT, settings, executor=executor)
     return replace(forward_map, error=COARSE_ERROR)

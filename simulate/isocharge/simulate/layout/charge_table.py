@@ -30,7 +30,6 @@ from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.family import DIRECTION_PERIOD, DIRECTIONS, nearest_to_clamp
 from isocharge.simulate.forward.readout import electrode_rule
-from isocharge.simulate.mechanics.theory import theory_for
 from isocharge.simulate.mesh.conformal_map import automorphism_onto, distance_coordinate
 from isocharge.simulate.mesh.placed_mesh import distance_on_circular_film, film_oval, from_oval, to_oval
 from isocharge.simulate.numerics.interpolation import (
@@ -146,7 +145,7 @@ class ChargeTable:
         """
         # All presses are solved with the mesh that the outermost press needs.
         film = sensor.film
-        basic_settings = SolveSettings(theory=theory_for(sensor, probe, (force, force)), layer=layer_for(film, force))
+        basic_settings = SolveSettings(layer=layer_for(film, force))
         resolution = needed_resolution(film, probe, nearest_to_clamp(film, radius), force, basic_settings)
         settings = replace(basic_settings, resolution=resolution)
 

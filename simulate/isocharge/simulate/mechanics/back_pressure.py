@@ -17,12 +17,6 @@ from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.placed_mesh import Geometry
 
-SERIES_BELOW = 1e-3
-"""Displaced share of the volume of the air below which the energy of the air is computed by a Taylor series.
-
-For smaller values, the formula with the logarithm loses digits.
-"""
-
 
 class BackPressure:
     """Energy of the static pressure and of the trapped air for a given mesh and given dimensionless groups.
@@ -122,12 +116,4 @@ class BackPressure:
         displaced_share = self.groups.compression * self._volume(deflection)
         if displaced_share >= 1.0:
             return np.inf
-        if abs(displaced_share) >= SERIES_BELOW:
-            return float(-np.log1p(-displaced_share) - displaced_share)
-
-        # For small x, the formula loses digits. The Taylor series x^2 / 2 + x^3 / 3 + ... + x^6 / 6 is evaluated by
-        # Horner's scheme instead.
-        series = 1.0 / 6.0
-        for exponent in (5.0, 4.0, 3.0, 2.0):
-            series = 1.0 / exponent + displaced_share * series
-        return displaced_share**2 * series
+        return float(-np.log1p(-displaced_share) - displaced_share)

@@ -302,33 +302,14 @@ def ring_edges(resolution: Resolution, template_radius: Array, thin_ring_width: 
     # With the total width t, the thin rings extend from r = 1 - t to r = 1, over which ln(r) increases by about t.
     # According to the definition of the depth, the depth increases by t / ln(1 / r0).
     requested_thin_depth = -thin_ring_width / np.log(template_radius)
-    thin_depth = np.minimum(requested_thin_depth, _max_thin_depth(resolution))[..., None]
+    # All thin rings together are at most as deep as each of the other rings. The limit is smooth, because fields at the
+    # nodes are interpolated between presses at different distances.
+    max_thin_depth = 1.0 / (resolution.rings + 1)
+    limited_thin_depth = requested_thin_depth / (1.0 + (requested_thin_depth / max_thin_depth) ** 2) ** 0.5
+    thin_depth = limited_thin_depth[..., None]
 
     # The even rings share the remaining depth. The part of the thin rings outside edge i is 3^-i of their total depth.
     edges_of_even_rings = even_edges * (1.0 - thin_depth)
     edges_of_thin_rings = 1.0 - thin_depth * 3.0 ** -np.arange(1.0, resolution.rim + 1)
     edges_of_thin_rings[..., -1] = 1.0  # the last ring extends to the rim
     return np.concatenate([edges_of_even_rings, edges_of_thin_rings], axis=-1)
-
-
-def max_thin_ring_width(resolution: Resolution, map_parameter: Array, template_radius: Array) -> Array:
-    """Compute the largest total width of the thin rings for which `ring_edges` does not limit their total depth.
-
-    Args:
-        resolution: Fineness of the mesh.
-        map_parameter: Parameter c of the conformal map, shape (...).
-        template_radius: Radius of the innermost circle in the template plane, shape (...).
-
-    Returns:
-        Widths, shape (...), in film radii.
-    """
-    width_in_template = -np.log(template_radius) * _max_thin_depth(resolution)
-    return np.asarray(width_in_template * (1.0 - map_parameter) / (1.0 + map_parameter))
-
-
-def _max_thin_depth(resolution: Resolution) -> float:
-    """Return the largest allowed total depth of the thin rings.
-
-    If the thin rings have the largest allowed depth, all thin rings together are as deep as each of the other rings.
-    """
-    return 1.0 / (resolution.rings + 1)

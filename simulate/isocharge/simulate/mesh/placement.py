@@ -31,16 +31,12 @@ from isocharge.simulate.mesh.blocks import Blocks
 from isocharge.simulate.mesh.conformal_map import (
     automorphism_onto,
     enclosing_circle,
-    max_thin_ring_width,
     rim_angles,
     ring_edges,
     sector_angles,
     stretch_on_circle,
 )
 from isocharge.simulate.sensor.probe import Probe
-
-CHECKED_ORIENTATIONS = 12
-"""Number of orientations of a probe for which the width of the thin rings is checked."""
 
 
 @dataclass(frozen=True)
@@ -290,30 +286,3 @@ def _unit_coordinates(blocks: Blocks) -> tuple[Array, Array]:
         Radial coordinate and angular coordinate, both from 0 to 1, each of shape (n_local,).
     """
     return 0.5 * (blocks.xi + 1.0), 0.5 * (blocks.eta + 1.0)
-
-
-def widest_smooth_layer(mesh: Blocks, probe: Probe, distance: float, film_radius: float) -> float:
-    """Compute the largest width of the thin rings for which the nodes move smoothly if the press moves.
-
-    The nodes of the mesh move when the distance of the press from the centre increases. Fields at the nodes can be
-    interpolated by polynomials in this distance only if the nodes move smoothly. For presses near the rim, the function
-    `ring_edges` limits the thin rings to a largest width. The movement of the nodes has a kink at the distance beyond
-    which the requested width exceeds this largest width. Thin rings that are not wider than the returned width never
-    reach the limit.
-
-    Args:
-        mesh: Template of the mesh.
-        probe: The probe.
-        distance: Largest distance of a press from the centre of the film, mm.
-        film_radius: Radius of the film, mm.
-
-    Returns:
-        Total width of the thin rings, in film radii.
-    """
-    # Place the mesh under the outermost press, in several orientations of the probe. Only the parameters of
-    # the conformal map are needed. They do not depend on the width of the thin rings, so the width is set to 0.
-    no_thin_rings = 0.0
-    rotation = 2.0 * np.pi * np.arange(CHECKED_ORIENTATIONS) / CHECKED_ORIENTATIONS
-    distances = np.full(CHECKED_ORIENTATIONS, distance)
-    placement = Placement.of(mesh, probe, distances, film_radius, no_thin_rings, rotation)
-    return float(max_thin_ring_width(mesh.resolution, placement.map_parameter, placement.template_radius).min())

@@ -152,10 +152,7 @@ def estimated_error(equilibrium: Equilibrium) -> float:
     Returns:
         Relative error, which is infinite if the theory cannot describe the film.
     """
-    film = equilibrium.film
-    probe = equilibrium.probe
-    force = equilibrium.force
-    return mesh_error(equilibrium) + modelling_error(film, probe, force, equilibrium.theory)
+    return mesh_error(equilibrium) + modelling_error(equilibrium.film, equilibrium.force, equilibrium.theory)
 
 
 def relative_difference(one: Equilibrium, other: Equilibrium) -> float:

@@ -1,4 +1,4 @@
-"""Checks of a press before the solve, and choice of the theory and the mesh."""
+"""Checks of a press before the solve, and choice of the mesh."""
 
 import math
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ import numpy as np
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.scaling import amplitude_squared
-from isocharge.simulate.mechanics.theory import ACCURACY, Theory, bending_length, check_strains, choose_theory
+from isocharge.simulate.mechanics.theory import ACCURACY, WITH_BENDING, Theory, bending_length, check_strains
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import CLEARANCE
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, distance_on_circular_film, place
@@ -30,12 +30,6 @@ Auto = Literal["auto"]
 
 LAYER_WIDTH = 6.0
 """Total width of the thin rings at the rim, in bending lengths. Widths from 4 to 14 change a charge by at most 1e-4."""
-
-MIN_LAYER_REUSE = 0.75
-"""Smallest ratio of the width of the thin rings of a starting equilibrium to `LAYER_WIDTH` at which it is reused."""
-
-MAX_LAYER_REUSE = 2.0
-"""Largest ratio of the width of the thin rings of a starting equilibrium to `LAYER_WIDTH` at which it is reused."""
 
 MAX_SIDE_SHARE = 1.0
 """Largest ratio of the side force to the force of the press. It corresponds to a coefficient of friction of one."""
@@ -91,15 +85,14 @@ class SolveSettings:
 
     Attributes:
         accuracy: Largest allowed relative error of a charge.
-        theory: Terms of the film theory; "auto" for the fewest terms that the accuracy allows.
+        theory: Terms of the film theory.
         resolution: Fineness of the mesh; "auto" for the coarsest mesh that reaches the accuracy.
-        layer: Total width of the thin rings at the rim, in film radii. "auto" for six bending lengths, or for the width
-            of the thin rings of the starting equilibrium if it is similar.
+        layer: Total width of the thin rings at the rim, in film radii; "auto" for six bending lengths.
         tolerance: Ratio of the out-of-balance force to the load at which a solve has converged.
     """
 
     accuracy: float = ACCURACY
-    theory: Theory | Auto = "auto"
+    theory: Theory = WITH_BENDING
     resolution: Resolution | Auto = "auto"
     layer: float | Auto = "auto"
     tolerance: float = TOLERANCE
@@ -232,10 +225,9 @@ class LoadCase:
         at: tuple[float, float],
         force: float,
         settings: SolveSettings,
-        start: PlacedMesh | None,
         side_force: tuple[float, float] = (0.0, 0.0),
     ) -> Self:
-        """Check a press. Choose the theory and the width of the thin rings where the settings are "auto".
+        """Check a press, and choose the width of the thin rings if the setting is "auto".
 
         Args:
             film: The film.
@@ -243,7 +235,6 @@ class LoadCase:
             at: Centroid (x, y) of the footprint, mm.
             force: Force, N.
             settings: Settings of the solve.
-            start: Mesh of the equilibrium from which the solve starts; None if there is no such equilibrium.
             side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N.
 
         Raises:
@@ -252,19 +243,13 @@ class LoadCase:
         began = process_time()
         check_press(film, probe, at, force)
         check_side_force(side_force, force)
-        theory = settings.theory
-        if theory == "auto":
-            theory = choose_theory(film, probe, force, settings.accuracy)
-
-        layer = settings.layer
-        if layer == "auto":
-            layer = _choose_thin_ring_width(film, force, probe, settings, start)
+        layer = layer_for(film, force) if settings.layer == "auto" else settings.layer
         return cls(
             film=film,
             probe=probe,
             at=at,
             force=force,
-            theory=theory,
+            theory=settings.theory,
             layer=layer,
             accuracy=settings.accuracy,
             tolerance=settings.tolerance,
@@ -275,37 +260,6 @@ class LoadCase:
     def place(self, resolution: Resolution) -> PlacedMesh:
         """Create the mesh under this press with a given resolution."""
         return place(self.film, self.probe, self.at, resolution, self.layer, whole=any(self.side_force))
-
-
-def _choose_thin_ring_width(
-    film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None
-) -> float:
-    """Choose the total width of the thin rings of elements at the rim.
-
-    The default width is `LAYER_WIDTH` bending lengths. A solve that starts from an equilibrium on another mesh may use
-    the width of the thin rings of that mesh instead. The solve can then start from the field of the equilibrium. The
-    other width is used only if it is similar to the default width, and if the new mesh can have the same elements as
-    the other mesh.
-
-    Args:
-        film: The film.
-        force: Force, N.
-        probe: The probe.
-        settings: Settings of the solve.
-        start: Mesh of the starting equilibrium; None if there is no starting equilibrium.
-
-    Returns:
-        Width of the thin rings, in film radii.
-    """
-    default_width = layer_for(film, force)
-    if start is None:
-        return default_width
-    has_similar_width = MIN_LAYER_REUSE < start.layer / default_width < MAX_LAYER_REUSE
-    may_have_same_resolution = settings.resolution in ("auto", start.resolution)
-    has_same_topology = probe.topology == start.template.topology
-    if has_similar_width and may_have_same_resolution and has_same_topology:
-        return start.layer
-    return default_width
 
 
 def choose_mesh(case: LoadCase) -> PlacedMesh:

@@ -87,8 +87,7 @@ def press(
         SceneError: If the press cannot exist, or if the mesh is too distorted.
         SolveError: If the solve fails and `throw` is True.
     """
-    start_mesh = start.mesh if start else None
-    case = LoadCase.of(film, probe, at, force, settings, start_mesh, side_force)
+    case = LoadCase.of(film, probe, at, force, settings, side_force)
     with single_threaded_blas():
         if settings.resolution != "auto":
             solved = _solve(case, case.place(settings.resolution), start)
@@ -119,7 +118,7 @@ def needed_resolution(
         SceneError: If the press cannot exist, or if every mesh for the press is too distorted.
         SolveError: If two meshes must be compared and no equilibrium is found.
     """
-    case = LoadCase.of(film, probe, at, force, settings, None)
+    case = LoadCase.of(film, probe, at, force, settings)
     if settings.resolution != "auto":
         return settings.resolution
     if needs_second_mesh(case):
