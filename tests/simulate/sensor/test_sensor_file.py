@@ -168,7 +168,6 @@ def test_error_message_names_the_key_of_the_wrong_type(path):
         (("film", "thickness_um"), 3000.3, r"film thickness: .* radius \(30 mm\), got 3\.0003 mm"),
         (("electrodes", "side_mm"), 0.0, "electrodes.side_mm: expected a number above 0"),
         (("electrodes", "A"), [8.0, 5.0], "electrodes 'A' and 'B' overlap"),
-        (("electrodes", "coating_N_per_mm"), 22.5, r"electrodes\.coating_N_per_mm = 22\.5: .* calibrate the gains"),
         (("calibration", "gain"), {"A": 0.0}, "calibration.gain.A: expected a positive number, got 0.0"),
         (("calibration", "gain"), {"Z": 1.0}, "calibration gain: no electrode named"),
         (("surface",), "inside", r"surface: expected one of middle, top, bottom, got 'inside'"),

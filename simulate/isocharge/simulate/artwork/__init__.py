@@ -1,1 +1,1 @@
-"""Writing of electrode layouts as drawings (DXF and SVG), and reading of electrodes from DXF drawings."""
+"""Writing of electrode layouts as drawings (DXF and SVG) and as folders of a design."""

@@ -58,14 +58,11 @@ def straight_leads(sensor: Sensor, width: float = 0.3, clearance: float = 0.3) -
     Returns:
         The leads, and the names of the electrodes for which no straight lead was found.
     """
-    metal = {
-        electrode.name: shapely.MultiPolygon(map(shapely.Polygon, electrode.metal)) for electrode in sensor.electrodes
-    }
     paths: dict[str, Array] = {}
     outermost_first = sorted(sensor.electrodes, key=lambda electrode: float(np.hypot(*electrode.centre)), reverse=True)
     for electrode in outermost_first:
         # The distances are measured from the centre lines of the leads.
-        others = shapely.union_all([polygons for name, polygons in metal.items() if name != electrode.name])
+        others = shapely.union_all([other.region for other in sensor.electrodes if other is not electrode])
         leads = shapely.MultiLineString(list(paths.values()))
         possible_paths = _possible_paths(np.array(electrode.centre), sensor.film.radius)
         lines = shapely.linestrings(possible_paths)

@@ -69,24 +69,6 @@ def _cross(first: Array, second: Array) -> Array:
     return np.asarray(x1 * y2 - y1 * x2)
 
 
-def overlap(first: Array, second: Array, within: float = 0.0) -> bool:
-    """Return whether two polygons overlap or are closer to each other than a given distance.
-
-    Args:
-        first: Corners (x, y), shape (n, 2).
-        second: Corners (x, y), shape (m, 2).
-        within: Distance in the unit of the corners. With the distance 0, polygons that only touch do not overlap.
-    """
-    first_polygon = shapely.Polygon(first)
-    second_polygon = shapely.Polygon(second)
-    if within > 0.0:
-        return bool(shapely.distance(first_polygon, second_polygon) < within)
-
-    # Pattern of the dimensionally extended nine-intersection model: only the interiors are required to intersect.
-    interiors_intersect = "T********"
-    return bool(shapely.relate_pattern(first_polygon, second_polygon, interiors_intersect))
-
-
 def to_complex(corners: Array) -> Complexes:
     """Convert corners (x, y), shape (n, 2), into complex numbers x + iy, shape (n,)."""
     return np.asarray(corners @ np.array([1.0, 1j]))

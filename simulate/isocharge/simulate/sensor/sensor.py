@@ -11,11 +11,12 @@ from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
+import shapely
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SensorError, cut, shown
 from isocharge.common.printable_text import is_printable
-from isocharge.simulate.numerics.polygon import area_of, is_convex, overlap, to_complex, to_corners
+from isocharge.simulate.numerics.polygon import area_of, is_convex, to_complex, to_corners
 from isocharge.simulate.numerics.polygon_union import is_simple, subdivide, trace_outline, union_parts
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.size_check import check_range
@@ -48,12 +49,18 @@ MAX_NAME_LENGTH = 100
 """Largest number of characters of the name of an electrode."""
 
 RESERVED_NAMES = (
-    *("side_mm", "coating_N_per_mm", "x_mm", "y_mm", "force_N", "position_std_mm", "force_std", "temperature_C"),
+    *("side_mm", "x_mm", "y_mm", "force_N", "position_std_mm", "force_std", "temperature_C"),
     *("probe", "orientation_deg", "t_us", "t_ms", "t_s", "seq"),
 )
 """Names that an electrode cannot have, because they have another meaning in a file or a frame.
 
 They are keys of the sensor file, columns of tables of presses, and fields of a frame.
+"""
+
+INTERIORS_INTERSECT = "T********"
+"""Pattern of the dimensionally extended nine-intersection model for regions that share an area.
+
+Regions that only touch do not match.
 """
 
 MAX_ELECTRODES = 64
@@ -190,29 +197,16 @@ class Electrode:
         return replace(self, back=()).parts if self.back else self.parts
 
     @cached_property
+    def region(self) -> shapely.Geometry:
+        """Region of the film that the metal on the front covers."""
+        return shapely.union_all([shapely.Polygon(part) for part in self.metal])
+
+    @cached_property
     def boxes(self) -> tuple[Array, Array]:
         """Lower left and upper right corners of the bounding boxes of `metal`, each of shape (n_part, 2), mm."""
         low = np.array([part.min(axis=0) for part in self.metal])
         high = np.array([part.max(axis=0) for part in self.metal])
         return low, high
-
-    def overlaps(self, other: "Electrode", within: float = 0.0) -> bool:
-        """Return whether the metal of this electrode overlaps the metal of another electrode on the front.
-
-        Args:
-            other: The other electrode.
-            within: Distance below which the electrodes also count as overlapping, mm.
-        """
-        # Only parts whose bounding boxes are near along both axes can overlap. The comparison of the boxes, which is
-        # fast, has the shape (n_part, n_other_part, 2).
-        low, high = self.boxes
-        other_low, other_high = other.boxes
-        are_near_along_axis = (low[:, None] <= other_high + within) & (other_low - within <= high[:, None])
-        pairs_of_near_parts = np.argwhere(are_near_along_axis.all(axis=2))
-        return any(
-            overlap(self.metal[own_index], other.metal[other_index], within)
-            for own_index, other_index in pairs_of_near_parts
-        )
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -439,7 +433,7 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
                 "with Electrode.of_square"
             )
     for first, second in combinations(electrodes, 2):
-        if first.overlaps(second):
+        if shapely.relate_pattern(first.region, second.region, INTERIORS_INTERSECT):
             raise SensorError(f"electrodes {first.name!r} and {second.name!r} overlap; move one of them")
 
 

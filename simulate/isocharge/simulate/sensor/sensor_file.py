@@ -4,6 +4,7 @@ A sensor file is a TOML file whose keys contain the units of the values. Unknown
 """
 
 import logging
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from importlib import resources
 from pathlib import Path
@@ -34,19 +35,10 @@ from isocharge.simulate.sensor.size_check import tidy
 MAX_COORDINATE_mm = 1e6
 """Largest accepted magnitude of a coordinate or a length in a sensor file, mm."""
 
-PPM = 1e6
-"""Factor that converts a fraction into parts per million."""
-
-PASCAL_PER_MPA = 1e6
-"""Factor that converts megapascals into pascals."""
-
 log = logging.getLogger(__name__)
 
 SIDE = "side_mm"
 """Key of the section `electrodes` whose value is the side of all square electrodes."""
-
-COATING = "coating_N_per_mm"
-"""Key of the section `electrodes` that is refused. It stated the stiffness of the metal or ink of the electrodes."""
 
 Coordinate = Annotated[float, Meta(ge=-MAX_COORDINATE_mm, le=MAX_COORDINATE_mm)]
 Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm, each at most {MAX_COORDINATE_mm:g}")]
@@ -74,7 +66,22 @@ class FilmTable(Settings, frozen=True):
     back_volume_mm3: Positive | None = None
     static_pressure_Pa: Finite = 0.0
     expansion_ppm_per_K: Finite | Annotated[list[Finite], Meta(min_length=2, max_length=2)] | None = None
-    ring_expansion_ppm_per_K: Finite = PPM * ALUMINIUM_EXPANSION
+    ring_expansion_ppm_per_K: Finite = 1e6 * ALUMINIUM_EXPANSION
+
+
+FILM_ATTRIBUTES = {
+    "radius_mm": ("radius", 1.0),
+    "thickness_um": ("thickness", 1e-3),
+    "poisson": ("poisson", 1.0),
+    "shear_GPa": ("shear", 1e3),
+    "axis_deg": ("axis", math.radians(1.0)),
+    "oval": ("oval", 1.0),
+    "oval_axis_deg": ("oval_axis", math.radians(1.0)),
+    "back_volume_mm3": ("back_volume", 1.0),
+    "static_pressure_Pa": ("static_pressure", 1e-6),
+    "ring_expansion_ppm_per_K": ("ring_expansion", 1e-6),
+}
+"""Attribute of `Film` for each key of the section `film` with one number, and the unit of the key in that of `Film`."""
 
 
 class PiezoTable(Settings, frozen=True):
@@ -134,14 +141,7 @@ class SensorTable(Settings, frozen=True):
 
         Raises:
             WrongKey: If a value is not allowed, or if a key is missing.
-            ValueError: If the section contains the key `COATING`.
         """
-        if COATING in self.electrodes:
-            raise ValueError(
-                f"electrodes.{COATING} = {self.electrodes[COATING]}: coats (metal or ink that stiffens the film) are "
-                "not modelled, because their effect on a charge is typically 0.1 to 0.2 % once the gains are "
-                "calibrated; remove the key and calibrate the gains"
-            )
         for name, value in self.electrodes.items():
             if name != SIDE and isinstance(value, float):
                 raise WrongKey(f"electrodes.{name}", "[x, y] in mm or a table", value)
@@ -266,42 +266,33 @@ def film_to_dict(film: Film) -> dict[str, Any]:
     """Convert a film into the section `film` of a sensor file.
 
     This function is the inverse of `_film`. Young's modulus is a single number if it does not depend on the direction,
-    and a list if it does. The same applies to the pretension.
+    and a list if it does. The same applies to the pretension. Optional keys with their default value are omitted.
 
     Args:
         film: Film to be converted.
     """
+    numbers = {
+        key: None if getattr(film, attribute) is None else tidy(getattr(film, attribute) / unit)
+        for key, (attribute, unit) in FILM_ATTRIBUTES.items()
+    }
     half_difference, shear_tension = film.deviator
-    mean_tension = film.pretension
-    tension_components = (mean_tension + half_difference, mean_tension - half_difference, shear_tension)
-    tension_MPa = [tidy(component) for component in tension_components]
+    tension = (film.pretension + half_difference, film.pretension - half_difference, shear_tension)
 
     # If E is the geometric mean of the moduli and r^2 = E1 / E2, the moduli are E1 = E r and E2 = E / r.
-    root_of_ratio = np.sqrt(film.young_ratio)
-    young_GPa = [tidy(film.young * 1e-3 * root_of_ratio), tidy(film.young * 1e-3 / root_of_ratio)]
-
-    # Collect the optional keys. Keys that have their default value are omitted below.
-    optional: dict[str, Any] = {
-        "shear_GPa": None if film.shear is None else tidy(film.shear * 1e-3),
-        "axis_deg": tidy(float(np.rad2deg(film.axis))),
-        "oval": tidy(film.oval),
-        "oval_axis_deg": tidy(float(np.rad2deg(film.oval_axis))),
-        "back_volume_mm3": None if film.back_volume is None else tidy(film.back_volume),
-        "static_pressure_Pa": tidy(film.static_pressure * PASCAL_PER_MPA),
+    root_of_ratio = math.sqrt(film.young_ratio)
+    moduli = (1e-3 * film.young * root_of_ratio, 1e-3 * film.young / root_of_ratio)
+    table: dict[str, Any] = {
+        "radius_mm": numbers.pop("radius_mm"),
+        "thickness_um": numbers.pop("thickness_um"),
+        "young_GPa": tidy(moduli[0]) if film.young_ratio == 1.0 else [tidy(modulus) for modulus in moduli],
+        "poisson": numbers.pop("poisson"),
+        "pretension_MPa": [tidy(part) for part in tension] if any(film.deviator) else tidy(film.pretension),
     }
     default_of_key: dict[str, Any] = {field.name: field.default for field in msgspec.structs.fields(FilmTable)}
     if film.expansion is not None:
-        optional["expansion_ppm_per_K"] = [tidy(PPM * coefficient) for coefficient in film.expansion]
+        table["expansion_ppm_per_K"] = [tidy(1e6 * coefficient) for coefficient in film.expansion]
         del default_of_key["ring_expansion_ppm_per_K"]  # a film that expands is always written with its ring
-    optional["ring_expansion_ppm_per_K"] = tidy(PPM * film.ring_expansion)
-    return {
-        "radius_mm": tidy(film.radius),
-        "thickness_um": tidy(film.thickness * 1e3),
-        "young_GPa": tidy(film.young * 1e-3) if film.young_ratio == 1.0 else young_GPa,
-        "poisson": film.poisson,
-        "pretension_MPa": tension_MPa if any(film.deviator) else tidy(mean_tension),
-        **{name: value for name, value in optional.items() if value != default_of_key.get(name)},
-    }
+    return table | {key: number for key, number in numbers.items() if number != default_of_key.get(key)}
 
 
 def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
@@ -423,41 +414,21 @@ def _film(table: FilmTable) -> Film:
         tension_12 = 0.0
     mean_tension = tension_11 if tension_11 == tension_22 else 0.5 * (tension_11 + tension_22)
 
+    numbers: dict[str, Any] = {
+        attribute: None if getattr(table, key) is None else getattr(table, key) * unit
+        for key, (attribute, unit) in FILM_ATTRIBUTES.items()
+    }
+    expansion = table.expansion_ppm_per_K
+    if isinstance(expansion, float):
+        expansion = [expansion, expansion]
     return Film(
-        radius=table.radius_mm,
-        thickness=table.thickness_um * 1e-3,
-        young=mean_young * 1e3,
-        poisson=table.poisson,
+        young=1e3 * mean_young,
         pretension=mean_tension,
         deviator=(0.5 * (tension_11 - tension_22), tension_12),
         young_ratio=young_1 / young_2,
-        shear=None if table.shear_GPa is None else table.shear_GPa * 1e3,
-        axis=float(np.deg2rad(table.axis_deg)),
-        oval=table.oval,
-        oval_axis=float(np.deg2rad(table.oval_axis_deg)),
-        back_volume=table.back_volume_mm3,
-        static_pressure=table.static_pressure_Pa / PASCAL_PER_MPA,
-        expansion=_expansion(table),
-        ring_expansion=table.ring_expansion_ppm_per_K / PPM,
+        expansion=None if expansion is None else (1e-6 * expansion[0], 1e-6 * expansion[1]),
+        **numbers,
     )
-
-
-def _expansion(table: FilmTable) -> tuple[float, float] | None:
-    """Return the thermal expansion coefficients of a film along its axes 1 and 2, 1/K.
-
-    Args:
-        table: Content of the section `film` of a sensor file.
-
-    Returns:
-        The coefficients; None if the section contains none.
-    """
-    coefficients = table.expansion_ppm_per_K
-    if coefficients is None:
-        return None
-    if isinstance(coefficients, list):
-        along, across = coefficients
-        return along / PPM, across / PPM
-    return coefficients / PPM, coefficients / PPM
 
 
 def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:
