@@ -282,7 +282,6 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     figures, released, out = [], find_model(SENSOR), tmp_path / "first-light"
     for name, stub in {
         "SAMPLES": 40,
-        "LATENCY_S": 0.05,
         "solve_maps": partial(kept, solve_maps),
         "fit": lambda *_: None,
         "release": lambda _, folder, **__: load_model(shutil.copytree(released, folder / "1")),
@@ -316,8 +315,8 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
 
 def test_demo_plays_the_working_area_of_the_released_model_of_the_sensor():
     """For a sensor without a released model, the presses lie within the default radius."""
-    assert played_radius_mm("three-25um-biaxial") == pytest.approx(8.0)
-    assert played_radius_mm("four-25um-biaxial-15mm") == pytest.approx(15.0)
+    assert played_radius_mm("three-25um-biaxial") == pytest.approx(8.0, rel=2e-3)
+    assert played_radius_mm("four-25um-biaxial-15mm") == pytest.approx(15.0, rel=2e-3)
     assert played_radius_mm("no-such-sensor") == 8.0
 
 

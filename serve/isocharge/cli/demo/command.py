@@ -21,7 +21,7 @@ def demo_command(
             "--output",
             "-o",
             metavar="DIR",
-            help="Folder to make for the results. (default: demo-output; demo-output-2, ... if it exists)",
+            help="Folder to make for the results. (default: demo-output)",
         ),
     ] = None,
     seconds: Annotated[

@@ -3,9 +3,9 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import chain, count, islice
+from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.arrays import Array
 from isocharge.common.files import new_folder
 from isocharge.common.progress import track
-from isocharge.serve import Port, PredictionRecord, Predictor, TouchStream, find_model, load_model
+from isocharge.serve import Port, Predictor, TouchStream, find_model, load_model
 from isocharge.serve.benchmark import in_process_contenders, press_charges, take_turns
 from isocharge.serve.live.stream import StreamTotals
 from isocharge.simulate import Circle, Equilibrium, ForwardMap, Sweep, load_sensor, press, read_dataset
@@ -46,45 +46,18 @@ LIVE_S = 10.0
 PRINT_INTERVAL_S = 0.5
 """Time between two printed lines of the live part, s."""
 
-DRAWN_POSITION_MM = (3.0, -2.0)
-"""Position of the press whose deflection is drawn, mm."""
-
-DRAWN_FORCE_N = 1.0
-"""Force of the press whose deflection is drawn, N."""
-
-LATENCY_S = 0.5
-"""Time for which the latency of a prediction is measured, s."""
-
-
-class FollowedFrame(NamedTuple):
-    """Frame of the live part in which both the virtual sensor and the model report a contact.
-
-    Attributes:
-        press_number: Number of the press to which the frame belongs, counted from 1.
-        true_x_mm, true_y_mm, true_force_N: True contact, which the virtual sensor plays.
-        x_mm, y_mm, force_N: Contact that the model estimates.
-    """
-
-    press_number: int
-    true_x_mm: float
-    true_y_mm: float
-    true_force_N: float
-    x_mm: float
-    y_mm: float
-    force_N: float
-
 
 def run_demo(output: Path | None, seconds: float | None, config: Path | None, sensor_name: str | None = None) -> None:
     """Run the demo, print a table of its results, and write the dataset, the model and a picture into a new folder.
 
     Args:
-        output: The folder; None for the first free name of demo-output, demo-output-2, ...
+        output: The folder; None for demo-output.
         seconds: Duration of the live part, s; None for `LIVE_S`.
         config: Training settings, TOML; None for those of the released models.
         sensor_name: Name of the simulated sensor and of the model that is trained; None for `DEFAULT_SENSOR`.
     """
     settings = load_config(config) if config else None
-    folder = output or _free_name(Path("demo-output"))
+    folder = output or Path("demo-output")
     sensor = load_sensor(sensor_name or DEFAULT_SENSOR)
     probe = Circle(1.0)
     sweep = Sweep(played_radius_mm(sensor.name), samples=SAMPLES, seed=SEED)
@@ -111,7 +84,7 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
             followed, totals = _follow_live(forward_map, predictor, seconds or LIVE_S)
             say(f"   {totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated")
         with _demo_step("show", "one page of pictures", durations_s):
-            equilibrium = press(forward_map.sensor.film, forward_map.probe, DRAWN_POSITION_MM, DRAWN_FORCE_N)
+            equilibrium = press(sensor.film, probe, (3.0, -2.0), 1.0)  # a press inside every working area
             draw_page(forward_map, equilibrium, followed, draft / "demo.png")
     say(f"   {folder / 'demo.png'}")
     show_result(_results(followed, durations_s, folder / "models" / sensor.name), json=False)
@@ -134,12 +107,6 @@ def _demo_step(name: str, description: str, durations_s: dict[str, float]) -> It
     durations_s[name] = time.perf_counter() - start_s
 
 
-def _free_name(base: Path) -> Path:
-    """Return the first path of the sequence base, base-2, base-3, ... that does not exist."""
-    numbered_paths = (base.with_name(f"{base.name}-{number}") for number in count(2))
-    return next(path for path in chain([base], numbered_paths) if not path.exists())
-
-
 def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, StreamTotals]:
     """Play a virtual sensor, read its port, and print the estimated and the true contact at regular intervals.
 
@@ -150,54 +117,33 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
 
     Returns:
         Two values. The first is an array of the frames in which both the virtual sensor and the model have a contact,
-        shape (n, 7), mm and N: number of the press, true (x, y, F) and estimated (x, y, F), as in `FollowedFrame`. The
-        second contains the counts of all frames of the stream.
+        shape (n, 2, 3): the true and the estimated (x, y, F), mm and N. The second contains the counts of all frames of
+        the stream.
     """
     touch = TouchStream(predictor)
     frame_count = round(seconds * RATE_HZ)
     print_interval = round(PRINT_INTERVAL_S * RATE_HZ)
-    followed: list[FollowedFrame] = []
-    press_number = 0
-    is_pressed = False
+    followed = []
     say("   estimated: x mm, y mm, N   true: x mm, y mm, N")
     with virtual_sensor(forward_map, "reference", SEED, RATE_HZ) as sensor, Port(sensor.url) as port:
         all_records = (record for chunk in port for record in touch.feed(chunk))
         records = islice(all_records, frame_count)
+        script = np.column_stack([sensor.script.x_mm, sensor.script.y_mm, sensor.script.force_N])
         for frame_number, record in enumerate(track(records, "following", frame_count), start=1):
             # The script that the virtual sensor repeats contains the true press of this frame.
-            row = round(1e-6 * (record.t_device_us or 0) * RATE_HZ) % len(sensor.script)
-            true_force_N = float(sensor.script.force_N[row])
-            true_contact = (float(sensor.script.x_mm[row]), float(sensor.script.y_mm[row]), true_force_N)
-            contact = _contact_of(record)
-
-            # A press lasts as long as both the virtual sensor and the model have a contact. A new press has a new
-            # number.
-            was_pressed = is_pressed
-            is_pressed = record.contact and true_force_N > 0.0
-            if is_pressed and not was_pressed:
-                press_number += 1
-            if is_pressed:
-                followed.append(FollowedFrame(press_number, *true_contact, *contact))
+            row = round(1e-6 * (record.t_device_us or 0) * RATE_HZ) % len(script)
+            true_contact = script[row] if sensor.script.touching[row] else None
+            contact = np.array([record.x_mm, record.y_mm, record.force_N], float) if record.contact else None
+            if true_contact is not None and contact is not None:
+                followed.append((true_contact, contact))
             if frame_number % print_interval == 0:
-                estimated_columns = _contact_columns(record.contact, contact)
-                true_columns = _contact_columns(true_force_N > 0.0, true_contact)
-                say(f"   {estimated_columns}     {true_columns}")
+                say(f"   {_contact_columns(contact)}     {_contact_columns(true_contact)}")
     return np.array(followed), touch.totals()
 
 
-def _contact_of(record: PredictionRecord) -> tuple[float, float, float]:
-    """Return x (mm), y (mm) and the force (N) of a record. A value that the record does not contain is 0."""
-    return record.x_mm or 0.0, record.y_mm or 0.0, record.force_N or 0.0
-
-
-def _contact_columns(is_contact: bool, contact: tuple[float, float, float]) -> str:
-    """Format a contact for the table of the live part.
-
-    Args:
-        is_contact: Whether there is a contact. Otherwise the text "no contact" is returned.
-        contact: Position x and y, mm, and force, N.
-    """
-    if not is_contact:
+def _contact_columns(contact: Array | None) -> str:
+    """Format a contact (x, y, F), mm and N, for the table of the live part. If it is None, say that there is none."""
+    if contact is None:
         return f"{'no contact':>22}"
     x_mm, y_mm, force_N = contact
     return f"{x_mm:7.2f} {y_mm:7.2f} {force_N:6.3f}"
@@ -207,7 +153,7 @@ def _results(followed: Array, durations_s: dict[str, float], model_folder: Path)
     """Measure the latency of a prediction, and return the results of the demo, with units in their names.
 
     Args:
-        followed: Frames of the live part, shape (n, 7), mm and N, as in `FollowedFrame`.
+        followed: True and estimated contacts of the live part, shape (n, 2, 3), mm and N.
         durations_s: Duration of each step by its name, s.
         model_folder: Folder of the model, which is `models/NAME` in the folder of the results.
     """
@@ -215,10 +161,10 @@ def _results(followed: Array, durations_s: dict[str, float], model_folder: Path)
     predictor = Predictor(model.folder)
     # The second kind of call is the prediction of a single press from a list of charges.
     press_from_list = in_process_contenders(predictor, press_charges(predictor, model.golden.charge_pC))[1]
-    (latency,) = take_turns([press_from_list], LATENCY_S)
+    (latency,) = take_turns([press_from_list], seconds=0.5)
 
     errors = model.metadata.errors
-    live_errors_mm = position_error(followed[:, 4:], followed[:, 1:4])
+    live_errors_mm = position_error(followed[:, 1], followed[:, 0])
     live_median_mm, live_p95_mm = np.percentile(live_errors_mm, (50, 95))
     return {
         "model": model.metadata.label,
@@ -238,7 +184,7 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
     Args:
         forward_map: Forward map of the film.
         equilibrium: The press whose deflection is drawn.
-        followed: Frames of the live part, shape (n, 7), mm and N: number of the press, true and estimated (x, y, F).
+        followed: True and estimated contacts of the live part, shape (n, 2, 3), mm and N.
         path: Path of the picture, which is written.
     """
     figure = new_figure(15.0, 9.2)
@@ -249,7 +195,11 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
     draw_deflection(left, equilibrium)
     draw_electrodes(left, forward_map.sensor, names=False)
     draw_section(middle, equilibrium)
-    _draw_live_paths(right, forward_map, followed)
+    true_contact, contact = followed.transpose(1, 2, 0)  # each of shape (3, n)
+    right.plot(true_contact[0], true_contact[1], ".", color=PRESSED, ms=4.0, label="pressed")
+    right.plot(contact[0], contact[1], ".", color=FELT, ms=1.0, label="estimated")
+    right.legend(loc="upper right")
+    draw_layout(right, forward_map.sensor, forward_map.domain.radius, "live contacts, through the port")
 
     # Lower row: a map of the charge of each electrode.
     all_axes = bottom.subplots(1, len(forward_map.electrodes))
@@ -259,28 +209,3 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
         draw_layout(axes, forward_map.sensor, forward_map.domain.radius, title, highlight=name)
     figure.suptitle(f"isocharge demo: {forward_map.sensor.name}, {forward_map.probe.notation}", fontsize=14)
     save_picture(figure, path)
-
-
-def _draw_live_paths(axes: Any, forward_map: ForwardMap, followed: Array) -> None:
-    """Draw the true and the estimated path of each press of the live part.
-
-    Args:
-        axes: Axes of matplotlib.
-        forward_map: Forward map of the film, whose layout is drawn.
-        followed: Frames of the live part, shape (n, 7), mm and N: number of the press, true and estimated (x, y, F),
-            with the names of `FollowedFrame`. There must be at least one press.
-    """
-    columns = dict(zip(FollowedFrame._fields, followed.T, strict=True))
-    for press_number in np.unique(columns["press_number"]):
-        is_in_press = columns["press_number"] == press_number  # mask of the frames of this press
-        true_path = (columns["true_x_mm"][is_in_press], columns["true_y_mm"][is_in_press])
-        estimated_path = (columns["x_mm"][is_in_press], columns["y_mm"][is_in_press])
-        axes.plot(*true_path, color=PRESSED, lw=3.0, solid_capstyle="round")
-        axes.plot(*estimated_path, color=FELT, lw=0.7)
-
-    # Only the two lines of the first press get labels, so that the legend has two entries.
-    true_line, estimated_line = axes.lines[:2]
-    true_line.set_label("pressed")
-    estimated_line.set_label("estimated")
-    axes.legend(loc="upper right")
-    draw_layout(axes, forward_map.sensor, forward_map.domain.radius, "live path, through the port")

@@ -13,12 +13,6 @@ from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.network.address import Address
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 
-RATE_HZ = 200.0
-"""Frames per second of the virtual sensor, Hz."""
-
-SEED = 0
-"""Seed of the presses."""
-
 
 def show_live_film(address: Address, seconds: float | None, sensor_name: str | None = None) -> None:
     """Play a virtual sensor, estimate its contacts with a released model, and show the contacts on the live page.
@@ -45,7 +39,7 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
             radius_mm = played_radius_mm(sensor)
             forward_map = ForwardMap.build(load_sensor(sensor), Circle(1.0), radius_mm, DEFAULT_PLAYED_FORCE_RANGE)
 
-        board = stack.enter_context(virtual_sensor(forward_map, "reference", SEED, RATE_HZ))
+        board = stack.enter_context(virtual_sensor(forward_map, "reference", seed=0))
         port = stack.enter_context(Port(board.url))
 
         # A recording that the page begins has every frame, and neither a device file nor a name of the film.
@@ -57,5 +51,5 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
         records = stack.enter_context(closing(stream.follow(port)))
         for record in records:
             feed.write(record)
-            if seconds is not None and touch.counts.records > seconds * RATE_HZ:
+            if seconds is not None and touch.counts.records > seconds * board.script.rate_Hz:
                 break

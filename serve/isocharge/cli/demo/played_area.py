@@ -24,12 +24,5 @@ def played_radius_mm(sensor: str) -> float:
     except ModelError:
         return DEFAULT_RADIUS
 
-    # The working area is a polygon around the centre of the film, which is the origin. The radius is the smallest
-    # distance of an edge from the origin. The distance of the origin from the line through an edge is
-    # |corner x edge| / |edge|, with the cross product.
-    corners = np.array(model.metadata.working_area_mm)  # shape (n, 2)
-    edges = np.roll(corners, -1, axis=0) - corners  # vector from each corner to the next
-    corner_x, corner_y = corners.T
-    edge_x, edge_y = edges.T
-    edge_distance = np.abs(corner_x * edge_y - corner_y * edge_x) / np.hypot(edge_x, edge_y)
-    return round(float(edge_distance.min()), 3)
+    corners_mm = np.array(model.metadata.working_area_mm)  # shape (n, 2), around the centre of the film
+    return round(float(np.hypot(*corners_mm.T).min()), 2)
