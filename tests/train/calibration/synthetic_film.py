@@ -37,7 +37,6 @@ class SyntheticFilm:
     uneven: float = 0.5
 
     into_domain = FilmCharges.into_domain
-    side_forces = None
 
     @property
     def values(self):

@@ -8,8 +8,8 @@ import pytest
 from tests.benchmarks.measured_films import measured_presses
 from tests.train.calibration.conftest import rig
 
-from isocharge.common.errors import PressError, SceneError
-from isocharge.train import CalibrationProblem, calibrate, next_presses
+from isocharge.common.errors import PressError
+from isocharge.train import calibrate, next_presses
 
 pytestmark = pytest.mark.usefixtures("never_solved")
 
@@ -128,10 +128,3 @@ def test_presses_that_no_film_explains_are_refused(problem, synthetic, change, m
         return
     with pytest.raises(PressError, match=message):
         fit(changed, problem, synthetic)
-
-
-def test_problem_refuses_impossible_side_forces_and_friction(problem):
-    with pytest.raises(SceneError, match=r"share of the force from 0 to 0\.5, such as 0\.1, got 0\.7"):
-        CalibrationProblem(problem.sensor, problem.probe, side_force=0.7)
-    with pytest.raises(SceneError, match="friction"):
-        CalibrationProblem(problem.sensor, problem.probe, friction=3.0)

@@ -12,7 +12,7 @@ from isocharge.common.errors import PressError
 from isocharge.simulate import Circle, NoiseModel, load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.calibration_file import film_table, json_text, read_film
-from isocharge.train.calibration.contact_error import PLANNED
+from isocharge.train.calibration.estimator import PLANNED
 
 PROBLEM = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
 
@@ -58,8 +58,8 @@ def changed(key, value):
 
 
 FAULTS = {
-    "older": (changed("format_version", 3), "format_version: expected 4, got 3: .* calibrate again with its presses"),
-    "no version": (lambda table: table.pop("format_version"), "format_version: expected 4, got None"),
+    "older": (changed("format_version", 4), "format_version: expected 5, got 4: .* calibrate again with its presses"),
+    "no version": (lambda table: table.pop("format_version"), "format_version: expected 5, got None"),
     "sensor": (changed("sensor", "mine"), "sensor: expected four-25um-biaxial, as in this calibration, got mine"),
     "probe": (changed("probe", "circle:2"), "probe: expected circle:1"),
     "radius": (changed("radius_mm", 10.0), "radius_mm: expected 8"),
@@ -76,9 +76,9 @@ FAULTS = {
         r"unknowns\.young\.std: expected a number from 0",
     ),
     "text": (changed("radius_mm", "wide"), "radius_mm: expected"),
-    "rows": (changed("correlations", [[], [0.1, 0.2]]), "correlations: expected 148 rows of 0 to 147 numbers"),
+    "rows": (changed("correlations", [[], [0.1, 0.2]]), "correlations: expected 147 rows of 0 to 146 numbers"),
     "large": (
-        lambda table: changed("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(148)])(table),
+        lambda table: changed("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(147)])(table),
         "positive semidefinite",
     ),
     "beyond": (lambda table: table["correlations"][1].__setitem__(0, 1.5), r"correlations\[1\]\[0\]: expected"),

@@ -23,7 +23,7 @@ QUICK = FitConfig(
 )
 
 SHORTEST = FitConfig(
-    network=QUICK.network, training=TrainingConfig(steps=60, misfit_steps=10, misfit_charges=1_000, batch=256)
+    network=QUICK.network, training=TrainingConfig(steps=150, misfit_steps=10, misfit_charges=1_000, batch=256)
 )
 
 

@@ -14,7 +14,6 @@ from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.simulate import load_sensor, local_workers, parse_probe
-from isocharge.simulate.solver.friction import MAX_FRICTION
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
 from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.folder import (
@@ -23,7 +22,6 @@ from isocharge.train.calibration.folder import (
     result_table,
     write_calibration,
 )
-from isocharge.train.calibration.problem import MAX_SIDE_FORCE
 
 
 def calibrate_command(
@@ -71,28 +69,6 @@ def calibrate_command(
             help="Start from the calibration in this folder, allowing for drift since then. (default: the sensor file)",
         ),
     ] = None,
-    friction: Annotated[
-        float,
-        typer.Option(
-            "--friction",
-            metavar="COEFFICIENT",
-            min=0.0,
-            max=MAX_FRICTION,
-            help="Expected coefficient of friction between tip and film, such as 0.2, for presses on a vertical stage. "
-            "The calibration estimates it.",
-        ),
-    ] = 0.0,
-    side_force: Annotated[
-        float,
-        typer.Option(
-            "--side-force",
-            metavar="SHARE",
-            min=0.0,
-            max=MAX_SIDE_FORCE,
-            help="Largest side force of later contacts over their force, such as 0.1. It is added to the standard "
-            "deviations of the model.",
-        ),
-    ] = 0.0,
     json: JsonOption = False,
 ) -> None:
     """Calibrate a film: estimate its properties from measured presses, and write a model of this film.
@@ -106,15 +82,8 @@ def calibrate_command(
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
-    _check_usage(file, output, next_count, friction, side_force)
-    problem = CalibrationProblem(
-        load_sensor(sensor),
-        parse_probe(probe),
-        radius=radius,
-        stress_limit=stress_limit,
-        friction=friction,
-        side_force=side_force,
-    )
+    _check_usage(file, output, next_count)
+    problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius=radius, stress_limit=stress_limit)
     result: CalibrationResult | None = None  # None if only presses are proposed
     proposed_presses: list[ProposedPress] = []
     with (
@@ -175,33 +144,14 @@ def _write(result: CalibrationResult, folder: Path, executor: Executor | None) -
     say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
 
 
-def _check_usage(file: Path | None, output: Path | None, next_count: int, friction: float, side_force: float) -> None:
-    """Raise an error if arguments of the command contradict each other.
-
-    Args:
-        file: File of presses.
-        output: Folder to write.
-        next_count: Number of presses to propose.
-        friction: Expected coefficient of friction of the presses.
-        side_force: Largest side force of later contacts over their force.
-
-    Raises:
-        InputError: If the arguments contradict each other.
-    """
-    has_no_presses = file is None
-    # The first message whose condition is true becomes the error.
+def _check_usage(file: Path | None, output: Path | None, next_count: int) -> None:
+    """Raise InputError if neither presses are given nor proposed, or if a model is requested without presses."""
     refuse(
         {
             "expected PRESSES.csv, or --next K for presses to begin with, got neither; `isocharge train press` takes "
-            "presses at a port": has_no_presses and not next_count,
+            "presses at a port": file is None and not next_count,
             "--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out": (
-                has_no_presses and output is not None
-            ),
-            f"--friction {friction:g}: expected PRESSES.csv that were made with this friction, got none": (
-                has_no_presses and friction > 0.0
-            ),
-            f"--side-force {side_force:g}: expected PRESSES.csv to train a model with it, got none": (
-                has_no_presses and side_force > 0.0
+                file is None and output is not None
             ),
         }
     )

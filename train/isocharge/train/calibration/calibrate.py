@@ -11,12 +11,9 @@ from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.diagnosis import (
-    FAR_FROM_ALL_FILMS,
-    MOSTLY_OUTSIDE,
     check_channels,
     check_places,
     find_mistakes,
-    large_residual_reason,
     misfit,
     unexplained_error,
 )
@@ -95,17 +92,20 @@ def calibrate(
     with threadpool_limits(1):  # the matrices are small, so a second thread would only wait
         charges = start or solve_even(problem, executor)
         if is_outside.mean() > 0.5:
-            raise unexplained_error(ordered_presses, charges, MOSTLY_OUTSIDE)
+            raise unexplained_error(
+                ordered_presses, charges, "most of them lie outside the places and forces of a calibration"
+            )
         check_channels(used_presses, charges)
         is_suspicious = not _is_one_place(used_presses) and misfit(used_presses, charges) > SUSPICIOUS_MISFIT
         if is_suspicious and find_mistakes(used_presses, charges):
-            raise unexplained_error(used_presses, charges, FAR_FROM_ALL_FILMS)
+            raise unexplained_error(used_presses, charges, "their charges are very different from those of its films")
         data = PressData.of(used_presses, problem.noise, problem.solved_domain)
         estimation = _fit_even_film(problem, data, charges, executor)
         if accurate:
             estimation = _fit_uneven_film(problem, data, estimation, executor)
         if is_unexplained(estimation, BAD_PROBABILITY, UNEXPLAINED_CHI2):
-            reason = large_residual_reason(np.sqrt(estimation.chi2 / estimation.redundancy))
+            residual = np.sqrt(estimation.chi2 / estimation.redundancy)
+            reason = f"the charges of the best film differ from theirs by {residual:.2g} times the noise"
             raise unexplained_error(used_presses, estimation.charges, reason)
         noisy_problem = replace(problem, noise=estimation.film.noise)
         sensitivity = ContactSensitivity.of(noisy_problem, estimation.charges, estimation.film.values)
@@ -135,7 +135,6 @@ def solve_even(
         problem.prior.mean[layout.film] if values is None else values,
         problem.solved_domain,
         executor,
-        with_side_forces=problem.friction > 0.0 or problem.side_force > 0.0,
     )
 
 
@@ -170,17 +169,10 @@ def _fit_uneven_film(
 def _estimated(
     problem: CalibrationProblem, data: PressData, charges: FilmCharges, previous: Estimation | None
 ) -> Estimation:
-    """Estimate the unknowns with one solved film, beginning with a previous estimate.
-
-    The charges that friction adds are computed at the contacts of the previous estimate.
-    """
-    contact = None if previous is None else previous.contact
-    if problem.friction > 0.0 and charges.side_forces is not None:
-        measured = np.column_stack([data.contact[:, :2], np.exp(data.contact[:, 2])])
-        place = charges.into_domain(measured if contact is None else contact)
-        friction_charge = charges.side_forces.friction_charges(place, problem.friction) / problem.friction
-        data = replace(data, friction_charge=friction_charge)
-    return estimate(charges, data, problem.prior, None if previous is None else previous.film.values, contact)
+    """Estimate the unknowns with one solved film, beginning with a previous estimate."""
+    if previous is None:
+        return estimate(charges, data, problem.prior)
+    return estimate(charges, data, problem.prior, previous.film.values, previous.contact)
 
 
 def _solved_distance(charges: FilmCharges, values: Array) -> float:

@@ -20,7 +20,7 @@ from isocharge.simulate import NoiseModel
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.problem import CalibrationProblem
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 """Version of the file format that this module writes and reads."""
 
 DIGITS = 6

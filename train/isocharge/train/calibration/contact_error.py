@@ -22,13 +22,13 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.simulate import Domain, noise_model
+from isocharge.simulate import Domain
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.solver.stress_limit import force_within_stress
-from isocharge.train.calibration.estimator import Hypothesis
+from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate
-from isocharge.train.calibration.press_data import PressData, PressErrors
+from isocharge.train.calibration.film_estimate import FilmEstimate
+from isocharge.train.calibration.press_data import PressData
 from isocharge.train.calibration.press_model import linearise
 from isocharge.train.calibration.problem import CalibrationProblem
 
@@ -43,9 +43,6 @@ GRID_MM = 0.5
 
 GRID_N = 0.05
 """Grid to which proposed forces are rounded, N."""
-
-PLANNED = Hypothesis(0.5, 0.01, (0.0,) * len(SESSION), PressErrors(noise_model("reference")), 1.0)
-"""Imperfections and discrepancy that are assumed when presses are planned before the first press."""
 
 
 @dataclass(frozen=True)

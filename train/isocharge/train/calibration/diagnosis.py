@@ -7,7 +7,6 @@ search, separate checks find positions outside the film, dead channels, and chan
 """
 
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -26,36 +25,14 @@ MIN_POSITION_RANGE_MM = 0.05
 """Smallest credible range of the positions, mm. Positions in a smaller range were probably written in metres."""
 
 
-class OtherUnit(NamedTuple):
-    """Unit that may have been used by mistake instead of the expected unit.
+FORCE_UNITS_N = {"g": 9.80665e-3, "mN": 1e-3, "kg": 9.80665, "lbf": 4.4482216}
+"""Units in which forces may have been written by mistake."""
 
-    Attributes:
-        values: Name of the values that have the unit.
-        expected: Unit in which the values should have been written.
-        written: Unit in which the values may have been written instead.
-        factor: Factor that converts values from the written unit to the expected unit.
-    """
+POSITION_UNITS_mm = {"m": 1e3, "cm": 10.0, "inch": 25.4, "um": 1e-3}
+"""Units in which positions may have been written by mistake."""
 
-    values: Literal["forces", "positions", "charges"]
-    expected: str
-    written: str
-    factor: float
-
-
-OTHER_UNITS = (
-    OtherUnit("forces", "N", "g", 9.80665e-3),
-    OtherUnit("forces", "N", "mN", 1e-3),
-    OtherUnit("forces", "N", "kg", 9.80665),
-    OtherUnit("forces", "N", "lbf", 4.4482216),
-    OtherUnit("positions", "mm", "m", 1e3),
-    OtherUnit("positions", "mm", "cm", 10.0),
-    OtherUnit("positions", "mm", "inch", 25.4),
-    OtherUnit("positions", "mm", "um", 1e-3),
-    OtherUnit("charges", "pC", "nC", 1e3),
-    OtherUnit("charges", "pC", "C", 1e12),
-    OtherUnit("charges", "pC", "fC", 1e-3),
-)
-"""Wrong units that the search for mistakes considers."""
+CHARGE_UNITS_pC = {"nC": 1e3, "C": 1e12, "fC": 1e-3}
+"""Units in which charges may have been written by mistake."""
 
 PRETENSIONS_MPa = (0.3, 1.5, 3.0)
 """Pretensions of the films with which presses are compared, MPa."""
@@ -129,39 +106,23 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
     Raises:
         PressError: If a channel has no charges, is dead or has the wrong sign.
     """
-    charge = presses.charge_pC
-    for name, channel_charge in zip(presses.electrodes, charge.T, strict=True):
+    for name, channel_charge in zip(presses.electrodes, presses.charge_pC.T, strict=True):
         if np.isnan(channel_charge).all():
             raise PressError(f"electrode {name!r}: no press has a charge of it; a calibration needs all electrodes")
 
-    placed = presses.placed
-    film_charges = expected_charges(charges, presses.contact[placed])
-    _check_dead_channels(presses, film_charges)
-    _check_signs(presses[placed], film_charges)
-
-
-def _check_dead_channels(presses: MeasuredPresses, film_charges: Array) -> None:
-    """Raise an error if the charges of a channel are far smaller than those of the other channels.
-
-    The limit is lower for a channel that also has small charges on one of the films.
-
-    Args:
-        presses: All measured presses.
-        film_charges: Charges of the presses with a known place and force, on a few films, shape (n_film, n_placed,
-            n_electrode), pC.
-    """
-    smallest_film_ratio = np.ones(len(presses.electrodes))
-    for film_charge in film_charges if film_charges.size else ():
-        smallest_film_ratio = np.minimum(smallest_film_ratio, _charge_ratios(film_charge))
-    typical_charge = np.nanmedian(np.abs(presses.charge_pC), axis=0)
+    placed = presses[presses.placed]
+    film_charges = expected_charges(charges, placed.contact)
+    film_ratios = [_charge_ratios(film_charge) for film_charge in film_charges if len(placed)]
+    smallest_film_ratio = np.min([np.ones(len(presses.electrodes)), *film_ratios], axis=0)
     ratio = _charge_ratios(presses.charge_pC)
-    is_dead = ratio < MAX_DEAD_RATIO * smallest_film_ratio
-    for channel in np.flatnonzero(is_dead):
+    for channel in np.flatnonzero(ratio < MAX_DEAD_RATIO * smallest_film_ratio):
+        typical_charge = np.nanmedian(np.abs(presses.charge_pC[:, channel]))
         raise PressError(
             f"electrode {presses.electrodes[channel]!r} is dead: half of its charges are below "
-            f"{typical_charge[channel]:.3g} pC, {100.0 * ratio[channel]:.2g} % of those of the others; check "
+            f"{typical_charge:.3g} pC, {100.0 * ratio[channel]:.2g} % of those of the others; check "
             "the channel, its cable and its amplifier"
         )
+    _check_signs(placed, film_charges)
 
 
 def _check_signs(presses: MeasuredPresses, film_charges: Array) -> None:
@@ -239,18 +200,17 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     if not len(placed_presses):
         return []
     misfits = {
-        correction.sentence: contact_misfit(correction.contact, correction.charge, charges)
-        for correction in _possible_corrections(placed_presses, charges)
+        sentence: _contact_misfit(contact, charge, charges)
+        for sentence, contact, charge in _possible_corrections(placed_presses, charges)
     }
     limit = BETTER_MISFIT_RATIO * misfit(presses, charges)
-    clear = [
-        sentence for sentence in sorted(misfits, key=lambda sentence: misfits[sentence]) if misfits[sentence] < limit
-    ]
-    return [sentence for sentence in clear if misfits[clear[0]] >= BETTER_MISFIT_RATIO * misfits[sentence]]
+    best = min(misfits.values())
+    clear = [name for name, value in misfits.items() if value < limit and BETTER_MISFIT_RATIO * value <= best]
+    return sorted(clear, key=lambda sentence: misfits[sentence])
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
-    """Return the misfit of all presses with a known place and force; see `contact_misfit`.
+    """Return the misfit of all presses with a known place and force; see `_contact_misfit`.
 
     If there are no such presses, the misfit is 0. Correctly recorded presses usually have a misfit of about 1. A misfit
     of 20 indicates a mistake in the records.
@@ -262,10 +222,10 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
     placed_presses = presses[presses.placed]
     if not len(placed_presses):
         return 0.0
-    return contact_misfit(placed_presses.contact, placed_presses.charge_pC, charges)
+    return _contact_misfit(placed_presses.contact, placed_presses.charge_pC, charges)
 
 
-def contact_misfit(contact: Array, charge: Array, charges: FilmCharges) -> float:
+def _contact_misfit(contact: Array, charge: Array, charges: FilmCharges) -> float:
     """Compute the misfit between measured charges and the charges of the most similar film.
 
     The misfit of one film is computed from the logarithms of the ratio of measured charge to expected charge. It is the
@@ -303,21 +263,7 @@ def _log_ratio(measured: Array, expected: Array) -> Array:
     return np.asarray(np.log(np.maximum(ratio, tiny)))
 
 
-class Correction(NamedTuple):
-    """Presses after the correction of a possible mistake.
-
-    Attributes:
-        sentence: Sentence that describes the mistake.
-        contact: Corrected contacts (x, y, F), shape (n, 3), mm and N.
-        charge: Corrected charges, shape (n, n_electrode), pC.
-    """
-
-    sentence: str
-    contact: Array
-    charge: Array
-
-
-def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[Correction]:
+def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str, Array, Array]]:
     """Yield a corrected copy of the presses for each possible mistake.
 
     The mistakes are swapped charge columns, rotated or mirrored axes of the rig, and wrong units.
@@ -325,35 +271,29 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
     Args:
         presses: The measured presses, all with a known place and force.
         charges: Charges of a film and of similar films, with which plausible orders of the columns are found.
+
+    Yields:
+        A sentence that describes the mistake; the corrected contacts (x, y, F), shape (n, 3), mm and N; and the
+        corrected charges, shape (n, n_electrode), pC.
     """
     contact = presses.contact
     charge = presses.charge_pC
     electrodes = presses.electrodes
-
-    # Swapped columns. For each column, `electrode_of_column` contains the index of the electrode to which the charges
-    # belong.
     for electrode_of_column in _plausible_electrode_orders(presses, charges):
-        held_names = ", ".join(electrodes[electrode_index] for electrode_index in electrode_of_column)
+        held_names = ", ".join(electrodes[electrode] for electrode in electrode_of_column)
         sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {held_names}"
-        column_of_electrode = np.argsort(electrode_of_column)  # the inverse permutation of `electrode_of_column`
-        yield Correction(sentence, contact, charge[:, column_of_electrode])
+        yield sentence, contact, charge[:, np.argsort(electrode_of_column)]
 
-    # Rotated or mirrored axes
     for description, matrix in AXES:
-        position = contact[:, :2] @ matrix.T
-        rotated_contact = np.column_stack([position, contact[:, 2]])
-        yield Correction(f"the rig's axes are not the film's: {description}", rotated_contact, charge)
+        rotated_contact = np.column_stack([contact[:, :2] @ matrix.T, contact[:, 2]])
+        yield f"the rig's axes are not the film's: {description}", rotated_contact, charge
 
-    # Wrong units. Each unit belongs to the positions, the forces or the charges, and the other values are not changed.
-    for unit in OTHER_UNITS:
-        position_factor = unit.factor if unit.values == "positions" else 1.0
-        force_factor = unit.factor if unit.values == "forces" else 1.0
-        charge_factor = unit.factor if unit.values == "charges" else 1.0
-        yield Correction(
-            f"the {unit.values} are in {unit.written}, not {unit.expected}",
-            contact * [position_factor, position_factor, force_factor],
-            charge * charge_factor,
-        )
+    for unit, factor in FORCE_UNITS_N.items():
+        yield f"the forces are in {unit}, not N", contact * [1.0, 1.0, factor], charge
+    for unit, factor in POSITION_UNITS_mm.items():
+        yield f"the positions are in {unit}, not mm", contact * [factor, factor, 1.0], charge
+    for unit, factor in CHARGE_UNITS_pC.items():
+        yield f"the charges are in {unit}, not pC", contact, charge * factor
 
 
 def _plausible_electrode_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
@@ -385,22 +325,6 @@ def _plausible_electrode_orders(presses: MeasuredPresses, charges: FilmCharges) 
     return electrode_orders - {written_order}
 
 
-FAR_FROM_ALL_FILMS = "their charges are very different from those of its films"
-"""Reason why presses are refused before a film is fitted to them."""
-
-MOSTLY_OUTSIDE = "most of them lie outside the places and forces of a calibration"
-"""Reason why presses are refused if more than half of them lie outside the domain of the films."""
-
-
-def large_residual_reason(residual_over_noise: float) -> str:
-    """Return the reason for refusing presses that differ too much from the best film of a fit.
-
-    Args:
-        residual_over_noise: Root-mean-square residual of the best film, in units of the noise.
-    """
-    return f"the charges of the best film differ from theirs by {residual_over_noise:.2g} times the noise"
-
-
 def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: str) -> PressError:
     """Create the error for presses that no film of the sensor explains.
 
@@ -410,7 +334,7 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
     Args:
         presses: The presses as they are written in the file.
         charges: Charges of a film and of similar films.
-        reason: Reason why the presses are refused, such as `FAR_FROM_ALL_FILMS`.
+        reason: Reason why the presses are refused, as a part of a sentence.
     """
     sensor_name = charges.prior.sensor.name
     statement = f"no film of {sensor_name!r} explains these {len(presses)} presses: {reason}"

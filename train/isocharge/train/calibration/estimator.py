@@ -14,7 +14,7 @@ evidence.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -23,7 +23,7 @@ from scipy.special import chdtrc, chdtri
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, RobustEstimate, robust_estimate
 from isocharge.serve.model.robust_estimate import Prior as StatePrior
-from isocharge.simulate import NoiseModel
+from isocharge.simulate import NoiseModel, noise_model
 from isocharge.train.calibration.discrepancy import unit_covariance
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout
@@ -94,28 +94,28 @@ class Hypothesis:
         return self.imperfections, self.discrepancy, self.session_std
 
 
-def typical(data: PressData) -> Hypothesis:
-    """Return the hypothesis with which the search for the most probable unknowns begins."""
-    session_std = tuple(one.stds[-1][0] if one.is_possible(data) else 0.0 for one in SESSION)
-    return Hypothesis(1.0, 0.01, session_std, PressErrors(data.noise), 1.0)
-
-
-def hypotheses(data: PressData, noise: NoiseModel) -> Iterator[Hypothesis]:
-    """Yield all hypotheses about presses. An unknown of the session that these presses cannot have is zero.
+def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
+    """Yield all hypotheses about presses.
 
     Args:
-        data: The presses.
         noise: Noise of a good amplifier.
     """
     noises = [
         (noise if ratio == 1.0 else NoiseModel("presses", noise.white, ratio * noise.gain), probability)
         for ratio, probability in NOISE_RATIOS
     ]
-    stds = [one.stds if one.is_possible(data) else ((0.0, 1.0),) for one in SESSION]
-    for cases in product(noises, POSITION_RATIOS, FORCE_SCATTERS, IMPERFECTION_SCALES, DISCREPANCY_SIZES, *stds):
+    session = [one.stds for one in SESSION]
+    for cases in product(noises, POSITION_RATIOS, FORCE_SCATTERS, IMPERFECTION_SCALES, DISCREPANCY_SIZES, *session):
         sizes, probabilities = zip(*cases, strict=True)
-        errors, (imperfections, discrepancy, *session) = PressErrors(*sizes[:3]), sizes[3:]
-        yield Hypothesis(imperfections, discrepancy, tuple(session), errors, float(np.prod(probabilities)))
+        errors, (imperfections, discrepancy, *session_std) = PressErrors(*sizes[:3]), sizes[3:]
+        yield Hypothesis(imperfections, discrepancy, tuple(session_std), errors, float(np.prod(probabilities)))
+
+
+TYPICAL = Hypothesis(1.0, 0.01, tuple(one.stds[-1][0] for one in SESSION), PressErrors(noise_model("reference")), 1.0)
+"""Hypothesis with which the most probable unknowns are searched, so that all unknowns can differ from zero."""
+
+PLANNED = Hypothesis(0.5, 0.01, tuple(one.stds[0][0] for one in SESSION), TYPICAL.errors, 1.0)
+"""Hypothesis with which presses are planned before the first press."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def estimate(
         start: Unknowns from which the search begins; None for the prior mean.
         contact: Contacts (x, y, F) from which the search begins, shape (n, 3); None for the measured contacts.
     """
-    all_hypotheses = list(hypotheses(data, data.noise))
+    all_hypotheses = list(hypotheses(data.noise))
     assumed = PressErrors(data.noise)
     estimation = _estimate_with_errors(charges, data, assumed, prior, all_hypotheses, start, contact)
     probable = estimation.hypothesis.errors
@@ -277,15 +277,16 @@ def _estimate_with_errors(
         used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
         unknowns = _bounded(mean, layout)
     deviation = means - mean
-    covariance = sum(weight[index] * estimates[index].covariance for index in np.flatnonzero(weight > MIN_WEIGHT))
-    covariance = covariance + (weight[:, None] * deviation).T @ deviation
+    covariance = (weight[:, None] * deviation).T @ deviation
+    for index in np.flatnonzero(weight > MIN_WEIGHT):
+        covariance += weight[index] * cho_solve(estimates[index].factor, np.eye(len(mean)))
 
     log_contact[is_used] = used_contact
     final = linearise(charges, layout, data, unknowns, log_contact)
     final_residual, _ = final.eliminated()
     final_chi2 = (final_residual**2).sum(axis=1)
     best_hypothesis = all_hypotheses[int(weight.argmax())]
-    film = FilmEstimate(layout, unknowns, np.asarray(covariance), best_hypothesis.errors.noise)
+    film = FilmEstimate(layout, unknowns, covariance, best_hypothesis.errors.noise)
     return Estimation(
         charges=charges,
         film=film,
@@ -307,87 +308,54 @@ def _search(charges: FilmCharges, data: PressData, prior: Prior, unknowns: Array
         prior: Prior distribution.
         unknowns: Unknowns from which the search begins.
         contact: Contacts (x, y, ln F) from which it begins.
-
-    Returns:
-        The result, whose state contains all unknowns.
     """
-    covariance = prior.covariance(typical(data))
-    is_free = np.diag(covariance) > 0.0
     layout = prior.layout
-
-    def all_unknowns(free: Array) -> Array:
-        """Return all unknowns, of which those without a prior variance have their mean."""
-        values = prior.mean.copy()
-        values[is_free] = free
-        return values
-
-    def model(contacts: Array, free: Array) -> ModelValues:
-        """Compute charges and their derivatives with respect to the free unknowns."""
-        values = model_values(charges, layout, data, all_unknowns(free), contacts)
-        return values._replace(by_state=values.by_state[:, :, is_free])
-
     low, high = np.full((2, len(unknowns)), np.inf) * [[-1.0], [1.0]]
     low[layout.film], high[layout.film] = layout.prior.bounds
     variance = np.minimum(data.charge_std, UNKNOWN_CHARGE_STD) ** 2
-    found = robust_estimate(
-        model,
+    return robust_estimate(
+        lambda contacts, state: model_values(charges, layout, data, state, contacts),
         data.charge,
         variance[:, :, None] * np.eye(variance.shape[1]),
-        StatePrior(prior.mean[is_free], covariance[np.ix_(is_free, is_free)]),
-        unknowns[is_free],
+        StatePrior(prior.mean, prior.covariance(TYPICAL)),
+        unknowns,
         contact,
         measured=MeasuredContacts(data.contact, data.contact_std),
-        state_bounds=(low[is_free], high[is_free]),
+        state_bounds=(low, high),
     )
-    return found._replace(state=all_unknowns(found.state))
-
-
-@dataclass(frozen=True)
-class _Posterior:
-    """Estimate under one hypothesis.
-
-    Attributes:
-        mean: Most probable unknowns, shape (n_unknown,).
-        free: Elements of a matrix of all unknowns that belong to the unknowns with a prior variance.
-        factor: Cholesky factor of the inverse covariance of these unknowns, as `cho_factor` returns it.
-        log_evidence: Logarithm of the evidence.
-        chi2: Sum of the squared residuals of the presses and of the prior distribution.
-    """
-
-    mean: Array
-    free: tuple[Any, ...]
-    factor: tuple[Array, bool]
-    log_evidence: float
-    chi2: float
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance of the unknowns, shape (n_unknown, n_unknown)."""
-        covariance = np.zeros((self.mean.size, self.mean.size))
-        covariance[self.free] = cho_solve(self.factor, np.eye(len(self.factor[0])))
-        return covariance
 
 
 class _Precision(NamedTuple):
-    """Prior distribution of the unknowns that have a prior variance.
+    """Prior distribution under one hypothesis.
 
     Attributes:
-        free: Elements of a matrix of all unknowns that belong to these unknowns, as `np.ix_` selects them.
-        matrix: Inverse of their covariance.
-        log_determinant: Logarithm of the determinant of their covariance.
+        matrix: Inverse covariance of the unknowns, shape (n_unknown, n_unknown).
+        log_determinant: Logarithm of the determinant of this matrix.
     """
 
-    free: tuple[Any, ...]
     matrix: Array
     log_determinant: float
 
     @classmethod
     def of(cls, covariance: Array) -> "_Precision":
         """Invert the covariance of the unknowns, shape (n_unknown, n_unknown)."""
-        is_free = np.diag(covariance) > 0.0
-        free = np.ix_(is_free, is_free)
-        inverse = np.asarray(np.linalg.inv(covariance[free]), dtype=float)
-        return cls(free, inverse, float(np.linalg.slogdet(covariance[free])[1]))
+        return cls(np.asarray(np.linalg.inv(covariance)), -float(np.linalg.slogdet(covariance)[1]))
+
+
+class _Posterior(NamedTuple):
+    """Estimate under one hypothesis.
+
+    Attributes:
+        mean: Most probable unknowns, shape (n_unknown,).
+        factor: Cholesky factor of the inverse covariance, as `cho_factor` returns it.
+        log_evidence: Logarithm of the evidence.
+        chi2: Sum of the squared residuals of the presses and of the prior distribution.
+    """
+
+    mean: Array
+    factor: tuple[Array, bool]
+    log_evidence: float
+    chi2: float
 
 
 @dataclass(frozen=True)
@@ -441,14 +409,12 @@ class _Evidence:
             mean: Prior means of the unknowns, shape (n_unknown,).
             probability: Prior probability of the hypothesis.
         """
-        free = precision.free[1].ravel()  # indices of the unknowns with a prior variance
-        factor = cho_factor(precision.matrix + self.information[precision.free], lower=True)
-        change = np.zeros(mean.size)
-        change[free] = -cho_solve(factor, self.gradient[free])
+        factor = cho_factor(precision.matrix + self.information, lower=True)
+        change = -cho_solve(factor, self.gradient)
         chi2 = self.chi2 + float(self.gradient @ change)
-        log_determinant = 2.0 * float(np.log(np.diag(factor[0])).sum()) + precision.log_determinant
-        log_evidence = -0.5 * (chi2 + log_determinant) + self.log_volume + np.log(probability)
-        return _Posterior(mean + change, precision.free, factor, float(log_evidence), chi2)
+        log_determinant = 2.0 * np.log(np.diag(factor[0])).sum() - precision.log_determinant
+        log_evidence = self.log_volume - 0.5 * (chi2 + log_determinant) + np.log(probability)
+        return _Posterior(mean + change, factor, float(log_evidence), chi2)
 
 
 def _redundancy(data: PressData) -> Array:

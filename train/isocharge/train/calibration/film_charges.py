@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Piezo, Probe, Sensor, SideForceMap
+from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Piezo, Probe, Sensor
 from isocharge.simulate.forward.derivative_maps import NODE_COUNT
 from isocharge.simulate.sensor.film_properties import PRETENSION, FilmProperty, changed_film
 
@@ -51,7 +51,6 @@ class FilmCharges:
         same_probe: Forward map of the axisymmetric film under a circular probe, with the few nodes of the slopes.
         increased: The same map after the increase of a property by `SOLVED_STEP`, by the name of the property. It
             contains the properties that change the stress and for which no derivative of the stress is computed.
-        side_forces: Effect of side forces; None if they are not needed.
     """
 
     prior: FilmPrior
@@ -61,7 +60,6 @@ class FilmCharges:
     slopes: FilmSlopes
     same_probe: ForwardMap
     increased: dict[str, ForwardMap]
-    side_forces: SideForceMap | None = None
 
     @classmethod
     def solve_roughly(
@@ -70,8 +68,6 @@ class FilmCharges:
         values: Array,
         domain: Domain,
         executor: Executor | None,
-        *,
-        with_side_forces: bool = False,
     ) -> "FilmCharges":
         """Solve the axisymmetric film with the mean properties, under a circular probe, at a few presses.
 
@@ -80,7 +76,6 @@ class FilmCharges:
             values: Properties of the film, shape (n_property,). Imperfections are ignored.
             domain: Contacts for which the charges are needed.
             executor: Executor that runs the solves; None for this process.
-            with_side_forces: Whether the effect of side forces is needed.
 
         Raises:
             SceneError: If some presses of the domain cannot exist.
@@ -110,7 +105,6 @@ class FilmCharges:
             slopes=FilmSlopes.build(same_probe, executor=executor),
             same_probe=same_probe,
             increased=increased,
-            side_forces=SideForceMap.build(same_probe, executor=executor) if with_side_forces else None,
         )
 
     def solved(self, values: Array, executor: Executor | None) -> "FilmCharges":

@@ -26,7 +26,6 @@ class SessionProperty:
         effect: Function that computes the derivatives of the charges, shape (n, n_electrode). Its arguments are the
             presses and the charges of the film.
         caution: Words about a value that is certainly not zero, with the fields `value` and `std`.
-        is_possible: Function that returns whether the presses can have this unknown.
     """
 
     name: str
@@ -34,14 +33,13 @@ class SessionProperty:
     stds: tuple[tuple[float, float], ...]
     effect: Callable[[PressData, Array], Array]
     caution: str
-    is_possible: Callable[[PressData], bool] = lambda _: True
 
 
 SESSION = (
     SessionProperty(
         "offset",
         "pC",
-        ((0.0, 0.9), (30.0, 0.1)),
+        ((1e-6, 0.9), (30.0, 0.1)),
         lambda _, charge: np.ones_like(charge),
         "all charges of all presses contain an offset of {value:.2g} +- {std:.2g} pC: is the tare right? The model "
         "expects the same offset in later contacts; after a new tare, calibrate again",
@@ -49,21 +47,16 @@ SESSION = (
     SessionProperty(
         "drift",
         "1",
-        ((0.0, 0.95), (0.15, 0.05)),
+        ((1e-6, 0.95), (0.15, 0.05)),
         lambda data, charge: data.time[:, None] * charge,
         "the charges change by a share of {value:.2g} +- {std:.2g} from the first press to the last: does an amplifier "
         "drift? The standard deviations of the model contain this change",
     ),
-    SessionProperty(
-        "friction",
-        "1",
-        ((0.3, 1.0),),
-        lambda data, _: data.friction_charge,
-        "",
-        lambda data: bool(data.friction_charge.any()),
-    ),
 )
-"""All unknowns of a session, in the order of the vector."""
+"""All unknowns of a session, in the order of the vector.
+
+The smaller standard deviation stands for an unknown that is zero. It is positive, so that the covariance is invertible.
+"""
 
 
 @dataclass(frozen=True)
@@ -166,5 +159,5 @@ class FilmEstimate:
         return [
             one.caution.format(value=self.value(one.name), std=self.std(one.name))
             for one in SESSION
-            if one.caution and abs(self.value(one.name)) > certain * self.std(one.name) > 0.0
+            if abs(self.value(one.name)) > certain * self.std(one.name) > 0.0
         ]

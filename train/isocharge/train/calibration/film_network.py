@@ -17,13 +17,11 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.serve.model.charge_series import ChargeSeries, series_size
-from isocharge.serve.model.chebyshev_series import Series
 from isocharge.serve.presses.measured_presses import CONTACT
 from isocharge.simulate import Domain, ForwardMap, NoiseModel
 from isocharge.simulate.forward.derivative_maps import NODE_COUNT
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION
-from isocharge.simulate.solver.friction import MAX_FRICTION
 from isocharge.simulate.solver.stress_limit import yield_force
 from isocharge.train.calibration.discrepancy import terms
 from isocharge.train.calibration.film_charges import FilmCharges, axisymmetric, circle_of
@@ -184,16 +182,11 @@ def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge
 
 
 def training_data(
-    problem: CalibrationProblem,
-    charges: FilmCharges,
-    film: FilmEstimate,
-    series: ChargeSeries,
-    executor: Executor | None,
+    charges: FilmCharges, film: FilmEstimate, series: ChargeSeries, executor: Executor | None
 ) -> TrainingData:
     """Draw the presses from which the network of a calibrated film learns.
 
     Args:
-        problem: The calibration problem, with the side forces of later contacts.
         charges: Charges of the solved film and of similar films.
         film: The estimate of the film.
         series: The compact charge map of the film.
@@ -206,7 +199,6 @@ def training_data(
     drift = np.hypot(film.value("drift"), film.std("drift")) / np.sqrt(12.0)  # all gains of the session can occur
     charge = charge * (1.0 + drift * rng.standard_normal((PRESSES, 1)))
     charge = charge + film.std("offset") * rng.standard_normal((PRESSES, 1))
-    charge = charge + _side_charges(problem, charges, film, rng, contact)
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(
         sensor=sensor,
@@ -228,41 +220,6 @@ def _drawn_charges(series: ChargeSeries, rng: np.random.Generator, contact: Arra
         state[:, 0] = 0.0  # the pretension does not change
         drawn.append(series.changes(chunk, state).charge_pC)
     return np.concatenate(drawn)
-
-
-def _side_charges(
-    problem: CalibrationProblem, charges: FilmCharges, film: FilmEstimate, rng: np.random.Generator, contact: Array
-) -> Array:
-    """Draw the charges that side forces of later contacts add, shape (n, n_electrode), pC.
-
-    Later contacts have the friction of the presses or none, each with the probability 0.5.
-    The effect of side forces is computed at a few contacts, and described by a series.
-    """
-    charge = np.zeros((len(contact), len(charges.prior.sensor.electrode_names)))
-    side_force_map = charges.side_forces
-    if side_force_map is None:
-        return charge
-    domain = charges.domain
-    sample = draw_contacts(rng, domain, DIRECTION_CONTACTS)
-
-    def at_contacts(values: Array) -> Array:
-        """Fit a series to values at the sample, shape (n_sample, k), and return its values at the contacts."""
-        series = Series(fit_series(domain.to_unit(sample), values, *DIRECTION_DEGREES))
-        return series.values_and_derivatives(domain.to_unit(contact))[:, 0]
-
-    coefficient = film.value("friction")
-    if problem.friction > 0.0 and coefficient > 0.0:
-        reference = min(coefficient, MAX_FRICTION)
-        friction_charge = at_contacts(side_force_map.friction_charges(sample, reference) / reference)
-        drawn = coefficient + film.std("friction") * rng.standard_normal(len(contact))
-        has_friction = rng.random(len(contact)) < 0.5
-        charge += (drawn * has_friction)[:, None] * friction_charge
-    if problem.side_force > 0.0:
-        jacobian = at_contacts(side_force_map.jacobian(sample).reshape(len(sample), -1)).reshape(*charge.shape, 2)
-        angle = 2.0 * np.pi * rng.random(len(contact))
-        direction = np.column_stack([np.cos(angle), np.sin(angle)])
-        charge += problem.side_force * contact[:, 2:] * np.einsum("nek,nk->ne", jacobian, direction)
-    return charge
 
 
 def _outside_presses(charges: FilmCharges, domain: Domain, executor: Executor | None) -> LabelledPresses | None:

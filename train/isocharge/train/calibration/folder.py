@@ -176,7 +176,7 @@ def write_calibration(
     settings = config or FitConfig()
     if film.noise != problem.noise:
         settings = FitConfig(settings.network, replace_setting(settings.training, noise=film.noise))
-    fitted = fit(training_data(problem, result.charges, film, series, executor), settings)
+    fitted = fit(training_data(result.charges, film, series, executor), settings)
 
     sensor, _ = result.sensor_and_probe
     is_folded = CHARGES in fitted.provenance.files
@@ -244,7 +244,7 @@ The model answers within {radius:g} mm of the centre, {min_force:g} to {max_forc
 
 {summary_list}
 
-![errors by the film, properties, residuals]({PICTURE})
+![errors by the film, residuals]({PICTURE})
 
 ## The film
 

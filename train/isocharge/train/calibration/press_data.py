@@ -38,8 +38,6 @@ class PressData:
         contact: Measured contacts (x, y, ln F), shape (n, 3); the middle of the domain if unknown.
         contact_std: Standard deviations of the contacts, shape (n, 3); infinite if unknown.
         time: Time of each press in the session, from -0.5 to 0.5, shape (n,).
-        friction_charge: Charge that a coefficient of friction of 1 would add, shape (n, n_electrode), pC; zero if the
-            presses have no friction.
     """
 
     charge: Array
@@ -48,7 +46,6 @@ class PressData:
     contact: Array
     contact_std: Array
     time: Array
-    friction_charge: Array
 
     @classmethod
     def of(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
@@ -73,7 +70,6 @@ class PressData:
             contact=np.where(is_contact_known, log_contact, domain.centre),
             contact_std=np.where(is_contact_known, measured_std, UNKNOWN_STD),
             time=np.arange(count) / max(count - 1, 1) - 0.5,
-            friction_charge=np.zeros_like(charge),
         )
 
     def __len__(self) -> int:
@@ -81,7 +77,7 @@ class PressData:
 
     def __getitem__(self, rows: Booleans) -> "PressData":
         """Return some of the presses. Their times keep their reference."""
-        names = ("charge", "charge_std", "contact", "contact_std", "time", "friction_charge")
+        names = ("charge", "charge_std", "contact", "contact_std", "time")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def with_errors(self, errors: PressErrors) -> "PressData":

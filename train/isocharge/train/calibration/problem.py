@@ -4,9 +4,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
-from isocharge.common.errors import SceneError
 from isocharge.simulate import Domain, FilmPrior, NoiseModel, Probe, Sensor, noise_model
-from isocharge.simulate.solver.friction import check_friction
 from isocharge.train.calibration.estimator import Prior
 from isocharge.train.calibration.film_charges import circle_of
 from isocharge.train.calibration.film_estimate import FilmEstimate, Layout
@@ -16,9 +14,6 @@ POSITION_MARGIN_MM = 0.5
 
 FORCE_MARGIN = 1.25
 """Ratio by which the solved forces extend beyond the range of forces, because the forces have errors."""
-
-MAX_SIDE_FORCE = 0.5
-"""Largest side force of a contact, relative to its force, because its effect is computed to first order."""
 
 RIM_MARGIN = 1.3
 """Smallest distance of a solved press from the clamp, in units of the reach of the largest probe."""
@@ -35,8 +30,6 @@ class CalibrationProblem:
         force_range: Smallest and largest force of a contact, N.
         earlier: Estimate of an earlier calibration, with the drift since then; None to begin with the sensor file.
         stress_limit: Largest stress of the film that a proposed press may cause, MPa.
-        friction: Expected coefficient of friction between tip and film, for presses on a vertical stage; 0 for none.
-        side_force: Largest side force of later contacts in any direction, divided by the force of the contact.
         noise: Smallest noise of the charges, that of a good amplifier. The presses may show a larger noise.
 
     Example:
@@ -51,18 +44,7 @@ class CalibrationProblem:
     force_range: tuple[float, float] = DEFAULT_FORCE_RANGE
     earlier: FilmEstimate | None = None
     stress_limit: float = DEFAULT_STRESS_LIMIT
-    friction: float = 0.0
-    side_force: float = 0.0
     noise: NoiseModel = field(default_factory=partial(noise_model, "reference"))
-
-    def __post_init__(self) -> None:
-        if self.friction:
-            check_friction(self.friction)
-        if not 0.0 <= self.side_force <= MAX_SIDE_FORCE:
-            raise SceneError(
-                f"side force: expected a share of the force from 0 to {MAX_SIDE_FORCE:g}, such as 0.1, got "
-                f"{self.side_force}"
-            )
 
     @property
     def electrodes(self) -> tuple[str, ...]:

@@ -8,8 +8,8 @@ import numpy as np
 
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import Probe, Sensor
-from isocharge.train.calibration.contact_error import PLANNED, ContactError, ContactSensitivity
-from isocharge.train.calibration.estimator import Estimation
+from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity
+from isocharge.train.calibration.estimator import PLANNED, Estimation
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.problem import CalibrationProblem
