@@ -19,11 +19,7 @@ from isocharge.train.calibration.folder import calibration_folder, read_earlier,
 
 QUICK = FitConfig(
     network=NetworkConfig(hidden=(32, 32), misfit_hidden=(16, 16)),
-    training=TrainingConfig(steps=300, misfit_steps=100, misfit_charges=1_000, batch=256),
-)
-
-SHORTEST = FitConfig(
-    network=QUICK.network, training=TrainingConfig(steps=150, misfit_steps=10, misfit_charges=1_000, batch=256)
+    training=TrainingConfig(steps=600, misfit_steps=100, misfit_charges=1_000, batch=256),
 )
 
 
@@ -79,7 +75,7 @@ def test_next_calibration_is_the_next_version_and_stale_files_are_mended(written
             pass
         assert (path / "card.md").read_bytes() == (path / "1" / "card.md").read_bytes()
         assert not (path / ".2.draft").exists()
-        assert write_calibration(written.result, path, config=SHORTEST).name == "2"
+        assert write_calibration(written.result, path, config=QUICK).name == "2"
     assert (path / "card.md").read_bytes() == (path / "2" / "card.md").read_bytes()
 
 
