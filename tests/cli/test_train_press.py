@@ -21,7 +21,6 @@ from isocharge.serve.live.steady_press import (
     Phase,
     SteadyPress,
     WatchResult,
-    unsteadiness,
 )
 from isocharge.simulate import Circle, ForwardMap, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
@@ -84,9 +83,9 @@ class Script:
         return event
 
 
-STEADY = WatchResult(Phase.taken, press=SteadyPress(np.full(4, 500.0), np.ones(4), np.ones(4), 0.7, 0.5, 100, ()))
-TARED = WatchResult(Phase.waiting, np.zeros(4))
-HELD, LATER, LATE = (WatchResult(Phase.settling, np.full(4, 400.0), held_s) for held_s in (0.3, 0.8, 1.4))
+STEADY = WatchResult(Phase.taken, press=SteadyPress(np.full(4, 500.0), np.ones(4), 0.7, 100, ()))
+TARED = WatchResult(Phase.waiting)
+HELD = WatchResult(Phase.settling)
 
 
 def refused(reason):
@@ -106,7 +105,7 @@ def dialogue(*events, asks=True, contacts=None):
 
 
 def test_enter_takes_a_press_as_proposed(capsys):
-    session, _ = dialogue(TARED, HELD, LATER, LATE, STEADY, "", STEADY, "1.5 2 0.9", STEADY, "? ? 0.5")
+    session, _ = dialogue(TARED, HELD, HELD, HELD, STEADY, "", STEADY, "1.5 2 0.9", STEADY, "? ? 0.5")
     assert session.taken[:2] == [(0.0, 0.0, 1.0), (1.5, 2.0, 0.9)]
     assert np.isnan(session.taken[2][:2]).all()
     message = capsys.readouterr().err
@@ -143,13 +142,6 @@ def test_a_press_that_is_refused_is_asked_for_again(capsys):
     session, script = dialogue(refused("it moves"), refused(PORT_LOST), STEADY, "", "q")
     assert (session.taken, script.armed) == ([FIRST], 4)
     assert "not taken: it moves; press again" in capsys.readouterr().err
-
-
-def test_reason_of_a_drift_is_the_worst_charge():
-    press = SteadyPress(
-        np.array([800.0, 400.0, -0.5, -300.0]), np.ones(4), np.array([-4.0, 20.0, 0.5, 1.0]), 2, 0.5, 100, ()
-    )
-    assert unsteadiness(press, np.ones(4), NAMES).startswith("the charge of B changes by 40 pC per second from 400 pC")
 
 
 def test_nothing_is_asked_with_yes():

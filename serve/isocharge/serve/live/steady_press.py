@@ -65,18 +65,14 @@ class SteadyPress(NamedTuple):
         charge_pC: Mean touch charges over the window, shape (n_electrode,), pC.
         scatter_pC: Standard deviation of each charge about a straight line that is fitted to it, shape (n_electrode,),
             pC.
-        drift_pC: Change of each straight line over the window, shape (n_electrode,), pC.
         held_s: Time from the touch to the end of the window, s.
-        window_s: Length of the window, s.
         frames: Number of frames in the window.
         flags: Flags of `isocharge.serve.flags` that at least one frame in the window has.
     """
 
     charge_pC: Array
     scatter_pC: Array
-    drift_pC: Array
     held_s: float
-    window_s: float
     frames: int
     flags: tuple[str, ...]
 
@@ -87,16 +83,11 @@ class WatchResult(NamedTuple):
     Attributes:
         phase: What the watch waits for. It is `taken` or `refused` only for the reading with which a press was accepted
             or refused.
-        charge_pC: Touch charges of this reading minus the charges at rest before the press, shape (n_electrode,), pC.
-            None if the reading has no charges.
-        held_s: Time since the touch began, s; 0 if nothing touches the film.
         reason: Reason why the press is refused or is not steady yet, as a part of a sentence.
         press: The accepted press if the phase is `taken`, and otherwise None.
     """
 
     phase: Phase
-    charge_pC: Array | None = None
-    held_s: float = 0.0
     reason: str = ""
     press: SteadyPress | None = None
 
@@ -157,7 +148,7 @@ class Press:
         self._last_check_s = begin_s  # time at which the window was last examined
         self._min_scatter_pC = math.inf  # smallest scatter of all windows
 
-    def add(self, frame: Frame) -> "SteadyPress | str":
+    def add(self, frame: Frame) -> SteadyPress | str:
         """Add the next frame to the window, and accept or refuse the press if this can be decided.
 
         The press is accepted if it is steady. It is refused if an amplifier is saturated, if the film was not at rest
@@ -190,50 +181,77 @@ class Press:
             return f"not steady within {self.MAX_HELD_S:g} s: {self.reason or 'too few frames come'}"
         return ""
 
-    def _examine_window(self, noise_pC: Array) -> "SteadyPress | None":
+    def _examine_window(self, noise_pC: Array) -> SteadyPress | None:
         """Return the press in the window if the press is steady. Otherwise, return None and store the reason.
 
-        The reason is that of the window with the smallest scatter, because the reason of a window with a sudden
+        A straight line is fitted to each charge in the window. The scatter of a charge is the standard deviation of its
+        residuals from the line. The drift of a charge is the change of its line from the beginning to the end of the
+        window. The reason is that of the window with the smallest scatter, because the reason of a window with a sudden
         movement, such as the release, would only describe the movement.
 
         Args:
             noise_pC: Standard deviation of each charge at rest, shape (n_electrode,), pC.
         """
-        press = self._measure_window()
-        reason = unsteadiness(press, noise_pC, self._electrodes)
-        if not reason:
-            return press
-        scatter_pC = float(press.scatter_pC.max())
-        if scatter_pC <= self._min_scatter_pC:
-            self._min_scatter_pC = scatter_pC
-            self.reason = reason
-        return None
-
-    def _measure_window(self) -> "SteadyPress":
-        """Fit a straight line to each charge in the window, and return the mean, the scatter and the drift of each.
-
-        The scatter of a charge is the standard deviation of its residuals from the line. The drift of a charge is the
-        change of its line from the beginning to the end of the window.
-        """
         times_s = np.array([frame.clock_s for frame in self._window])
         charge_pC = np.array([frame.charge_pC for frame in self._window]) - self.rest_pC  # shape (frames, n_electrode)
-        window_s = float(times_s[-1] - times_s[0])
 
         # The line is fitted by least squares. Its value at the mean time of the frames is the mean charge.
         centred_s = times_s - times_s.mean()
         square_sum_s2 = max(float(centred_s @ centred_s), 1e-30)  # avoids a division by 0 if all times are equal
         slope_pC_per_s = centred_s @ charge_pC / square_sum_s2
         mean_pC = charge_pC.mean(axis=0)
-        residual_pC = charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)
-        different_flags = dict.fromkeys(flag for frame in self._window for flag in frame.flags)  # each flag once
-        return SteadyPress(
-            charge_pC=mean_pC,
-            scatter_pC=residual_pC.std(axis=0),
-            drift_pC=slope_pC_per_s * window_s,
-            held_s=self.end_s - self.begin_s,
-            window_s=window_s,
-            frames=len(self._window),
-            flags=tuple(different_flags),
+        scatter_pC = (charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)).std(axis=0)
+
+        window_s = float(times_s[-1] - times_s[0])
+        reason = self._shaking(mean_pC, scatter_pC, noise_pC)
+        reason = reason or self._drifting(mean_pC, scatter_pC, slope_pC_per_s, window_s)
+        if not reason:
+            flags = dict.fromkeys(flag for frame in self._window for flag in frame.flags)  # each flag once
+            return SteadyPress(mean_pC, scatter_pC, self.end_s - self.begin_s, len(self._window), tuple(flags))
+        if scatter_pC.max() <= self._min_scatter_pC:
+            self._min_scatter_pC = float(scatter_pC.max())
+            self.reason = reason
+        return None
+
+    def _shaking(self, charge_pC: Array, scatter_pC: Array, noise_pC: Array) -> str:
+        """Return the reason if a charge scatters too much; empty if the scatter of all charges is small.
+
+        The charges scatter because of the noise at rest, and because a hand varies its force.
+
+        Args:
+            charge_pC: Mean charges, shape (n_electrode,), pC.
+            scatter_pC: Scatter of the charges, shape (n_electrode,), pC.
+            noise_pC: Standard deviation of the charges at rest, shape (n_electrode,), pC.
+        """
+        expected_scatter_pC = np.hypot(noise_pC, self.RELATIVE_NOISE * np.abs(charge_pC).mean())
+        relative_scatter = scatter_pC / expected_scatter_pC
+        worst = int(relative_scatter.argmax())
+        if relative_scatter[worst] <= self.MAX_SCATTER_SIGMAS:
+            return ""
+        return f"the charge of {self._electrodes[worst]} shakes by {scatter_pC[worst]:.2g} pC"
+
+    def _drifting(self, charge_pC: Array, scatter_pC: Array, slope_pC_per_s: Array, window_s: float) -> str:
+        """Return the reason if a charge drifts too much; empty if the drift of all charges is small.
+
+        Args:
+            charge_pC: Mean charges, shape (n_electrode,), pC.
+            scatter_pC: Scatter of the charges, shape (n_electrode,), pC.
+            slope_pC_per_s: Slopes of the lines, shape (n_electrode,), pC/s.
+            window_s: Length of the window, s.
+        """
+        # The change of a line through n values has the standard deviation sqrt(12 / n) times that of one value.
+        drift_std_pC = scatter_pC * math.sqrt(12.0 / len(self._window))
+        # A charge that is smaller than the mean magnitude may change as much as a charge of the mean magnitude.
+        reference_pC = np.maximum(np.abs(charge_pC), np.abs(charge_pC).mean())
+        max_drift_pC = self.MAX_RELATIVE_DRIFT * reference_pC + self.DRIFT_SIGMAS * drift_std_pC
+        relative_drift = np.abs(slope_pC_per_s) * window_s / max_drift_pC
+        worst = int(relative_drift.argmax())
+        if relative_drift[worst] <= 1.0:
+            return ""
+        return (
+            f"the charge of {self._electrodes[worst]} changes by {slope_pC_per_s[worst]:.2g} pC per second from "
+            f"{charge_pC[worst]:.3g} pC: hold place and force still; if it also changes under a weight, measure the "
+            "leak of the amplifiers with isocharge serve doctor"
         )
 
 
@@ -264,7 +282,7 @@ class PressWatch:
             self._phase = Phase.lift
 
     def feed(self, frame: Frame) -> WatchResult:
-        """Process the next reading, and return the phase of the watch with the charges of the reading.
+        """Process the next reading, and return the phase of the watch.
 
         The first phase is `taring`, which ends when the charge of the untouched film has been measured. The phase
         `waiting` follows until a touch begins. The phase `settling` follows until the press is accepted or refused. The
@@ -277,15 +295,15 @@ class PressWatch:
             frame: The frame, after the stages of a `ReadingStream`.
 
         Returns:
-            The phase, the charges of the reading and, if a press is refused or not steady yet, the reason. The result
-            contains an accepted press only for the reading with which the press was accepted.
+            The phase and, if a press is refused or not steady yet, the reason. The result contains an accepted press
+            only for the reading with which the press was accepted.
         """
         t_s = frame.clock_s
         if RECONNECTED in frame.flags or RESTART in frame.flags:
             # The charges before the interruption cannot be compared with later charges.
             self._rest_frames.clear()
             self._phase = Phase.taring
-            return WatchResult(Phase.refused, reason=PORT_LOST)
+            return WatchResult(Phase.refused, PORT_LOST)
         if frame.charge_pC is None:  # there is no tare yet, or the frame is invalid
             if TARE in frame.flags:  # the tare is being measured
                 self._phase = Phase.taring
@@ -300,17 +318,15 @@ class PressWatch:
             self._press = Press(self._electrodes, t_s, rest_charges_pC)
             self._rest_frames.clear()
             self._phase = Phase.settling
-        press = self._press
-        result = WatchResult(self._phase, frame.charge_pC - press.rest_pC, t_s - press.begin_s)
         if self._phase is Phase.lift:  # the press was accepted or refused before, and the finger is still on the film
-            return result
-        decision = press.add(frame)
+            return WatchResult(self._phase)
+        decision = self._press.add(frame)
         if not decision:
-            return result._replace(reason=press.reason)
+            return WatchResult(self._phase, self._press.reason)
         self._phase = Phase.lift
         if isinstance(decision, SteadyPress):
-            return result._replace(phase=Phase.taken, press=decision)
-        return result._replace(phase=Phase.refused, reason=decision)
+            return WatchResult(Phase.taken, press=decision)
+        return WatchResult(Phase.refused, decision)
 
     def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
         """Store a frame in which nothing touches the film, and refuse a press that has ended without becoming steady.
@@ -333,45 +349,5 @@ class PressWatch:
         held_s = press.end_s - press.begin_s
         if is_press_unfinished and held_s >= Press.MIN_HELD_S:
             reason = press.reason or "hold it longer"
-            return WatchResult(Phase.refused, reason=f"released after {held_s:.1f} s, before it was steady: {reason}")
-        return WatchResult(Phase.waiting, charge_pC)
-
-
-def unsteadiness(press: SteadyPress, noise_pC: Array, electrodes: tuple[str, ...]) -> str:
-    """Return the reason why a press is not steady, or an empty text if the press is steady.
-
-    A straight line was fitted to each charge in the window. The press is steady if the scatter of each charge about its
-    line is small, and if the change of each line over the window (the drift) is small. The limits allow for the scatter
-    and the drift that noise alone causes.
-
-    Args:
-        press: Charges, scatter and drift in a window of the press.
-        noise_pC: Standard deviation of each charge at rest, shape (n_electrode,), pC.
-        electrodes: Names of the electrodes, for the reason.
-
-    Returns:
-        The reason as a part of a sentence.
-    """
-    # The charges scatter because of the noise at rest, and because a hand varies its force.
-    mean_magnitude_pC = float(np.abs(press.charge_pC).mean())
-    expected_scatter_pC = np.hypot(noise_pC, Press.RELATIVE_NOISE * mean_magnitude_pC)
-    relative_scatter = press.scatter_pC / expected_scatter_pC
-    if relative_scatter.max() > Press.MAX_SCATTER_SIGMAS:
-        worst_index = int(relative_scatter.argmax())
-        return f"the charge of {electrodes[worst_index]} shakes by {press.scatter_pC[worst_index]:.2g} pC"
-
-    # If a line is fitted to n values of noise, the standard deviation of its change is sqrt(12 / n) times the noise.
-    drift_std_pC = press.scatter_pC * np.sqrt(12.0 / press.frames)
-    # A charge that is smaller than the mean magnitude may change as much as a charge of the mean magnitude.
-    reference_pC = np.maximum(np.abs(press.charge_pC), mean_magnitude_pC)
-    max_drift_pC = Press.MAX_RELATIVE_DRIFT * reference_pC + Press.DRIFT_SIGMAS * drift_std_pC
-    relative_drift = np.abs(press.drift_pC) / max_drift_pC
-    if relative_drift.max() <= 1.0:
-        return ""
-    worst_index = int(relative_drift.argmax())
-    drift_pC_per_s = press.drift_pC[worst_index] / press.window_s
-    return (
-        f"the charge of {electrodes[worst_index]} changes by {drift_pC_per_s:.2g} pC per second from "
-        f"{press.charge_pC[worst_index]:.3g} pC: hold place and force still; if it also changes under a weight, "
-        "measure the leak of the amplifiers with isocharge serve doctor"
-    )
+            return WatchResult(Phase.refused, f"released after {held_s:.1f} s, before it was steady: {reason}")
+        return WatchResult(Phase.waiting)
