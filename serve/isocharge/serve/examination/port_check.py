@@ -24,11 +24,10 @@ from isocharge.serve.examination.missing import (
     unit_sentences,
 )
 from isocharge.serve.examination.press_detector import find_touch
-from isocharge.serve.examination.proposal import propose, unit_of
+from isocharge.serve.examination.proposal import propose, recognised_frames, unit_of
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
 from isocharge.serve.port.serial_line import Request, without_telnet
 from isocharge.serve.port.source import has_speed
-from isocharge.serve.recognition.recognise import recognise
 from isocharge.serve.signal_chain.channels import channel_index
 from isocharge.serve.signal_chain.gain import Gain, GainRule
 
@@ -137,8 +136,7 @@ def _intact_share(received: ReceivedData, device: Device) -> float:
         device: Settings of the board. For `ANY_BOARD`, the format of the frames is recognised from the bytes.
     """
     if device is ANY_BOARD:
-        frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
-        device = device_from_table({"frames": frames or {}}, "board")
+        device = device_from_table({"frames": recognised_frames(received)}, "board")
     return read_frames(received, device).intact_share
 
 
@@ -181,16 +179,13 @@ def examine_received(
     Raises:
         DeviceError: If the gain is not valid, or is stated for other electrodes.
     """
-    # Without a device file (`ANY_BOARD`), the format of the frames and the settings are proposed from the bytes. If no
-    # gain is stated, the values remain as the board sends them.
-    given_device = device
-    table = dict(device.table)
-    if device is ANY_BOARD:
-        table, electrodes = propose(received, electrodes, gain or {})
-        device = device_from_table({key: value for key, value in table.items() if gain or key != "gain"}, "board")
-        Gain(device.setup(electrodes))  # raises an error for the numbers of other electrodes
+    # Without a device file (`ANY_BOARD`), the format of the frames and the settings are proposed from the bytes.
+    is_proposed = device is ANY_BOARD
+    frames = recognised_frames(received) if is_proposed else {}
+    if is_proposed:
+        device = device_from_table({"frames": frames}, "board")
     capture = read_frames(received, device)
-    uses_telnet = _uses_telnet(received, given_device, capture.intact_share)
+    uses_telnet = _uses_telnet(received, ANY_BOARD if is_proposed else device, capture.intact_share)
     missing = list(transmission_sentences(capture, uses_telnet=uses_telnet))
     counts = capture.parser.counts
     examination = Examination(
@@ -203,19 +198,26 @@ def examine_received(
         good=len(capture.frames),
         bad=counts.crc_errors + counts.malformed,
         missing=tuple(missing),
-        device=table,
+        device={} if is_proposed else dict(device.table),
     )
     if not capture.frames or uses_telnet:
         return examination
 
-    # Examine the electrodes' channels in the time before a held press. With a gain, all values are converted to pC.
-    electrode_at_position = electrodes_by_position(capture, device)
-    unit = "pC" if device.rule(GainRule) is not None else unit_of(capture)
+    # The last moments before a held press do not count as rest, because the force is already rising.
     values, times_s = capture.values()
     held_press = find_held_press(values, times_s)
-    # The last moments before a held press do not count as rest, because the force is already rising.
     rest_end_s = math.inf if held_press is None else held_press.begin_s - PRESS_MARGIN_S
     is_rest = times_s < rest_end_s
+
+    # If no gain is stated, the values remain as the board sends them. With a gain, they are converted to pC.
+    table = dict(device.table)
+    if is_proposed:
+        table = propose(capture, values[is_rest], frames, electrodes, gain or {})
+        electrodes = electrodes or tuple(table.get("channels", {}))
+        device = device_from_table({key: value for key, value in table.items() if gain or key != "gain"}, "board")
+        Gain(device.setup(electrodes))  # raises an error for the numbers of other electrodes
+    electrode_at_position = electrodes_by_position(capture, device)
+    unit = "pC" if device.rule(GainRule) is not None else unit_of(capture)
     charges = values[is_rest][:, list(electrode_at_position)]  # shape (n, n_electrode)
     gain_rule = device.rule(GainRule)
     if gain_rule is not None:

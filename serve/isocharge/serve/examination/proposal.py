@@ -5,17 +5,15 @@ The charge of one count cannot be derived from the bytes. The user has to state 
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError
-from isocharge.serve.examination.held_press import find_held_press
-from isocharge.serve.examination.listening import Capture, ReceivedData, read_frames
+from isocharge.serve.examination.listening import Capture, ReceivedData
 from isocharge.serve.examination.press_detector import estimate_noise
 from isocharge.serve.frames.binary import FORMAT as BINARY
-from isocharge.serve.live.device import device_from_table
 from isocharge.serve.recognition.recognise import recognise
 from isocharge.serve.signal_chain.channels import Channels, stated_unit
 from isocharge.serve.signal_chain.stage import Setup
@@ -34,59 +32,48 @@ ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Names of the electrodes if there is no model."""
 
 
-class Proposal(NamedTuple):
-    """A proposed device file.
-
-    Attributes:
-        table: Content of the file; empty if the frames are not recognised.
-        electrodes: Electrodes of the model. Without a model, one name for each channel whose values vary.
-    """
-
-    table: dict[str, Any]
-    electrodes: tuple[str, ...]
-
-
-def propose(received: ReceivedData, electrodes: tuple[str, ...], gain: Mapping[str, Any]) -> Proposal:
-    """Propose the device file for a board.
-
-    The bytes determine the format of the frames, the channels of the electrodes, and the offsets of the channels. An
-    offset is the value of a channel without charge. The section `[gain]` is proposed if the user states the gain, if
-    the channels have large offsets, or if their unit is not pC.
-
-    Args:
-        received: Bytes that the board sent.
-        electrodes: Electrodes of the model; empty for any model.
-        gain: Gain as the user states it, such as `pC_per_unit`; empty if it is unknown.
-
-    Returns:
-        The sections of the device file, which are empty if no frames are recognised, and the names of the electrodes.
-    """
+def recognised_frames(received: ReceivedData) -> dict[str, Any]:
+    """Return the section `[frames]` of a device file that describes the received bytes; empty if it is unknown."""
     frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
     if frames is None:
-        return Proposal({}, electrodes)
+        return {}
     if received.request is not None:
         frames["request"] = received.request.data.hex(" ").upper()  # bytes as hexadecimal numbers, such as "3F 0A"
         frames["request_Hz"] = received.request.rate_Hz
-    table: dict[str, Any] = {"name": "board", "frames": frames}
-    capture = read_frames(received, device_from_table(table, "board"))
-    if not capture.frames:
-        return Proposal({}, electrodes)
+    return frames
 
-    values, times_s = capture.values()
+
+def propose(
+    capture: Capture,
+    rest_values: Array,
+    frames: Mapping[str, Any],
+    electrodes: tuple[str, ...],
+    gain: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Propose the content of a device file for a board.
+
+    The offset of a channel is its value without charge. The section `[gain]` is proposed if the user states the gain,
+    if the channels have large offsets, or if their unit is not pC.
+
+    Args:
+        capture: Frames that the board sent, at least one.
+        rest_values: Values of all channels while the film is at rest, shape (n, channels).
+        frames: Section `[frames]`.
+        electrodes: Electrodes of the model. Without a model, each channel whose values vary is an electrode.
+        gain: Gain as the user states it, such as `pC_per_unit`; empty if it is unknown.
+    """
+    table: dict[str, Any] = {"name": "board", "frames": frames}
+    values, _times_s = capture.values()
     positions = _choose_channels(capture, values, electrodes)
     if positions:  # otherwise it is not clear which channels belong to the electrodes
         table["channels"] = {electrode: capture.names[position] for electrode, position in positions.items()}
-
-    # Measure the offsets in the frames in which the film is at rest, which end before a held press.
-    held_press = find_held_press(values, times_s)
-    rest_values = values if held_press is None else values[times_s < held_press.begin_s]
     offset = {electrode: _rest_level(rest_values[:, position]) for electrode, position in positions.items()}
     has_large_offset = any(abs(level) > TareRule().offset_limit_pC for level in offset.values())
     is_in_pC = unit_of(capture) == "pC"
     if gain or has_large_offset or not is_in_pC:
         known_gain = dict(gain) or ({"pC_per_unit": 1.0} if is_in_pC else {})
         table["gain"] = ({"offset": offset} if any(offset.values()) else {}) | known_gain
-    return Proposal(table, electrodes or tuple(positions))
+    return table
 
 
 def unit_of(capture: Capture) -> str:
