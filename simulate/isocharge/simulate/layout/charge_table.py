@@ -68,23 +68,15 @@ MARGIN = 0.03
 The gap contains no nodes, because the finite differences would be wrong there: the stress has a kink on the circle.
 """
 
-RELATIVE_STEP = 0.02
-"""Step of the finite differences with respect to the position and the probe radius, in units of the probe radius."""
+STEPS = {"x": 0.02, "y": 0.02, "ln force": 0.05, "probe radius": 0.02, "pretension": 0.1}
+"""Steps of the finite differences of the stress.
 
-LOG_FORCE_STEP = 0.05
-"""Step of the finite differences with respect to ln F, dimensionless."""
+The steps of the position and of the probe radius are in units of the probe radius, and that of the pretension is in
+MPa.
+"""
 
-PRETENSION_STEP = 0.1
-"""Step of the finite differences with respect to the pretension, MPa."""
-
-WIDE_RADIUS = 0.25
-"""Largest distance of a press in the table above which more distances are solved, in film radii, dimensionless."""
-
-N_DISTANCES = 5
-"""Number of solved distances if the largest distance of a press is at most `WIDE_RADIUS`."""
-
-N_DISTANCES_WIDE = 8
-"""Number of solved distances if the largest distance of a press is above `WIDE_RADIUS`."""
+N_DISTANCES = 8
+"""Number of distances of the solved presses from the centre."""
 
 GAUSS_RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
 """Integration rules of electrodes in ascending order of the distance between the electrode and the press.
@@ -150,10 +142,8 @@ class ChargeTable:
         settings = replace(basic_settings, resolution=resolution)
 
         # The distances are Chebyshev nodes in `distance_coordinate`, whose inverse is `tanh`.
-        is_wide = radius > WIDE_RADIUS * film.radius
-        n_distance = N_DISTANCES_WIDE if is_wide else N_DISTANCES
         largest_coordinate = float(distance_coordinate(radius / film.radius))
-        distance = film.radius * np.tanh(chebyshev_nodes(n_distance, 0.0, largest_coordinate))
+        distance = film.radius * np.tanh(chebyshev_nodes(N_DISTANCES, 0.0, largest_coordinate))
         n_direction = 1 if film.is_axisymmetric else DIRECTIONS
         direction = DIRECTION_PERIOD * np.arange(n_direction) / n_direction
         presses = list(product(distance.tolist(), direction.tolist()))
@@ -421,57 +411,30 @@ def _stress_at(
     film = film.rotated(-direction)
     points = _grid_points(film, probe.radius, distance)
     unchanged_press = press(film, probe, (distance, 0.0), force, settings)
+    stress = touch_stress(unchanged_press, points, surface)
 
-    def changed_stress(
-        x_change: float = 0.0,
-        y_change: float = 0.0,
-        log_force_change: float = 0.0,
-        radius_change: float = 0.0,
-        pretension_change: float = 0.0,
-    ) -> Array:
-        """Solve a press that differs from the unchanged press, and return its stress on the grid.
-
-        Args:
-            x_change: Change of the position along x, mm.
-            y_change: Change of the position along y, mm.
-            log_force_change: Change of the logarithm of the force, dimensionless.
-            radius_change: Change of the probe radius, mm.
-            pretension_change: Change of the pretension, MPa.
-
-        Returns:
-            Stress (s11, s22, s12), shape (n_node, 3), MPa.
-        """
-        changed_film = replace(film, pretension=film.pretension + pretension_change)
-        changed_probe = Circle(probe.radius + radius_change)
-        changed_force = force * float(np.exp(log_force_change))
-        position = (distance + x_change, y_change)
-        changed_press = press(changed_film, changed_probe, position, changed_force, settings, start=unchanged_press)
+    def changed_stress(column: str, change: float) -> Array:
+        """Return the stress on the grid under a press that differs in the quantity of one column."""
+        changes = dict.fromkeys(STEPS, 0.0) | {column: change}
+        changed_press = press(
+            replace(film, pretension=film.pretension + changes["pretension"]),
+            Circle(probe.radius + changes["probe radius"]),
+            (distance + changes["x"], changes["y"]),
+            force * math.exp(changes["ln force"]),
+            settings,
+            start=unchanged_press,
+        )
         return touch_stress(changed_press, points, surface)
 
-    def central_difference(change: str, step: float) -> Array:
-        """Return the derivative of the stress with respect to one argument of `changed_stress`, shape (n_node, 3).
-
-        Args:
-            change: Name of the argument.
-            step: Step of the central difference, in the unit of the argument.
-        """
-        return (changed_stress(**{change: step}) - changed_stress(**{change: -step})) / (2.0 * step)
-
-    stress = touch_stress(unchanged_press, points, surface)
-    length_step = RELATIVE_STEP * probe.radius
-
-    # The pretension may be zero and must not become negative, so its finite difference is one-sided.
-    pretension_derivative = (changed_stress(pretension_change=PRETENSION_STEP) - stress) / PRETENSION_STEP
-    return np.stack(
-        [
-            stress,
-            central_difference("x_change", length_step),
-            central_difference("y_change", length_step),
-            central_difference("log_force_change", LOG_FORCE_STEP),
-            central_difference("radius_change", length_step),
-            pretension_derivative,
-        ]
-    )
+    columns = [stress]
+    for column, relative_step in STEPS.items():
+        step = relative_step if column in ("ln force", "pretension") else relative_step * probe.radius
+        forward = changed_stress(column, step)
+        if column == "pretension":  # the pretension may be zero and must not become negative
+            columns.append((forward - stress) / step)
+        else:
+            columns.append((forward - changed_stress(column, -step)) / (2.0 * step))
+    return np.stack(columns)
 
 
 def _grid_points(film: Film, probe_radius: float, distance: float) -> Array:

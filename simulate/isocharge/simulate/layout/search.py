@@ -117,11 +117,6 @@ class Search:
         """Error model with the nuisances of the case."""
         return ErrorModel.of(self.case.noise, self.case.nuisances)
 
-    @cached_property
-    def _lattice(self) -> "PressedLayout":
-        """Presses on a coarse lattice."""
-        return PressedLayout.of(self, self.case.search_presses)
-
     def errors(self, positions: Array) -> Array:
         """Compute the position error of each press of the fine grid, shape (n_press,), mm.
 
@@ -150,7 +145,7 @@ class Search:
             Improved layout, whose error is the power mean.
         """
         power = POWER if self.case.goal == "worst" else 2.0
-        return self._lattice.minimise(start, power)
+        return self.minimise(self.case.search_presses, start, power)
 
     def refine(self, layout: Layout) -> Layout:
         """Reduce the largest error on the fine grid, and return the layout with the value of the goal.
@@ -165,51 +160,35 @@ class Search:
         for round_number in range(1, ROUNDS + 1):
             largest = np.argsort(-smallest_errors)[: len(self.case.search_presses)]
             presses = np.concatenate([self.case.search_presses, self.case.fine_grid[largest]])
-            pressed = PressedLayout.of(self, presses)
-            changed = pressed.minimise(positions, POWER * 2.0**round_number).positions
+            changed = self.minimise(presses, positions, POWER * 2.0**round_number).positions
             errors = self.errors(changed)
             if errors.max() < smallest_errors.max():
                 positions = changed
                 smallest_errors = errors
         return Layout(positions, float(smallest_errors.max()))
 
-
-@dataclass(frozen=True)
-class PressedLayout:
-    """Film under several presses, with the kept electrodes of a design case.
-
-    Attributes:
-        case: Requirements of the layout.
-        model: Error model with the nuisances of the case.
-        pressed: Charge per area that the presses cause.
-        kept_rows: Rows of the kept electrodes, shape (n_press, n_kept, 6); see `ChargeTable`.
-    """
-
-    case: DesignCase
-    model: ErrorModel
-    pressed: PressedFilm
-    kept_rows: Array
-
-    @classmethod
-    def of(cls, search: Search, presses: Array) -> "PressedLayout":
-        """Evaluate the charge table of a search for presses at positions (x, y), shape (n_press, 2), mm."""
-        pressed = PressedFilm.interpolate(search.table, presses)
-        return cls(search.case, search.model, pressed, pressed.rows(search.case.kept_electrodes))
-
-    def minimise(self, start: Array, power: float) -> Layout:
-        """Minimise a power mean of the position errors of all presses.
+    def minimise(self, presses: Array, start: Array, power: float) -> Layout:
+        """Minimise a power mean of the position errors of presses.
 
         Args:
+            presses: Positions (x, y) of the presses, shape (n_press, 2), mm.
             start: Centres (x, y) of the new squares, which satisfy the distance rules, shape (n_new, 2), mm.
             power: Exponent of the power mean.
 
         Returns:
             Layout with its power mean.
         """
+        pressed = PressedFilm.interpolate(self.table, presses)
+        kept_rows = pressed.rows(self.case.kept_electrodes)
+        side = self.case.square_side
+
+        def square_rows(positions: Array) -> Array:
+            """Return the rows of squares at positions of shape (n, 2), shape (n_press, n, 6)."""
+            return pressed.rows([Electrode.of_square("A", (x, y), side) for x, y in positions.tolist()])
 
         def log_mean(new_rows: Array) -> float:
             """Return the logarithm of the power mean for rows of the new squares, shape (n_press, n_new, 6)."""
-            squared_error = self.model.squared_errors(np.concatenate([new_rows, self.kept_rows], axis=1))
+            squared_error = self.model.squared_errors(np.concatenate([new_rows, kept_rows], axis=1))
             largest = squared_error.max()  # the powers of the ratios neither overflow nor all underflow
             mean_power = np.mean((squared_error / largest) ** (0.5 * power))
             return float(0.5 * np.log(largest) + np.log(mean_power) / power)
@@ -219,10 +198,10 @@ class PressedLayout:
             # If one square moves, only the rows of this square change.
             positions = coordinates.reshape(-1, 2)
             moved_positions = (positions[:, None] + DIFFERENCE_STEP * np.eye(2)).reshape(-1, 2)
-            rows = self._square_rows(positions)
+            rows = square_rows(positions)
             value = log_mean(rows)
             gradient = np.empty(coordinates.size)
-            for index, moved_rows in enumerate(self._square_rows(moved_positions).swapaxes(0, 1)):
+            for index, moved_rows in enumerate(square_rows(moved_positions).swapaxes(0, 1)):
                 changed_rows = rows.copy()
                 changed_rows[:, index // 2] = moved_rows
                 gradient[index] = (log_mean(changed_rows) - value) / DIFFERENCE_STEP
@@ -240,8 +219,3 @@ class PressedLayout:
         if self.case.all_clearances(positions).min() < -CLEARANCE_TOLERANCE:
             return Layout(start, float(np.exp(objective(start.ravel())[0])))
         return Layout(positions, float(np.exp(solution.fun)))
-
-    def _square_rows(self, positions: Array) -> Array:
-        """Return the rows of squares at positions (x, y), shape (n, 2), mm, for all presses, shape (n_press, n, 6)."""
-        side = self.case.square_side
-        return self.pressed.rows([Electrode.of_square("A", (x, y), side) for x, y in positions.tolist()])
