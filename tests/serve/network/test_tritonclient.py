@@ -126,12 +126,8 @@ def test_tritonclient_statistics(client, module, film):
     counts = {name.lower().replace("_", ""): value for name, value in second.items()}
     spent = {name.lower().replace("_", ""): value for name, value in counts["inferencestats"].items()}
     assert (int(counts["inferencecount"]), int(counts["executioncount"])) == (5, 2)
-    assert {name: int(spent[name]["count"]) for name in ("success", "fail", "computeinfer")} == {
-        "success": 2,
-        "fail": 1,
-        "computeinfer": 2,
-    }
-    assert 60e9 > int(spent["success"]["ns"]) >= int(spent["computeinfer"]["ns"]) > 0
+    assert {name: int(spent[name]["count"]) for name in ("success", "fail")} == {"success": 2, "fail": 1}
+    assert 60e9 > int(spent["success"]["ns"]) > 0
     assert int(first.get("inference_count", first.get("inferenceCount", 0))) == 0
     assert len(plain(client.get_inference_statistics()).popitem()[1]) == 2
 

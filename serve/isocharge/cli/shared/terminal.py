@@ -336,35 +336,22 @@ def shown_progress() -> Iterator[None]:
         with _progress_bars() as show_bar, listening(show_bar):
             yield
     else:
-        with listening(_ProgressLines()):
+        with listening(_progress_lines()):
             yield
 
 
-class _ProgressLines:
-    """Shows progress as plain lines of text, at most one line in each `PROGRESS_LINE_INTERVAL_S`.
+def _progress_lines() -> Listener:
+    """Return a function that prints the progress as lines, at most one line in `PROGRESS_LINE_INTERVAL_S`."""
+    next_line_s = time.monotonic() + PROGRESS_LINE_INTERVAL_S
 
-    The end of a computation is always shown if one of its earlier lines was shown.
-    """
-
-    def __init__(self) -> None:
-        """Print the first line after one interval."""
-        self._next_line_s = time.monotonic() + PROGRESS_LINE_INTERVAL_S
-        self._unfinished_titles: set[str] = set()  # titles whose latest line does not show the end
-
-    def __call__(self, title: str, done: int, total: int, note: str) -> None:
+    def show_line(title: str, done: int, total: int, note: str) -> None:
         """Print how many of the `total` steps are complete, unless the latest line is too recent."""
-        is_due = time.monotonic() >= self._next_line_s
-        is_end = done >= total
-        is_missing_end = is_end and title in self._unfinished_titles
-        if not (is_due or is_missing_end):
-            return
+        nonlocal next_line_s
+        if time.monotonic() >= next_line_s:
+            next_line_s = time.monotonic() + PROGRESS_LINE_INTERVAL_S
+            say(f"{title}: {done} of {total} {note}".rstrip())
 
-        self._next_line_s = time.monotonic() + PROGRESS_LINE_INTERVAL_S
-        if is_end:
-            self._unfinished_titles.discard(title)
-        else:
-            self._unfinished_titles.add(title)
-        say(f"{title}: {done} of {total} {note}".rstrip())
+    return show_line
 
 
 @contextmanager

@@ -18,12 +18,6 @@ CONTENT_TYPE = b"text/plain; version=0.0.4; charset=utf-8"
 VERSION_LABELS = ("model", "version")
 """Labels of the metrics that have one value for each version of a model."""
 
-STAGES = ("compute_input", "compute_infer", "compute_output", "fail")
-"""Triton's names of the three stages of an inference, and of the time of refused requests.
-
-In these stages, the server reads the request, runs the model, and writes the response.
-"""
-
 LATENCY_BOUNDS_S = (1e-5, 2e-5, 3e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 2e-2)
 """Upper bounds of the buckets of the latency histogram, s.
 
@@ -60,12 +54,7 @@ class ModelMetrics:
             buckets=LATENCY_BOUNDS_S,
             **settings,
         )
-        self.stages = Counter(
-            "isocharge_inference_stage_seconds",
-            "Time of each stage of an inference, under the names of Triton.",
-            (*VERSION_LABELS, "stage"),
-            registry=registry,
-        )
+        self.refused_time = Counter("isocharge_refused_seconds", "Time of refused requests.", **settings)
         self.latest = Gauge("isocharge_inference_latest_seconds", "Unix time of the latest inference.", **settings)
 
 
@@ -86,22 +75,20 @@ class Statistics:
         self._alarms = metrics.alarms.labels(*labels)
         self._refused = metrics.refused.labels(*labels)
         self._latency = metrics.latency.labels(*labels)
-        self._stages = [metrics.stages.labels(*labels, stage) for stage in STAGES]
+        self._refused_time = metrics.refused_time.labels(*labels)
         self._latest = metrics.latest.labels(*labels)
 
-    def count_answered(self, presses: int, stages_ns: tuple[int, int, int], alarms: int = 0) -> None:
+    def count_answered(self, presses: int, duration_ns: int, alarms: int = 0) -> None:
         """Count a request that was answered.
 
         Args:
             presses: Number of presses in the request.
-            stages_ns: Time that the request has spent in each of the first three `STAGES`, ns.
+            duration_ns: Time to read the request, to run the model and to write the response, ns.
             alarms: Number of presses whose misfit is above the limit.
         """
         self._presses.inc(presses)
         self._alarms.inc(alarms)
-        self._latency.observe(sum(stages_ns) / 1e9)
-        for stage, ns in zip(self._stages, stages_ns, strict=False):
-            stage.inc(ns / 1e9)
+        self._latency.observe(duration_ns / 1e9)
         self._latest.set(time.time())
 
     def count_refused(self, ns: int) -> None:
@@ -111,20 +98,22 @@ class Statistics:
             ns: Time from the complete request to the refusal, ns.
         """
         self._refused.inc()
-        self._stages[-1].inc(ns / 1e9)
+        self._refused_time.inc(ns / 1e9)
 
     def to_json(self) -> dict[str, Any]:
         """Return the counters as a JSON object with the names that Triton uses in its statistics."""
         answered = int(_value(self._latency, "_count"))
-        durations_s = {name: _value(stage, "_total") for name, stage in zip(STAGES, self._stages, strict=True)}
-        durations_s |= {"queue": 0.0, "success": _value(self._latency, "_sum")}  # no request waits in a queue
-        inference_stats = {name: {"count": answered, "ns": round(1e9 * s)} for name, s in durations_s.items()}
-        inference_stats["fail"]["count"] = int(_value(self._refused, "_total"))
+        answered_ns = round(1e9 * _value(self._latency, "_sum"))
+        refused = int(_value(self._refused, "_total"))
+        refused_ns = round(1e9 * _value(self._refused_time, "_total"))
         return {
             "last_inference": round(1e3 * _value(self._latest, "")),
             "inference_count": int(_value(self._presses, "_total")),
             "execution_count": answered,
-            "inference_stats": inference_stats,
+            "inference_stats": {
+                "success": {"count": answered, "ns": answered_ns},
+                "fail": {"count": refused, "ns": refused_ns},
+            },
             "batch_stats": [],
         }
 

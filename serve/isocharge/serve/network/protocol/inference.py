@@ -190,7 +190,7 @@ def answer_inference(
     read: Callable[[], InferRequest],
     write: Callable[[LoadedVersion, InferRequest, dict[str, Rows]], ResponseType],
 ) -> ResponseType:
-    """Read a request, run the model, and return the response. The request is counted with the duration of each step.
+    """Read a request, run the model, and return the response. The request is counted with its duration.
 
     Args:
         loaded: Version of the model that is run.
@@ -204,20 +204,18 @@ def answer_inference(
     start_ns = clock_ns()
     try:
         request = read()
-        read_end_ns = clock_ns()
         outputs = dict[str, Rows](run(loaded.model.session, request.charge_pC))
         if FLAGS in request.outputs:
             outputs[FLAGS] = _flags(loaded, outputs)
-        run_end_ns = clock_ns()
         response = write(loaded, request, {name: outputs[name] for name in request.outputs})
     except Exception:
         loaded.statistics.count_refused(clock_ns() - start_ns)
         raise
-    stages_ns = (read_end_ns - start_ns, run_end_ns - read_end_ns, clock_ns() - run_end_ns)
+    duration_ns = clock_ns() - start_ns
     misfits = outputs["misfit"].ravel().tolist()
     limit = loaded.validity.misfit_limit
     alarms = sum(not misfit <= limit for misfit in misfits)  # also counts NaN
-    loaded.statistics.count_answered(len(misfits), stages_ns, alarms)
+    loaded.statistics.count_answered(len(misfits), duration_ns, alarms)
     return response
 
 

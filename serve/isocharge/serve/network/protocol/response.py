@@ -1,4 +1,4 @@
-"""HTTP responses, compression of their bodies, and statuses of errors for HTTP and gRPC."""
+"""HTTP responses, decompression of requests, and statuses of errors for HTTP and gRPC."""
 
 import logging
 import zlib
@@ -116,9 +116,6 @@ PAGE_HEADERS = [
 ]
 """Headers of every page, in addition to its content security policy."""
 
-MIN_COMPRESSED_BYTES = 1024
-"""Smallest size of a body that is compressed, bytes. Shorter bodies are sent faster without compression."""
-
 _WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
 """Argument `wbits` of zlib for each encoding. The encoding `deflate` of HTTP is the zlib format."""
 
@@ -153,41 +150,6 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     if not decompressor.eof or decompressor.unused_data:
         raise errors.RequestError(f"the body ends before, or goes on after, the end of its {_quoted(encoding)} data")
     return plain_body
-
-
-def compress(body: bytes, accepted: bytes) -> tuple[bytes, bytes]:
-    """Compress the body of a response if the client accepts a supported encoding and the body is long enough.
-
-    Args:
-        body: Body of the response.
-        accepted: Value of the header Accept-Encoding of the request. It is empty if the request has no such header.
-
-    Returns:
-        The body, and the value of its header Content-Encoding. This value is empty if the body was not compressed.
-    """
-    if len(body) < MIN_COMPRESSED_BYTES:
-        return body, b""
-    encodings = _accepted_encodings(accepted)
-    for encoding in (b"gzip", b"deflate"):
-        if encoding in encodings:  # the lowest level of compression is the fastest
-            return zlib.compress(body, 1, _WINDOW_BITS[encoding]), encoding
-    return body, b""
-
-
-def _accepted_encodings(header: bytes) -> set[bytes]:
-    """Return the names of the encodings that an Accept-Encoding header accepts.
-
-    An encoding with the weight 0 is not accepted. For example, `gzip, deflate;q=0.5, br;q=0` accepts `gzip` and
-    `deflate`.
-    """
-    names = set()
-    for part in header.split(b","):
-        normalised = part.replace(b" ", b"").lower()
-        name, _, weight = normalised.partition(b";q=")
-        is_zero = weight != b"" and weight.strip(b"0.") == b""  # such as 0, 0. and 0.000
-        if not is_zero:
-            names.add(name)
-    return names
 
 
 def _quoted(encoding: bytes) -> str:

@@ -18,7 +18,7 @@ from isocharge.serve.network.protocol import describe
 from isocharge.serve.network.protocol.bodies import IndexBody
 from isocharge.serve.network.protocol.inference import answer_inference, read_infer, write_answer
 from isocharge.serve.network.protocol.openapi import openapi_document
-from isocharge.serve.network.protocol.response import Response, compress, response_of
+from isocharge.serve.network.protocol.response import Response, response_of
 from isocharge.serve.network.traffic import Traffic
 
 
@@ -108,8 +108,7 @@ def _unload(request: Request) -> dict[str, Any]:
 def _infer(request: Request) -> Response:
     """Compute the contacts of the presses in a request.
 
-    The body of the response is a JSON text, which may be followed by binary tensors. The server compresses only the
-    responses to inferences, because the asyncio client of Triton does not decompress other responses.
+    The body of the response is a JSON text, which may be followed by binary tensors.
     """
     loaded = request.loaded
     if not request.body and b"upgrade" in request.headers:  # uvicorn discards the body of a request for an upgrade
@@ -117,18 +116,13 @@ def _infer(request: Request) -> Response:
     header_length = request.headers.get(b"inference-header-content-length")
     # `answer_inference` calls `read` and `write_answer`, because it measures the duration of these steps.
     read = partial(read_infer, request.body, header_length, loaded, request.limits.batch)
-    plain_body, json_length = answer_inference(loaded, read, write_answer)
-
-    accepted_encodings = request.headers.get(b"accept-encoding", b"")
-    body, encoding = compress(plain_body, accepted_encodings)
+    body, json_length = answer_inference(loaded, read, write_answer)
 
     # If binary tensors follow the JSON text, a header contains the length of the text.
     content_type = b"application/json" if json_length is None else b"application/octet-stream"
     response = response_of(200, content_type, body)
     if json_length is not None:
         response.headers.append((b"inference-header-content-length", b"%d" % json_length))
-    if encoding:
-        response.headers.append((b"content-encoding", encoding))
     return response
 
 
