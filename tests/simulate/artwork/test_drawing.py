@@ -1,7 +1,6 @@
-"""DXF and SVG drawings, read again with ezdxf and svgelements, and straight leads."""
+"""DXF and SVG drawings, read again with ezdxf and svgelements."""
 
 from dataclasses import replace
-from itertools import combinations
 
 import ezdxf
 import numpy as np
@@ -10,7 +9,6 @@ from svgelements import SVG, Path
 
 from isocharge.simulate import Electrode, load_sensor
 from isocharge.simulate.artwork.drawing import RULER_LENGTH, draw_layout, to_dxf, to_svg
-from isocharge.simulate.artwork.leads import straight_leads
 
 MICROMETRE = 1e-3
 """One micrometre, mm."""
@@ -27,7 +25,7 @@ def sensor(request):
 
 @pytest.fixture
 def drawing(sensor):
-    return draw_layout(sensor, straight_leads(sensor))
+    return draw_layout(sensor)
 
 
 def box(points):
@@ -48,7 +46,6 @@ def test_dxf_has_the_positions_and_sizes_of_the_sensor(sensor, drawing, tmp_path
     assert film.dxf.radius == pytest.approx(sensor.film.radius)
     names = [text.dxf.text.replace("\ufffd", "") for text in space.query('TEXT[layer=="NAMES"]')]
     assert names == ["".join(filter(str.isprintable, name)) for name in sensor.electrode_names]
-    assert {line.dxf.const_width for line in space.query('LWPOLYLINE[layer=="LEADS"]')} == {0.3}
 
 
 def test_svg_is_to_scale(sensor, drawing, tmp_path):
@@ -64,34 +61,3 @@ def test_svg_is_to_scale(sensor, drawing, tmp_path):
         expected = [middle[0] + left, middle[1] - high, middle[0] + right, middle[1] - low]
         assert np.abs(boxes - expected).max(axis=1).min() < MICROMETRE
     assert np.abs(boxes[:, 2] - boxes[:, 0] - RULER_LENGTH).min() < MICROMETRE
-
-
-def sampled(path):
-    return path[0] + np.linspace(0.0, 1.0, 2000)[:, None] * (path[1] - path[0])
-
-
-def test_leads_reach_the_rim_without_crossing_leads_or_electrodes(sensor):
-    leads = straight_leads(sensor)
-    assert leads.unconnected == ()
-    assert leads.summary == f"all {len(sensor.electrodes)} leads go straight to the rim"
-    for electrode in sensor.electrodes:
-        path = leads.paths[electrode.name]
-        assert np.hypot(*path[1]) == pytest.approx(sensor.film.radius)
-        assert path[0] == pytest.approx(np.array(electrode.centre))
-        for other in sensor.electrodes:
-            left, low, right, high = box(other.corners)
-            x, y = sampled(path).T
-            near = (x > left - 0.44) & (x < right + 0.44) & (y > low) & (y < high)
-            assert other is electrode or not near.any()
-    for first, second in combinations(leads.paths.values(), 2):
-        assert min(np.hypot(*(sampled(second) - point).T).min() for point in sampled(first)[::10]) > 0.59
-
-
-def test_electrode_without_a_straight_lead_is_reported():
-    """The gaps in a ring of squares are too narrow for the lead of the square in the middle."""
-    angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
-    ring = [Electrode.of_square(f"R{n}", (10.0 * np.cos(a), 10.0 * np.sin(a)), 2.7) for n, a in enumerate(angles)]
-    middle = Electrode.of_square("M", (0.0, 0.0), 3.0)
-    leads = straight_leads(replace(load_sensor("three-25um-biaxial"), electrodes=(middle, *ring)))
-    assert leads.unconnected == ("M",)
-    assert leads.summary == "no straight lead to the rim for M: use another layer for their leads"

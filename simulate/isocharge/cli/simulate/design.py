@@ -20,7 +20,6 @@ from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
 from isocharge.simulate import Circle, load_sensor, noise_model, parse_probe
 from isocharge.simulate.artwork.design_folder import write_design
-from isocharge.simulate.artwork.leads import straight_leads
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Goal, Nuisances
 from isocharge.simulate.layout.design import design
 
@@ -105,4 +104,4 @@ def design_command(
     del results["case"]
     show_result(results, json=False)
     caution = "" if result.unambiguous else "caution: "
-    say(f"{caution}{result.summary}; {straight_leads(result.sensor).summary}; files in {output}")
+    say(f"{caution}{result.summary}; files in {output}")

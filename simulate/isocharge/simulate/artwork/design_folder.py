@@ -5,7 +5,6 @@ from pathlib import Path
 
 from isocharge.common.files import new_folder, write_whole
 from isocharge.simulate.artwork.drawing import draw_layout, to_dxf, to_svg
-from isocharge.simulate.artwork.leads import straight_leads
 from isocharge.simulate.layout.design import Design
 from isocharge.simulate.plots.error_maps import error_maps_picture
 from isocharge.simulate.plots.figure import picture_bytes
@@ -16,8 +15,7 @@ def write_design(design: Design, folder: Path) -> None:
     """Write a designed layout into a new folder.
 
     The files are `sensor.toml`, `layout.svg`, `layout.dxf`, `design.json`, and the picture `design.png` of the position
-    errors. The drawings also show the leads, which are the conductors from the electrodes to the rim of the film. Equal
-    designs result in identical files.
+    errors. Equal designs result in identical files.
 
     Args:
         design: Result of the design.
@@ -33,14 +31,12 @@ def write_design(design: Design, folder: Path) -> None:
         f"Positions searched for {case.electrodes} electrodes over {case.radius:g} mm, goal {case.goal}:",
         f"lower limit of the position error {errors['worst_mm']:.3f} mm at worst, {errors['rms_mm']:.3f} mm rms.",
     ]
-    leads = straight_leads(design.sensor)
-    drawing = draw_layout(design.sensor, leads)
-    results = {**design.to_dict(), "leads": leads.summary}
+    drawing = draw_layout(design.sensor)
     files = {
         "sensor.toml": sensor_to_toml(design.sensor, sensor_comment).encode(),
         "layout.svg": to_svg(drawing).encode(),
         "layout.dxf": to_dxf(drawing).encode(),
-        "design.json": (json.dumps(results, indent=1, allow_nan=False) + "\n").encode(),
+        "design.json": (json.dumps(design.to_dict(), indent=1, allow_nan=False) + "\n").encode(),
         "design.png": picture_bytes(error_maps_picture(design)),
     }
     # The files are written into a temporary folder, which is renamed to `folder` when all files are complete.

@@ -1,6 +1,6 @@
 """Drawing of an electrode layout, and conversion of the drawing into DXF and SVG files.
 
-The unit of the drawing is the millimetre. There is one layer for each kind of object, such as electrodes and leads.
+The unit of the drawing is the millimetre. There is one layer for each kind of object.
 """
 
 import io
@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from typing import Any
 
 from isocharge.common.extras import require
-from isocharge.simulate.artwork.leads import Leads
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
 
 with require("design"):
@@ -22,7 +21,7 @@ with require("design"):
     from ezdxf.addons.drawing.svg import SVGBackend
     from ezdxf.document import Drawing
 
-LAYERS = {"FILM": 7, "ELECTRODES": 1, "LEADS": 30, "RULER": 8, "NAMES": 8}
+LAYERS = {"FILM": 7, "ELECTRODES": 1, "RULER": 8, "NAMES": 8}
 """Names of the layers of a drawing, and their colours in the AutoCAD colour index."""
 
 BACK_COLOUR = 5
@@ -44,15 +43,14 @@ MARGIN = 5.0
 """Margin around an SVG drawing, mm."""
 
 
-def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
-    """Create a drawing of the film, the electrodes, their names and leads, the metal of the back, and a ruler.
+def draw_layout(sensor: Sensor) -> Drawing:
+    """Create a drawing of the film, the electrodes, their names, the metal of the back, and a ruler.
 
-    The electrodes are closed polylines at their nominal positions. The leads are polylines with a width. The layer
-    `BACK` exists only if the back is not completely covered with metal.
+    The electrodes are closed polylines at their nominal positions. The layer `BACK` exists only if the back is not
+    completely covered with metal.
 
     Args:
         sensor: Sensor with the layout.
-        leads: Leads of the electrodes.
 
     Returns:
         The drawing as a DXF document.
@@ -64,11 +62,13 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
     for name, colour in LAYERS.items():
         document.layers.add(name, color=colour)
 
-    # Draw the film and the leads.
+    # Draw the film and the electrodes with their names.
     space = document.modelspace()
     space.add_circle((0.0, 0.0), sensor.film.radius, dxfattribs={"layer": "FILM"})
-    for path in leads.paths.values():
-        space.add_lwpolyline(path.tolist(), dxfattribs={"layer": "LEADS", "const_width": leads.width})
+    for electrode in sensor.electrodes:
+        for polygon in electrode.front:
+            space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "ELECTRODES"})
+        _draw_name(space, electrode)
 
     # Draw the metal of the back. Electrodes may share it, so equal polygons are drawn only once.
     back_polygons = dict.fromkeys(polygon for electrode in sensor.electrodes for polygon in electrode.back)
@@ -76,11 +76,6 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
         document.layers.add("BACK", color=BACK_COLOUR)
     for polygon in back_polygons:
         space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "BACK"})
-
-    for electrode in sensor.electrodes:
-        for polygon in electrode.front:
-            space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "ELECTRODES"})
-        _draw_name(space, electrode)
 
     # Draw a ruler below the film, with a label whose letters are below the line.
     ruler_y = -sensor.film.radius - RULER_OFFSET
