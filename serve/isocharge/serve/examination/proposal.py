@@ -3,7 +3,6 @@
 The charge of one count cannot be derived from the bytes. The user has to state this charge.
 """
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -24,9 +23,6 @@ QUIET_SHARE = 0.1
 
 LARGEST_NOISE_V = 0.02
 """Largest noise of a board that sends volts, V. Charges of a film in pC have more noise."""
-
-SMALLEST_NOISE = 1e-12
-"""Lower limit for the noise of a channel, in any unit, which avoids a division by zero."""
 
 ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Names of the electrodes if there is no model."""
@@ -119,8 +115,11 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
     Returns:
         Position of the channel in the frame by the name of the electrode; empty if there are too few channels.
     """
-    names = capture.names
-    candidates = _varying_channels(values)
+    # A channel is left out if its values do not vary, vary much less than the others, or are mostly not finite.
+    noise = np.array([estimate_noise(column) for column in values.T])
+    noise[2 * np.isfinite(values).sum(axis=0) <= len(values)] = 0.0
+    usual_noise = np.median(noise[noise > 0.0]) if noise.any() else 0.0
+    candidates = np.flatnonzero(noise >= QUIET_SHARE * usual_noise).tolist()
     if not electrodes:
         electrodes = tuple(ELECTRODES[: len(candidates)])  # A, B, C, ...
     try:
@@ -130,39 +129,15 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
         return {}
     if named_positions is not None:
         return dict(zip(electrodes, named_positions, strict=True))
-    if len(names) == len(electrodes):
-        candidates = list(range(len(names)))  # with a channel that never changes, which is reported later
-    if len(candidates) < len(electrodes):
-        return {}
-    noise = [estimate_noise(values[:, position]) for position in candidates]
-    count = len(electrodes)
-
-    def noise_ratio(first: int) -> int:
-        """Return the largest noise of a group over the smallest one, as a rounded power of ten."""
-        group = noise[first : first + count]
-        return round(math.log10(max(*group, SMALLEST_NOISE) / max(min(group), SMALLEST_NOISE)))
-
-    first = min(range(len(candidates) - count + 1), key=noise_ratio)
-    return dict(zip(electrodes, candidates[first:], strict=False))
-
-
-def _varying_channels(values: Array) -> list[int]:
-    """Return the positions of the channels whose values vary, except channels with much less noise than the others.
-
-    A channel of which most values are not finite is left out, too. If no channel remains, all positions are returned.
-
-    Args:
-        values: Values of all channels, shape (n, channels).
-    """
-    noise_at_position = {}  # noise of each channel that varies
-    for position, column in enumerate(values.T):
-        finite_values = column[np.isfinite(column)]
-        if 2 * len(finite_values) > len(column) and np.ptp(finite_values) > 0.0:
-            noise_at_position[position] = estimate_noise(column)
-    if not noise_at_position:
-        return list(range(values.shape[1]))
-    usual_noise = float(np.median(list(noise_at_position.values())))
-    return [position for position, noise in noise_at_position.items() if noise >= QUIET_SHARE * usual_noise]
+    if values.shape[1] == len(electrodes):
+        candidates = list(range(len(electrodes)))  # with a channel that never changes, which is reported later
+    first = 0
+    if len(candidates) > len(electrodes):
+        # Compare the groups of adjacent channels by their largest noise over the smallest one, in powers of ten.
+        groups = np.lib.stride_tricks.sliding_window_view(np.log10(noise[candidates]), len(electrodes))
+        first = int(np.argmin(np.round(np.ptp(groups, axis=1))))
+    chosen = candidates[first : first + len(electrodes)]
+    return dict(zip(electrodes, chosen, strict=True)) if len(chosen) == len(electrodes) else {}
 
 
 def _rest_level(values: Array) -> float:

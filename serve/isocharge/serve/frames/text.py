@@ -52,9 +52,6 @@ RECOGNITION_REPEATS = 3
 MESSAGE_REPEATS = 10
 """Number of times in succession that a layout that resembles a message must occur before it is recognised."""
 
-MAX_VALUES = 256
-"""Largest number of values in a line."""
-
 MAX_HEADERS = 8
 """Number of lines without numbers that are kept, because one of them may be the header of the following lines."""
 
@@ -126,8 +123,8 @@ class TextParser(DelimitedParser):
         # Lines from which the layout will be recognised, and their sizes in bytes
         self._collected_lines: list[tuple[Line, int]] = []
 
-        # Lines, values and bytes of the present cycle of lines, which together contain one frame
-        self._clear_cycle()
+        # Values and sizes of the lines of the present cycle, which together contain one frame
+        self._cycle: list[tuple[tuple[float, ...], int]] = []
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames in the lines that end within `data`. A line ends with a line feed or a carriage return."""
@@ -209,8 +206,7 @@ class TextParser(DelimitedParser):
     def _recognise_layout(self, line: Line, size: int) -> list[Frame]:
         """Add a line to the collected lines. If their layout can now be recognised, return their frames.
 
-        Collected lines before the lines that determine the layout are counted as rejected. Lines with more than
-        `MAX_VALUES` values are never recognised.
+        Collected lines before the lines that determine the layout are counted as rejected.
 
         Args:
             line: The next line.
@@ -222,7 +218,7 @@ class TextParser(DelimitedParser):
         names = tuple(self._meanings.get(name, name) for name in line.names)
         self._collected_lines.append((line._replace(names=names), size))
         repeats = MESSAGE_REPEATS if line.is_prose else RECOGNITION_REPEATS
-        cycle_length = self._repeated_cycle_length(repeats) if len(line.numbers) <= MAX_VALUES else 0
+        cycle_length = self._repeated_cycle_length(repeats)
         repeated_lines = self._collected_lines[-repeats * cycle_length :] if cycle_length > 0 else []
         frame_lines = _frame_lines([line for line, _ in repeated_lines], cycle_length)
         if not frame_lines:
@@ -282,49 +278,26 @@ class TextParser(DelimitedParser):
             values = skeleton.values(text)
             if values is None:
                 continue
-            if position != self._cycle_position:
+            if position != len(self._cycle):
                 self._drop_cycle()
-                if position > 0:
-                    return self._reject(size)
-            self._cycle_position += 1
-            self._cycle_values += values
-            self._cycle_byte_count += size
-            if self._cycle_position < len(layout.skeletons):
+            if position != len(self._cycle):  # the beginning of this cycle is lost
+                return self._reject(size)
+            self._cycle.append((values, size))
+            if len(self._cycle) < len(layout.skeletons):
                 return []
-            cycle_values = self._cycle_values
-            cycle_byte_count = self._cycle_byte_count
-            self._clear_cycle()
-            return self._frame_of_values(layout, cycle_values, cycle_byte_count)
+            values_of_lines, sizes = zip(*self._cycle, strict=True)
+            self._cycle = []
+            frames = self._try_decode(layout.columns.frame, sum(values_of_lines, ()), dropped_size=sum(sizes))
+            for frame in frames:
+                self._update_seq_modulus(frame.seq or 0)
+            return frames
         return None
 
     def _drop_cycle(self) -> None:
         """Drop the lines of an unfinished cycle, and count them as rejected."""
-        if self._cycle_position > 0:
-            self.counts.count_rejected(self._cycle_byte_count)
-        self._clear_cycle()
-
-    def _clear_cycle(self) -> None:
-        """Delete the stored values of the present cycle, so that a new cycle can begin."""
-        self._cycle_position = 0
-        self._cycle_values: tuple[float, ...] = ()
-        self._cycle_byte_count = 0
-
-    def _frame_of_values(self, layout: Layout, values: Sequence[float], size: int) -> list[Frame]:
-        """Convert values to a frame, and update the modulus of the counter.
-
-        Args:
-            layout: The recognised layout.
-            values: Value of each column.
-            size: Number of bytes that are counted as dropped if the values are not a valid frame.
-
-        Returns:
-            A list with the frame; an empty list if the values are not a valid frame, for example because the counter is
-            infinite.
-        """
-        frames = self._try_decode(layout.columns.frame, values, dropped_size=size)
-        for frame in frames:
-            self._update_seq_modulus(frame.seq or 0)
-        return frames
+        if self._cycle:
+            self.counts.count_rejected(sum(size for _, size in self._cycle))
+        self._cycle = []
 
     def _update_seq_modulus(self, seq: int) -> None:
         """Determine the value at which the counter wraps from its next value."""

@@ -122,7 +122,10 @@ class Requester:
 
 
 MAX_READ_BYTES = 65536
-"""Largest number of bytes that are read at the same time. No datagram is larger."""
+"""Largest number of bytes that are read at the same time, and after which no waiting bytes are added to a chunk.
+
+No datagram is larger.
+"""
 
 
 READ_ERRORS = (OSError, termios.error)

@@ -32,6 +32,7 @@ from typing import NamedTuple, Protocol, Self
 from isocharge.common.errors import InputError, PortError, PortLost
 from isocharge.serve.port.foreign_files import HEAD_BYTES, refuse_foreign_file
 from isocharge.serve.port.serial_line import (
+    MAX_READ_BYTES,
     OPEN_ERRORS,
     READ_ERRORS,
     UDP_SCHEME,
@@ -50,9 +51,6 @@ START_UP_s = 10.0
 
 Many boards restart when their port is opened, and send nothing for up to 6 s.
 """
-
-MAX_CHUNK_BYTES = 65536
-"""Number of bytes after which no further waiting bytes are added to a chunk."""
 
 log = logging.getLogger(__name__)
 
@@ -284,7 +282,7 @@ class Port:
         if self._line is None or self._requester is not None:  # a board sends nothing without a request
             return data
         with contextlib.suppress(*READ_ERRORS):  # the next call reports the error
-            while len(data) < MAX_CHUNK_BYTES and (waiting := self._line.receive_waiting()):
+            while len(data) < MAX_READ_BYTES and (waiting := self._line.receive_waiting()):
                 data += waiting
         return data
 
