@@ -222,5 +222,5 @@ def test_allowed_error_bounds_the_working_area():
 
 def test_where_nothing_ends_it_the_search_does():
     working = working_area(folded_map(radius=1.0), REFERENCE, error=1000.0)
-    assert (working.radius, working.bound) == (1.0, "search")
+    assert (working.radius, working.bound) == (1.0, "searched")
     assert working.summary.endswith("The search ended at 1 mm.")

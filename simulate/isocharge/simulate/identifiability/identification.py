@@ -15,12 +15,7 @@ from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion, mirror_region
-from isocharge.simulate.identifiability.working_area import (
-    DEFAULT_ERROR,
-    Bound,
-    WorkingArea,
-    working_area,
-)
+from isocharge.simulate.identifiability.working_area import DEFAULT_ERROR, WorkingArea, working_area
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.simulate.numerics.disk import Rings
@@ -47,9 +42,6 @@ MAX_LISTED_PAIRS = 20
 
 CONTACT_KEYS = ("x_mm", "y_mm", "force_N")
 """Keys of the position and the force of a contact in JSON."""
-
-BOUND_NAMES: dict[Bound, str] = {"fold": "fold", "ambiguous pair": "twins", "error": "error", "search": "searched"}
-"""Names in JSON of the reasons for the radius of a working area."""
 
 
 @dataclass(frozen=True)
@@ -90,17 +82,15 @@ class LimitMap:
         # The area that a position represents is proportional to its distance from the centre.
         n_angle = self.position.shape[1]
         area = np.repeat(self.rings.distance, n_angle)
-        position_error = self.position.ravel()
-        force_error_percent = 100.0 * self.relative_force.ravel()
-        return {
-            "force_N": self.force,
-            "position_median_mm": _median(position_error, area),
-            "position_rms_mm": float(np.sqrt(np.average(position_error**2, weights=area))),
-            "position_worst_mm": float(position_error.max()),
-            "force_median_percent": _median(force_error_percent, area),
-            "force_rms_percent": float(np.sqrt(np.average(force_error_percent**2, weights=area))),
-            "force_worst_percent": float(force_error_percent.max()),
-        }
+        statistics = {"force_N": self.force}
+        for name, errors in (
+            ("position_{}_mm", self.position.ravel()),
+            ("force_{}_percent", 100.0 * self.relative_force.ravel()),
+        ):
+            statistics[name.format("median")] = _median(errors, area)
+            statistics[name.format("rms")] = float(np.sqrt(np.average(errors**2, weights=area)))
+            statistics[name.format("worst")] = float(errors.max())
+        return statistics
 
 
 @dataclass(frozen=True)
@@ -157,8 +147,10 @@ class Identification:
 
         # Compute the limits on the whole disk of the map, and within the working area.
         area = working_area(charges, noise, error=error)
-        maps = _limit_maps(charges, noise, forces, charges.domain.radius)
-        inner_maps = _limit_maps(charges, noise, forces, area.radius)
+        maps, inner_maps = (
+            tuple(LimitMap.of(charges, noise, force, Rings.spread(radius)) for force in forces if radius > 0.0)
+            for radius in (charges.domain.radius, area.radius)
+        )
         return cls(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inner_maps)
 
     @property
@@ -194,7 +186,7 @@ class Identification:
             "force_N": list(area.force_range),
             "working_area": {
                 "radius_mm": area.radius,
-                "why": BOUND_NAMES[area.bound],
+                "why": area.bound,
                 "fold_radius_mm": finite_or_none(area.fold_radius),
                 "twin_radius_mm": finite_or_none(area.pairs.radius),
                 "error_radius_mm": area.error_radius,
@@ -318,33 +310,13 @@ def map_to_search(
         SceneError: If a press in the domain cannot exist.
         SolveError: If the map with the smallest of these radii cannot be built.
     """
-    radius = search_radius(sensor, probe)
-    for _ in range(MAX_REDUCTIONS):
+    radii = search_radius(sensor, probe) * RADIUS_REDUCTION ** np.arange(MAX_REDUCTIONS + 1.0)
+    for radius in radii.tolist():
         try:
             return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
-        except SolveError:
-            radius *= RADIUS_REDUCTION
-
-    # The last attempt is outside the loop, so that its error reaches the caller.
-    return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
-
-
-def _limit_maps(charges: ChargeMap, noise: NoiseModel, forces: list[float], radius: float) -> tuple[LimitMap, ...]:
-    """Compute the error limits on a disk for each of several forces.
-
-    Args:
-        charges: Map that computes the charges of contacts.
-        noise: Noise of the readings.
-        forces: Forces of the contacts, N.
-        radius: Radius of the disk, mm.
-
-    Returns:
-        A map of the limits for each force. There are no maps if the radius is 0.
-    """
-    if radius <= 0.0:
-        return ()
-    rings = Rings.spread(radius)
-    return tuple(LimitMap.of(charges, noise, force, rings) for force in forces)
+        except SolveError as error:
+            last_error = error
+    raise last_error
 
 
 def _median(values: Array, weights: Array) -> float:

@@ -8,13 +8,12 @@ nearly the same influence on the points of the circle.
 """
 
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.charge_map import ChargeMap, within
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.identifiability.nearest_contact import search
@@ -39,9 +38,6 @@ N_RINGS = 32
 
 N_SECTORS = 48
 """Number of sectors of each ring."""
-
-N_CANDIDATES = 1024
-"""Number of contacts among which the starting points of the search for the nearest contact are chosen."""
 
 INTERIOR = 0.98
 """Distance from the centre up to which a contact counts as inside the working area, in radii of the working area.
@@ -82,17 +78,24 @@ class MirrorRegion:
             whole_film: Charge map of the whole film.
             noise: Noise of the readings.
         """
-        outer_radius = whole_film.domain.radius
-        presses = presses_outside(radius, whole_film.domain, N_RINGS, N_SECTORS, N_FORCES)
-        is_mirrored = has_mirror(within(charges, radius), whole_film.charges(presses.reshape(-1, 3)), noise)
-        share_of_forces = is_mirrored.reshape(N_RINGS, N_SECTORS, N_FORCES).mean(axis=2)
-        return cls(radius, outer_radius, presses[0, 0, :, 2], share_of_forces)
+        min_force, max_force = whole_film.domain.force_range
+        forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, N_FORCES)
+        empty = cls(radius, whole_film.domain.radius, forces, np.zeros((N_RINGS, N_SECTORS)))
+        angles = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
+        distance, angle, force = np.meshgrid(empty.distance, angles, forces, indexing="ij")
+        presses = np.stack([distance * np.cos(angle), distance * np.sin(angle), force], axis=-1).reshape(-1, 3)
+        is_mirrored = has_mirror(within(charges, radius), whole_film.charges(presses), noise)
+        return replace(empty, share=is_mirrored.reshape(distance.shape).mean(axis=2))
+
+    @property
+    def edges(self) -> Array:
+        """Distances from the centre of the film to the edges of the rings, shape (n_ring + 1,), mm."""
+        return np.linspace(self.inner, self.outer, len(self.share) + 1)
 
     @property
     def distance(self) -> Array:
         """Distance from the centre of the film to the middle of each ring, shape (n_ring,), mm."""
-        edges = np.linspace(self.inner, self.outer, len(self.share) + 1)
-        return np.asarray(0.5 * (edges[1:] + edges[:-1]))
+        return np.asarray(0.5 * (self.edges[1:] + self.edges[:-1]))
 
     @property
     def total_share(self) -> float:
@@ -129,31 +132,6 @@ class MirrorRegion:
         }
 
 
-def presses_outside(radius: float, domain: Domain, n_ring: int, n_sector: int, n_force: int) -> Array:
-    """Return presses in the middles of sectors between the working area and the edge of a domain.
-
-    The rings have equal widths, and the sectors of a ring have equal angles. The ratio of the largest to the smallest
-    force is at most `FORCE_RATIO`.
-
-    Args:
-        radius: Radius of the working area, mm.
-        domain: Positions and forces of a charge map of the whole film.
-        n_ring: Number of rings.
-        n_sector: Number of sectors of each ring.
-        n_force: Number of forces at each position.
-
-    Returns:
-        Presses (x, y, F), shape (n_ring, n_sector, n_force, 3), mm and N.
-    """
-    min_force, max_force = domain.force_range
-    forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, n_force)
-    ring_edges = np.linspace(radius, domain.radius, n_ring + 1)
-    distances = 0.5 * (ring_edges[1:] + ring_edges[:-1])
-    angles = 2.0 * np.pi * (np.arange(n_sector) + 0.5) / n_sector
-    distance, angle, force = np.meshgrid(distances, angles, forces, indexing="ij")
-    return np.stack([distance * np.cos(angle), distance * np.sin(angle), force], axis=-1)
-
-
 def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
     """Return for each press whether a press inside a domain causes charges that agree within the noise.
 
@@ -165,27 +143,13 @@ def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
     Returns:
         Whether a press inside the domain causes the charges of each row, shape (n,).
     """
-    contact, residual = search(inside, charge, noise.sigma(charge), candidates=N_CANDIDATES)
+    contact, residual = search(inside, charge, noise.sigma(charge))
     is_same_charge = np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS
 
     # If a search stopped at the edge of the domain, the contact on the edge does not explain the charges.
-    return np.asarray(is_same_charge & is_interior(inside.domain, contact))
-
-
-def is_interior(domain: Domain, contact: Array) -> Booleans:
-    """Return whether each contact lies inside a domain and not on its edge.
-
-    Args:
-        domain: Positions and forces of the domain.
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-
-    Returns:
-        Whether each contact lies inside, shape (n,).
-    """
-    unit_x, unit_y, unit_log_force = domain.to_unit(contact).T
-    is_position_inside = np.hypot(unit_x, unit_y) < INTERIOR
-    is_force_inside = np.abs(unit_log_force) < INTERIOR
-    return np.asarray(is_position_inside & is_force_inside)
+    unit_x, unit_y, unit_log_force = inside.domain.to_unit(contact).T
+    is_interior = (np.hypot(unit_x, unit_y) < INTERIOR) & (np.abs(unit_log_force) < INTERIOR)
+    return np.asarray(is_same_charge & is_interior)
 
 
 def mirror_region(
@@ -220,7 +184,6 @@ def mirror_region(
     """
     if not 0.0 < radius < outermost_distance(sensor.film, probe):
         return None
-    is_round = probe.period == 0.0  # every rotation maps a round probe onto itself
-    round_probe = probe if is_round else Circle(probe.reach)  # the reach is the distance of the farthest point
+    round_probe = probe if probe.is_axisymmetric else Circle(probe.reach)
     whole_film = whole_film_map(sensor, round_probe, charges.domain.force_range, executor=executor)
     return MirrorRegion.of(charges, radius, whole_film, noise)

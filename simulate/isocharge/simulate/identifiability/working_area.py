@@ -7,6 +7,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
+from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.identifiability.ambiguous_pairs import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import find_folds
@@ -25,9 +26,10 @@ RADIUS_STEP = 0.1
 MAX_RINGS = 200
 """Largest number of rings on which the position error is evaluated. Larger disks have a multiple of `RADIUS_STEP`."""
 
-Bound = Literal["fold", "ambiguous pair", "error", "search"]
-"""Reason for the radius of a working area. "search" means that only the radius of the search bounds the area.
+Bound = Literal["fold", "twins", "error", "searched"]
+"""Reason for the radius of a working area.
 
+"twins" are an ambiguous pair, and "searched" means that only the radius of the search bounds the area.
 The error grows without limit towards a fold. An area that ends just before a fold therefore mostly has the bound
 "error".
 """
@@ -87,7 +89,7 @@ class WorkingArea:
             )
         if len(self.pairs):
             sentences.append(self.pairs.summary)
-        if self.bound == "search":
+        if self.bound == "searched":
             sentences.append(f"The search ended at {self.search_radius:.3g} mm.")
         return " ".join(sentences)
 
@@ -114,16 +116,8 @@ def working_area(
     Raises:
         SceneError: If the map has fewer than three electrodes.
     """
-    from isocharge.simulate.forward.charge_spline import with_fast_derivatives  # imports the solver
-
-    return search_working_area(with_fast_derivatives(charge_map), noise, error=error, search_pairs=search_pairs)
-
-
-def search_working_area(
-    charge_map: ChargeMap, noise: NoiseModel, *, error: float = DEFAULT_ERROR, search_pairs: bool = True
-) -> WorkingArea:
-    """Find the working area like `working_area`, but evaluate the charge map itself, of whatever class it is."""
     check_electrode_count(len(charge_map.electrodes))
+    charge_map = with_fast_derivatives(charge_map)
     search_radius = charge_map.domain.radius
     min_force, max_force = charge_map.domain.force_range
     middle_force = float(np.sqrt(min_force * max_force))
@@ -147,9 +141,9 @@ def search_working_area(
     # The smallest of the following radii bounds the working area. If the error never exceeds its limit, `error_radius`
     # is the radius of the search, and the error is not a bound.
     radii: dict[Bound, float] = {
-        "search": search_radius,
+        "searched": search_radius,
         "fold": fold_radius,
-        "ambiguous pair": pairs.radius,
+        "twins": pairs.radius,
         "error": error_radius if error_radius < search_radius else np.inf,
     }
     bound = min(radii, key=lambda reason: radii[reason])

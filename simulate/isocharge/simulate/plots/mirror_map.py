@@ -54,11 +54,10 @@ def _draw_region(axes: Any, sensor: Sensor, mirror: MirrorRegion) -> Any:
         The coloured cells of the map, for which a colour bar can be drawn.
     """
     # Compute the corners of the cells, shape (n_ring + 1, n_sector + 1). A cell is the part of a ring in one sector.
-    n_ring, n_sector = mirror.share.shape
-    edge_radius = np.linspace(mirror.inner, mirror.outer, n_ring + 1)
+    n_sector = mirror.share.shape[1]
     edge_angle = 2.0 * np.pi * np.arange(n_sector + 1) / n_sector
-    corner_x = np.outer(edge_radius, np.cos(edge_angle))
-    corner_y = np.outer(edge_radius, np.sin(edge_angle))
+    corner_x = np.outer(mirror.edges, np.cos(edge_angle))
+    corner_y = np.outer(mirror.edges, np.sin(edge_angle))
     shades = axes.pcolormesh(corner_x, corner_y, mirror.share, vmin=0.0, vmax=1.0, cmap="Reds")
 
     # Draw the clamp, the working area and the electrodes.
@@ -81,8 +80,7 @@ def _draw_distance(axes: Any, mirror: MirrorRegion) -> None:
         axes: Axes of matplotlib.
         mirror: Mirror region of a sensor.
     """
-    edges = np.linspace(mirror.inner, mirror.outer, len(mirror.share) + 1)
-    axes.stairs(100.0 * mirror.share.mean(axis=1), edges, color=FELT, lw=2.0)
+    axes.stairs(100.0 * mirror.share.mean(axis=1), mirror.edges, color=FELT, lw=2.0)
     axes.axvline(mirror.inner, ls="--", color=INK)
     axes.set(
         xlim=(0.0, mirror.outer),

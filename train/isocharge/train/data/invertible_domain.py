@@ -8,7 +8,7 @@ from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import NoiseModel
 from isocharge.simulate.forward.charge_map import ChargeMap, within
 from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
-from isocharge.simulate.identifiability.working_area import search_working_area
+from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.train.data.presses import LabelledPresses
 
 MAX_ERROR_OF_CERTAIN_FOLD = 3e-4
@@ -153,7 +153,7 @@ def _fold_radius(field: ChargeSeries, noise: NoiseModel) -> float:
         field: Charge field in whose domain folds are searched for.
         noise: Noise of good presses.
     """
-    area = search_working_area(within(field, SEARCHED_RADIUS_RATIO * field.domain.radius), noise, search_pairs=False)
+    area = working_area(within(field, SEARCHED_RADIUS_RATIO * field.domain.radius), noise, search_pairs=False)
     if not np.isfinite(area.fold_radius):
         return np.inf
     return float(f"{area.unambiguous_radius:.6g}")
