@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.tracking.touch_peak import MAX_AVERAGED_FRAMES, TouchPeak
@@ -43,29 +42,3 @@ def test_average_reduces_independent_noise_by_the_square_root_of_the_number_of_f
         noisy_charges = 500.0 + rng.standard_normal((16, 4))
         means.append(peak_of([contact(1.0)] * 16, noisy_charges).mean_charge_pC)
     assert np.std(means) == pytest.approx(1.0 / 4.0, rel=0.1)
-
-
-@pytest.mark.parametrize(
-    ("independent_pC", "common_pC", "expected_ratio"),
-    [(2.0, 0.0, 1.0 / 32.0), (0.0, 2.0, 1.0), (np.sqrt(2.0), np.sqrt(2.0), 0.5 + 0.5 / 32.0)],
-    ids=["independent noise", "equal noise in all frames", "half of the variance is independent"],
-)
-def test_noise_of_the_average_is_estimated_from_the_differences_of_the_frames(
-    independent_pC, common_pC, expected_ratio
-):
-    rng = np.random.default_rng(5)
-    ratios = []
-    for _ in range(300):
-        common_noise_pC = common_pC * rng.standard_normal(4)
-        charges = 500.0 + common_noise_pC + independent_pC * rng.standard_normal((32, 4))
-        ratios.append(peak_of([contact(1.0)] * 32, charges).relative_noise_variance(np.full(4, 4.0)))
-    assert np.mean(ratios) == pytest.approx(expected_ratio, abs=0.08)
-
-
-def test_filtered_noise_is_hardly_reduced_by_the_average():
-    """The noise passes a low-pass filter whose time constant is as long as the touch."""
-    rng = np.random.default_rng(6)
-    noise_pC = lfilter([1.0], [1.0, -np.exp(-1.0 / 32.0)], rng.standard_normal((1000, 4)), axis=0)
-    variance_pC2 = noise_pC.var(axis=0)
-    ratio = peak_of([contact(1.0)] * 32, 500.0 + noise_pC[-32:]).relative_noise_variance(variance_pC2)
-    assert ratio > 0.9

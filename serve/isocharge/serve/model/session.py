@@ -28,7 +28,7 @@ CORRELATION = "contact_correlation"
 """Name of the output with the correlations, which come last in a `Contact`."""
 
 OUTPUTS = {"contact": 3, "contact_std": 3, CORRELATION: 3, "misfit": 1}
-"""Names of the outputs and their numbers of columns. `OUTPUT_MEANINGS` describes the columns."""
+"""Names of the outputs and their numbers of columns. `isocharge.serve.model.contact.Contact` describes the columns."""
 
 COLUMNS = {"contact": slice(0, 3), "contact_std": slice(3, 6), "misfit": slice(6, 7), CORRELATION: slice(7, 10)}
 """Columns of each output among the ten values of a `Contact`."""
@@ -38,14 +38,6 @@ N_WITHOUT_CORRELATION = 7
 
 EXTERNAL_DATA = b"\x0a\x08location"
 """Encoded key of the entry of an ONNX tensor that names the file with the numbers of the tensor."""
-
-OUTPUT_MEANINGS = {
-    "contact": "x_mm, y_mm, force_N: position (mm) and force (N, positive when the probe pushes)",
-    "contact_std": "one standard deviation of x (mm), y (mm) and the force (N)",
-    CORRELATION: "correlations of the errors, from -1 to 1: x with y, x with the force, y with the force",
-    "misfit": "distance of the charges from the nearest single contact, in standard deviations of the noise",
-}
-"""Columns of each output with their units. The rows of each output are the presses."""
 
 
 def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
@@ -228,9 +220,8 @@ def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
     Raises:
         ChargeError: If the number of charges is wrong, or a charge is not finite. The message names the electrode.
     """
-    charges = _as_numbers(charge_pC, electrodes)
-    if charges.shape != (len(electrodes),):
-        raise ChargeError(f"expected {_expected_charges(electrodes)}, got an array of shape {charges.shape}")
+    expected = f"{len(electrodes)} charges {electrodes}"
+    charges = _as_numbers(charge_pC, expected, (len(electrodes),))
     return np.asarray(as_float32(charges[np.newaxis], electrodes)[0])
 
 
@@ -244,37 +235,30 @@ def as_batch(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
     Raises:
         ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
     """
-    charges = _as_numbers(charge_pC, electrodes)
-    if charges.ndim != 2 or charges.shape[1] != len(electrodes):
-        raise ChargeError(
-            f"expected rows of {_expected_charges(electrodes)}, shape (n, {len(electrodes)}), "
-            f"got an array of shape {charges.shape}"
-        )
-    return as_float32(charges, electrodes)
+    n_electrode = len(electrodes)
+    expected = f"rows of {n_electrode} charges {electrodes}, shape (n, {n_electrode})"
+    return as_float32(_as_numbers(charge_pC, expected, ("n", n_electrode)), electrodes)
 
 
-def _expected_charges(electrodes: tuple[str, ...]) -> str:
-    """Return the number of charges and the names of the electrodes as text for an error message."""
-    return f"{len(electrodes)} charges {electrodes}"
-
-
-def _as_numbers(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> NDArray[np.number]:
+def _as_numbers(charge_pC: ArrayLike, expected: str, shape: tuple[str | int, ...]) -> NDArray[np.number]:
     """Convert charges to an array of numbers.
 
     Args:
         charge_pC: Charges of one press or of several presses, pC.
-        electrodes: Names of the electrodes, for error messages.
+        expected: Description of the required charges, for error messages.
+        shape: Required shape, in which a name stands for any length.
 
     Raises:
-        ChargeError: If the charges are not numbers.
+        ChargeError: If the charges are not numbers, or their array has another shape.
     """
-    expected = _expected_charges(electrodes)
     try:
         charges = np.asarray(charge_pC)
     except ValueError as error:  # rows of different lengths
         raise ChargeError(f"expected {expected} in each row, got {charge_pC!r:.200} ({error})") from error
     if charges.dtype.kind not in "fiu":  # neither floats nor signed or unsigned integers
         raise ChargeError(f"expected {expected} as numbers (pC), got {charge_pC!r:.200}")
+    if charges.ndim != len(shape) or charges.shape[-1] != shape[-1]:
+        raise ChargeError(f"expected {expected}, got an array of shape {charges.shape}")
     return charges
 
 

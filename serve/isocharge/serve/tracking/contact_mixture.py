@@ -73,12 +73,6 @@ The distance is large, because an error of a gain displaces the fold. The contac
 SPLIT_DISTANCE = 2.5
 """Distance of an added component from the component that extends across a fold, in standard deviations."""
 
-SPLIT_VARIANCE_RATIO = 0.25
-"""Variance of a component added at a fold along the axis of the split, relative to the original component."""
-
-MIN_SPLIT_STD_mm = 0.05
-"""Standard deviation of the position below which a component is not split, mm."""
-
 SEPARATE_DISTANCE = 3.0
 """Distance, in standard deviations, above which components on the same side of a fold are different contacts."""
 
@@ -198,81 +192,94 @@ class ContactMixture:
         if is_outside[best] or updated.squared_distance[best] > MAX_SQUARED_DISTANCE:
             return
         components = prune_components(components._replace(log_weight=log_weight))  # the most probable is now the first
-        self._hypotheses = self._hypotheses_of(components, math.sqrt(updated.squared_misfit[best]))
-        self._components = self._split_at_fold(components)
+        count = len(components.mean)
+        half_axis = _half_axis(components)
+        states = np.vstack([components.mean, components.mean[0] + FOLD_DISTANCE * half_axis])
+        is_across_fold = self._is_across_fold(states)
+        misfit = math.sqrt(updated.squared_misfit[best])
+        self._hypotheses = _hypotheses_of(components, is_across_fold[:count, :count], misfit)
+        if is_across_fold[0, count:].any():
+            components = _split_at_fold(components, half_axis)
+        self._components = components
 
-    def _split_at_fold(self, components: Components) -> Components:
-        """Add one component on each side of a fold if the most probable component extends across the fold.
-
-        A single Gaussian component describes only the contacts on one side of the fold accurately.
-
-        Args:
-            components: Components after the update with the charges of this step, the most probable first.
-        """
-        mean = components.mean[0]
-        covariance = components.covariance[0]
-        variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])  # in ascending order
-        std_mm = math.sqrt(max(variances[1], 0.0))
-        if std_mm < MIN_SPLIT_STD_mm:
-            return components
-
-        # Expected change of the whole state if the position changes by one standard deviation along the longest axis
-        change = covariance[:, POSITION] @ axes[:, 1] / std_mm
-        both_changes = np.array([change, -change])
-        if not self._is_across_fold(mean, mean + FOLD_DISTANCE * both_changes).any():
-            return components
-        narrow_covariance = covariance - (1.0 - SPLIT_VARIANCE_RATIO) * np.outer(change, change)
-        log_weight = components.log_weight[0] - 0.5 * SPLIT_DISTANCE**2  # density of the most probable component there
-        added = Components(
-            mean + SPLIT_DISTANCE * both_changes, np.array([narrow_covariance] * 2), np.array([log_weight] * 2)
-        )
-        return components.joined(added)
-
-    def _is_across_fold(self, state: Array, other_states: Array) -> Booleans:
-        """Return whether an odd number of folds lies between a state and each of other states, shape (n,).
+    def _is_across_fold(self, states: Array) -> Booleans:
+        """Return for each pair of n states whether an odd number of folds lies between them, shape (n, n).
 
         At a fold, the orientation of the map from contacts to charges changes. For three electrodes, the determinants
         of the Jacobians J and K of two states then differ in sign, and det(J^T K) = det(J) det(K) is negative. With
         more electrodes, J and K are not square, but the product J^T K is square.
 
         Args:
-            state: The reference state, shape (6 + n_electrode,).
-            other_states: The states that are compared with `state`, shape (n, 6 + n_electrode).
+            states: The states, shape (n, 6 + n_electrode).
         """
-        _, jacobians = film_charges(self.charges, np.vstack([state, other_states]))
-        return np.asarray(np.linalg.det(jacobians[0].T @ jacobians[1:]) < 0.0)
+        _, jacobians = film_charges(self.charges, states)
+        transposed = jacobians.swapaxes(1, 2)[:, np.newaxis]
+        return np.asarray(np.linalg.det(transposed @ jacobians) < 0.0)
 
-    def _hypotheses_of(self, components: Components, misfit: float) -> list[ContactHypothesis]:
-        """Combine the components that describe the same contact, and return one hypothesis for each contact.
 
-        Two components describe the same contact if x and y differ by less than `SEPARATE_DISTANCE` standard deviations
-        of the difference, and no fold lies between them.
+def _half_axis(components: Components) -> Array:
+    """Return the expected changes of the state to both ends of the longest axis of the most probable component.
 
-        Args:
-            components: Components after the update, the most probable first.
-            misfit: Misfit of the most probable component.
+    Args:
+        components: Components, the most probable first.
 
-        Returns:
-            The hypotheses in descending order of their probability.
-        """
-        probability = np.exp(components.log_weight)
-        probability /= probability.sum()
-        variance = np.diagonal(components.covariance, axis1=1, axis2=2)[:, POSITION]
-        remaining = np.ones(len(probability), dtype=bool)
-        hypotheses = []
-        while remaining.any():
-            first = int(remaining.argmax())
-            difference_mm = np.abs(components.mean - components.mean[first])[:, POSITION]
-            is_near = (difference_mm < SEPARATE_DISTANCE * np.sqrt(variance + variance[first])).all(axis=1)
-            is_same = remaining & is_near & ~self._is_across_fold(components.mean[first], components.mean)
-            is_same[first] = True  # even if rounding errors make it appear to be across a fold
-            remaining &= ~is_same
-            total = float(probability[is_same].sum())
-            (mean,), (covariance,) = mixture_moments(
-                probability[None, is_same] / total, components.mean[is_same], components.covariance[is_same]
-            )
-            hypotheses.append(ContactHypothesis(mean, covariance, total, misfit))
-        return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)
+    Returns:
+        Changes of the whole state if the position changes by one standard deviation along the axis, or by minus one,
+        shape (2, 6 + n_electrode).
+    """
+    covariance = components.covariance[0]
+    variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])  # in ascending order
+    change = covariance[:, POSITION] @ axes[:, 1] / math.sqrt(variances[1])
+    return np.array([change, -change])
+
+
+def _split_at_fold(components: Components, half_axis: Array) -> Components:
+    """Add one component on each side of the most probable component, which extends across a fold.
+
+    A single Gaussian component describes only the contacts on one side of the fold accurately.
+
+    Args:
+        components: Components, the most probable first.
+        half_axis: Changes of the state, as `_half_axis` returns them.
+    """
+    log_weight = components.log_weight[0] - 0.5 * SPLIT_DISTANCE**2  # density of the most probable component there
+    both_sides = components.select([0, 0])
+    added = Components(both_sides.mean + SPLIT_DISTANCE * half_axis, both_sides.covariance, np.full(2, log_weight))
+    return components.joined(added)
+
+
+def _hypotheses_of(components: Components, is_across_fold: Booleans, misfit: float) -> list[ContactHypothesis]:
+    """Combine the components that describe the same contact, and return one hypothesis for each contact.
+
+    Two components describe the same contact if x and y differ by less than `SEPARATE_DISTANCE` standard deviations of
+    the difference, and no fold lies between them.
+
+    Args:
+        components: The n components after the update, the most probable first.
+        is_across_fold: Whether a fold lies between two components, shape (n, n).
+        misfit: Misfit of the most probable component.
+
+    Returns:
+        The hypotheses in descending order of their probability.
+    """
+    probability = np.exp(components.log_weight)
+    probability /= probability.sum()
+    variance = np.diagonal(components.covariance, axis1=1, axis2=2)[:, POSITION]
+    remaining = np.ones(len(probability), dtype=bool)
+    hypotheses = []
+    while remaining.any():
+        first = int(remaining.argmax())
+        difference_mm = np.abs(components.mean - components.mean[first])[:, POSITION]
+        is_near = (difference_mm < SEPARATE_DISTANCE * np.sqrt(variance + variance[first])).all(axis=1)
+        is_same = remaining & is_near & ~is_across_fold[first]
+        is_same[first] = True  # even if rounding errors make it appear to be across a fold
+        remaining &= ~is_same
+        total = float(probability[is_same].sum())
+        (mean,), (covariance,) = mixture_moments(
+            probability[None, is_same] / total, components.mean[is_same], components.covariance[is_same]
+        )
+        hypotheses.append(ContactHypothesis(mean, covariance, total, misfit))
+    return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)
 
 
 def _predicted(components: Components, dt_s: float) -> Components:

@@ -204,19 +204,17 @@ class FilmFollower:
         peak = self._peak
         self.discard_touch()
         if peak.is_usable:
-            frame_variance_pC2 = self.predictor.metadata.noise.variance(peak.mean_charge_pC)
-            variance_pC2 = frame_variance_pC2 * peak.relative_noise_variance(frame_variance_pC2)
-            self._observe_touch(peak.mean_charge_pC, variance_pC2, clock_s)
+            self._observe_touch(peak.mean_charge_pC, clock_s)
 
-    def _observe_touch(self, charge_pC: Array, variance_pC2: Array, clock_s: float) -> None:
+    def _observe_touch(self, charge_pC: Array, clock_s: float) -> None:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
 
         The charges of a touch have three errors: their noise, the part of the charges that the charge map does not
-        describe, and the deviation of the offset of the touch from the common offset.
+        describe, and the deviation of the offset of the touch from the common offset. The noise of the average charges
+        is assumed to be that of a single frame, because a board may filter its signals over the whole touch.
 
         Args:
             charge_pC: Average touch charges near the largest force, shape (n_electrode,), pC.
-            variance_pC2: Variance of the noise of these charges, shape (n_electrode,), pC^2.
             clock_s: Time of the touch, s.
         """
         elapsed_hours = max(clock_s - self._latest_touch_s, 0.0) / SECONDS_PER_HOUR
@@ -224,7 +222,8 @@ class FilmFollower:
         self._covariance[0, 0] += self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
         touch_offset_pC = self._offset_std_pC * self._offset_ratio
         model_error_pC = self._series.charge_std * charge_pC
-        covariance_pC2 = np.diag(variance_pC2 + model_error_pC**2) + np.outer(touch_offset_pC, touch_offset_pC)
+        variance_pC2 = self.predictor.metadata.noise.variance(charge_pC) + model_error_pC**2
+        covariance_pC2 = np.diag(variance_pC2) + np.outer(touch_offset_pC, touch_offset_pC)
         start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
         estimate = robust_estimate(
             self._values,

@@ -3,9 +3,7 @@
 A film is followed with one set of charges of each touch. A single frame has the noise of one reading. Therefore the
 charges of several frames are averaged, namely of frames whose contact is close to the contact with the largest force.
 
-The average has less noise than a frame only if the noise differs from frame to frame. The frames themselves show how
-much of the noise does: if a board filters its signals, for example, successive frames are nearly equal. A touch is not
-used if its frames have flags that make the charges unreliable.
+A touch is not used if its frames have flags that make the charges unreliable.
 """
 
 import numpy as np
@@ -82,24 +80,3 @@ class TouchPeak:
     def mean_charge_pC(self) -> Array:
         """Average of the touch charges, shape (n_electrode,), pC."""
         return np.asarray(np.mean(self._averaged_charges_pC, axis=0))
-
-    def relative_noise_variance(self, frame_variance_pC2: Array) -> float:
-        """Estimate the variance of the noise of the average charges, relative to the variance for a single frame.
-
-        One part of the noise of a frame is independent of the other frames, and the average of n frames has a variance
-        of 1/n of this part. The other part is equal in all frames, and the average does not reduce it. The variance of
-        the independent part is half the mean squared difference of successive frames (von Neumann 1941).
-
-        Args:
-            frame_variance_pC2: Variance of the noise of a single frame, shape (n_electrode,), pC^2.
-
-        Returns:
-            Ratio of the variances, averaged over the electrodes, from 1/n to 1.
-        """
-        frame_count = len(self._averaged_charges_pC)
-        if frame_count == 1:
-            return 1.0
-        difference_pC = np.diff(self._averaged_charges_pC, axis=0)  # of successive frames, shape (n - 1, n_electrode)
-        independent_variance_pC2 = 0.5 * (difference_pC**2).mean(axis=0)
-        independent_share = min(float((independent_variance_pC2 / frame_variance_pC2).mean()), 1.0)
-        return 1.0 - independent_share + independent_share / frame_count
