@@ -165,25 +165,6 @@ def test_a_missing_extra_says_so_in_python_too(base, tmp_path, stage):
     assert f"pip install 'isocharge[{stage}]'" in done.stderr
 
 
-@pytest.mark.first_cases(2)
-@pytest.mark.parametrize(
-    ("words", "extra"),
-    [
-        ("demo", "train"),
-        ("demo --live", "simulate,http"),
-        ("simulate point three-25um-biaxial", "simulate"),
-        ("serve http --port 0", "http"),
-        ("serve stream three-25um-biaxial --port - --output touch.mcap", "record"),
-        ("serve check three-25um-biaxial presses.parquet", "parquet"),
-    ],
-)
-def test_a_missing_extra_says_how_to_get_it(base, tmp_path, words, extra):
-    done = run(base, "isocharge", *words.split(), cwd=tmp_path)
-    assert done.returncode == 1
-    assert f"pip install 'isocharge[{extra}]'" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
 def check_help_and_missing_argument(bin_folder, folder):
     """Check what typer and click print."""
     for command in ("", "serve stream", "serve predict"):
@@ -191,10 +172,6 @@ def check_help_and_missing_argument(bin_folder, folder):
         assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
     done = run(bin_folder, "isocharge", "serve", "predict", cwd=folder)
     assert (done.returncode, "Missing argument 'MODEL'" in done.stderr) == (2, True), done.stderr
-
-
-def test_help_and_a_missing_argument_are_no_crash(base, tmp_path):
-    check_help_and_missing_argument(base, tmp_path)
 
 
 @pytest.mark.slow
