@@ -170,22 +170,14 @@ def stuffed(framing, **others):
         ("hdlc", lambda data: b"~" + data.replace(b"}", b"}]").replace(b"~", b"}^") + b"~"),
     ],
 )
-def test_cobs_slip_and_hdlc_frames_are_encoded_and_read(framing, stuff):
-    """The encoder sends no delimiter before a frame of HDLC, which is optional (RFC 1662).
-
-    A frame with a wrong checksum and a piece of another length are dropped without damage to other frames.
-    """
+def test_cobs_slip_and_hdlc_frames_are_read(framing, stuff):
+    """A frame with a wrong checksum and a piece of another length are dropped without damage to other frames."""
     bodies = [struct.pack("<Bf", seq, 0.1 * seq) for seq in range(256)]
     sent = [stuff(body + struct.pack("<I", binascii.crc32(body))) for body in bodies]
     with_wrong_checksum = stuff(bodies[0] + struct.pack("<I", binascii.crc32(bodies[1])))
     too_short = stuff(b"123")
     stream = b"".join([*sent[:9], with_wrong_checksum, too_short, *sent[9:]])
-    described = stuffed(framing)
-    encoded_frames = [encode_layout(described, Frame(seq, None, (0.1 * seq,))) for seq in range(256)]
-    first_delimiter = b"~" if framing == "hdlc" else b""
-    assert [first_delimiter + data for data in encoded_frames] == sent
-
-    parser = described.parser()
+    parser = stuffed(framing).parser()
     frames = []
     for start in range(0, len(stream), 7):
         frames += parser.feed(stream[start : start + 7])

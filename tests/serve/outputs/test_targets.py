@@ -176,7 +176,7 @@ def test_ctrl_c_while_an_output_closes_spoils_no_other_output(record, tmp_path, 
 
 def test_added_kind_that_cannot_tell_what_it_accepts_is_named(add_kind):
     add_kind(raise_error, None)
-    with pytest.raises(InputError, match=r"output mine: .* accepts 'touch.txt' \(RuntimeError: not open\)"):
+    with pytest.raises(InputError, match=r"output mine \(mine:KIND\): .* 'touch.txt' \(RuntimeError: not open\)"):
         output_kind("touch.txt")
 
 

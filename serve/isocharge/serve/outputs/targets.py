@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Self
 
@@ -68,43 +68,19 @@ def output_kind(target: str) -> OutputKind:
     # No built-in kind accepts the target. Try the kinds of other packages, and collect their forms for the message.
     added_forms = []
     for entry_point in entry_points(group=ENTRY_POINTS):
-        added_kind = _load_kind(entry_point)
         try:
+            added_kind: OutputKind = entry_point.load()
             if added_kind.accepts(target):
                 return added_kind
-        except Exception as error:
+            added_forms.append(added_kind.form)
+        except Exception as error:  # also if the entry point is no `OutputKind`
             raise InputError(
-                f"output {entry_point.name}: cannot tell whether it accepts {shown(target)} ({type(error).__name__}: "
-                f"{error}); correct or remove the package that adds it"
+                f"output {entry_point.name} ({entry_point.value}): cannot be used for {shown(target)} "
+                f"({type(error).__name__}: {error}); correct or remove the package that adds it"
             ) from error
-        added_forms.append(added_kind.form)
 
     forms = ", ".join([target_forms(), *added_forms])
     raise InputError(f"output {shown(target)}: expected one of the forms {forms}")
-
-
-def _load_kind(entry_point: EntryPoint) -> OutputKind:
-    """Load and return a kind of output that another package adds.
-
-    Args:
-        entry_point: Entry point of the package, which should refer to an `OutputKind`.
-
-    Raises:
-        InputError: If the package cannot be loaded, or its entry point is not an OutputKind.
-    """
-    try:
-        kind = entry_point.load()
-    except Exception as error:
-        raise InputError(
-            f"output {entry_point.name} ({entry_point.value}): cannot be loaded ({type(error).__name__}: {error}); "
-            "reinstall or remove the package that adds it"
-        ) from error
-    if not isinstance(kind, OutputKind):
-        raise InputError(
-            f"output {entry_point.name} ({entry_point.value}): expected an OutputKind, got {shown(kind)}; correct the "
-            "package that adds it"
-        )
-    return kind
 
 
 class Outputs:
