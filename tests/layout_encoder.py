@@ -2,19 +2,10 @@
 
 import sys
 
-from cobs import cobs
-
 from isocharge.serve.frames.frame import FLAGS, SEQ, TIMES_US
 
 LARGEST_FLOATS = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": sys.float_info.max}
 """Largest number of each floating-point type (IEEE 754)."""
-
-STUFFINGS = {
-    "cobs": lambda data: cobs.encode(data) + b"\0",
-    "slip": lambda data: data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0",
-    "hdlc": lambda data: data.replace(b"\x7d", b"\x7d\x5d").replace(b"\x7e", b"\x7d\x5e") + b"\x7e",
-}
-"""Byte stuffing of Cheshire and Baker 1999, RFC 1055 and RFC 1662, with the delimiter."""
 
 
 def packed_number(field, value, byte_order):
@@ -30,8 +21,8 @@ def packed_number(field, value, byte_order):
     return whole.to_bytes(3, byte_order, signed=field.is_signed) if field.size == 3 else whole
 
 
-def encode_unstuffed(layout, frame):
-    """Return the bytes of a frame without byte stuffing and without a delimiter."""
+def encode_layout(layout, frame):
+    """Return the bytes of a frame, without byte stuffing and without a delimiter."""
     values = {SEQ: frame.seq or 0, FLAGS: frame.bits}
     values |= {name: (frame.t_us or 0) / unit_us for name, unit_us in TIMES_US.items()}
     values |= {channel.name: value for channel, value in zip(layout.channels, frame.values, strict=True)}
@@ -40,9 +31,3 @@ def encode_unstuffed(layout, frame):
     for position, constant in layout.constants:
         data[position : position + len(constant)] = constant
     return bytes(data) + layout.compute_checksum(bytes(data))
-
-
-def encode_layout(layout, frame):
-    """Return the bytes that a board sends for a frame."""
-    data = encode_unstuffed(layout, frame)
-    return STUFFINGS[layout.framing](data) if layout.framing in STUFFINGS else data

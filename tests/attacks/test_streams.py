@@ -21,7 +21,7 @@ from isocharge.serve import (
 )
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.recognition.recognise import recognise
-from layout_encoder import encode_layout, encode_unstuffed
+from layout_encoder import encode_layout
 
 FRAMES = [Frame(seq, 5000 * seq, (800.0 + seq, 700.0 - seq, 900.5), 0, ("A", "B", "C")) for seq in range(6)]
 
@@ -57,7 +57,7 @@ def stuffed(framing):
         "hdlc": lambda data: data.replace(b"}", b"}]").replace(b"~", b"}^") + b"~",
         "datagram": lambda data: data,
     }
-    return layout.parser, b"".join(escapes[framing](encode_unstuffed(layout, frame)) for frame in FRAMES)
+    return layout.parser, b"".join(escapes[framing](encode_layout(layout, frame)) for frame in FRAMES)
 
 
 def formats():

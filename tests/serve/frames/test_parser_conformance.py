@@ -17,7 +17,7 @@ from isocharge.serve import AutoParser, BinaryParser, Frame, device_from_table, 
 from isocharge.serve.frames.frame import Parser, SequenceGaps
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_lines import TEXT_FORMATS
-from layout_encoder import encode_layout, encode_unstuffed
+from layout_encoder import encode_layout
 
 HEAD = [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
 FLOATS = [{"name": name, "type": "f32"} for name in "ABC"]
@@ -88,7 +88,7 @@ def described(table):
 
 def slip(frame):
     """Return a frame with the byte stuffing of RFC 1055."""
-    data = encode_unstuffed(device_from_table({"frames": STUFFED}, "test").frames, frame)
+    data = encode_layout(device_from_table({"frames": STUFFED}, "test").frames, frame)
     return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
 
 

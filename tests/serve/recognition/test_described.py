@@ -160,17 +160,6 @@ def test_constant_bytes_and_nothing_are_not_recognised():
         assert described_frames_section([data], 1.0) is None
 
 
-@pytest.mark.parametrize("per_datagram", [1, 3])
-def test_datagrams_of_plain_structs_are_recognised(per_datagram):
-    values = np.random.default_rng(1).normal([5.0, -3.0, 0.0, 11.0], 0.3, (300, 4)).astype(np.float32)
-    frames = [struct.pack("<I4f", seq, *row) for seq, row in enumerate(values)]
-    chunks = [b"".join(frames[start : start + per_datagram]) for start in range(0, 300, per_datagram)]
-    table = recognise(chunks, 1.5, are_datagrams=True)
-    assert table["framing"] == "datagram"
-    assert table["length"] == 20
-    assert [(entry["name"], entry["type"]) for entry in table["fields"][:2]] == [("seq", "u32"), ("ch1", "f32")]
-
-
 @pytest.mark.parametrize("tick_rate_Hz", [31250.0, 32768.0])
 def test_clock_has_the_nearest_usual_tick_rate(tick_rate_Hz):
     ticks = np.round(np.arange(FRAMES) * tick_rate_Hz / RATE_HZ).astype(int)
