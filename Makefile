@@ -73,7 +73,6 @@ bench: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_solve.py
 	$(BIN)/python tests/benchmarks/bench_model.py
 	$(BIN)/python tests/benchmarks/bench_whole_film.py
-	$(BIN)/python tests/benchmarks/bench_pairs.py
 	$(BIN)/python tests/benchmarks/bench_predictor.py
 	$(BIN)/python tests/benchmarks/bench_stream.py
 	$(BIN)/python tests/benchmarks/bench_touch.py

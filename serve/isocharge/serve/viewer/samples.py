@@ -7,7 +7,6 @@ and the touch charge of each electrode. An unknown number is NaN. If contacts ar
 contact instead of the contact of the frame.
 """
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -76,33 +75,18 @@ def coalesce(samples: Samples, max_samples: int) -> Samples:
     """
     if len(samples) <= max_samples:
         return samples
-    # Index of the first sample of each run, and the number of samples as the end of the last run
-    run_edges = np.linspace(0, len(samples), max_samples + 1).astype(int)
-    chosen: Samples = samples[_chosen_indices(samples, run_edges)]
+    return np.concatenate([_coalesced_run(run) for run in np.array_split(samples, max_samples)])
 
-    # `reduceat` combines the values of each run, from its first sample to the last sample before the next run.
-    run_starts = run_edges[:-1]
-    chosen["flags"] = np.bitwise_or.reduceat(samples["flags"].astype(np.int64), run_starts)
-    chosen["records"] = np.add.reduceat(samples["records"], run_starts)
-    chosen["latency_us"] = np.fmax.reduceat(samples["latency_us"], run_starts)  # ignores latencies that are NaN
+
+def _coalesced_run(run: Samples) -> Samples:
+    """Return the sample that replaces a run of neighbouring samples, as `coalesce` describes, shape (1,)."""
+    is_contact = run["contact"] == 1.0
+    chosen_index = len(run) - 1
+    if is_contact.any() and not is_contact[-1]:
+        force_N = np.where(is_contact, run["force_N"], -np.inf)
+        chosen_index = int(force_N.argmax())
+    chosen = run[[chosen_index]]  # a copy
+    chosen["flags"] = np.bitwise_or.reduce(run["flags"].astype(np.int64))
+    chosen["records"] = run["records"].sum()
+    chosen["latency_us"] = np.fmax.reduce(run["latency_us"])  # ignores latencies that are NaN
     return chosen
-
-
-def _chosen_indices(samples: Samples, run_edges: np.ndarray) -> np.ndarray:
-    """Choose one sample of each run of neighbouring samples, as `coalesce` describes.
-
-    Args:
-        samples: The samples, shape (n,).
-        run_edges: Index of the first sample of each run, and n as the end of the last run, shape (n_run + 1,).
-
-    Returns:
-        Index of the chosen sample of each run, shape (n_run,).
-    """
-    is_contact = samples["contact"] != 0.0
-    known_force_N = np.nan_to_num(samples["force_N"], nan=0.0)
-    # Samples without contact get a negative value, so that the largest value of a run is a contact if there is one.
-    force_N = np.where(is_contact, known_force_N, -1.0)
-    latest_indices = run_edges[1:] - 1
-    strongest_indices = np.array([start + int(force_N[start:stop].argmax()) for start, stop in pairwise(run_edges)])
-    has_contact_ended = ~is_contact[latest_indices] & is_contact[strongest_indices]
-    return np.where(has_contact_ended, strongest_indices, latest_indices)
