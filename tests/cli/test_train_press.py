@@ -9,12 +9,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.benchmarks.measured_films import measured_presses
 
 from boards import TcpBoard, until
 from isocharge.cli.train.press_dialogue import Dialogue
 from isocharge.cli.train.press_events import PressEvents, SessionEnd
-from isocharge.common.errors import OutputExists, PortLost, PressError
+from isocharge.common.errors import PortLost
 from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_frame, read_presses
 from isocharge.serve.live.steady_press import (
     PORT_LOST,
@@ -27,7 +26,6 @@ from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.calibration import session as session_module
 from isocharge.train.calibration.calibrate import solve_even
-from isocharge.train.calibration.press_file import open_press_file
 from kept import kept
 
 NAMES = ("A", "B", "C", "D")
@@ -40,11 +38,11 @@ class FakeSession:
     summary = ("so much is known",)
 
     def __init__(self):
-        self.taken, self.skips = [], 0
+        self.taken = []
         self._place()
 
     def _place(self):
-        self.proposed = SimpleNamespace(contact=np.array([len(self.taken) + self.skips / 10, 0.0, 1.0]))
+        self.proposed = SimpleNamespace(contact=np.array([len(self.taken), 0.0, 1.0]))
         self.presses = SimpleNamespace(contact=np.array(self.taken))
 
     def __len__(self):
@@ -58,14 +56,10 @@ class FakeSession:
         self.taken.append(tuple(contact.tolist()))
         self._place()
 
-    def undo(self, number):
-        self.taken.pop(-1 if number == "last" else number - 1)
+    def undo(self):
+        self.taken.pop()
         self._place()
-        return len(self.taken) + 1 if number == "last" else number
-
-    def skip(self):
-        self.skips += 1
-        self._place()
+        return len(self.taken) + 1
 
 
 class Script:
@@ -127,8 +121,6 @@ FIRST, SECOND, THIRD = ((float(x), 0.0, 1.0) for x in range(3))
         ([STEADY, SessionEnd()], [], ""),
         ([SessionEnd()], [], ""),
         ([STEADY, "u", STEADY, "", "u", "q"], [], "press 1 is removed"),
-        ([STEADY, "", STEADY, "u 1", "", "q"], [SECOND], "press 1 is removed"),
-        (["s", STEADY, "s", STEADY, "", "q"], [(0.2, 0.0, 1.0)], "(0.2, 0.0) mm"),
         (["what?", STEADY, "1 2", "1 2 3", "q"], [(1.0, 2.0, 3.0)], "got '1 2'"),
         (["", STEADY, "q"], [], "press first"),
     ],
@@ -225,8 +217,8 @@ def test_a_press_that_had_begun_is_left_out_and_a_line_is_not(film, places):
     with PressEvents(chunks(), ReadingStream(NAMES), PressWatch(NAMES), reader) as events:
         coming = iter(events.next, None)
         assert any(event.phase is Phase.settling for event in coming)
-        os.write(keyboard, b"u 1\n")
-        assert "u 1\n" in coming
+        os.write(keyboard, b"u\n")
+        assert "u\n" in coming
         events.arm()
         armed.set()
         press = next(event.press for event in coming if event.press)
@@ -285,29 +277,6 @@ def test_a_killed_session_leaves_whole_lines_and_continues(start_command, comman
     np.testing.assert_array_equal(read_presses(path, NAMES).contact, places)
 
 
-def test_presses_of_another_probe_or_sensor_are_not_continued(problem, film, places, tmp_path):
-    path = tmp_path / "presses.csv"
-    presses = measured_presses(problem, places, film.charges(places))
-    stds = {"position_std_mm": 0.1, "force_std": 0.01}
-    with open_press_file(path, problem.sensor, Circle(1.0)) as file:
-        assert file.read(**stds) is None
-        file.write(presses)
-    with open_press_file(path, problem.sensor, Circle(1.0)) as file:
-        assert file.read(**stds) == presses
-        with pytest.raises(OutputExists, match="another process"), open_press_file(path, problem.sensor, Circle(1.0)):
-            pass
-    other_probe = open_press_file(path, problem.sensor, Circle(1.2))
-    with pytest.raises(PressError, match="got presses of another probe;"), other_probe:
-        pass
-    other_sensor = open_press_file(path, load_sensor("four-25um-uniaxial"), Circle(1.0))
-    with pytest.raises(PressError, match="got presses of another sensor;"), other_sensor:
-        pass
-    assert read_presses(path) == presses
-    with open_press_file(path, problem.sensor, Circle(1.2), fresh=True) as file:
-        assert file.read(**stds) is None
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_file_with_further_columns_is_not_overwritten(refused, desk):
     text = "x_mm,y_mm,force_N,A,B,C,D,comment\n1,1,1,500,500,500,500,mine\n"
     (desk / "presses.csv").write_text(text)
@@ -321,7 +290,7 @@ def test_a_file_with_further_columns_is_not_overwritten(refused, desk):
         (["--port", "some.bin", "--press-list", "far.csv"], "far.csv, press 2: expected a press within 8.5 mm"),
         (["--port", "some.bin", "--press-list", "half.csv"], "half.csv, line 2: expected both x_mm and y_mm"),
         (["--port", "some.bin", "--press-list", "nothing.csv"], "cannot be read"),
-        (["--port", "some.bin", "--yes", "-o", "."], "expected a file for the presses, got a folder"),
+        (["--port", "some.bin", "--yes", "-o", "."], "expected a file in an existing folder"),
         (["--port", "some.bin", "--yes", "-o", "nowhere/presses.csv"], "nowhere"),
         (["--port", "noise.bin", "--press-list", "list.csv"], "no intact frame"),
     ],

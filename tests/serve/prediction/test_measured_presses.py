@@ -104,32 +104,18 @@ def test_default_uncertainty_fills_empty_cells(read):
     assert (plain.position_std_mm.tolist(), plain.force_std.tolist()) == ([0.1], [0.01])
 
 
-def test_presses_with_semicolons_and_decimal_commas(read):
-    header = f"{HEADER},force_std,temperature_C".replace(",", ";")
-    presses = read(f"{header}\n2;-6;0,2;502,3;244,8;215,8;0,01;21,5\n")
-    assert presses.contact.tolist() == [[2.0, -6.0, 0.2]]
-    assert presses.charge_pC.tolist() == [[502.3, 244.8, 215.8]]
-    assert presses.force_std.tolist() == [0.01]
-    assert (presses.electrodes, presses.lines) == (("A", "B", "C"), (2,))
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", r"presses\.csv: empty; expected a header with x_mm, y_mm, force_N and the electrodes \('A', 'B', 'C'\)"),
         (HEADER, "expected one press or more below the header, got none"),
-        (f"{HEADER}\n,,,,,\n", "expected one press or more below the header, got none"),
         ("x_mm,y_mm,force_N,A,C\n1,2,3,4,5\n", r"got the header .*; missing: \['B'\]$"),
         (f"{HEADER},B\n1,2,3,4,5,6,7\n", r"got the header .*; repeated: \['B'\]$"),
-        (f"{HEADER},force_N\n1,2,3,4,5,6,7\n", r"repeated: \['force_N'\]$"),
         ("x_mm,A,B,C\n1,2,3,4\n", "line 2: expected both x_mm and y_mm"),
-        (f"{HEADER}\n1,,3,4,5,6\n", "line 2: expected both x_mm and y_mm, or two empty cells"),
         (f"{HEADER}\n1,2,3,4,5,6\n1,2,x,4,5,6\n", "line 3, column 'force_N': expected a positive force in N.*got 'x'"),
         (f"{HEADER}\n1,inf,3,4,5,6\n", "line 2, column 'y_mm': expected a position in mm.*got 'inf'"),
         (f"{HEADER}\n1,1e999,3,4,5,6\n", "line 2, column 'y_mm': .*got '1e999'"),
-        (f"{HEADER}\n1,2,3,nan,5,6\n", "line 2, column 'A': expected a charge in pC, got 'nan'"),
         (f"{HEADER}\n\n1,2,0,4,5,6\n", "line 3, column 'force_N': expected a positive force in N.*got 0$"),
-        (f"{HEADER}\n# x\n1,2,-0.5,4,5,6\n", "line 3, column 'force_N': .*got -0.5$"),
         (
             f"{HEADER},position_std_mm\n1,2,3,4,5,6,0\n",
             "column 'position_std_mm': expected a positive standard .*got 0$",
@@ -138,7 +124,6 @@ def test_presses_with_semicolons_and_decimal_commas(read):
         (f"{HEADER},force_std\n1,2,3,4,5,6,5\n", r"a positive share of the force up to 1 \(0\.01 is 1 %\), got 5$"),
         (f"{HEADER}\n1,2,3,,,\n", "line 2: expected a charge of one electrode or more, got none; fill it in"),
         (f"{HEADER}\n1,2,3,4,5\n", "line 2: expected 6 cells as in the header, got 5"),
-        (f"{HEADER}\n1,2,3,4,5,6,7\n", "line 2: expected 6 cells as in the header, got 7"),
         (f'{HEADER}\n1.5,2,"0,5",4,5,6\n', "column 'force_N': expected .*, got '0,5'; the decimal mark is '.'"),
     ],
 )
@@ -166,8 +151,6 @@ def test_press_file_with_too_many_presses_is_refused(monkeypatch, read):
         ("force_std", "A"),
         ("A\nB",),
         (" A",),
-        ("A\u2028B",),
-        ("\ud800",),
         ("A" * 1001,),
         tuple(f"Q{number}" for number in range(996)),
     ],

@@ -38,13 +38,6 @@ def test_predict_equals_a_plain_session(plain_session, predictor, charge_pC):
     assert predictor.predict(charge_pC) == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
-def test_contact_does_not_change_with_later_predictions(predictor):
-    first = predictor.predict([100.0, 200.0, 300.0])
-    before = tuple(first)
-    predictor.predict([900.0, 800.0, 700.0])
-    assert tuple(first) == before
-
-
 @pytest.mark.parametrize(
     "kind",
     [

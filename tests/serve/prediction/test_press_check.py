@@ -148,17 +148,6 @@ def test_presses_outside_the_domain_or_with_unknown_values_are_excluded(predicto
     assert (row["x_mm"], row["x_error_mm"], row["left_out"]) == (None, None, "a charge is unknown")
 
 
-def test_misfit_flags_use_the_limit_of_the_model(film, tmp_path, measure):
-    """The misfit of the linear model is the sum of the negative charges."""
-    film.write(tmp_path, errors={"misfit_p99": 2.5, "misfit_p999": 9.0})
-    presses = measure(6)
-    presses.charge_pC[0] = film.charge_pC([20.0], [0.0], [1.0])[0]
-    presses.charge_pC[1:4] = [-3.0, 900.0, 900.0]
-    check = check_presses(Predictor("linear", models=tmp_path), presses)
-    assert check.errors.flags[0] == ("outside",)
-    assert check.errors.has_misfit.tolist() == [False, True, True, True, False, False]
-
-
 def test_note_for_a_film_that_does_not_fit_states_the_explaining_rig_std(predictor, measure):
     """With the standard deviations that the note states, the same presses fit."""
     presses = measure(30, seed=1)
@@ -192,20 +181,6 @@ def test_electrodes_are_assigned_by_name(predictor, measure):
     )
     with pytest.raises(PressError, match=r"expected charges of the electrodes \('A', 'B', 'C'\) of linear/1, got"):
         check_presses(predictor, replace(presses, electrodes=("A", "B", "D")))
-
-
-def test_common_error_is_the_weighted_mean():
-    rng = np.random.default_rng(0)
-    std = rng.uniform(0.5, 2.0, 500)
-    for scatter in (1.0, 3.0):
-        error = 0.3 + scatter * std * rng.normal(size=500)
-        columns = (np.append(error, np.nan), np.append(std, 1.0) ** 2, np.zeros(501))
-        common = common_error(*(column[:, None] for column in columns))
-        mean, weight = np.average(error, weights=std**-2, returned=True)
-        widening = max(1.0, np.sum(((error - mean) / std) ** 2) / 499) ** 0.5  # as the Particle Data Group averages
-        assert (common.mean[0], common.std[0]) == pytest.approx((mean, widening * weight**-0.5))
-        assert widening == pytest.approx(scatter, rel=0.1)
-        assert common.significance == pytest.approx(common.mean / common.std)
 
 
 def test_constant_error_of_the_rig_reduces_the_significance_of_a_common_error():

@@ -103,13 +103,6 @@ def test_proposed_presses_reduce_the_errors_as_announced(problem, synthetic):
         random_errors.append(fit(presses, problem, synthetic).film_error.position_mm)
     assert chosen < np.mean(random_errors)
 
-    avoided = contact[:, :2]
-    others = next_presses(problem, synthetic, 3, avoid_mm=avoided)
-    assert all(np.hypot(*(press.contact[:2] - avoided).T).min() > 1.0 for press in others)
-    everywhere = np.mgrid[-8:9, -8:9].reshape(2, -1).T.astype(float)
-    with pytest.raises(PressError, match="no position for a press is left"):
-        next_presses(problem, synthetic, 1, avoid_mm=everywhere)
-
 
 @pytest.mark.parametrize(
     ("change", "message"),

@@ -16,7 +16,10 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.prediction.press_errors import PressErrors
 
 SIGNIFICANCE = 0.01
-"""Probability that a model that fits is rejected. Each of the two tests has half of this probability."""
+"""Probability that a model that fits is rejected. Each of the three tests has a third of this probability."""
+
+TEST_SIGNIFICANCE = SIGNIFICANCE / 3.0
+"""Probability that one test rejects a model that fits."""
 
 MAX_ACCEPTED_CHI_SQUARED = 1.1
 """Chi-squared per degree of freedom up to which the scatter is always accepted, dimensionless.
@@ -119,17 +122,15 @@ class Agreement:
         """Whether the noise of the charges and the uncertainty of the rig explain the errors.
 
         The first test rejects a large scatter of the errors, and the second test rejects large common errors. Each test
-        rejects good presses with a probability of `SIGNIFICANCE` / 2. The probability that one of the tests rejects
-        good presses is therefore at most `SIGNIFICANCE`.
+        rejects good presses with a probability of `TEST_SIGNIFICANCE`.
 
         The expected variances are not known exactly, and for many presses even a small error of these variances would
         be significant. The scatter is therefore also accepted if `chi_squared` exceeds its expected value `degrees` by
         only a few percent.
         """
-        max_p_value = 0.5 * SIGNIFICANCE
         max_accepted_chi_squared = MAX_ACCEPTED_CHI_SQUARED * self.degrees
-        is_scatter_large = self.p_value < max_p_value and self.chi_squared > max_accepted_chi_squared
-        is_common_error_large = self.common_p_value < max_p_value
+        is_scatter_large = self.p_value < TEST_SIGNIFICANCE and self.chi_squared > max_accepted_chi_squared
+        is_common_error_large = self.common_p_value < TEST_SIGNIFICANCE
         return not is_scatter_large and not is_common_error_large
 
 

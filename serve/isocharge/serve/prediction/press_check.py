@@ -22,7 +22,12 @@ from isocharge.common.json_values import plain_values
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.validity import Validity
-from isocharge.serve.prediction.agreement import Agreement, binomial_distribution, chi_squared_deviate
+from isocharge.serve.prediction.agreement import (
+    TEST_SIGNIFICANCE,
+    Agreement,
+    binomial_distribution,
+    chi_squared_deviate,
+)
 from isocharge.serve.prediction.press_errors import (
     FORCE,
     NOT_TRAINED,
@@ -38,17 +43,11 @@ from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
 MIN_PRESSES = 3
 """Smallest number of presses for a verdict. With fewer presses, a single bad press cannot be recognised."""
 
-BAD_PRESS_PROBABILITY = 1e-3
-"""Probability that the noise makes at least one of all good presses look bad."""
-
 MAX_BAD_FRACTION = 0.1
 """Largest fraction of bad presses for which a model may still fit. A single bad press is always allowed."""
 
 MISFIT_FRACTION = 0.01
 """Fraction of good presses whose misfit is above the limit `misfit_p99` of the model."""
-
-MISFIT_PROBABILITY = 2e-3
-"""Probability below which a number of presses with a large misfit is not attributed to chance."""
 
 MIN_COMMON_SIGNIFICANCE = 3.0
 """Significance above which a common shift or a common scale factor is reported, in standard deviations."""
@@ -251,11 +250,11 @@ def _bad_presses(errors: PressErrors) -> Booleans:
 
     # The probability of such large errors is below a limit, which is divided by the number of compared presses
     # (Bonferroni correction). If all presses are good, the probability that one of them is found is therefore at most
-    # `BAD_PRESS_PROBABILITY`.
+    # `TEST_SIGNIFICANCE`.
     compared_count = int(is_compared.sum())
     degrees = np.maximum(np.count_nonzero(~np.isnan(errors.error), axis=1), 1)
     deviate = chi_squared_deviate(np.nansum(errors.squared_ratio, axis=1), degrees)
-    limit = NormalDist().inv_cdf(1.0 - BAD_PRESS_PROBABILITY / max(1, compared_count))
+    limit = NormalDist().inv_cdf(1.0 - TEST_SIGNIFICANCE / max(1, compared_count))
     is_improbable = is_compared & (deviate > limit)
     improbable_count = int(is_improbable.sum())
     few_are_improbable = 0 < improbable_count <= max(1.0, MAX_BAD_FRACTION * compared_count)
@@ -284,7 +283,7 @@ def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: Mode
     selected_count = int(is_selected.sum())
     misfit_count = int((errors.has_misfit & is_selected).sum())
     probability_of_at_most = binomial_distribution(selected_count, MISFIT_FRACTION)
-    if misfit_count == 0 or 1.0 - probability_of_at_most[misfit_count - 1] >= MISFIT_PROBABILITY:
+    if misfit_count == 0 or 1.0 - probability_of_at_most[misfit_count - 1] >= TEST_SIGNIFICANCE:
         return ""
     return (
         f"{misfit_count} of {selected_count} presses have a misfit above {misfit_limit(metadata):.3g}, which 1 % of "

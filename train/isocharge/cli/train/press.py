@@ -3,6 +3,7 @@
 import shlex
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -16,14 +17,14 @@ from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue
 from isocharge.cli.train.press_events import PressEvents
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
-from isocharge.common.errors import InputError, PressError, error_prefix
+from isocharge.common.errors import InputError, OutputError, PressError, error_prefix
+from isocharge.common.files import as_output_errors
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch
-from isocharge.serve.presses.measured_presses import read_press_list
+from isocharge.serve.presses.measured_presses import MeasuredPresses, read_press_list, read_presses, write_presses
 from isocharge.serve.signal_chain.thermal import ThermalRule
 from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.train import CalibrationProblem, read_earlier
-from isocharge.train.calibration.press_file import open_press_file
 from isocharge.train.calibration.session import PressSession
 
 
@@ -41,7 +42,7 @@ def press_command(
             "--output",
             "-o",
             metavar="PRESSES.csv",
-            help="File to write. If it already has presses of this sensor, the session continues with them.",
+            help="File to write. If it already exists, the session continues with its presses.",
         ),
     ],
     probe: ProbeOption = "circle:1.0",
@@ -88,10 +89,6 @@ def press_command(
             "(default: the film of the sensor file)",
         ),
     ] = None,
-    fresh: Annotated[
-        bool,
-        typer.Option("--fresh", help="Delete the presses in the output file, and begin again. (default: continue)"),
-    ] = False,
 ) -> None:
     """Record presses on a film at a port, and write them to a file of measured presses.
 
@@ -120,15 +117,13 @@ def press_command(
         say(f"{device}: [common_mode] is not used for these presses, because it needs a model of the film")
 
     stds = {"position_std_mm": position_std_mm, "force_std": force_std}
-    with (
-        open_press_file(output, problem.sensor, problem.probe, fresh=fresh) as press_file,
-        local_workers(worker_count(None)) as executor,
-    ):
-        presses = press_file.read(**stds)
-        if presses is not None:
-            say(f"{output} has {len(presses)} presses; the session continues with them (--fresh deletes them)")
+    presses = _earlier_presses(output, problem.electrodes, **stds)
+    if presses is not None:
+        say(f"{output} has {len(presses)} presses; the session continues with them. Delete the file to begin again")
+    with local_workers(worker_count(None)) as executor:
         say("solving the film of the sensor file")
-        session = PressSession(problem, save=press_file.write, presses=presses, until=until, executor=executor, **stds)
+        save = partial(_save, output)
+        session = PressSession(problem, save=save, presses=presses, until=until, executor=executor, **stds)
         for number, contact in enumerate([] if contacts is None else contacts, start=1):
             with error_prefix(f"{press_list}, press {number}: ", PressError):
                 session.check(contact)
@@ -155,6 +150,44 @@ def press_command(
     if session.refusal:  # the reason why the presses cannot be used for a calibration
         raise PressError(f"{output}: {session.refusal}")
     say(f"To make a model: isocharge train calibrate {shlex.quote(str(output))} --sensor {sensor} -o my-film")
+
+
+def _earlier_presses(
+    path: Path, electrodes: tuple[str, ...], *, position_std_mm: float, force_std: float
+) -> MeasuredPresses | None:
+    """Return the presses of an earlier session, or None if there is no file.
+
+    Args:
+        path: File of the session.
+        electrodes: Names of the electrodes.
+        position_std_mm: Standard deviation of x and y of a press if the file does not contain it, mm.
+        force_std: Standard deviation of the force of a press if the file does not contain it, relative to the force.
+
+    Raises:
+        OutputError: If the file cannot be written.
+        PressError: If the file is not a file of presses, or if it has further columns. These columns would be lost when
+            the file is written again.
+    """
+    if path.is_file():
+        presses = read_presses(path, electrodes, position_std_mm=position_std_mm, force_std=force_std)
+        if presses.ignored:
+            raise PressError(
+                f"{path}: expected a file of `isocharge train press`, got further columns: "
+                f"{', '.join(presses.ignored)}; they would be lost, so choose another output"
+            )
+        return presses
+    if path.exists() or not path.parent.is_dir():
+        raise OutputError(f"{path}: expected a file in an existing folder; choose another output")
+    return None
+
+
+def _save(path: Path, presses: MeasuredPresses) -> None:
+    """Replace the file of a session, or delete it if there are no presses."""
+    if len(presses):
+        write_presses(path, presses)
+        return
+    with as_output_errors(path):
+        path.unlink(missing_ok=True)
 
 
 def _keyboard_descriptor() -> int:

@@ -26,9 +26,9 @@ PHASE_TEXTS = {
 }
 """Instruction for the person in each phase of the press watch."""
 
-QUESTION = '   Was it there, and as hard? Enter: yes; or type "x y force" (? is unknown), s: skip, u: undo, q: quit'
+QUESTION = '   Was it there, and as hard? Enter: yes; or type "x y force" (? is unknown), u: undo, q: quit'
 
-KEYS = "   (type s to skip this place, u to undo the last press, q to quit)"
+KEYS = "   (press elsewhere if you cannot reach a place; type u to undo the last press, q to quit)"
 
 
 class Dialogue:
@@ -212,19 +212,15 @@ class Dialogue:
             answer = read_answer(line)
             if answer.reply == "quit":
                 raise SessionEnd
-            if answer.reply == "skip":
-                self._session.skip()
-                return True
             if answer.reply == "take" and press is not None:
-                contact = proposed if isinstance(answer.contact, str) else answer.contact  # the text: "as proposed"
-                return self._take(press, contact)
+                return self._take(press, proposed if answer.contact is None else answer.contact)
             if answer.reply == "take":
                 self._say("   press first: the question comes when the press is steady")
                 return False
-            if answer.number == "last" and press is not None:
+            if press is not None:
                 self._say("   this press is not taken")
                 return True
-            self._say(f"   press {self._session.undo(answer.number)} is removed")
+            self._say(f"   press {self._session.undo()} is removed")
             self._say_summary()
         except PressError as error:
             self._say(f"   {error}")

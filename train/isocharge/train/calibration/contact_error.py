@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.simulate import Domain
 from isocharge.simulate.numerics.disk import sunflower
@@ -147,7 +146,6 @@ def next_presses(
     count: int,
     film: FilmEstimate | None = None,
     *,
-    avoid_mm: Array | None = None,
     position_std_mm: float = POSITION_STD_MM,
     force_std: float = FORCE_STD,
 ) -> list[ProposedPress]:
@@ -158,16 +156,12 @@ def next_presses(
         charges: Charges of a film and of similar films.
         count: Number of presses.
         film: Estimate of the film; None before the first press.
-        avoid_mm: Positions near which no press is proposed, shape (n, 2), mm.
         position_std_mm: Standard deviation of the positions, mm.
         force_std: Relative standard deviation of the forces.
-
-    Raises:
-        PressError: If every position is avoided, or every press exceeds the limit of the stress.
     """
     unknowns = problem.prior.mean if film is None else film.values
     covariance = problem.prior.covariance(PLANNED) if film is None else film.covariance
-    candidates = _candidates(problem, avoid_mm)
+    candidates = _candidates(problem)
     data, contact = _ideal_presses(problem, charges, unknowns, candidates, position_std_mm, force_std)
     _, information_root = linearise(charges, problem.prior.layout, data, unknowns, contact).eliminated()
     sensitivity = ContactSensitivity.of(problem, charges, unknowns)
@@ -199,22 +193,17 @@ def spread_contacts(domain: Domain, count: int) -> Array:
     return np.column_stack([point.real, point.imag, np.exp(low + shares * (high - low))])
 
 
-def _candidates(problem: CalibrationProblem, avoid_mm: Array | None) -> Array:
+def _candidates(problem: CalibrationProblem) -> Array:
     """Return the presses that are compared, (x, y, F), shape (n, 3)."""
     domain = problem.domain
     grid_position = np.unique(np.round(spread_contacts(domain, N_CONTACTS)[:, :2] / GRID_MM), axis=0)
     position = GRID_MM * grid_position
     position = position[np.hypot(*position.T) <= domain.radius]
-    if avoid_mm is not None and len(avoid_mm):
-        distance = np.linalg.norm(position[:, None] - avoid_mm, axis=2).min(axis=1)
-        position = position[distance > 2.0 * GRID_MM]  # not beside the avoided position either
     low, high = domain.force_range
     strongest = force_within_stress(problem.sensor.film, problem.probe, problem.stress_limit, domain.force_range)
     high = min(high, strongest)
     forces = np.exp(np.log(low) + np.array(CANDIDATE_FORCES) * (np.log(high) - np.log(low)))
     forces = np.clip(np.round(forces / GRID_N) * GRID_N, max(low, GRID_N), high)
-    if not len(position):
-        raise PressError("no position for a press is left; allow one of the rejected positions")
     return np.array([(x, y, force) for x, y in position for force in forces])
 
 

@@ -6,17 +6,17 @@ session.
 """
 
 import math
-import re
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
+from isocharge.serve.presses.number_text import parse_number
 from isocharge.train.calibration.calibrate import calibrate, solve_even
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.estimator import FEW_PRESSES
@@ -31,44 +31,35 @@ ENOUGH = 0.5
 The ratio is that of the error by the uncertainty of the film to the error by noise."""
 
 EXPECTED_ANSWER = (
-    'Enter for "as proposed", the real "x y force" in mm and N (? for a value that is unknown), s to skip the place, '
-    "u to undo the last press (u 3: press 3), or q to quit"
+    'Enter for "as proposed", the real "x y force" in mm and N (? for a value that is unknown), u to undo the last '
+    "press, or q to quit"
 )
 
-Reply = Literal["take", "skip", "undo", "quit"]
+Reply = Literal["take", "undo", "quit"]
 """Action that a person requests."""
 
-REPLIES: dict[str, Reply] = {"": "take", "take": "take", "s": "skip", "skip": "skip", "q": "quit", "quit": "quit"}
+REPLIES: dict[str, Reply] = {"": "take", "take": "take", "u": "undo", "undo": "undo", "q": "quit", "quit": "quit"}
 """Actions by the word that a person types to request the action."""
 
-UNDO = re.compile(r"(?:u|undo)\s*(\d*)")
-"""Text that a person types to undo a press. The number of the press may follow the word."""
 
-UNKNOWN_CELLS = ("", "?")
-"""Texts that a person types for an unknown value."""
-
-
-@dataclass(frozen=True)
-class Answer:
+class Answer(NamedTuple):
     """Answer of a person to a proposed press.
 
     Attributes:
         reply: The requested action.
-        contact: Contact (x_mm, y_mm, force_N) of the press that is added, shape (3,), NaN where unknown; "as proposed"
-            if the press was made at the proposed contact.
-        number: Number of the press to undo, counted from 1; "last" for the last press.
+        contact: Contact (x_mm, y_mm, force_N) of the press that is added, shape (3,), NaN where unknown; None if the
+            press was made at the proposed contact.
     """
 
     reply: Reply
-    contact: Array | Literal["as proposed"] = "as proposed"
-    number: int | Literal["last"] = "last"
+    contact: Array | None = None
 
 
 def read_answer(text: str) -> Answer:
     """Convert the text that a person typed into an answer.
 
     Args:
-        text: Empty, a question mark, three values with blanks or commas between them, `u`, `u 3`, `s` or `q`.
+        text: Empty, a question mark, three values with blanks or commas between them, `u` or `q`.
 
     Raises:
         PressError: If the text has none of these forms.
@@ -76,51 +67,20 @@ def read_answer(text: str) -> Answer:
     normalised_text = text.strip().lower()
     if normalised_text in REPLIES:
         return Answer(REPLIES[normalised_text])
-    undo_match = UNDO.fullmatch(normalised_text)
-    if undo_match is not None:
-        digits = undo_match[1]
-        return Answer("undo", number=int(digits) if digits else "last")
     if normalised_text == "?":  # a press with an unknown place and an unknown force
         return Answer("take", np.full(len(CONTACT), np.nan))
 
+    separator = "," if "," in normalised_text else None  # None: any blanks
+    cells = [cell.strip() for cell in normalised_text.split(separator)]
     try:
-        contact = _typed_contact(normalised_text)
+        contact = np.array([math.nan if cell in ("", "?") else parse_number(cell) for cell in cells])
     except ValueError:
+        contact = np.empty(0)
+    has_written_nan = any("nan" in cell for cell in cells)
+    if len(contact) != len(CONTACT) or np.isinf(contact).any() or has_written_nan:
         # The message repeats at most 60 characters of the text.
-        raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}") from None
+        raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")
     return Answer("take", contact)
-
-
-def _typed_contact(text: str) -> Array:
-    """Return the contact (x_mm, y_mm, force_N) that a person typed, shape (3,). Unknown values are NaN.
-
-    Args:
-        text: Three values with blanks or commas between them.
-
-    Raises:
-        ValueError: If the text does not consist of three values.
-    """
-    cells = text.split(",") if "," in text else text.split()
-    if len(cells) != len(CONTACT):
-        raise ValueError(f"expected {len(CONTACT)} values, got {len(cells)}")
-    return np.array([_cell_value(cell.strip()) for cell in cells])
-
-
-def _cell_value(cell: str) -> float:
-    """Convert the text of one value into a number. The number is NaN if the value is unknown.
-
-    Args:
-        cell: Text of the value, without blanks at the ends.
-
-    Raises:
-        ValueError: If the text is neither a finite number nor one of `UNKNOWN_CELLS`.
-    """
-    if cell in UNKNOWN_CELLS:
-        return math.nan
-    value = float(cell)
-    if not math.isfinite(value):
-        raise ValueError(f"expected a finite number, got {cell}")
-    return value
 
 
 class PressSession:
@@ -168,7 +128,6 @@ class PressSession:
         self._save = save
         self._until = until
         self._stds = {"position_std_mm": position_std_mm, "force_std": force_std}
-        self._skipped_places: list[tuple[float, float]] = []
         self._fit(presses or no_presses(problem.electrodes))
 
     def __len__(self) -> int:
@@ -179,19 +138,15 @@ class PressSession:
         """The proposed next press, with the largest expected reduction of the remaining error.
 
         The proposal is computed at the first access after each change, and is then stored.
-
-        Raises:
-            PressError: If every position was rejected.
         """
         if self._proposed is not None:
             return self._proposed
 
-        skipped_mm = np.reshape(self._skipped_places, (-1, 2))  # shape (0, 2) if no position was rejected
         # If there are no presses, or no film explains them, all presses are planned from the beginning. The presses so
         # far count as the first presses of this plan, and the next one is proposed.
         film = None if self.result is None else self.result.film
         count = 1 if self.result is not None else len(self) + 1
-        plan = next_presses(self.problem, self._charges, count, film, avoid_mm=skipped_mm, **self._stds)
+        plan = next_presses(self.problem, self._charges, count, film, **self._stds)
         self._proposed = plan[-1]
         return self._proposed
 
@@ -250,30 +205,17 @@ class PressSession:
                 f"{max_force:.2g} N, got {describe_press(contact)}; press there, or give the real values in mm and N"
             )
 
-    def undo(self, number: int | Literal["last"] = "last") -> int:
-        """Remove a press, fit the film to the other presses, and return the number of the removed press.
-
-        Args:
-            number: Number of the press, counted from 1; "last" for the last press.
+    def undo(self) -> int:
+        """Remove the last press, fit the film to the other presses, and return the number of the removed press.
 
         Raises:
-            PressError: If there is no press with this number.
+            PressError: If there is no press.
         """
         count = len(self)
         if not count:
             raise PressError("there is no press to undo yet")
-        removed_number = count if number == "last" else number
-        if not 1 <= removed_number <= count:
-            count_text = "1 is taken" if count == 1 else f"{count} are taken"
-            raise PressError(f"there is no press {removed_number} to undo: {count_text}")
-        numbers = np.arange(1, count + 1)
-        self._change(self.presses[numbers != removed_number])
-        return removed_number
-
-    def skip(self) -> None:
-        """Reject the proposed position. A rejected position is never proposed again."""
-        self._skipped_places.append((self.proposed.x_mm, self.proposed.y_mm))
-        self._proposed = None
+        self._change(self.presses[:-1])
+        return count
 
     def _change(self, presses: MeasuredPresses) -> None:
         """Save a changed list of presses, and fit the film to the presses in the list."""
@@ -325,7 +267,7 @@ class PressSession:
         )
         bad_sentences = [
             f"Press {number}, {describe_press(self.presses.contact[number - 1])}, does not agree with the others "
-            f"and is left out. Were its position and its force as stated? Type u {number} to remove it."
+            "and is left out. Were its position and its force as stated?"
             for number in self.result.bad_lines
         ]
         return (error_sentence, *bad_sentences)
