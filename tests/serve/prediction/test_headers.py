@@ -9,7 +9,6 @@ import pytest
 from isocharge.common.errors import ChargeError, PressError
 from isocharge.serve import read_charges, read_presses
 from isocharge.serve.prediction.table import read_charge_file
-from isocharge.serve.presses.measured_presses import read_press_list
 
 NAMES = ("A", "B", "C")
 ROW = "1,2,3,4,5,6\n"
@@ -70,11 +69,6 @@ def test_headers_of_charges_alone(write):
     with pytest.raises(ChargeError, match="rename 'a' to 'A'"):
         read_charges(io.StringIO("a,B,C\n1,2,3\n"), NAMES, "stdin")
     assert read_charge_file(write(f"x,y,Kraft,A,B,C\n{ROW}"), NAMES).tolist() == [[4.0, 5.0, 6.0]]
-
-
-def test_headers_of_a_list_of_presses(write):
-    with pytest.raises(PressError, match=r"got the header .*'Kraft \[N\]'.*missing: \['force_N'\]"):
-        read_press_list(write("x_mm,y_mm,Kraft [N]\n1,2,3\n"))
 
 
 TEXT = f"# Größe\nx_mm,y_mm,force_N,A,B,C\n{ROW}"

@@ -1,7 +1,6 @@
 """Tests of calibration.json: round trips, and damaged files."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import PressError
-from isocharge.simulate import Circle, NoiseModel, load_sensor, parse_probe
+from isocharge.simulate import Circle, NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.calibration_file import film_table, json_text, read_film
 from isocharge.train.calibration.estimator import PLANNED
@@ -95,12 +94,3 @@ def test_damaged_files_are_refused_with_the_key(tmp_path, name):
     path.write_text(json.dumps(table))
     with pytest.raises(PressError, match=f"calibration.json: .*{message}"):
         read_film(path, PROBLEM)
-
-
-def test_another_working_area_or_probe_needs_its_own_calibration(tmp_path):
-    path = tmp_path / "calibration.json"
-    path.write_text(json_text(film_table(PROBLEM, random_film(0))))
-    with pytest.raises(PressError, match=r"probe: expected rectangle:4\.0x2\.0"):
-        read_film(path, CalibrationProblem(PROBLEM.sensor, parse_probe("rectangle:4x2")))
-    with pytest.raises(PressError, match="radius_mm: expected 6"):
-        read_film(path, replace(PROBLEM, radius=6.0))

@@ -110,22 +110,6 @@ def test_estimate_minimises_the_sum_of_squares_of_all_unknowns_and_contacts(prob
     np.testing.assert_allclose(given, whole, atol=0.02 * np.sqrt(np.outer(np.diag(whole), np.diag(whole))).max())
 
 
-@pytest.mark.usefixtures("_one_hypothesis")
-def test_covariance_is_that_of_the_errors_on_drawn_films(problem, synthetic):
-    """The squared error in units of the covariance has the mean of a chi-squared distribution."""
-    is_free = np.diag(problem.prior.covariance(ONE)) > 0.0
-    squared = []
-    for seed in range(40):
-        rng = np.random.default_rng([seed, 2])
-        unknowns = draw_unknowns(problem, ONE, rng)
-        data = PressData.of(presses_on(problem, synthetic, unknowns, 15, rng), problem.noise, problem.solved_domain)
-        film = estimate(synthetic, data, problem.prior).film
-        error = (film.values - unknowns)[is_free]
-        squared.append(error @ np.linalg.solve(film.covariance[np.ix_(is_free, is_free)], error))
-    free_count = int(is_free.sum())
-    assert abs(np.mean(squared) / free_count - 1.0) < 4.0 * np.sqrt(2.0 / free_count / len(squared))
-
-
 def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(problem, synthetic, monkeypatch):
     """The films are drawn from the hypotheses with their probabilities. To save time, there are only 32 hypotheses."""
     monkeypatch.setattr(estimator, "IMPERFECTION_SCALES", ((0.1, 0.5), (1.5, 0.5)))

@@ -8,7 +8,6 @@ import pytest
 from tests.benchmarks.measured_films import measured_presses, with_rig_errors
 
 from isocharge.serve import Predictor
-from isocharge.serve.presses.measured_presses import read_presses
 from isocharge.simulate import Circle, ForwardMap, load_sensor, local_workers, parse_probe, press, touch_charge
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import CalibrationProblem, FitConfig, TrainingConfig, calibrate, write_calibration
@@ -162,18 +161,3 @@ def test_derivatives_of_a_strongly_uneven_film_include_the_change_from_the_even_
     uneven = solved.solved(values.copy(), None)
     values[prior.index("stiffness_x")] = np.log(1.4)
     np.testing.assert_allclose(uneven.charges(values, CONTACT), direct(*prior.film(values), CONTACT), rtol=2e-3)
-
-
-@pytest.mark.slow
-def test_negative_coefficients_and_charges_give_the_same_film_as_positive_ones():
-    """The charges are proportional to the coefficients, so both signs must change together."""
-    sensor = load_sensor("four-25um-biaxial")
-    negative = replace(sensor, piezo=replace(sensor.piezo, d31=-sensor.piezo.d31, d32=-sensor.piezo.d32))
-    presses = read_presses(PRESSES_FILE, sensor.electrode_names)
-    opposite = replace(presses, charge_pC=-presses.charge_pC)
-    film = calibrate(presses, CalibrationProblem(sensor, Circle(1.0))).film
-    opposite_film = calibrate(opposite, CalibrationProblem(negative, Circle(1.0))).film
-    count = len(film.film_values)
-    std = np.sqrt(np.diag(film.covariance)[:count])
-    difference = (opposite_film.film_values - film.film_values) / std
-    assert np.abs(difference).max() < 0.2

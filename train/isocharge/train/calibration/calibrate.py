@@ -17,7 +17,7 @@ from isocharge.train.calibration.diagnosis import (
     misfit,
     unexplained_error,
 )
-from isocharge.train.calibration.estimator import BAD_PROBABILITY, Estimation, estimate, is_unexplained
+from isocharge.train.calibration.estimator import Estimation, estimate
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.calibration.problem import CalibrationProblem
@@ -37,9 +37,6 @@ The neglected second-order effect is about the square of this value.
 
 SUSPICIOUS_MISFIT = 8.0
 """Misfit of the recorded presses, as `misfit` returns it, above which mistakes are searched for before the fit."""
-
-UNEXPLAINED_CHI2 = 9.0
-"""Mean squared residual above which no film explains the presses, in units of the noise variance."""
 
 MAX_USUAL_NOISE = 0.01
 """Noise that is proportional to the charge, above which a caution is given, dimensionless."""
@@ -103,7 +100,7 @@ def calibrate(
         estimation = _fit_even_film(problem, data, charges, executor)
         if accurate:
             estimation = _fit_uneven_film(problem, data, estimation, executor)
-        if is_unexplained(estimation, BAD_PROBABILITY, UNEXPLAINED_CHI2):
+        if estimation.is_unexplained:
             residual = np.sqrt(estimation.chi2 / estimation.redundancy)
             reason = f"the charges of the best film differ from theirs by {residual:.2g} times the noise"
             raise unexplained_error(used_presses, estimation.charges, reason)

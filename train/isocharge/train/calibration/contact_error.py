@@ -27,8 +27,7 @@ from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate
-from isocharge.train.calibration.press_data import PressData
-from isocharge.train.calibration.press_model import linearise
+from isocharge.train.calibration.press_data import PressData, linearise
 from isocharge.train.calibration.problem import CalibrationProblem
 
 N_CONTACTS = 200

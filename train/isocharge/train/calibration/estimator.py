@@ -27,14 +27,23 @@ from isocharge.simulate import NoiseModel, noise_model
 from isocharge.train.calibration.discrepancy import unit_covariance
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout
-from isocharge.train.calibration.press_data import PressData, PressErrors
-from isocharge.train.calibration.press_model import Linearised, in_domain, linearise, model_values
+from isocharge.train.calibration.press_data import (
+    Linearised,
+    PressData,
+    PressErrors,
+    in_domain,
+    linearise,
+    model_values,
+)
 
 UNKNOWN_CHARGE_STD = 1e9
 """Standard deviation of a charge that was not measured, pC."""
 
 BAD_PROBABILITY = 1e-5
 """Probability of residuals as large as those of a press, below which the press is left out."""
+
+UNEXPLAINED_CHI2 = 9.0
+"""Mean squared residual above which no film explains the presses, in units of the noise variance."""
 
 FEW_PRESSES = 3
 """Largest number of presses that counts as few. Among a few presses, a bad press cannot be recognised."""
@@ -187,6 +196,14 @@ class Estimation:
     chi2: float
     redundancy: float
     hypothesis: Hypothesis
+
+    @property
+    def is_unexplained(self) -> bool:
+        """Whether the residuals are too large for any film."""
+        if self.redundancy == 0.0:
+            return False
+        improbable_chi2 = float(chdtri(self.redundancy, BAD_PROBABILITY))
+        return self.chi2 > max(UNEXPLAINED_CHI2 * self.redundancy, improbable_chi2)
 
 
 def estimate(
@@ -429,17 +446,3 @@ def _bounded(unknowns: Array, layout: Layout) -> Array:
     low, high = layout.prior.bounds
     bounded[layout.film] = np.clip(bounded[layout.film], low, high)
     return bounded
-
-
-def is_unexplained(estimation: Estimation, probability: float, ratio: float) -> bool:
-    """Return whether the residuals are too large for any film.
-
-    Args:
-        estimation: Result of the estimator.
-        probability: Probability of such residuals, below which they are too large.
-        ratio: Mean squared residual above which they are too large.
-    """
-    if estimation.redundancy == 0.0:
-        return False
-    limit = max(ratio * estimation.redundancy, float(chdtri(estimation.redundancy, probability)))
-    return estimation.chi2 > limit

@@ -17,11 +17,14 @@ from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap
 from isocharge.simulate.forward.derivative_maps import NODE_COUNT
 from isocharge.simulate.sensor.film_properties import PRETENSION, FilmProperty, changed_film
 
-SOLVED_STEP = 1.0 / 3.0
-"""Step of the difference quotients for which a film is solved, in prior standard deviations of the property."""
+STEP = 1.0 / 3.0
+"""Step of the difference quotients, in prior standard deviations of the property."""
 
-READING_STEP = 0.05
-"""Step of the difference quotients for which the solved film is only read again, in prior standard deviations."""
+PROBE_RADIUS = "probe_radius"
+"""Name of the only property that changes the stress and whose derivative does not follow from that of the stress."""
+
+UNEVEN_TENSIONS = ("tension_difference", "tension_shear")
+"""Properties that are uneven parts of the pretension, relative to the pretension."""
 
 MAX_LOG_CHANGE = 1.0
 """Largest change of the logarithm of a charge to which a first-order change is applied."""
@@ -49,8 +52,7 @@ class FilmCharges:
         film: Forward map of the solved film.
         slopes: Derivatives with respect to the mechanical properties, for the axisymmetric film.
         same_probe: Forward map of the axisymmetric film under a circular probe, with the few nodes of the slopes.
-        increased: The same map after the increase of a property by `SOLVED_STEP`, by the name of the property. It
-            contains the properties that change the stress and for which no derivative of the stress is computed.
+        larger_probe: The same map under a probe whose radius is larger by `STEP`; None if the probe is not round.
     """
 
     prior: FilmPrior
@@ -59,7 +61,7 @@ class FilmCharges:
     film: ForwardMap
     slopes: FilmSlopes
     same_probe: ForwardMap
-    increased: dict[str, ForwardMap]
+    larger_probe: ForwardMap | None
 
     @classmethod
     def solve_roughly(
@@ -91,12 +93,10 @@ class FilmCharges:
             )
 
         same_probe = solve(even_values)
-        increased = {}
-        for index, name in enumerate(prior.names):
-            if prior.changes_stress[index] and name not in KNOWN_DERIVATIVES:
-                step = np.zeros(len(values))
-                step[index] = SOLVED_STEP * prior.std[index]
-                increased[name] = solve(even_values + step)
+        larger_probe = None
+        if PROBE_RADIUS in prior.names:
+            is_radius = np.arange(len(values)) == prior.index(PROBE_RADIUS)
+            larger_probe = solve(even_values + STEP * prior.std * is_radius)
         return cls(
             prior=prior,
             values=even_values,
@@ -104,7 +104,7 @@ class FilmCharges:
             film=same_probe,
             slopes=FilmSlopes.build(same_probe, executor=executor),
             same_probe=same_probe,
-            increased=increased,
+            larger_probe=larger_probe,
         )
 
     def solved(self, values: Array, executor: Executor | None) -> "FilmCharges":
@@ -266,9 +266,10 @@ class _Reading:
             derivatives[name] = values[PRETENSION.name] * derivatives[name]
         derivatives["young"] = charge - force_slope - values[PRETENSION.name] * derivatives[PRETENSION.name]
         same_charge = self._read(self._charges.same_probe).charges(contact)
-        for name, increased in self._charges.increased.items():
-            step = SOLVED_STEP * self._prior.std[self._prior.index(name)]
-            derivatives[name] = (self._read(increased).charges(contact) - same_charge) / step
+        larger_probe = self._charges.larger_probe
+        if larger_probe is not None:
+            step = STEP * self._prior.std[self._prior.index(PROBE_RADIUS)]
+            derivatives[PROBE_RADIUS] = (self._read(larger_probe).charges(contact) - same_charge) / step
         return derivatives
 
     def _coefficients(self, contact: Array) -> dict[str, Array]:
@@ -286,23 +287,7 @@ class _Reading:
 
     def _read_difference(self, one: FilmProperty, contact: Array) -> Array:
         """Compute the derivative with respect to a property that does not change the stress, by central differences."""
-        step = READING_STEP * one.std
+        step = STEP * one.std
         sensors = [changed_film(self.film.sensor, self.film.probe, {one.name: change})[0] for change in (step, -step)]
         forward, backward = (replace(self.film, sensor=sensor).charges(contact) for sensor in sensors)
         return np.asarray((forward - backward) / (2.0 * step))
-
-
-UNEVEN_TENSIONS = ("tension_difference", "tension_shear")
-"""Properties that are uneven parts of the pretension, relative to the pretension."""
-
-KNOWN_DERIVATIVES = (
-    PRETENSION.name,
-    *UNEVEN_TENSIONS,
-    "young",
-    "thickness",
-    "stiffness_x",
-    "stiffness_xy",
-    "oval_x",
-    "oval_xy",
-)
-"""Properties that change the stress, with derivatives that follow from those of the stress."""

@@ -9,7 +9,6 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.simulate import FilmPrior, NoiseModel, noise_model
 from isocharge.train.calibration.discrepancy import term_names
-from isocharge.train.calibration.press_data import PressData
 
 COEFFICIENT_DRIFT = 0.002
 """Standard deviation of the change of each coefficient of the discrepancy between two calibrations."""
@@ -24,14 +23,14 @@ class SessionProperty:
         unit: Unit of its value.
         stds: Standard deviations of the prior distribution that are considered, with their probabilities.
         effect: Function that computes the derivatives of the charges, shape (n, n_electrode). Its arguments are the
-            presses and the charges of the film.
+            times of the presses, shape (n,), and the charges of the film, shape (n, n_electrode).
         caution: Words about a value that is certainly not zero, with the fields `value` and `std`.
     """
 
     name: str
     unit: str
     stds: tuple[tuple[float, float], ...]
-    effect: Callable[[PressData, Array], Array]
+    effect: Callable[[Array, Array], Array]
     caution: str
 
 
@@ -48,7 +47,7 @@ SESSION = (
         "drift",
         "1",
         ((1e-6, 0.95), (0.15, 0.05)),
-        lambda data, charge: data.time[:, None] * charge,
+        lambda time, charge: time[:, None] * charge,
         "the charges change by a share of {value:.2g} +- {std:.2g} from the first press to the last: does an amplifier "
         "drift? The standard deviations of the model contain this change",
     ),
@@ -150,14 +149,10 @@ class FilmEstimate:
         covariance[session] = covariance[:, session] = 0.0
         return replace(self, values=values, covariance=covariance)
 
-    def session_cautions(self, certain: float = 3.0) -> Sequence[str]:
-        """Return sentences about unknowns of the session that are certainly not zero.
-
-        Args:
-            certain: Smallest ratio of a value to its standard deviation.
-        """
+    def session_cautions(self) -> Sequence[str]:
+        """Return sentences about unknowns of the session that differ from zero by three standard deviations."""
         return [
             one.caution.format(value=self.value(one.name), std=self.std(one.name))
             for one in SESSION
-            if abs(self.value(one.name)) > certain * self.std(one.name) > 0.0
+            if abs(self.value(one.name)) > 3.0 * self.std(one.name)
         ]
