@@ -23,7 +23,7 @@ from isocharge.train.data.presses import draw_contacts
 ONE = Hypothesis(
     1.0,
     0.003,
-    tuple(20.0 if one.name == "offset" else 1e-6 for one in SESSION),
+    tuple(20.0 if one.name == "offset" else 1e-4 for one in SESSION),
     PressErrors(noise_model("reference")),
     1.0,
 )
