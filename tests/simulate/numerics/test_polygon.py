@@ -79,6 +79,16 @@ def test_shared_area_of_two_squares(shift, expected):
     assert shared_area(SQUARE, SQUARE + shift) == pytest.approx(expected, abs=1e-15)
 
 
+@pytest.mark.parametrize("corners", [[0, 1, 2, 2 + 1j, 1j], [0, 1, 1 + 1j, 0.5 + 0.2j, 1j], [0, 1, 1, 1j]])
+def test_polygon_with_a_straight_or_reentrant_or_repeated_corner_is_not_convex(corners):
+    assert not is_convex(corners_of(np.array(corners)))
+
+
+def test_star_polygon_is_not_convex():
+    """It turns left at every corner, but it crosses itself."""
+    assert not is_convex(corners_of(np.exp(0.8j * np.pi * np.arange(5))))
+
+
 def test_centroid_of_a_triangle_is_the_mean_of_its_corners():
     corners = np.array([[0.0, 0.0], [6.0, 0.0], [0.0, 3.0]])
     np.testing.assert_allclose(centroid_of(corners), [2.0, 1.0], atol=1e-15)

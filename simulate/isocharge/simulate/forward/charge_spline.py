@@ -22,7 +22,7 @@ from isocharge.simulate.forward.charge_map import ChargeMap, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.numerics.disk import onto_disk, sunflower
-from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
+from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
 from isocharge.simulate.numerics.spline_fit import disk_positions, fit_spline, rectangle_positions, spline_knots
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.sensor import Calibration
@@ -258,7 +258,7 @@ class ChargeSpline:
         """
         nodes = np.log(self.force)
         flat_log_force = log_force.ravel()
-        weights = lagrange_values(nodes, barycentric_weights(nodes), flat_log_force)
+        weights = lagrange_values(nodes, flat_log_force)
         weights *= amplitude_squared(self.film, np.exp(flat_log_force))[:, None]
         return weights.reshape(*log_force.shape, nodes.size)
 
@@ -366,7 +366,7 @@ class _ScaledCharges:
 
         # A sensor with d33 has more spline forces than solved forces. Interpolate the charges to the spline forces.
         nodes = np.log(solved_force)
-        force_weights = lagrange_values(nodes, barycentric_weights(nodes), np.log(self.force))
+        force_weights = lagrange_values(nodes, np.log(self.force))
         scaled_charge = force_weights @ scaled_stress_charge  # shape (n, n_force, n_electrode)
 
         # Add the charge of the contact pressure, which is proportional to the force.

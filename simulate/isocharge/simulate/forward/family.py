@@ -19,7 +19,6 @@ from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import (
-    barycentric_weights,
     chebyshev_nodes,
     lagrange_values,
     periodic_weights,
@@ -186,9 +185,9 @@ class Family:
         # Interpolation weights along each axis; `rotation` may have the shape (1,) if it is the same for all presses.
         distance_nodes = distance_coordinate(self.distance / self.film_radius)
         press_coordinates = distance_coordinate(np.abs(position) / self.film_radius)
-        distance_weights = lagrange_values(distance_nodes, barycentric_weights(distance_nodes), press_coordinates)
+        distance_weights = lagrange_values(distance_nodes, press_coordinates)
         force_nodes = np.log(self.force)
-        force_weights = lagrange_values(force_nodes, barycentric_weights(force_nodes), np.log(force))
+        force_weights = lagrange_values(force_nodes, np.log(force))
         turn_weights = self._turn_weights(np.angle(position), rotation)
 
         # The weight of a node is the product of its weights along the axes (press, distance, force, turn).

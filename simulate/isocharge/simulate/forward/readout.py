@@ -18,8 +18,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.errors import SensorError
-from isocharge.simulate.numerics.interpolation import gauss_line, gauss_square
-from isocharge.simulate.numerics.polygon import gauss_polygon, gauss_quadrilateral
+from isocharge.simulate.numerics.interpolation import gauss_line
+from isocharge.simulate.numerics.polygon import gauss_quadrilateral
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import MAX_PART_SIDE, Electrode, Readout, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
@@ -277,18 +277,28 @@ def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
         Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3). The three
         weights of a point are equal. The sum of each weight over all points is 1.
     """
-    if electrode.square:  # the product of two one-dimensional Gauss rules
-        unit_points, shares = gauss_square(per_side)  # coordinates from 0 to 1
-        lower_left, _, upper_right, _ = np.array(electrode.corners)  # anticlockwise
-        points = lower_left + unit_points * (upper_right - lower_left)
-    elif len(electrode.parts) == 1:
-        points, shares = gauss_polygon(electrode.parts[0], per_side)
-    else:  # an electrode that consists of several quadrilaterals
-        rules = [gauss_quadrilateral(part, per_side, MAX_PART_SIDE) for part in electrode.parts]
-        points = np.concatenate([part_points for part_points, _ in rules])
-        weights = np.concatenate([part_weights for _, part_weights in rules])
-        shares = weights / weights.sum()
+    if len(electrode.parts) == 1:
+        corners = electrode.parts[0]
+        pieces = _quadrilaterals(corners)
+        full_length = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min())
+    else:  # sides that are shorter than the longest possible side have fewer points
+        pieces = list(electrode.parts)
+        full_length = MAX_PART_SIDE
+    rules = [gauss_quadrilateral(piece, per_side, full_length) for piece in pieces]
+    points = np.concatenate([piece_points for piece_points, _ in rules])
+    weights = np.concatenate([piece_weights for _, piece_weights in rules])
+    shares = weights / weights.sum()
     return points, np.repeat(shares[:, None], 3, axis=1)
+
+
+def _quadrilaterals(corners: Array) -> list[Array]:
+    """Divide a convex polygon into quadrilaterals, and possibly one triangle, that share the first corner.
+
+    Args:
+        corners: Corners (x, y), shape (n, 2), mm.
+    """
+    n_corner = len(corners)
+    return [corners[[0, *range(second, min(second + 3, n_corner))]] for second in range(1, n_corner - 1, 2)]
 
 
 def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:

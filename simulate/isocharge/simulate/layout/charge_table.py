@@ -33,7 +33,6 @@ from isocharge.simulate.forward.readout import electrode_rule
 from isocharge.simulate.mesh.conformal_map import automorphism_onto, distance_coordinate
 from isocharge.simulate.mesh.placed_mesh import distance_on_circular_film, film_oval, from_oval, to_oval
 from isocharge.simulate.numerics.interpolation import (
-    barycentric_weights,
     chebyshev_nodes,
     cubic_weights,
     lagrange_values,
@@ -210,7 +209,7 @@ class PressedFilm:
         # Compute the weights that interpolate between the solved presses, shape (n, n_distance * n_direction).
         nodes = distance_coordinate(table.distance / table.film.radius)
         coordinate = distance_coordinate(relative_distance)
-        distance_weights = lagrange_values(nodes, barycentric_weights(nodes), coordinate)
+        distance_weights = lagrange_values(nodes, coordinate)
         direction_weights = periodic_weights(table.direction, DIRECTION_PERIOD, np.angle(position))
         press_weights = (distance_weights[:, :, None] * direction_weights[:, None, :]).reshape(len(position), -1)
 

@@ -22,6 +22,8 @@ C, and a deviator is added to tau I (`scaling.Anisotropy`). The bending stiffnes
 film.
 """
 
+from itertools import combinations_with_replacement
+
 import numpy as np
 
 from isocharge.common.arrays import Array
@@ -29,9 +31,6 @@ from isocharge.simulate.mechanics.back_pressure import BackPressure
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_stress
 from isocharge.simulate.mechanics.stress import strain
 from isocharge.simulate.mesh.placed_mesh import Geometry
-
-COMPONENT_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Pairs of displacement components whose blocks of the tangent are computed. The other blocks follow by symmetry."""
 
 SHIFT = 5.0
 """Shift s of the linear solves with bending; see `Bending`.
@@ -183,11 +182,9 @@ class Membrane:
         self.groups = groups
         # Weights of the squared slopes of U1, U2 and W in the strain, shape (3,)
         self._slope_weights = np.array([groups.squared_amplitude, groups.squared_amplitude, 1.0])
-
-    @property
-    def _deviator(self) -> Array | None:
-        """Pretension minus its mean, in units of E_young A^2, shape (2, 2). None if the pretension is isotropic."""
-        return None if self.groups.anisotropy is None else _symmetric_matrix(self.groups.anisotropy.tension)
+        # Pretension in units of E_young A^2, as stress (T11, T22, T12) and as a symmetric matrix
+        self._pretension = groups.tension * np.array([1.0, 1.0, 0.0]) + groups.anisotropy.tension
+        self._pretension_matrix = _symmetric_matrix(self._pretension)
 
     def _slopes(self, field: Array) -> Array:
         """Compute the derivatives of (U1, U2, W) with respect to (X1, X2) at the quadrature points.
@@ -236,12 +233,9 @@ class Membrane:
         energy_density = 0.5 * np.sum(scaled_strain * scaled_stress(scaled_strain, self.groups), axis=-1)
 
         # The difference tr E' - div U is half of the weighted sum of the squared slopes. The weights are A^2 for the
-        # slopes of U1 and U2, and 1 for the slopes of W, where A is the amplitude. If the pretension depends on the
-        # direction, its deviator adds a similar term.
-        energy_density += 0.5 * self.groups.tension * np.sum(slopes**2 @ self._slope_weights, axis=-1)
-        if self._deviator is not None:
-            deviator_products = slopes * (self._deviator @ slopes)
-            energy_density += 0.5 * np.sum(deviator_products @ self._slope_weights, axis=-1)
+        # slopes of U1 and U2, and 1 for the slopes of W, where A is the amplitude.
+        pretension_products = slopes * (self._pretension_matrix @ slopes)
+        energy_density += 0.5 * np.sum(pretension_products @ self._slope_weights, axis=-1)
         return float(np.sum(energy_density * self.geometry.weights))
 
     def forces(self, field: Array) -> Array:
@@ -259,11 +253,9 @@ class Membrane:
         elastic_stress = scaled_stress(scaled_strain, self.groups)
 
         # The traction is the derivative of the energy density with respect to the slopes, shape (n_element, n_point, 2,
-        # 3). Its terms belong to the elastic stress, to the mean pretension and to the deviator of the pretension.
+        # 3). Its terms belong to the elastic stress and to the pretension.
         traction = _symmetric_matrix(elastic_stress) @ self._deformation_gradient(slopes)
-        traction += self.groups.tension * self._slope_weights * slopes
-        if self._deviator is not None:
-            traction += self._slope_weights * (self._deviator @ slopes)
+        traction += self._slope_weights * (self._pretension_matrix @ slopes)
 
         # Integrate the product of the traction and the derivatives of the basis functions over each element.
         weighted_traction = traction * geometry.weights[..., None, None]
@@ -287,13 +279,11 @@ class Membrane:
         slopes = self._slopes(field)
         deformation = self._deformation_gradient(slopes)
 
-        # The total stress (S11, S22, S12) is the sum of the elastic stress, the mean pretension, and the deviator of
-        # the pretension. The total stress is multiplied by the integration weights.
-        total_stress = scaled_stress(strain(slopes, self.groups.squared_amplitude), self.groups)
-        total_stress[..., :2] += self.groups.tension
-        if self.groups.anisotropy is not None:
-            total_stress += self.groups.anisotropy.tension
-        weighted_stress = _symmetric_matrix(total_stress * geometry.weights[..., None])
+        # The total stress (S11, S22, S12) is the sum of the elastic stress and the pretension. It is multiplied by the
+        # integration weights.
+        elastic_stress = scaled_stress(strain(slopes, self.groups.squared_amplitude), self.groups)
+        weighted_stress = _symmetric_matrix((elastic_stress + self._pretension) * geometry.weights[..., None])
+        weighted_stiffness = self._material_stiffness(deformation) * geometry.weights[..., None, None, None, None]
 
         # Compute one block for each pair (i, j) of displacement components. A block consists of the material part and,
         # for i = j, of the part that is caused by the stress. The matrix is symmetric, so the blocks below the diagonal
@@ -301,8 +291,8 @@ class Membrane:
         n_element, _, _, n_local = gradient.shape
         transposed_gradient = np.ascontiguousarray(geometry.stacked.transpose(0, 2, 1))
         matrix = np.empty((n_element, 3, n_local, 3, n_local))
-        for i, j in COMPONENT_PAIRS:
-            block = self._material_block(deformation, i, j) * geometry.weights[..., None, None]
+        for i, j in combinations_with_replacement(range(3), 2):
+            block = weighted_stiffness[..., i, :, j].copy()
             if i == j:
                 block += self._slope_weights[i] * weighted_stress  # the weights are A^2 for U1 and U2, and 1 for W
 
@@ -313,43 +303,31 @@ class Membrane:
                 matrix[:, j, :, i] = matrix[:, i, :, j].transpose(0, 2, 1)
         return matrix.transpose(0, 2, 1, 4, 3)  # the node before the component
 
-    def _material_block(self, deformation: Array, i: int, j: int) -> Array:
-        """Compute the second derivatives of the elastic energy density with respect to the slopes of two components.
+    def _material_stiffness(self, deformation: Array) -> Array:
+        """Compute the second derivatives of the elastic energy density with respect to all slopes.
 
-        The result is the product B_i C B_j', where C is the elasticity matrix. The matrix B_i contains the derivatives
-        of the strain (E11, E22, 2 E12) with respect to the slopes of component i. For the isotropic part of C, the
-        product is written out component by component. The part of the second derivatives that is caused by the stress
-        is not included.
+        The result is the product B C B', where C is the elasticity matrix. The matrix B contains the derivatives of the
+        strain (E11, E22, 2 E12) with respect to the slopes. The part of the second derivatives that is caused by the
+        stress is not included.
 
         Args:
-            deformation: Scaled deformation gradient F, shape (n_element, n_point, 2, 3).
-            i: First displacement component, from 0 to 2.
-            j: Second displacement component, from 0 to 2.
+            deformation: Scaled deformation gradient F, shape (n_element, n_point, 2, 3). The last two axes are the
+                coordinate and the displacement component.
 
         Returns:
-            Second derivatives, shape (n_element, n_point, 2, 2). The last two axes are the coordinates of the slopes of
-            components i and j.
+            Second derivatives, shape (n_element, n_point, 2, 3, 2, 3). The last four axes are the coordinate and the
+            displacement component of the first slope, and those of the second slope.
         """
-        # Compute the part of an isotropic film. F_i1 and F_i2 are components of the deformation gradient.
-        poisson = self.groups.poisson
-        plane_modulus = 1.0 / (1.0 - poisson**2)
-        shear_modulus = 0.5 / (1.0 + poisson)
-        f_i1 = deformation[..., 0, i]
-        f_i2 = deformation[..., 1, i]
-        f_j1 = deformation[..., 0, j]
-        f_j2 = deformation[..., 1, j]
-        block = np.empty((*f_i1.shape, 2, 2))
-        block[..., 0, 0] = plane_modulus * f_i1 * f_j1 + shear_modulus * f_i2 * f_j2
-        block[..., 1, 1] = plane_modulus * f_i2 * f_j2 + shear_modulus * f_i1 * f_j1
-        block[..., 0, 1] = plane_modulus * poisson * f_i1 * f_j2 + shear_modulus * f_i2 * f_j1
-        block[..., 1, 0] = plane_modulus * poisson * f_i2 * f_j1 + shear_modulus * f_i1 * f_j2
+        strain_derivative = np.zeros((*deformation.shape, 3))
+        strain_derivative[..., 0, :, 0] = deformation[..., 0, :]  # d E11 / d U_i,1
+        strain_derivative[..., 1, :, 1] = deformation[..., 1, :]  # d E22 / d U_i,2
+        strain_derivative[..., 0, :, 2] = deformation[..., 1, :]  # d 2 E12 / d U_i,1
+        strain_derivative[..., 1, :, 2] = deformation[..., 0, :]  # d 2 E12 / d U_i,2
 
-        # Add the part of the additional moduli of an orthotropic film.
-        if self.groups.anisotropy is not None:
-            i_derivative = _strain_derivative(f_i1, f_i2)
-            j_derivative = _strain_derivative(f_j1, f_j2)
-            block += i_derivative @ self.groups.anisotropy.moduli @ j_derivative.swapaxes(-1, -2)
-        return block
+        n_element, n_point, _, _ = deformation.shape
+        derivatives = strain_derivative.reshape(n_element, n_point, 6, 3)  # one row for each slope
+        stiffness = scaled_stress(derivatives, self.groups) @ derivatives.swapaxes(-1, -2)
+        return stiffness.reshape(n_element, n_point, 2, 3, 2, 3)
 
 
 class Bending:
@@ -472,24 +450,6 @@ class Bending:
         matrix[:, :, 3, :, 2] = coupling
         matrix[:, :, 3, :, 3] = -mass
         return matrix
-
-
-def _strain_derivative(f_i1: Array, f_i2: Array) -> Array:
-    """Compute the derivatives of the strain with respect to the slopes U_i,1 and U_i,2 of displacement component i.
-
-    Args:
-        f_i1: Component F_i1 of the scaled deformation gradient, shape (...).
-        f_i2: Component F_i2 of the scaled deformation gradient, shape (...).
-
-    Returns:
-        Derivatives of (E11, E22, 2 E12), shape (..., 2, 3), with one row for each slope.
-    """
-    derivative = np.zeros((*f_i1.shape, 2, 3))
-    derivative[..., 0, 0] = f_i1  # d E11 / d U_i,1
-    derivative[..., 1, 1] = f_i2  # d E22 / d U_i,2
-    derivative[..., 0, 2] = f_i2  # d 2 E12 / d U_i,1
-    derivative[..., 1, 2] = f_i1  # d 2 E12 / d U_i,2
-    return derivative
 
 
 def _symmetric_matrix(stress: Array) -> Array:

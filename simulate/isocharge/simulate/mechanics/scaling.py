@@ -58,6 +58,10 @@ class Anisotropy:
     tension: Array
 
 
+ISOTROPIC = Anisotropy(moduli=np.zeros((3, 3)), tension=np.zeros(3))
+"""Properties of an isotropic film with an isotropic pretension."""
+
+
 @dataclass(frozen=True)
 class DimensionlessGroups:
     """Dimensionless groups that define the scaled problem of a press.
@@ -70,7 +74,7 @@ class DimensionlessGroups:
         tension: Mean pretension divided by E A^2.
         bending: Bending stiffness divided by E h a^2 A^2. Zero if the theory omits bending.
         poisson: Poisson's ratio.
-        anisotropy: Direction-dependent properties; None if the film is isotropic.
+        anisotropy: Direction-dependent properties.
         side_load: Side force (Fx, Fy) divided by E h a A^2, in the axes of the press.
         static_pressure: Static pressure divided by E h A^3 / a, positive in the direction of the push.
         ambient_pressure: Pressure of the atmosphere divided by E h A^3 / a. Zero if the back is vented.
@@ -83,7 +87,7 @@ class DimensionlessGroups:
     tension: float
     bending: float
     poisson: float
-    anisotropy: Anisotropy | None = None
+    anisotropy: Anisotropy = ISOTROPIC
     side_load: tuple[float, float] = (0.0, 0.0)
     static_pressure: float = 0.0
     ambient_pressure: float = 0.0
@@ -134,7 +138,7 @@ class DimensionlessGroups:
             tension=film.pretension / (film.young * squared_amplitude),
             bending=slenderness(film) / squared_amplitude if bending else 0.0,
             poisson=film.poisson,
-            anisotropy=_anisotropy(film, squared_amplitude, angle) if film.is_anisotropic else None,
+            anisotropy=_anisotropy(film, squared_amplitude, angle),
             side_load=side_load,
             static_pressure=film.static_pressure / pressure_unit,
             ambient_pressure=AMBIENT_PRESSURE / pressure_unit if compression else 0.0,
@@ -201,8 +205,7 @@ def scaled_stress(scaled_strain: Array, groups: DimensionlessGroups) -> Array:
     Returns:
         Scaled stress (S11, S22, S12) without the pretension, shape (..., 3), in units of E_young A^2.
     """
-    moduli = None if groups.anisotropy is None else groups.anisotropy.moduli
-    return stress(scaled_strain, groups.poisson, moduli)
+    return stress(scaled_strain, groups.poisson, groups.anisotropy.moduli)
 
 
 def _anisotropy(film: Film, squared_amplitude: float, angle: float) -> Anisotropy:

@@ -51,32 +51,25 @@ def strain(slopes: Array, squared_amplitude: float) -> Array:
     return np.stack([strain_11, strain_22, double_strain_12], axis=-1)
 
 
-def stress(strain: Array, poisson: float, moduli: Array | None = None) -> Array:
+def stress(strain: Array, poisson: float, moduli: Array | float = 0.0) -> Array:
     """Compute the plane stress that a strain causes according to Hooke's law, without the pretension.
 
     Args:
         strain: Strain (E11, E22, 2 E12), shape (..., 3).
         poisson: Poisson's ratio.
         moduli: Symmetric matrix that is added to the elasticity matrix C / E_young of an isotropic material, shape
-            (3, 3). None for an isotropic material.
+            (3, 3). It is zero for an isotropic material.
 
     Returns:
         Stress (S11, S22, S12), shape (..., 3), in units of E_young times the unit of the strain.
     """
-    e11 = strain[..., 0]
-    e22 = strain[..., 1]
-    double_e12 = strain[..., 2]
     plane_modulus = 1.0 / (1.0 - poisson**2)
     shear_modulus = 0.5 / (1.0 + poisson)
-
-    # Hooke's law for plane stress of an isotropic material
-    s11 = plane_modulus * (e11 + poisson * e22)
-    s22 = plane_modulus * (e22 + poisson * e11)
-    s12 = shear_modulus * double_e12
-    isotropic_stress = np.stack([s11, s22, s12], axis=-1)
-    if moduli is None:
-        return isotropic_stress
-    return isotropic_stress + strain @ moduli
+    coupling = plane_modulus * poisson
+    isotropic_moduli = np.array(
+        [[plane_modulus, coupling, 0.0], [coupling, plane_modulus, 0.0], [0.0, 0.0, shear_modulus]]
+    )
+    return np.asarray(strain @ (isotropic_moduli + moduli))
 
 
 def stress_rotation(angle: float) -> Array:

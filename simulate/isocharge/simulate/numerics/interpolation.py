@@ -1,18 +1,12 @@
-"""Polynomial interpolation on Gauss-Lobatto nodes, Chebyshev nodes and uniform grids, and Gauss quadrature rules.
-
-The Lagrange polynomials are evaluated in the barycentric form, which is numerically stable at every order (Berrut and
-Trefethen 2004).
-"""
+"""Polynomial interpolation on Gauss-Lobatto nodes, Chebyshev nodes and uniform grids, and Gauss quadrature rules."""
 
 from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial.legendre import legder, leggauss, legvander
 from scipy.special import eval_legendre, roots_jacobi
 
 from isocharge.common.arrays import Array, Integers
-
-MIN_DIFFERENCE = 1e-200
-"""Distance below which a point is treated as equal to a node, because the barycentric formula would overflow."""
 
 
 @lru_cache(maxsize=32)
@@ -33,18 +27,6 @@ def lobatto_nodes(order: int) -> Array:
 
 
 @lru_cache(maxsize=32)
-def lobatto_weights(order: int) -> Array:
-    """Return the barycentric weights of the nodes that `lobatto_nodes` returns, shape (order + 1,).
-
-    The weight of the node x_j is proportional to 1 / P(x_j), where P is the Legendre polynomial of the given order.
-    According to Wang, Huybrechs and Vandewalle (2014), the magnitudes of the barycentric weights are proportional to
-    the square roots of the quadrature weights. The signs of neighbouring weights are opposite.
-    """
-    weights: Array = 1.0 / eval_legendre(order, lobatto_nodes(order))
-    return _read_only(weights / np.abs(weights).max())
-
-
-@lru_cache(maxsize=32)
 def lobatto_quadrature(order: int) -> Array:
     """Return the quadrature weights of the nodes that `lobatto_nodes` returns, shape (order + 1,).
 
@@ -59,7 +41,7 @@ def modal_matrix(order: int) -> Array:
 
     The function `lobatto_nodes` returns the nodes. The matrix has the shape (order + 1, order + 1).
     """
-    return _read_only(np.linalg.inv(np.polynomial.legendre.legvander(lobatto_nodes(order), order)).astype(np.float64))
+    return _read_only(np.linalg.inv(legvander(lobatto_nodes(order), order)).astype(np.float64))
 
 
 def _read_only(values: Array) -> Array:
@@ -89,26 +71,6 @@ def chebyshev_nodes(count: int, low: float, high: float) -> Array:
     return np.asarray(middle + half_width * np.cos(angles))
 
 
-def barycentric_weights(nodes: Array) -> Array:
-    """Compute the barycentric weights of distinct interpolation nodes.
-
-    The weight of a node is the reciprocal of the product of its differences from all other nodes. The nodes are first
-    scaled to an interval of length 4. Because of this scaling, the products neither overflow nor underflow, even for
-    many nodes.
-
-    Args:
-        nodes: Interpolation nodes, shape (n,).
-
-    Returns:
-        Weights, shape (n,). The scaling multiplies all weights by a common factor, which does not affect the
-        interpolation.
-    """
-    scale = 4.0 / np.ptp(nodes) if nodes.size > 1 else 1.0
-    difference = (nodes[:, None] - nodes[None, :]) * scale
-    np.fill_diagonal(difference, 1.0)  # excludes the difference of a node from itself from the product
-    return np.asarray(1.0 / difference.prod(axis=1))
-
-
 def periodic_weights(nodes: Array, period: float, angle: Array) -> Array:
     """Compute the weights that interpolate between evenly spaced nodes of a periodic function.
 
@@ -136,57 +98,25 @@ def periodic_weights(nodes: Array, period: float, angle: Array) -> Array:
     return np.asarray((1.0 + np.cos(phase) @ amplitudes) / n_node)
 
 
-def lagrange_values(nodes: Array, weights: Array, points: Array) -> Array:
-    """Evaluate the Lagrange polynomials of given nodes by the barycentric formula (Berrut and Trefethen 2004).
+def lagrange_values(nodes: Array, points: Array) -> Array:
+    """Evaluate the Lagrange polynomials of given nodes.
 
-    At the point x, the polynomial of node j has the value w_j / (x - x_j), divided by the sum of w_k / (x - x_k) over
-    all nodes k. The numbers w_j are the barycentric weights.
+    The polynomial of a node is 1 at this node and 0 at all other nodes. It is the product of (x - y) / (node - y) over
+    all other nodes y.
 
     Args:
         nodes: Interpolation nodes, shape (n,).
-        weights: Barycentric weights of the nodes, shape (n,).
         points: Points of evaluation, shape (m,).
 
     Returns:
         Value of each polynomial at each point, shape (m, n). Each row adds up to one.
     """
-    difference = points[:, None] - nodes[None, :]  # shape (m, n)
-    # Points that coincide with a node would cause a division by zero. Their rows are replaced at the end.
-    coinciding_point, coinciding_node = np.nonzero(np.abs(difference) < MIN_DIFFERENCE)
-    difference[coinciding_point, coinciding_node] = 1.0
-
-    numerator = weights / difference
-    denominator = numerator @ np.ones(nodes.size)  # sum over the nodes
-    values: Array = numerator / denominator[:, None]
-
-    # At a node, the polynomial of this node is 1 and all other polynomials are 0.
-    values[coinciding_point] = nodes == nodes[coinciding_node, None]
+    values = np.ones((points.size, nodes.size))
+    for index, node in enumerate(nodes):
+        is_other = np.arange(nodes.size) != index
+        factors = (points[:, None] - node) / (nodes[is_other] - node)
+        values[:, is_other] *= factors
     return values
-
-
-@lru_cache(maxsize=32)
-def derivative_matrix(order: int) -> Array:
-    """Return the matrix that converts the values of a polynomial at the nodes into its derivatives at the nodes.
-
-    The symbols x_i and w_i denote the nodes that `lobatto_nodes` returns, and their barycentric weights. The matrix
-    element in row i and column j is (w_j / w_i) / (x_i - x_j) if i and j are different (Berrut and Trefethen 2004).
-
-    Args:
-        order: Order of the polynomials.
-
-    Returns:
-        Matrix, shape (order + 1, order + 1).
-    """
-    nodes = lobatto_nodes(order)
-    weights = lobatto_weights(order)
-    difference = nodes[:, None] - nodes[None, :]
-    np.fill_diagonal(difference, 1.0)  # avoids a division by zero on the diagonal, which is replaced below
-    matrix = weights[None, :] / weights[:, None] / difference
-
-    # The derivative of a constant is zero. Therefore each row adds up to zero, which determines the diagonal.
-    np.fill_diagonal(matrix, 0.0)
-    np.fill_diagonal(matrix, -matrix.sum(axis=1))
-    return _read_only(matrix)
 
 
 def basis(order: int, points: Array) -> tuple[Array, Array]:
@@ -199,8 +129,9 @@ def basis(order: int, points: Array) -> tuple[Array, Array]:
     Returns:
         Values and derivatives, each of shape (m, order + 1).
     """
-    values = lagrange_values(lobatto_nodes(order), lobatto_weights(order), points)
-    return values, values @ derivative_matrix(order)
+    coefficients = modal_matrix(order)  # one column of Legendre coefficients for each polynomial
+    legendre_values = legvander(points, order)
+    return legendre_values @ coefficients, legendre_values[:, :-1] @ legder(coefficients)
 
 
 def tensor_values(order: int, xi: Array, eta: Array) -> Array:
@@ -214,9 +145,8 @@ def tensor_values(order: int, xi: Array, eta: Array) -> Array:
     Returns:
         Values of the products, shape (n, (order + 1)^2). The polynomial in xi changes fastest from column to column.
     """
-    nodes = lobatto_nodes(order)
-    weights = lobatto_weights(order)
-    return _tensor_product(lagrange_values(nodes, weights, xi), lagrange_values(nodes, weights, eta))
+    coefficients = modal_matrix(order)
+    return _tensor_product(legvander(xi, order) @ coefficients, legvander(eta, order) @ coefficients)
 
 
 def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
@@ -301,7 +231,7 @@ def gauss_line(count: int) -> tuple[Array, Array]:
     Returns:
         Points and weights, each of shape (count,). The weights add up to one.
     """
-    points, weights = np.polynomial.legendre.leggauss(count)  # on the interval [-1, 1]
+    points, weights = leggauss(count)  # on the interval [-1, 1]
     return 0.5 * (points + 1.0), 0.5 * weights
 
 
@@ -316,22 +246,7 @@ def gauss_reference_square(count: int) -> tuple[Array, Array, Array]:
         Coordinates xi and eta of the points, and the weights of the points, each of shape (count^2,). The coordinate xi
         varies fastest. The weights add up to 4.
     """
-    line_points, line_weights = np.polynomial.legendre.leggauss(count)
+    line_points, line_weights = leggauss(count)
     xi, eta = np.meshgrid(line_points, line_points)
     weights = np.outer(line_weights, line_weights)
     return _read_only(xi.ravel()), _read_only(eta.ravel()), _read_only(weights.ravel())
-
-
-@lru_cache(maxsize=32)
-def gauss_square(count: int) -> tuple[Array, Array]:
-    """Return the points and weights of the Gauss-Legendre rule on the square [0, 1]^2.
-
-    Args:
-        count: Number of points in each direction.
-
-    Returns:
-        Points, shape (count^2, 2), and weights, shape (count^2,). The weights add up to one.
-    """
-    xi, eta, weights = gauss_reference_square(count)
-    points = 0.5 * (np.stack([xi, eta], axis=1) + 1.0)
-    return _read_only(points), _read_only(0.25 * weights)

@@ -4,13 +4,11 @@ The library shapely (GEOS) computes centroids, overlaps and intersections of pol
 not use shapely, because shapely would replace the disk by a polygon.
 """
 
-from itertools import pairwise
-
 import numpy as np
 import shapely
 
 from isocharge.common.arrays import Array, Complexes
-from isocharge.simulate.numerics.interpolation import gauss_line, gauss_square
+from isocharge.simulate.numerics.interpolation import gauss_line
 
 
 def area_of(corners: Array) -> float:
@@ -35,38 +33,15 @@ def centroid_of(corners: Array) -> Array:
 def is_convex(corners: Array) -> bool:
     """Return whether a polygon is strictly convex and has its corners in anticlockwise order.
 
-    A star polygon turns left at every corner, but it crosses itself and is therefore not convex.
-
     Args:
         corners: Corners (x, y), shape (n, 2).
     """
-    edges = np.roll(corners, -1, axis=0) - corners
-    next_edges = np.roll(edges, -1, axis=0)
-    turns_left = np.all(_cross(edges, next_edges) > 0.0)
-
-    # All corners of a convex polygon lie on each edge or on the left of the edge.
-    offsets = corners[None, :] - corners[:, None]  # from the start of each edge to each corner, shape (n, n, 2)
-    cross_products = _cross(edges[:, None], offsets)  # positive for corners on the left of the edge, shape (n, n)
-    rounding_tolerance = 1e-9 * cross_products.max()
-    all_on_left = cross_products.min() >= -rounding_tolerance
-    return bool(turns_left and all_on_left)
-
-
-def _cross(first: Array, second: Array) -> Array:
-    """Compute the cross product x1 y2 - y1 x2 of each pair of plane vectors (x1, y1) and (x2, y2).
-
-    Args:
-        first: Vectors (x1, y1), shape (..., 2).
-        second: Vectors (x2, y2), shape (..., 2).
-
-    Returns:
-        Cross products, shape (...). A cross product is positive if the second vector points to the left of the first.
-    """
-    x1 = first[..., 0]
-    y1 = first[..., 1]
-    x2 = second[..., 0]
-    y2 = second[..., 1]
-    return np.asarray(x1 * y2 - y1 * x2)
+    polygon = shapely.Polygon(corners)
+    if not (polygon.is_valid and polygon.exterior.is_ccw):
+        return False
+    # The convex hull of a polygon contains only the corners at which the polygon is strictly convex.
+    n_hull_corner = len(shapely.get_coordinates(polygon.convex_hull)) - 1  # the first corner is repeated
+    return bool(n_hull_corner == len(corners))
 
 
 def to_complex(corners: Array) -> Complexes:
@@ -150,41 +125,6 @@ def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float)
     angle_after_chord = np.angle(end * np.conj(chord_end))
     sector_area = 0.5 * radius**2 * (angle_before_chord + angle_after_chord)
     return np.asarray((triangle_area + sector_area).sum(axis=-1))
-
-
-def gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
-    """Compute the points and weights of a Gauss rule for a convex polygon.
-
-    The polygon is divided into triangles that share the first corner of the polygon. The rule of each triangle is
-    obtained from the rule of a square by contracting one side of the square to a point (Duffy 1982).
-
-    Args:
-        corners: Corners (x, y), anticlockwise, shape (n, 2).
-        count: Number of points in each direction of a square.
-
-    Returns:
-        Points (x, y), shape (m, 2), and weights, shape (m,). The weights add up to one.
-    """
-    # Coordinates of the square, each of shape (count^2, 1). The radial coordinate is 0 at the first corner of a
-    # triangle, and 1 on the opposite side. The angular coordinate is 0 on the first side, and 1 on the second side.
-    square_points, square_weights = gauss_square(count)
-    radial = square_points[:, :1]
-    angular = square_points[:, 1:]
-
-    first_corner = corners[0]
-    points = []
-    weights = []
-    for second_corner, third_corner in pairwise(corners[1:]):
-        first_side = second_corner - first_corner
-        second_side = third_corner - first_corner
-        point_on_opposite_side = (1.0 - angular) * first_side + angular * second_side
-        points.append(first_corner + radial * point_on_opposite_side)
-
-        # The determinant of the Jacobian is the radial coordinate times twice the area of the triangle.
-        double_area = float(_cross(first_side, second_side))
-        weights.append(square_weights * radial[:, 0] * double_area)
-    all_weights = np.concatenate(weights)
-    return np.concatenate(points), all_weights / all_weights.sum()
 
 
 def bilinear(corners: Complexes, s: Array, t: Array) -> Complexes:

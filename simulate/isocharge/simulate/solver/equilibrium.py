@@ -207,7 +207,7 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     # Compute the scaled principal stresses without the mean pretension. The deviator of the pretension is added before,
     # because it changes the directions of the principal stresses.
     groups = equilibrium.groups
-    deviator = np.zeros(3) if groups.anisotropy is None else groups.anisotropy.tension
+    deviator = groups.anisotropy.tension
     smallest, largest = principal_stresses(_induced_stress(equilibrium, "middle") + deviator)
     if equilibrium.theory.bending:
         for surface in ("top", "bottom"):

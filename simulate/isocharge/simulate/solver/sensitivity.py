@@ -24,7 +24,6 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.scaling import Anisotropy
 from isocharge.simulate.mechanics.stress import stress_rotation
 from isocharge.simulate.mesh.placed_mesh import from_oval
 from isocharge.simulate.mesh.placement import Placement
@@ -69,18 +68,11 @@ def _tension_imperfection(direction: tuple[float, float, float]) -> AddImperfect
     def add_tension(solved: Equilibrium, value: float) -> Equilibrium:
         """Return the equilibrium with `value` units of additional tension."""
         unit = 1.0 + solved.groups.tension  # divided by E A^2, like all tensions in `groups`
-        anisotropy = _anisotropy(solved)
+        anisotropy = solved.groups.anisotropy
         tension = anisotropy.tension + value * unit * np.array(direction)
         return replace(solved, groups=replace(solved.groups, anisotropy=replace(anisotropy, tension=tension)))
 
     return add_tension
-
-
-def _anisotropy(solved: Equilibrium) -> Anisotropy:
-    """Return the direction-dependent properties of the film of an equilibrium, which are zero for an isotropic film."""
-    if solved.groups.anisotropy is None:
-        return Anisotropy(moduli=np.zeros((3, 3)), tension=np.zeros(3))
-    return solved.groups.anisotropy
 
 
 def _stiffness_imperfection(angle: float) -> AddImperfection:
@@ -102,7 +94,7 @@ def _stiffness_imperfection(angle: float) -> AddImperfection:
         # Rotate the change into the frame of the press.
         rotation = stress_rotation(angle)
         moduli_change = rotation @ change_in_film_axes @ rotation.T
-        anisotropy = _anisotropy(solved)
+        anisotropy = solved.groups.anisotropy
         moduli = anisotropy.moduli + moduli_change
         return replace(solved, groups=replace(solved.groups, anisotropy=replace(anisotropy, moduli=moduli)))
 
