@@ -5,10 +5,9 @@ The splines compute charges and their derivatives about two hundred times faster
 Each charge is divided by the squared amplitude of the press, which the module `mechanics.scaling` computes from the
 force. The scaled charges depend only weakly on the force. At each of a few forces, a cubic spline in (x, y)
 approximates the scaled charges. The spline is fitted by least squares to presses on a disk around the centre of the
-film. The charge of an electrode varies strongly with the position of a press near the electrode. Around each electrode,
-a second spline with more closely spaced knots therefore corrects the charge of the electrode. For all other forces, the
-scaled charges are interpolated by Lagrange polynomials in ln F. A forward map interpolates its stress fields between
-forces in the same way. The interpolation between forces therefore adds no further error.
+film. For all other forces, the scaled charges are interpolated by Lagrange polynomials in ln F. A forward map
+interpolates its stress fields between forces in the same way. The interpolation between forces therefore adds no
+further error.
 """
 
 from dataclasses import dataclass, replace
@@ -16,28 +15,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy  # scipy.interpolate is imported when it is used
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.charge_map import ChargeMap, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.numerics.disk import onto_disk, sunflower
 from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
-from isocharge.simulate.numerics.spline_fit import disk_positions, fit_spline, rectangle_positions, spline_knots
+from isocharge.simulate.numerics.spline_fit import disk_positions, fit_spline, spline_knots
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.sensor import Calibration
 
-COARSE_SPACING = 0.6
-"""Largest distance between the knots of the spline over the disk, mm."""
-
-PATCH_MARGIN = 3.0
-"""Distance by which the fine spline of an electrode extends beyond the presses that touch the electrode, mm."""
-
 MAX_KNOT_SPACING = 0.3
-"""Largest distance between the knots near an electrode, mm."""
+"""Largest distance between the knots, mm."""
 
-RELATIVE_KNOT_SPACING = 1.0 / 6.0
-"""Largest distance between the knots near an electrode, in units of the reach of the probe, dimensionless.
+RELATIVE_KNOT_SPACING = 0.25
+"""Largest distance between the knots in units of the reach of the probe, dimensionless.
 
 The reach is the largest distance of a point of the footprint from its centroid. The charge of an electrode changes
 considerably if the press moves by the reach.
@@ -46,8 +39,8 @@ considerably if the press moves by the reach.
 MIN_CELLS = 8
 """Smallest number of cells of a spline along x or y."""
 
-MAX_CELLS = 400
-"""Largest number of cells of a spline along x or y."""
+MAX_CELLS = 200
+"""Largest number of cells of a spline along x or y, which limits the time of the fit to a few seconds."""
 
 EXTRA_FORCE_NODES = 2
 """Number of additional force nodes if the piezoelectric coefficient d33 is not zero.
@@ -64,33 +57,6 @@ LOG_FORCE_STEP = 1e-4
 
 
 @dataclass(frozen=True)
-class Patch:
-    """Correction of the scaled charge of one electrode for presses in a rectangle around the electrode.
-
-    The correction and its first derivatives are zero on the edges of the rectangle.
-
-    Attributes:
-        electrode: Index of the electrode.
-        low: Lower left corner (x, y) of the rectangle, shape (2,), mm.
-        high: Upper right corner (x, y) of the rectangle, shape (2,), mm.
-        table: Spline in x and y that returns the corrections for all forces of the splines, shape (n_force,), pC.
-    """
-
-    electrode: int
-    low: Array
-    high: Array
-    table: "scipy.interpolate.NdBSpline"
-
-    def contains(self, position: Array) -> Booleans:
-        """Return whether each position (x, y) lies in the rectangle.
-
-        Args:
-            position: Positions, shape (n, 2), mm.
-        """
-        return np.asarray(((position > self.low) & (position < self.high)).all(axis=1))
-
-
-@dataclass(frozen=True)
 class ChargeSpline:
     """Splines that compute touch charges as a function of the position (x, y) and the force F of a press.
 
@@ -103,7 +69,6 @@ class ChargeSpline:
         domain: Presses for which the splines are valid.
         force: Forces at which splines were fitted, shape (n_force,), N.
         table: Spline in x and y that returns the scaled charges without crosstalk, shape (n_force, n_electrode), pC.
-        patches: Corrections of the scaled charges near the electrodes.
         error: Largest difference between a charge of the splines and that of the forward map, relative to the largest
             charge of the same press, dimensionless.
     """
@@ -114,7 +79,6 @@ class ChargeSpline:
     domain: Domain
     force: Array
     table: "scipy.interpolate.NdBSpline"
-    patches: tuple[Patch, ...]
     error: float
 
     @classmethod
@@ -126,8 +90,9 @@ class ChargeSpline:
                 was built.
             radius: Largest distance of a press from the centre of the film, mm; None for the largest distance of the
                 forward map.
-            spacing: Largest distance between the knots near the electrodes, mm. If None, it is a sixth of the reach of
-                the probe, but at most `MAX_KNOT_SPACING`. The reach is the radius of a circular probe.
+            spacing: Largest distance between the knots, mm. If None, it is a quarter of the reach of the probe, but at
+                most `MAX_KNOT_SPACING`. The reach is the radius of a circular probe. There are at most `MAX_CELLS`
+                cells between the knots.
 
         Raises:
             SceneError: If the radius is not positive or is larger than the radius of the forward map.
@@ -137,17 +102,8 @@ class ChargeSpline:
         check_radius(domain.radius, map_domain.radius, "forward map")
         spacing = spacing or min(MAX_KNOT_SPACING, RELATIVE_KNOT_SPACING * forward_map.probe.reach)
 
-        # Fit coarse splines of all charges over the disk, and a finer correction near each electrode.
         sensor = forward_map.sensor
         samples = _ScaledCharges(forward_map, _force_nodes(forward_map))
-        coarse_spline = _fit_disk(samples, domain.radius, max(spacing, COARSE_SPACING))
-        patches: list[Patch] = []
-        if spacing < COARSE_SPACING:  # otherwise the coarse splines are already as fine as the corrections
-            for electrode in range(len(sensor.electrodes)):
-                patch = _fit_patch(samples, electrode, domain.radius, spacing, coarse_spline)
-                if patch is not None:
-                    patches.append(patch)
-
         # The error is unknown (NaN) until the finished splines are compared with the forward map.
         spline = cls(
             electrodes=forward_map.electrodes,
@@ -155,8 +111,7 @@ class ChargeSpline:
             calibration=sensor.calibration,
             domain=domain,
             force=samples.force,
-            table=coarse_spline,
-            patches=tuple(patches),
+            table=_fit_disk(samples, domain.radius, spacing),
             error=np.nan,
         )
         return replace(spline, error=_largest_error(spline, forward_map))
@@ -265,9 +220,7 @@ class ChargeSpline:
     def scaled_charges(self, position: Array) -> Array:
         """Compute the scaled charges for all forces at which splines were fitted.
 
-        A scaled charge is a charge divided by the squared amplitude of the press. The splines over the disk approximate
-        the scaled charges of all electrodes. Each patch corrects the scaled charge of one electrode in a rectangle
-        around the electrode. Finally, the calibration adds the crosstalk.
+        A scaled charge is a charge divided by the squared amplitude of the press.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
@@ -275,11 +228,7 @@ class ChargeSpline:
         Returns:
             Scaled charges, shape (n, n_force, n_electrode), pC.
         """
-        scaled_charge = np.asarray(self.table(position))
-        for patch in self.patches:
-            is_inside = patch.contains(position)
-            scaled_charge[is_inside, :, patch.electrode] += patch.table(position[is_inside])
-        return self.calibration.read(scaled_charge)
+        return self.calibration.read(np.asarray(self.table(position)))
 
     def scaled_gradients(self, position: Array) -> Array:
         """Compute the derivatives of `scaled_charges` with respect to x and y.
@@ -290,17 +239,10 @@ class ChargeSpline:
         Returns:
             Derivatives, shape (n, n_force, n_electrode, 2), pC/mm.
         """
-        # A spline expects the orders of the derivative with respect to x and y.
-        x_derivative_orders = (1, 0)
-        y_derivative_orders = (0, 1)
-        derivatives = []
-        for orders in (x_derivative_orders, y_derivative_orders):
-            derivative = np.asarray(self.table(position, nu=orders))
-            for patch in self.patches:
-                is_inside = patch.contains(position)
-                derivative[is_inside, :, patch.electrode] += patch.table(position[is_inside], nu=orders)
-            derivatives.append(self.calibration.read(derivative))
-        return np.stack(derivatives, axis=-1)
+        # The argument `nu` contains the orders of the derivative with respect to x and y.
+        x_derivative = self.calibration.read(np.asarray(self.table(position, nu=(1, 0))))
+        y_derivative = self.calibration.read(np.asarray(self.table(position, nu=(0, 1))))
+        return np.stack([x_derivative, y_derivative], axis=-1)
 
 
 def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
@@ -341,7 +283,7 @@ class _ScaledCharges:
     forward_map: ForwardMap
     force: Array
 
-    def charges_at(self, position: Array, is_needed: Booleans) -> Array:
+    def charges_at(self, position: Array) -> Array:
         """Compute the scaled charges that presses at given positions cause.
 
         A scaled charge is a charge divided by the squared amplitude of the press. At each position, the charges are
@@ -350,8 +292,6 @@ class _ScaledCharges:
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
-            is_needed: Whether the charge of each electrode is needed, shape (n_electrode,). The stress charges of the
-                other electrodes are not computed and are set to zero.
 
         Returns:
             Scaled charges, shape (n, n_force, n_electrode), pC.
@@ -359,7 +299,7 @@ class _ScaledCharges:
         forward_map = self.forward_map
         film = forward_map.sensor.film
         solved_force = forward_map.family.force
-        scaled_stress_charge = forward_map.stress_charges_by_force(position, is_needed)
+        scaled_stress_charge = forward_map.stress_charges_by_force(position)
         scaled_stress_charge /= amplitude_squared(film, solved_force)[:, None]
         if forward_map.sensor.piezo.d33 == 0.0:
             return scaled_stress_charge
@@ -390,54 +330,7 @@ def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.
     cells = int(np.clip(np.ceil(2.0 * radius / spacing), MIN_CELLS, MAX_CELLS))
     knots = spline_knots(-radius, radius, cells)
     position = radius * disk_positions(cells)
-    all_electrodes = np.ones(len(samples.forward_map.electrodes), dtype=bool)
-    charge = samples.charges_at(position, all_electrodes)
-    # No coefficients are fixed at zero, because the charges do not vanish at the edge of the disk.
-    return fit_spline(position, charge, (knots, knots), fixed=0)
-
-
-def _fit_patch(
-    samples: _ScaledCharges, electrode: int, radius: float, spacing: float, coarse: "scipy.interpolate.NdBSpline"
-) -> Patch | None:
-    """Fit a fine spline that corrects the coarse spline near one electrode.
-
-    The correction is the scaled charge of the electrode minus the value that the coarse spline returns. The fine spline
-    covers a rectangle around the electrode.
-
-    Args:
-        samples: Scaled charges to which the splines are fitted.
-        electrode: Index of the electrode.
-        radius: Radius of the disk that the coarse spline covers, mm.
-        spacing: Largest distance between the knots of the fine spline, mm.
-        coarse: Spline of the scaled charges of all electrodes over the disk.
-
-    Returns:
-        The correction; None if the rectangle lies outside the disk.
-    """
-    # Choose a rectangle so large that outside it the charge of the electrode is smooth.
-    sensor = samples.forward_map.sensor
-    corners = np.concatenate([sensor.calibration.place(part) for part in sensor.electrodes[electrode].parts])
-    margin = samples.forward_map.probe.reach + PATCH_MARGIN
-    lower_left = corners.min(axis=0) - margin
-    upper_right = corners.max(axis=0) + margin
-
-    # Choose the knots along x and y.
-    cells = np.clip(np.ceil((upper_right - lower_left) / spacing), MIN_CELLS, MAX_CELLS).astype(int)
-    x_cells, y_cells = cells
-    x_knots = spline_knots(lower_left[0], upper_right[0], x_cells)
-    y_knots = spline_knots(lower_left[1], upper_right[1], y_cells)
-
-    # Choose the presses of the fit in the part of the rectangle that lies in the disk.
-    position = rectangle_positions(lower_left, upper_right, cells, radius, spacing)
-    if not len(position):
-        return None
-
-    # Fit the error of the coarse spline for this electrode. Two coefficients at each end of an axis are fixed at zero.
-    # The correction and its first derivatives are therefore zero on the edges of the rectangle.
-    is_needed = np.arange(len(sensor.electrodes)) == electrode
-    residual = (samples.charges_at(position, is_needed) - coarse(position))[:, :, electrode]
-    fine_spline = fit_spline(position, residual, (x_knots, y_knots), fixed=2)
-    return Patch(electrode, lower_left, upper_right, fine_spline)
+    return fit_spline(position, samples.charges_at(position), (knots, knots))
 
 
 def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:

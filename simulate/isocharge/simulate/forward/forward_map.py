@@ -34,8 +34,7 @@ from isocharge.simulate.forward.family import (
     spread_check_presses,
 )
 from isocharge.simulate.forward.press_chunk import PressChunk
-from isocharge.simulate.forward.readout import ReadoutPoints, contact_charge
-from isocharge.simulate.forward.readout_rules import ReadoutRules
+from isocharge.simulate.forward.readout import COARSE, FINE, ReadoutPoints, are_near, contact_charge
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.blocks import Resolution
@@ -298,7 +297,7 @@ class ForwardMap:
         x, y, force = contact.T
         position = x + 1j * y
         orientation = np.zeros(1)  # the same for all presses, because a circular probe has no orientation
-        rule = readout or self._readout_rules.coarse
+        rule = readout or self._coarse_rule
 
         # The same rule is used for all pairs of a press and an electrode.
         all_pairs = np.ones((position.size, len(rule.count)), dtype=bool)
@@ -310,7 +309,7 @@ class ForwardMap:
                 charges[chunk] = self._integrate_fields(position[chunk], force[chunk], orientation, is_odd, rules)
         return charges
 
-    def stress_charges_by_force(self, position: Array, is_needed: Booleans) -> Array:
+    def stress_charges_by_force(self, position: Array) -> Array:
         """Compute the charges that the stress causes at given positions, for all forces of the family at once.
 
         The result includes neither the crosstalk nor the charges that the contact pressure causes. The probe keeps its
@@ -322,10 +321,9 @@ class ForwardMap:
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
-            is_needed: Whether the charge of each electrode is needed, shape (n_electrode,).
 
         Returns:
-            Charges, shape (n, n_force, n_electrode), pC. Charges that are not needed are zero.
+            Charges, shape (n, n_force, n_electrode), pC.
         """
         # Integrate all fields of the stacked map for chunks of presses. All fields have the symmetry
         # of the stress.
@@ -339,7 +337,7 @@ class ForwardMap:
         with single_threaded_blas():  # faster for the many small matrices of a chunk
             for start in range(0, complex_position.size, chunk_size):
                 chunk = complex_position[start : start + chunk_size]
-                rules = tuple((rule, uses_rule & is_needed) for rule, uses_rule in self._readout_rules.select(chunk))
+                rules = self._select_rules(chunk)
                 force = np.full(chunk.size, first_force)
                 charges.append(stacked_map._integrate_fields(chunk, force, orientation, is_odd, rules))
 
@@ -412,7 +410,7 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_electrode), pC.
         """
-        rules = self._readout_rules.select(position)
+        rules = self._select_rules(position)
         charge: Array = self._integrate_fields(position, force, orientation, EVEN_FIELD, rules)[..., 0]
         charge += force[:, None] * self._pressure_charges(position, orientation)
         return self.sensor.calibration.read(charge)
@@ -434,7 +432,7 @@ class ForwardMap:
             return charge
 
         # The contact pressure acts only on electrodes under the probe. Presses far from all electrodes cause no charge.
-        presses_near_electrodes = np.flatnonzero(self._readout_rules.is_near(position).any(axis=1))
+        presses_near_electrodes = np.flatnonzero(are_near(self.sensor, self.probe, position).any(axis=1))
         for press_index in presses_near_electrodes:
             probe = self.probe.rotated(float(orientation[press_index]))
             press_position = position[press_index]
@@ -503,6 +501,26 @@ class ForwardMap:
         return PressChunk(mesh, placement, nodal_fields, direction, frame_angle, film_oval(film, direction))
 
     @cached_property
-    def _readout_rules(self) -> ReadoutRules:
-        """Integration rules from which one is selected for each pair of a press and an electrode."""
-        return ReadoutRules(self.sensor, self.probe, self.resolution)
+    def _fine_rule(self) -> ReadoutPoints:
+        """Integration rule for electrodes near the probe."""
+        return ReadoutPoints.of(self.sensor, FINE)
+
+    @cached_property
+    def _coarse_rule(self) -> ReadoutPoints:
+        """Integration rule for electrodes away from the probe."""
+        return ReadoutPoints.of(self.sensor, COARSE)
+
+    def _select_rules(self, position: Complexes) -> tuple[tuple[ReadoutPoints, Booleans], ...]:
+        """Select an integration rule for each pair of a press and an electrode.
+
+        The stress varies strongly near the probe, so electrodes near the probe need a rule with many points.
+
+        Args:
+            position: Positions x + iy of the presses, shape (n,), mm.
+
+        Returns:
+            The two rules. Each rule is followed by an array, shape (n, n_electrode), that is True where a press and an
+            electrode use this rule.
+        """
+        is_near = are_near(self.sensor, self.probe, position)
+        return (self._fine_rule, is_near), (self._coarse_rule, ~is_near)

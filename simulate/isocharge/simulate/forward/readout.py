@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Complexes, Integers
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.errors import SensorError
 from isocharge.simulate.numerics.interpolation import gauss_line
 from isocharge.simulate.numerics.polygon import gauss_quadrilateral
@@ -40,20 +40,11 @@ The relative error of the charge is 8e-5.
 COARSE = 4
 """Number of Gauss points per side of an electrode away from the probe, for many presses."""
 
-FAR = 2
-"""Number of Gauss points per side of an electrode far from the probe, for many presses."""
-
 NEAR = 1.0
 """Distance between the footprint and an electrode below which the fine rule is used, mm.
 
 At larger distances, the relative error of the coarse rule is at most 1e-4 for square electrodes with sides of 1 to
 6 mm.
-"""
-
-FAR_DISTANCE = 8.0
-"""Distance between a press and the nearest part of an electrode above which `FAR` points are used, dimensionless.
-
-The distance is in units of the radius of the circle around the part. The relative error of the charge is about 2e-5.
 """
 
 
@@ -159,44 +150,25 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
     return sensor.calibration.read(charge)
 
 
-def electrode_gaps(sensor: Sensor, position: Complexes) -> Array:
-    """Compute the gap between each position and each electrode.
+def are_near(sensor: Sensor, probe: Probe, position: Complexes) -> Booleans:
+    """Return whether each electrode is so near to each press that the fine integration rule is needed.
 
-    Each part of an electrode is enclosed by a circle. The gap is the distance from the position to the nearest of the
-    enclosing circles of the electrode.
+    Each part of an electrode is enclosed by a circle. The electrode is near if the distance between the footprint and
+    one of these circles is less than `NEAR`.
 
     Args:
         sensor: Sensor with the electrodes.
-        position: Positions x + iy, shape (n,), mm.
+        probe: Probe that presses the film.
+        position: Positions x + iy of the presses, shape (n,), mm.
 
     Returns:
-        Gaps, shape (n, n_electrode), mm. A gap is negative if the position lies in a circle.
+        Whether each electrode is near, shape (n, n_electrode).
     """
-    gaps = []
+    smallest_gaps = []
     for part_centres, part_radii in sensor.part_circles:
         gap_of_parts = np.abs(position[:, None] - part_centres) - part_radii  # shape (n, n_part)
-        gaps.append(gap_of_parts.min(axis=1))
-    return np.stack(gaps, axis=1)
-
-
-def electrode_distances(sensor: Sensor, position: Complexes) -> Array:
-    """Compute the relative distance between each position and each electrode.
-
-    Each part of an electrode is enclosed by a circle. The distance from the centre of an enclosing circle is divided by
-    the radius of the circle. The relative distance is the smallest of the ratios of all parts.
-
-    Args:
-        sensor: Sensor with the electrodes.
-        position: Positions x + iy, shape (n,), mm.
-
-    Returns:
-        Relative distances, shape (n, n_electrode), dimensionless.
-    """
-    distances = []
-    for part_centres, part_radii in sensor.part_circles:
-        distance_of_parts = np.abs(position[:, None] - part_centres) / part_radii  # shape (n, n_part)
-        distances.append(distance_of_parts.min(axis=1))
-    return np.stack(distances, axis=1)
+        smallest_gaps.append(gap_of_parts.min(axis=1))
+    return np.asarray(np.stack(smallest_gaps, axis=1) < probe.reach + NEAR)
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:

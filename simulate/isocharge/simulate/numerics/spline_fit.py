@@ -5,7 +5,7 @@ import scipy  # scipy.interpolate is imported when it is used
 from scipy.sparse import csr_array, dia_array, diags_array, eye_array, kron, sparray, vstack
 from scipy.sparse.linalg import splu
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array
 from isocharge.simulate.numerics.disk import lattice
 
 SMOOTHING = 5e-3
@@ -43,15 +43,13 @@ def spline_knots(low: float, high: float, cells: int) -> Array:
     return np.concatenate([[low] * 3, np.linspace(low, high, cells + 1), [high] * 3])
 
 
-def fit_spline(position: Array, values: Array, knots: tuple[Array, Array], fixed: int) -> "scipy.interpolate.NdBSpline":
+def fit_spline(position: Array, values: Array, knots: tuple[Array, Array]) -> "scipy.interpolate.NdBSpline":
     """Fit a cubic spline by least squares with a penalty on the third differences of its coefficients.
 
     Args:
         position: Positions (x, y), shape (n, 2), mm.
         values: Values at the positions, shape (n, ...).
         knots: Knots along x and along y.
-        fixed: Number of coefficients at each end of each axis that are fixed at zero. With two fixed coefficients, the
-            spline and its slopes are zero on the edges.
 
     Returns:
         The spline. Its values have the shape of `values` without the first axis.
@@ -61,21 +59,13 @@ def fit_spline(position: Array, values: Array, knots: tuple[Array, Array], fixed
     x_count = x_knots.size - 4
     y_count = y_knots.size - 4
 
-    # The free coefficients are the unknowns of the fit. The fixed coefficients are zero.
-    is_free = np.zeros((x_count, y_count), dtype=bool)
-    is_free[fixed : x_count - fixed, fixed : y_count - fixed] = True
-    free = np.flatnonzero(is_free)
-    free_design = _design_matrix(position, knots)[:, free]
-    free_penalty = _penalty_matrix(x_count, y_count).tocsc()[:, free]
-
     # Solve the normal equations. Their matrix is positive definite, so the factorisation needs no pivoting.
-    normal_matrix = (free_design.T @ free_design + free_penalty.T @ free_penalty).tocsc()
-    right_side = np.ascontiguousarray(free_design.T @ values.reshape(len(position), -1))
+    design = _design_matrix(position, knots)
+    penalty = _penalty_matrix(x_count, y_count)
+    normal_matrix = (design.T @ design + penalty.T @ penalty).tocsc()
+    right_side = np.ascontiguousarray(design.T @ values.reshape(len(position), -1))
     factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    flat_coefficients = np.zeros((is_free.size, right_side.shape[1]))  # one column for each component of the values
-    flat_coefficients[free] = factors.solve(right_side)
-
-    coefficients = flat_coefficients.reshape(x_count, y_count, *values.shape[1:])
+    coefficients = factors.solve(right_side).reshape(x_count, y_count, *values.shape[1:])
     cubic_degree = 3
     return scipy.interpolate.NdBSpline(knots, coefficients, cubic_degree)
 
@@ -140,36 +130,3 @@ def disk_positions(cells: int) -> Array:
     edge_positions = np.exp(2j * np.pi * np.arange(edge_count) / edge_count) * EDGE_RADIUS
     complex_positions = np.concatenate([inner_positions, edge_positions])
     return np.stack([complex_positions.real, complex_positions.imag], axis=1)
-
-
-def rectangle_positions(lower_left: Array, upper_right: Array, cells: Integers, radius: float, spacing: float) -> Array:
-    """Return positions in a rectangle to which a spline that is zero outside the rectangle is fitted.
-
-    Some of the positions are the points of a grid that lie in the disk. The other positions are points on the edge of
-    the disk that lie in the rectangle.
-
-    Args:
-        lower_left: Lower left corner (x, y) of the rectangle, shape (2,), mm.
-        upper_right: Upper right corner (x, y) of the rectangle, shape (2,), mm.
-        cells: Numbers of cells of the spline along x and y, shape (2,).
-        radius: Radius of the disk, mm.
-        spacing: Largest distance between the knots, mm.
-
-    Returns:
-        Positions (x, y), shape (n, 2), mm.
-    """
-    # A grid with POSITIONS_PER_CELL points per cell has the square root of this number along each side of a cell.
-    x_count, y_count = np.ceil(np.sqrt(POSITIONS_PER_CELL) * cells).astype(int)
-    x_line = np.linspace(lower_left[0], upper_right[0], x_count)
-    y_line = np.linspace(lower_left[1], upper_right[1], y_count)
-    x_grid, y_grid = np.meshgrid(x_line, y_line)
-    grid = np.stack([x_grid.ravel(), y_grid.ravel()], axis=1)
-    is_in_disk = np.hypot(grid[:, 0], grid[:, 1]) < radius
-
-    # Use only the points on the edge of the disk that lie in the rectangle.
-    cells_along_edge = 2.0 * np.pi * radius / spacing  # along the whole edge of the disk
-    edge_count = int(POSITIONS_PER_EDGE_CELL * cells_along_edge)
-    edge_angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
-    edge = radius * EDGE_RADIUS * np.stack([np.cos(edge_angle), np.sin(edge_angle)], axis=1)
-    is_in_rectangle = ((edge > lower_left) & (edge < upper_right)).all(axis=1)
-    return np.concatenate([grid[is_in_disk], edge[is_in_rectangle]])
