@@ -121,19 +121,3 @@ def test_plot_refuses_empty_and_damaged_recordings(command, tmp_path, lines, mes
     code, _, err = command("serve", "plot", path, "-o", picture)
     assert (code, picture.exists()) == (2, False)
     assert re.search(message, err)
-
-
-def test_plot_breaks_lines_at_gaps_of_the_recording(command, recorded, tmp_path, figures):
-    """An hour without records is no straight line."""
-    path, _ = recorded
-    lines = path.read_text().splitlines()
-    later = [json.loads(line) for line in lines[1:]]
-    for entry in later:
-        if "timestamp" in entry:
-            entry["timestamp"] += 3600.0
-    path.write_text("\n".join([*lines, *map(json.dumps, later), ""]))
-    assert command("serve", "plot", path, "-o", tmp_path / "touch.png")[0] == 0
-    force = lines_of(figures[0])["force"]
-    (gap,) = np.flatnonzero(np.isnan(force[:, 0]))
-    assert gap == (len(force) - 1) // 2
-    assert force[gap + 1, 0] == pytest.approx(3600.0, abs=1.0)

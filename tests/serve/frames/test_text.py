@@ -198,10 +198,6 @@ def test_message_does_not_replace_the_header(message, is_after_header):
     assert [frame.names for frame in frames] == [("b", "a", "c", "d") if is_after_header else ()] * 4
 
 
-def test_number_that_equals_its_name_is_a_number():
-    assert [frame.values for frame in feed("0:0", "0:0", "0:0", "0:5")] == [(0,), (0,), (0,), (5,)]
-
-
 def test_hexadecimal_numbers():
     frames = feed("0x7FF0 0x8001 0x8011", "0x7FF1 0x8001 0x8011", "0x7FF2 0x8001 0x8011")
     assert frames[0].values == (0x7FF0, 0x8001, 0x8011)

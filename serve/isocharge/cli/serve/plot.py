@@ -12,17 +12,11 @@ from matplotlib.figure import Figure
 from msgspec import defstruct
 
 from isocharge.cli.shared.terminal import say, shown_progress
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array
 from isocharge.common.errors import RecordingError
 from isocharge.serve import PredictionRecord, Recording
 from isocharge.serve.flags import MEANINGS
 from isocharge.simulate.plots.figure import INK, check_picture, new_figure, save_picture
-
-MIN_GAP_S = 1.0
-"""Shortest time without a record at which a line is interrupted, s."""
-
-MIN_GAP_PERIODS = 5.0
-"""Shortest time without a record at which a line is interrupted, relative to the median time between two records."""
 
 
 def plot_command(
@@ -103,36 +97,32 @@ def _record_values(record: Any, electrodes: tuple[str, ...]) -> tuple[Any, ...]:
 
 
 def recording_picture(traces: dict[str, Array], title: str) -> Figure:
-    """Draw the picture of a recording.
+    """Draw the picture of a recording. Each value is a point, so that a time without records remains empty.
 
     Args:
         traces: Columns of the records by name, as `traces_of` returns them.
         title: Names of the file and the model.
     """
     start_s = traces["timestamp"][0]
-    after_gaps = _records_after_gaps(traces["timestamp"])
-    # A value of NaN before the first record after each gap interrupts the lines.
-    curves = {name: np.insert(column, after_gaps, np.nan) for name, column in traces.items()}
-    time_s = curves["timestamp"] - start_s
-
+    time_s = traces["timestamp"] - start_s
     flags = [flag for flag in MEANINGS if flag in traces]
     flag_height = 0.1 * (1 + len(flags))  # grows with the number of rows of flags
     figure = new_figure(12.0, 8.6)
-    figure.suptitle(f"{title}: {len(traces['timestamp'])} records; thin lines: ± 2 standard deviations")
+    figure.suptitle(f"{title}: {len(time_s)} records; faint points: ± 2 standard deviations")
     heights = (1.0, 1.0, 0.8, flag_height)
     charge_axes, position_axes, force_axes, flag_axes = figure.subplots(4, 1, sharex=True, height_ratios=heights)
 
-    for name, charge_pC in curves.items():
+    for name, charge_pC in traces.items():
         if name.startswith("charge_pC."):
-            charge_axes.plot(time_s, charge_pC, lw=1.1, label=name.removeprefix("charge_pC."))
+            charge_axes.plot(time_s, charge_pC, ".", ms=2.0, label=name.removeprefix("charge_pC."))
     for quantity, unit, axes in (("x", "mm", position_axes), ("y", "mm", position_axes), ("force", "N", force_axes)):
-        values = curves[f"{quantity}_{unit}"]
-        two_std = 2.0 * curves[f"{quantity}_std_{unit}"]
-        (line,) = axes.plot(time_s, values, lw=1.1, label=quantity)
+        values = traces[f"{quantity}_{unit}"]
+        two_std = 2.0 * traces[f"{quantity}_std_{unit}"]
+        (points,) = axes.plot(time_s, values, ".", ms=2.0, label=quantity)
         for limit in (values - two_std, values + two_std):
-            axes.plot(time_s, limit, lw=0.5, alpha=0.5, color=line.get_color())
+            axes.plot(time_s, limit, ".", ms=1.0, alpha=0.3, color=points.get_color())
     for row, flag in enumerate(flags):
-        flag_time_s = time_s[curves[flag] > 0.0]
+        flag_time_s = time_s[traces[flag] > 0.0]
         flag_axes.plot(flag_time_s, np.full(len(flag_time_s), row), "|", color=INK)
 
     charge_axes.set_ylabel("touch charge, pC")
@@ -143,18 +133,5 @@ def recording_picture(traces: dict[str, Array], title: str) -> Figure:
     for axes in (charge_axes, position_axes, force_axes):
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(loc="upper right", fontsize=8, ncols=8)
+            axes.legend(loc="upper right", fontsize=8, ncols=8, markerscale=4.0)
     return figure
-
-
-def _records_after_gaps(timestamp_s: Array) -> Integers:
-    """Return the indices of the records that follow a gap, in which no records were written.
-
-    Args:
-        timestamp_s: Times of the records, shape (n,), s.
-    """
-    if len(timestamp_s) < 2:
-        return np.empty(0, dtype=int)
-    pause_s = np.diff(timestamp_s)
-    min_gap_s = max(MIN_GAP_S, MIN_GAP_PERIODS * float(np.median(pause_s)))
-    return np.flatnonzero(pause_s > min_gap_s) + 1
