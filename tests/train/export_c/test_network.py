@@ -4,6 +4,7 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
+import onnxruntime
 import pytest
 from msgspec import structs
 from tests.train.random_networks import random_network
@@ -89,6 +90,17 @@ def test_any_width_and_number_of_electrodes(electrodes, hidden, misfit_hidden, i
     check_agreement(exported.predict(charge_pC), double_precision_answers(network, charge_pC))
     assert all(f"static const {array}" in exported.source for array in arrays)
     assert ("signed char" in exported.source) == is_int8
+
+
+def test_large_logarithms_are_limited_as_in_onnxruntime(build, tmp_path):
+    """The standard deviations of an unlimited network would be infinite and zero in single precision."""
+    network = random_network(4, (24, 24), (16, 16)).with_scaled_std(1e50, 1e-50)
+    charge_pC = np.random.default_rng(2).uniform(50.0, 5000.0, (500, 4)).astype(np.float32)
+    graph = write_graph(network, {})
+    in_onnxruntime = onnxruntime.InferenceSession(graph).run(["contact_std"], {"charge_pC": charge_pC})[0]
+    in_c = build(write_random_model(tmp_path / "limited", network)).predict(charge_pC)[:, 3:6]
+    for std in (in_onnxruntime, in_c, network.predict(charge_pC)[1]):
+        np.testing.assert_allclose(np.log(std), np.full((500, 3), [50.0, 50.0, -50.0]), rtol=1e-6)
 
 
 def test_signed_charges(build, tmp_path):

@@ -121,9 +121,9 @@ def test_the_graph_answers_as_the_network_does_on_unusual_charges(trained, held_
 def test_a_network_with_infinite_answers_is_not_released(trained, held_out):
     network = copy.deepcopy(trained.network)
     with torch.no_grad():
-        network.contact.skip.weight *= 15.0
+        network.misfit_vector.skip.weight *= 100.0
     diverging = fold_network(network)
-    with pytest.raises(TrainingError, match=r"answers contact = .* expected finite numbers for any charges"):
+    with pytest.raises(TrainingError, match=r"answers misfit = .* expected finite numbers for any charges"):
         check_graph(write_graph(diverging, {}), diverging.outputs, held_out, REFERENCE)
 
 

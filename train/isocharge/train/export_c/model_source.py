@@ -32,6 +32,7 @@ from isocharge.train.training.charge_features import ChargeFeatures
 from isocharge.train.training.folded_network import (
     ANGLES,
     COSINES_TO_CORRELATIONS,
+    LARGEST_LOGARITHM,
     LOG_STD,
     MISFIT_UNIT,
     POSITION,
@@ -126,6 +127,7 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         electrodes=network.features.n_electrode,
         plane=POSITION.stop,
         logs=LOG_STD.stop,
+        largest_logarithm=c_float(LARGEST_LOGARITHM),
         known=ANGLES.stop,
         answers=last.weight.shape[1],
         table=c_array("COSINES", COSINES_TO_CORRELATIONS.astype(np.float32)),

@@ -16,7 +16,12 @@ from isocharge.common.errors import ModelError, cut
 from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS
 from isocharge.train.training.activations import ACTIVATIONS
 from isocharge.train.training.charge_features import ChargeFeatures
-from isocharge.train.training.folded_network import COSINES_TO_CORRELATIONS, MISFIT_UNIT, FoldedNetwork
+from isocharge.train.training.folded_network import (
+    COSINES_TO_CORRELATIONS,
+    LARGEST_LOGARITHM,
+    MISFIT_UNIT,
+    FoldedNetwork,
+)
 from isocharge.train.training.perceptron import Layer, Perceptron
 
 OPSET = 17
@@ -99,11 +104,13 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     n_electrode = network.features.n_electrode
 
     # Split the answers: x and y, the logarithms of the force and of the three standard deviations, the angles that
-    # determine the correlations, and the misfit vector. The exponentials of the logarithms are the force and the
-    # standard deviations. A result of a split has the name of an output of the graph, so it needs no further node.
+    # determine the correlations, and the misfit vector. The exponentials of the limited logarithms are the force and
+    # the standard deviations. A result of a split has the name of an output of the graph, so it needs no further node.
     widths = {"plane": 2, "logs": 4, "angles": len(COSINES_TO_CORRELATIONS), "misfit_vector": n_electrode}
     position, logarithms, angles, misfit_vector = builder.split(_add_answers(builder, network), widths)
-    force, _ = builder.split(builder.add("Exp", logarithms), {"force": 1, "contact_std": 3})
+    limits = (builder.constant(-LARGEST_LOGARITHM), builder.constant(LARGEST_LOGARITHM))
+    limited_logarithms = builder.add("Clip", logarithms, *limits)
+    force, _ = builder.split(builder.add("Exp", limited_logarithms), {"force": 1, "contact_std": 3})
     builder.add("Concat", position, force, to="contact", axis=1)
     cosines = builder.add("Cos", angles)
     builder.add("MatMul", cosines, builder.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)

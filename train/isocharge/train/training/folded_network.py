@@ -33,6 +33,12 @@ MEAN = slice(0, 3)
 LOG_STD = slice(3, 6)
 """Columns of the answers with the logarithms of the standard deviations of x and y in mm and of the force in N."""
 
+LARGEST_LOGARITHM = 50.0
+"""Limit of the magnitudes of the logarithms of the force and of the standard deviations.
+
+Their exponentials are finite in single precision, also for charges that are far from those of the training.
+"""
+
 ANGLES = slice(6, 14)
 """Columns of the answers with the angles whose cosines determine the correlations, rad.
 
@@ -102,8 +108,10 @@ class FoldedNetwork:
             (n, 1).
         """
         answers = self.layers.evaluate(self.features.evaluate(charge))
-        contact = np.concatenate([answers[:, POSITION], np.exp(answers[:, LOG_FORCE])], axis=1)
-        std = np.exp(answers[:, LOG_STD])
+        position = answers[:, POSITION]
+        force = _limited_exp(answers[:, LOG_FORCE])
+        contact = np.concatenate([position, force], axis=1)
+        std = _limited_exp(answers[:, LOG_STD])
         # Each correlation is a weighted sum of the cosines of the eight angles.
         correlation = np.cos(answers[:, ANGLES]) @ COSINES_TO_CORRELATIONS
         # The misfit vector follows the angles. Its length is asinh(misfit / MISFIT_UNIT).
@@ -120,3 +128,8 @@ class FoldedNetwork:
         bias_change = np.zeros_like(bias)
         bias_change[LOG_STD] = np.log([position_factor, position_factor, force_factor])
         return replace(self, layers=replace(self.layers, last=Layer(weight, bias + bias_change)))
+
+
+def _limited_exp(logarithm: Array) -> Array:
+    """Return the exponentials of logarithms whose magnitudes are limited to `LARGEST_LOGARITHM`."""
+    return np.exp(np.clip(logarithm, -LARGEST_LOGARITHM, LARGEST_LOGARITHM))

@@ -29,7 +29,7 @@ static void contact_of(const float answers[$answers], float contact[7])
     for (int i = 0; i < $plane; ++i)
         contact[i] = answers[i];
     for (int i = $plane; i < $logs; ++i)
-        contact[i] = expf(answers[i]);
+        contact[i] = expf(clip(answers[i], -$largest_logarithm, $largest_logarithm));
     for (int i = $known; i < $answers; ++i)
         length += answers[i] * answers[i];
     contact[$logs] = sinhf(sqrtf(length)) * $misfit_unit;
