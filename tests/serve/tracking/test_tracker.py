@@ -124,7 +124,7 @@ def test_moving_mode_equals_the_kalman_filter_with_constant_velocity():
         np.testing.assert_allclose(modes.covariance[3][np.ix_([0, 3], [0, 3])], covariance, rtol=1e-6)
 
 
-@pytest.mark.parametrize("noise_ratio", [0.2, 4.0])
+@pytest.mark.parametrize("noise_ratio", [0.2, 4.0, 8.0])
 def test_reported_std_adapts_to_a_board_whose_noise_differs_from_the_training(noise_ratio):
     """A slide of 10 mm/s. Without the estimate of the noise, the ratio of the variances would be 0.04 or 16."""
     path, _ = slide(10.0)

@@ -76,9 +76,6 @@ FORCE_ACCELERATION_DENSITY = 1e3
 SQUARED_GATE = 30.0
 """Squared Mahalanobis distance of the innovation above which a frame does not belong to the contact."""
 
-MIN_PROBABILITY = 1e-6
-"""Smallest probability of a mode."""
-
 MAX_GAP_s = 1.0
 """Time without a frame after which the tracked contact is discarded, s."""
 
@@ -92,13 +89,10 @@ NOISE_INTERVAL_s = 0.0045
 """Time after which the noise of two frames is independent, s. Boards filter their charges over shorter times."""
 
 NOISE_FRAMES = 100
-"""Number of frames over which the estimate of the noise is averaged."""
+"""Number of frames over which the estimate of the noise is averaged.
 
-NOISE_PRIOR_FRAMES = 5
-"""Weight of the noise that the model states in this average, as a number of frames."""
-
-MAX_RELATIVE_SQUARE = 6.0
-"""Largest square of a frame, relative to the estimated noise, because a sudden movement is not noise."""
+At first, the noise that the model states has the weight of one frame.
+"""
 
 MIN_FORCE_N = 1e-6
 """Smallest force whose logarithm is computed, N."""
@@ -154,7 +148,7 @@ class NoiseEstimate:
     def __init__(self) -> None:
         """Start with the noise that the model states."""
         self.relative_variance = 1.0
-        self._frames = NOISE_PRIOR_FRAMES
+        self._frames = 1
         self._latest: list[Array] = []  # the latest values, at most three
         self._latest_s = -math.inf
 
@@ -175,9 +169,8 @@ class NoiseEstimate:
         (difference,) = np.diff(self._latest, n=2, axis=0)
         variance_factor = 6.0 * difference.size  # 1 + 2^2 + 1 for each of the values
         relative_square = float(difference @ np.linalg.solve(covariance, difference)) / variance_factor
-        limited_square = min(relative_square, MAX_RELATIVE_SQUARE * self.relative_variance)
         self._frames = min(self._frames + 1, NOISE_FRAMES)
-        self.relative_variance += (limited_square - self.relative_variance) / self._frames
+        self.relative_variance += (relative_square - self.relative_variance) / self._frames
 
 
 class MotionFilter:
@@ -246,8 +239,7 @@ class MotionFilter:
             return False
         likelihood = np.exp(0.5 * (smallest - squared_distance)) * np.sqrt(np.linalg.det(precision))
         posterior = self.probability * likelihood
-        self.probability = np.maximum(posterior / posterior.sum(), MIN_PROBABILITY)
-        self.probability /= self.probability.sum()
+        self.probability = np.maximum(posterior / posterior.sum(), np.finfo(float).tiny)
         gain = self.covariance[:, :, VALUES] @ precision
         self.mean = self.mean + (gain @ innovation)[:, :, 0]
         self.covariance = self.covariance - gain @ self.covariance[:, VALUES]
@@ -260,6 +252,7 @@ class ContactFilter:
     Some errors of a model, such as its approximation error and the errors of the gains, are the same in every frame of
     a held contact. Smoothing does not reduce these constant errors. The filter therefore uses only the variance of the
     errors that change from frame to frame. The variance of the constant errors is added to that of the smoothed values.
+    The estimate of the noise applies to the whole touch, even if frames begin a new contact.
     """
 
     def __init__(self, constant_variance_share: float) -> None:
@@ -310,7 +303,6 @@ class ContactFilter:
             self._is_outlier = not (belongs or self._is_outlier)
         if self._filter is None or not (belongs or self._is_outlier):
             self._filter = MotionFilter(measured, covariance)
-            self._noise = NoiseEstimate()
         if not self._is_outlier:
             self._noise.update(measured, covariance, t_s)
 
