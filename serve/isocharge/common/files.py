@@ -23,12 +23,6 @@ MAX_FILE_BYTES = 64 << 20
 MAX_LINE_CHARACTERS = 1 << 20
 """Largest number of characters of a line in a text that is read line by line."""
 
-READ_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
-"""Flags for opening a file without waiting for the writer of a pipe, as far as the system has these flags."""
-
-WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
-"""Flags for creating a file that must not exist already."""
-
 
 def sha256_of(data: bytes) -> str:
     """Return the SHA-256 checksum of data in hexadecimal digits."""
@@ -47,7 +41,7 @@ def open_regular(path: Path) -> BinaryIO:
         OSError: If the file cannot be opened, or is a pipe, a device or a folder. The attribute `strerror` of the
             exception states the reason.
     """
-    descriptor = os.open(path, READ_FLAGS)
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError(errno.EINVAL, "not a regular file", str(path))
@@ -164,7 +158,7 @@ class AtomicWriter:
         """
         refuse_existing(path)
         with as_output_errors(path):
-            self._descriptor = os.open(path, WRITE_FLAGS, 0o666)
+            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         self._size = 0  # number of bytes that complete calls of `write` have written
 
     def write(self, data: bytes) -> int:
@@ -305,15 +299,11 @@ def remove_empty(folders: Iterable[Path]) -> None:
 def flush_to_disk(path: Path) -> None:
     """Flush a file or a folder to disk, so that its content survives a power failure.
 
-    If the path is a folder, the names of its files are flushed. The function does nothing on Windows, where a folder
-    cannot be opened.
+    If the path is a folder, the names of its files are flushed.
 
     Args:
         path: The file or the folder.
     """
-    is_windows = not hasattr(os, "O_DIRECTORY")
-    if is_windows:
-        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -11,7 +11,6 @@ from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError
 from isocharge.common.extras import require
 from isocharge.common.files import refuse_existing, write_whole
-from isocharge.serve.virtual_sensor.pseudo_port import posix_modules
 
 
 def demo_command(
@@ -69,7 +68,6 @@ def demo_command(
             raise InputError("expected --playground without another option, got another option with it")
         _write_playground(playground)
         return
-    posix_modules()  # raises an error before anything is computed if there are no pseudo-terminals
 
     # The modules of both demos are imported late, because they need extras that may not be installed.
     if live is None:

@@ -63,7 +63,11 @@ MAX_MARKER_CHARACTERS = 80
 """Largest number of characters in the text of a marker."""
 
 
-class Read(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
+class PageRequest(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
+    """Base class of all requests that a browser can send."""
+
+
+class Read(PageRequest):
     """Request for samples.
 
     Attributes:
@@ -80,11 +84,11 @@ class Read(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
     most: Annotated[int, Meta(ge=1, le=MAX_READ_SAMPLES)] = MAX_READ_SAMPLES
 
 
-class Tare(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
+class Tare(PageRequest):
     """Request to measure the tare again."""
 
 
-class Record(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
+class Record(PageRequest):
     """Request to begin or end a recording.
 
     Attributes:
@@ -94,7 +98,7 @@ class Record(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
     on: bool
 
 
-class Marker(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
+class Marker(PageRequest):
     """Request to add a marker with a text at the present time of the stream."""
 
     text: str = ""

@@ -2,11 +2,10 @@
 
 import array
 import contextlib
-import importlib
+import fcntl
 import os
-from typing import Any
-
-from isocharge.common.errors import PortError
+import termios
+import tty
 
 PORT_BUFFER_BYTES = 3840
 """Largest number of bytes that wait for the reader.
@@ -23,12 +22,7 @@ class PseudoPort:
     """
 
     def __init__(self) -> None:
-        """Open a pseudo-terminal.
-
-        Raises:
-            PortError: If the operating system has no pseudo-terminals. Windows has none.
-        """
-        tty, self._fcntl, self._termios = posix_modules()
+        """Open a pseudo-terminal."""
         # The file descriptor of the reader's end also stays open here. Otherwise the operating system would hang up the
         # port when a reader closes it.
         self._writer, self._reader = os.openpty()
@@ -48,7 +42,7 @@ class PseudoPort:
         # The operating system writes the number of bytes that the reader has not read yet into this array of one
         # integer.
         unread_count = array.array("i", [0])
-        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, unread_count)
+        fcntl.ioctl(self._reader, termios.FIONREAD, unread_count)
         if unread_count[0] + len(data) > PORT_BUFFER_BYTES:
             return False
         try:
@@ -66,19 +60,3 @@ class PseudoPort:
         """Close the pseudo-terminal. For the reader, closing the port is the same as unplugging the cable."""
         os.close(self._writer)
         os.close(self._reader)
-
-
-def posix_modules() -> tuple[Any, Any, Any]:
-    """Import the modules `tty`, `fcntl` and `termios`, which handle pseudo-terminals.
-
-    Raises:
-        PortError: If the operating system has no pseudo-terminals.
-    """
-    try:
-        tty, fcntl, termios = map(importlib.import_module, ("tty", "fcntl", "termios"))
-    except ImportError as error:
-        raise PortError(
-            f"a virtual sensor needs a pseudo-terminal, and this system has none ({error}); run it on Linux or macOS, "
-            "or on Windows in WSL"
-        ) from error
-    return tty, fcntl, termios
