@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from scipy.stats import chi2, halfnorm
 
 from isocharge.common.errors import ConfigError
@@ -173,13 +172,6 @@ def test_the_folder_is_complete_and_its_card_and_metadata_agree(released, datase
     names = ["coverage_68", "coverage_95", "found_gain_20_percent", "found_dead_electrode"]
     expected_fractions = [metadata.errors[name] for name in names]
     np.testing.assert_allclose(np.array(percentages, float) / 100.0, expected_fractions, atol=6e-4)
-    _, block, _ = card.split("---\n", 2)
-    [index] = yaml.safe_load(block)["model-index"]
-    [result] = index["results"]
-    assert (index["name"], result["dataset"]["name"]) == (metadata.name, metadata.sensor["name"])
-    listed = {metric["type"]: metric["value"] for metric in result["metrics"]}
-    assert listed == {key: float(f"{metadata.errors[key]:g}") for key in listed}
-    assert "position_rms_mm" in listed
 
 
 def test_the_errors_in_the_metadata_are_those_of_the_served_model(fitted, released):

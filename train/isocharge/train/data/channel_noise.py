@@ -9,17 +9,14 @@ noise of a channel is modelled as white^2 + (gain * Q)^2, with the charge Q and 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
+from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Integers
 from isocharge.simulate import NoiseModel
 
 NEIGHBOURS = 16
-"""Number of presses to which a plane is fitted, which is four times the number of its coefficients."""
-
-LEAST_CONTACTS = 8
-"""Smallest number of different contacts to which a plane is fitted, which is twice the number of its coefficients."""
+"""Number of contacts to which a plane is fitted, which is four times the number of its coefficients."""
 
 MIN_REPEATED_PRESSES = 100
 """Number of presses at repeated contacts from which the noise is estimated from these presses only.
@@ -29,23 +26,15 @@ The standard deviation of the noise of a channel is then known to about 10 %."""
 SAME_CONTACT_DECIMALS = 3
 """Decimals of the unit coordinates in which two contacts agree if they count as the same contact."""
 
-ROUNDS = 10
-"""Number of weighted least-squares fits. The variances of each fit determine the weights of the next fit."""
-
-TINY = 1e-30
-"""Smallest divisor, so that no division by zero occurs."""
-
 OUTLIER = 3.0
 """Number of standard deviations to which residuals are clipped, because larger residuals are not due to noise."""
 
 LEAST_SHARE = 0.01
 """Smallest white noise of a channel, relative to the noise of its gain at a charge of the usual size.
 
-The lower limit is needed because the presses do not determine the white noise if no charge is small.
+The lower limit is needed because the presses do not determine the white noise if no charge is small. The quantiles at
+this share and at one minus this share show whether a channel has charges of both signs.
 """
-
-BOTH_SIGNS = 0.01
-"""Fraction of the charges with the rarer sign above which a channel counts as one with charges of both signs."""
 
 MIN_TRANSITION_RATIO = 0.5
 """Smallest `ChannelNoise.transition_charge` of a channel with both signs, relative to the usual size of its charges.
@@ -102,11 +91,12 @@ class ChannelNoise:
             planes = LocalPlanes.fit(unit_contact, charge)
             size = planes.value
             residual = planes.residual
-        channel_variances = [
-            _fit_variances(channel_size, channel_residual)
-            for channel_size, channel_residual in zip(size.T, residual.T, strict=True)
-        ]
-        white_std, gain_std = np.sqrt(np.array(channel_variances)).T  # each of shape (n_electrode,)
+        white_std, gain_std = np.array(
+            [
+                _fit_noise(channel_size, channel_residual)
+                for channel_size, channel_residual in zip(size.T, residual.T, strict=True)
+            ]
+        ).T  # each of shape (n_electrode,)
         gain = np.maximum(gain_std, LEAST_GAIN)
         # The presses do not determine the white noise if all charges are large. Its lower limit is a small fraction of
         # the noise of the gain at the usual charge.
@@ -155,9 +145,8 @@ class ChannelNoise:
         Args:
             charge: Charges of presses, shape (n, n_electrode), pC.
         """
-        positive_share = np.mean(charge > 0.0, axis=0)  # shape (n_electrode,)
-        negative_share = np.mean(charge < 0.0, axis=0)
-        has_both_signs = np.minimum(positive_share, negative_share) > BOTH_SIGNS
+        low_charge, high_charge = np.quantile(charge, (LEAST_SHARE, 1.0 - LEAST_SHARE), axis=0)
+        has_both_signs = (low_charge < 0.0) & (high_charge > 0.0)  # shape (n_electrode,)
         # Without this lower limit, asinh would have a kink at the charge 0 for a channel with little noise.
         smallest_transition = np.where(has_both_signs, MIN_TRANSITION_RATIO * usual_size(charge), 0.0)
         # Below this charge, the noise is mostly white, and above it mostly proportional to the charge.
@@ -179,16 +168,16 @@ class ChannelNoise:
 
 @dataclass(frozen=True)
 class LocalPlanes:
-    """One plane for each press, which is fitted to the neighbours of the press but not to the press itself.
+    """One plane for each contact, which is fitted to the nearest other contacts.
 
-    Neighbours with the same contact are averaged.
+    Presses with the same contact are averaged.
 
     Attributes:
-        value: Value of the plane at the press, shape (n, k).
+        value: Value of the plane at its contact, shape (n, k).
         slope: Derivatives of the values with respect to the unit coordinates, shape (n, k, 3).
-        residual: Difference between the values of the press and of the plane, shape (n, k). It is divided by sqrt(1 +
-            v), where v is the variance of the plane if the values of the neighbours have the variance 1.
-        reach: Distance of the farthest neighbours in unit coordinates, shape (n,).
+        residual: Difference between the mean values of the presses and the value of the plane, shape (n, k). It is
+            divided by its standard deviation for values of presses with the variance 1.
+        reach: Distance of the farthest neighbour in unit coordinates, shape (n,).
     """
 
     value: Array
@@ -198,58 +187,36 @@ class LocalPlanes:
 
     @classmethod
     def fit(cls, unit_contact: Array, values: Array) -> "LocalPlanes":
-        """For each press, fit a plane to the values of its neighbours by least squares.
+        """For each contact, fit a plane to the values of its neighbours by least squares.
 
-        The plane is a linear function from the unit coordinates of a contact to the k values. The press itself is not
-        used in the fit, so that its residual is independent of the plane. The residuals are scaled so that their
-        variance is equal to that of the noise of the values.
+        The plane is a linear function from the unit coordinates of a contact to the k values. The values at the contact
+        itself are not used in the fit, so that its residual is independent of the plane. The residuals are scaled so
+        that their variance is equal to that of the noise of the values.
 
         Args:
             unit_contact: Contacts in unit coordinates, shape (n, 3).
             values: Values at the contacts, such as charges, shape (n, k).
 
         Returns:
-            The planes, one for each press.
+            The planes, one for each different contact.
         """
-        # Average the presses of each contact: a rig may repeat a contact more often than a plane has neighbours.
-        _, contact_of_press, press_count = np.unique(
-            np.round(unit_contact, SAME_CONTACT_DECIMALS), axis=0, return_inverse=True, return_counts=True
-        )
-        contact_sum, value_sum = (
-            np.stack([np.bincount(contact_of_press, column) for column in table.T], axis=1)
-            for table in (unit_contact, values)
-        )
-        distance, nearest = cKDTree(contact_sum / press_count[:, None]).query(
-            unit_contact, min(NEIGHBOURS + 1, len(press_count))
-        )  # both of shape (n, number of contacts of a plane)
-        is_own = nearest == contact_of_press[:, None]
-        count = press_count[nearest] - is_own  # the press itself is left out
-        mean_divisor = np.maximum(count, 1)[..., None]
-        own = is_own[..., None]
-        offsets = (contact_sum[nearest] - own * unit_contact[:, None]) / mean_divisor - unit_contact[:, None]
-        neighbour_values = (value_sum[nearest] - own * values[:, None]) / mean_divisor
-
-        # Use as few contacts as have enough presses. A contact counts as often as it was pressed.
-        presses_before, contacts_before = (np.cumsum(number, axis=1) - number for number in (count, count > 0))
-        is_used = (count > 0) & ((presses_before < NEIGHBOURS) | (contacts_before < LEAST_CONTACTS))
-        root_weight = np.sqrt(count * is_used)[..., None]
-        # The constant and the offsets of the neighbours, shape (n, number of contacts, 1 + number of coordinates)
-        columns = np.concatenate([np.ones_like(root_weight), offsets], axis=2)
-        # The pseudoinverse contains the weights of the weighted neighbours in the least-squares solution.
-        neighbour_weights = np.linalg.pinv(root_weight * columns)
-        # The first coefficient is the value at the press, and the others are the slopes; shape (n, 4, k).
-        coefficients = neighbour_weights @ (root_weight * neighbour_values)
+        contact, mean_value, press_count, _ = _average_repeated(unit_contact, values)
+        distance, nearest = cKDTree(contact).query(contact, min(NEIGHBOURS + 1, len(contact)))
+        neighbours = nearest[:, 1:]  # the nearest contact is the contact itself
+        offsets = contact[neighbours] - contact[:, None]
+        # The constant and the offsets of the neighbours, shape (n, number of neighbours, 1 + number of coordinates)
+        columns = np.concatenate([np.ones_like(offsets[:, :, :1]), offsets], axis=2)
+        # The pseudoinverse contains the weights of the neighbours in the least-squares solution.
+        weights = np.linalg.pinv(columns)
+        # The first coefficient is the value at the contact, and the others are the slopes; shape (n, 4, k).
+        coefficients = weights @ mean_value[neighbours]
         value = coefficients[:, 0]
         slope = coefficients[:, 1:].swapaxes(1, 2)  # shape (n, k, 3)
 
-        # A residual contains the noise of the press and the noise of the plane. If the noise of each value has the
-        # variance 1, so has the noise of each weighted mean, and the variance of the plane is the sum of the squares of
-        # their weights.
-        value_weights = neighbour_weights[:, :1]  # weights in the value of the plane, shape (n, 1, number of contacts)
-        relative_residual_std = np.sqrt(1.0 + (value_weights**2).sum(axis=2))
-        residual = (values - value) / relative_residual_std
-        reach = np.max(distance * is_used, axis=1)
-        return cls(value, slope, residual, reach)
+        # A residual contains the noise of the mean value and the noise of the plane.
+        plane_variance = (weights[:, 0] ** 2 / press_count[neighbours]).sum(axis=1)
+        relative_std = np.sqrt(1.0 / press_count + plane_variance)
+        return cls(value, slope, (mean_value - value) / relative_std[:, None], distance[:, -1])
 
     def residuals(self, values: Array) -> Array:
         """Compute the difference between each set of k values and the nearest point of all planes.
@@ -275,8 +242,8 @@ class LocalPlanes:
             step = (inverse_slope[plane_index] @ difference[..., None])[..., 0]
 
             # Shorten steps that end beyond the farthest neighbour.
-            length = np.linalg.norm(step, axis=1)
-            length_ratio = np.minimum(1.0, self.reach[plane_index] / np.maximum(length, TINY))
+            reach = self.reach[plane_index]
+            length_ratio = reach / np.maximum(np.linalg.norm(step, axis=1), reach)
             limited_step = step * length_ratio[:, None]
 
             # Difference from the point at the end of the step, shape (m, k)
@@ -286,6 +253,26 @@ class LocalPlanes:
             is_nearer = (residual**2).sum(axis=1) < (smallest_residual**2).sum(axis=1)
             smallest_residual[is_nearer] = residual[is_nearer]
         return smallest_residual
+
+
+def _average_repeated(unit_contact: Array, values: Array) -> tuple[Array, Array, Integers, Integers]:
+    """Average the values of presses with the same contact.
+
+    Args:
+        unit_contact: Contacts in unit coordinates, shape (n, 3).
+        values: Values of the presses, shape (n, k).
+
+    Returns:
+        Different contacts, shape (m, 3). Their mean values, shape (m, k). Their numbers of presses, shape (m,). Index
+        of the contact of each press, shape (n,).
+    """
+    rounded_contact = np.round(unit_contact, SAME_CONTACT_DECIMALS)
+    _, contact_of_press, press_count = np.unique(rounded_contact, axis=0, return_inverse=True, return_counts=True)
+    contact_of_press = contact_of_press.ravel()  # some versions of NumPy return two axes
+    table = np.column_stack([unit_contact, values])
+    sums = np.stack([np.bincount(contact_of_press, column) for column in table.T], axis=1)
+    contact, mean_value = np.split(sums / press_count[:, None], [unit_contact.shape[1]], axis=1)
+    return contact, mean_value, press_count, contact_of_press
 
 
 def _repeated_residuals(unit_contact: Array, charge: Array) -> tuple[Array, Array]:
@@ -299,15 +286,12 @@ def _repeated_residuals(unit_contact: Array, charge: Array) -> tuple[Array, Arra
         The mean charges of the contact, and the residuals, both of shape (m, n_electrode), pC, for the m presses whose
         contact is repeated. The residuals have the variance of the noise.
     """
-    _, contact_of_press, press_count = np.unique(
-        np.round(unit_contact, SAME_CONTACT_DECIMALS), axis=0, return_inverse=True, return_counts=True
-    )
-    sums = np.stack([np.bincount(contact_of_press, column) for column in charge.T], axis=1)
-    mean = (sums / press_count[:, None])[contact_of_press]
-    count = press_count[contact_of_press, None]
-    is_repeated = count[:, 0] > 1
-    residual = (charge - mean)[is_repeated] * np.sqrt(count / np.maximum(count - 1, 1))[is_repeated]
-    return mean[is_repeated], residual
+    _, mean_charge, press_count, contact_of_press = _average_repeated(unit_contact, charge)
+    count = press_count[contact_of_press]
+    mean = mean_charge[contact_of_press]
+    is_repeated = count > 1
+    count = count[is_repeated, None]
+    return mean[is_repeated], (charge - mean)[is_repeated] * np.sqrt(count / (count - 1))
 
 
 def usual_size(charge: Array) -> Array:
@@ -319,40 +303,30 @@ def usual_size(charge: Array) -> Array:
     return np.array([np.median(np.abs(column[column != 0.0])) for column in charge.T])
 
 
-def _fit_variances(charge: Array, residual: Array) -> tuple[float, float]:
-    """Estimate the variances white^2 and gain^2 of one channel.
+def _fit_noise(charge: Array, residual: Array) -> Array:
+    """Estimate the white noise and the noise of the gain of one channel from residuals.
 
-    The function white^2 + gain^2 Q^2 is fitted to the squared residuals by weighted least squares. Neither white^2 nor
-    gain^2 can become negative. The squared residuals of large charges scatter more, so each squared residual is divided
-    by its expected value. The expected values are not known at first. The fit is therefore repeated, and each round
-    uses the expected values that follow from the variances of the previous round. Outliers are clipped.
+    The likelihood of the residuals is maximised. Their variance is white^2 + gain^2 Q^2. The likelihood is that of a
+    normal distribution, in which residuals beyond `OUTLIER` standard deviations are clipped.
 
     Args:
         charge: Charges Q without noise, shape (n,), pC.
         residual: Residuals, shape (n,), pC.
 
     Returns:
-        white^2, pC^2, and gain^2, dimensionless.
+        The standard deviation of the white noise, pC, and the relative standard deviation of the gain.
     """
-    # The expected values of the squared residuals are columns @ (white^2, gain^2).
-    columns = np.stack([np.ones_like(charge), charge**2], axis=1)  # shape (n, 2)
-    mean_square = np.mean(residual**2)
-    smallest_variance = 1e-12 * mean_square + TINY  # avoids a division by zero
-    # Both columns are scaled to the root mean square 1, because the squared charges may be very large or small.
-    sum_of_squares = np.maximum((columns**2).sum(axis=0), TINY)
-    column_scale = np.sqrt(sum_of_squares) / np.sqrt(len(charge))
+    # Both are divided by the values that explain the residuals alone, because charges may be very large or small.
+    units = np.full(2, np.finfo(float).tiny) + np.sqrt(np.mean(residual**2)) / [1.0, np.sqrt(np.mean(charge**2))]
 
-    variances = np.array([mean_square, 0.0])  # white^2 and gain^2 before the first round
-    for _ in range(ROUNDS):
-        expected_square = np.maximum(columns @ variances, smallest_variance)
-        clipped_square = np.minimum(residual**2, OUTLIER**2 * expected_square)  # limits the influence of outliers
-        # Divide both sides of the equations by the expected values, and solve them without negative variances.
-        weighted_columns = columns / column_scale / expected_square[:, None]
-        weighted_square = clipped_square / expected_square
-        scaled_variances, _ = nnls(weighted_columns, weighted_square)
-        variances = scaled_variances / column_scale
-    white_variance, gain_variance = variances.tolist()
-    return white_variance, gain_variance
+    def loss(log_std: Array) -> float:
+        """Return the mean negative logarithm of the likelihood, without a constant."""
+        white, gain = units * np.exp(log_std)
+        variance = np.maximum(white**2 + (gain * charge) ** 2, np.finfo(float).tiny)
+        clipped_square = np.minimum(residual**2 / variance, OUTLIER**2)
+        return float(np.mean(np.log(variance) + clipped_square))
+
+    return np.asarray(units * np.exp(minimize(loss, [-0.5, -0.5], method="Nelder-Mead").x))
 
 
 Noise = NoiseModel | ChannelNoise

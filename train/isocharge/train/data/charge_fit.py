@@ -5,7 +5,7 @@ folds of the map, and for distant contacts with the same charges. For a dataset 
 describes the mean of the charges over the probes.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -16,6 +16,7 @@ from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import TrainingError
 from isocharge.serve.model.charge_series import ChargeSeries, series_size
 from isocharge.serve.model.chebyshev_series import CHUNK_SIZE, chebyshev_terms, position_degrees
+from isocharge.simulate import noise_model
 from isocharge.train.data.contact_errors import rms
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 
@@ -55,15 +56,8 @@ exponent of the force changes with the force."""
 SIZE_DEGREE = 4
 """Degree of the polynomial that approximates the logarithm of the size S of the charges as a function of l."""
 
-NOISE_CORNER_pC = 500.0
-"""Charge at which both parts of the `reference` noise, 1 pC and 0.2 % of the charge, are equal, pC.
-
-For charges of both signs, the errors of a fit are divided by the root of the sum of the squares of the charge and of
-this value. Charges near zero would otherwise have large relative errors.
-"""
-
-ROWS_PER_TERM = 40
-"""Largest number of presses per coefficient. More presses would improve the fit mostly near the edge of the disk."""
+REFERENCE = noise_model("reference")
+"""Noise that decides which charges of both signs count as small."""
 
 FEWEST_PER_TERM = 8
 """Smallest number of presses per coefficient. Fewer presses would not determine the slopes near the edge."""
@@ -97,23 +91,38 @@ def fit_charge_series(
     Raises:
         TrainingError: If there are too few presses for the smallest degrees.
     """
-    fitter = _SeriesFitter.prepare(domain, electrodes, presses, validation)
-    candidate_degrees = SIGNED_CANDIDATE_DEGREES if presses.signed else CANDIDATE_DEGREES
-    first_degrees, *further_degrees = candidate_degrees
-    best_series = fitter.fit(*first_degrees)
-    if best_series is None:
-        fewest = FEWEST_PER_TERM * series_term_count(*first_degrees)
-        raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")
+    unit_contact = domain.to_unit(presses.contact)
+    if presses.signed:
+        # The values of the series are Q / S with the typical size S of the charges. Charges near zero would have large
+        # relative errors. Their errors are therefore relative to the charge of which the noise is proportional.
+        candidate_degrees = SIGNED_CANDIDATE_DEGREES
+        log_size = _fit_log_size(unit_contact[:, 2], presses.charge)
+        target = presses.charge / series_size(log_size, unit_contact[:, 2])[0]
+        error_unit = REFERENCE.sigma(validation.charge) / REFERENCE.gain
+    else:
+        candidate_degrees = CANDIDATE_DEGREES
+        log_size = None
+        target = np.log(presses.charge)
+        error_unit = validation.charge
 
-    # Try the further degrees until the error is small enough, or the presses are too few.
-    for degree, force_degree in further_degrees:
-        if best_series.charge_std < GOOD_ENOUGH:
+    # Try the degrees until the error is small enough, or the presses are too few.
+    best_series: ChargeSeries | None = None
+    has_one_force = domain.force_range[0] == domain.force_range[1]  # determines no slope in the force
+    for degree, largest_force_degree in candidate_degrees:
+        force_degree = 0 if has_one_force else largest_force_degree
+        fewest = FEWEST_PER_TERM * series_term_count(degree, force_degree)
+        if fewest > len(presses):
+            if best_series is None:
+                raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")
             break
-        series = fitter.fit(degree, force_degree)
-        if series is None:  # there are too few presses for this degree and all higher ones
+        coefficients = fit_series(unit_contact, target, degree, force_degree)[None]
+        series = ChargeSeries(domain=domain, electrodes=electrodes, coefficients=coefficients, log_size=log_size)
+        error = rms((series.charges(validation.contact) - validation.charge) / error_unit)
+        if best_series is None or error < best_series.charge_std:
+            best_series = replace(series, charge_std=error)
+        if error < GOOD_ENOUGH:
             break
-        if series.charge_std < best_series.charge_std:
-            best_series = series
+    assert best_series is not None  # the first degrees were fitted, or an error was raised
     return best_series
 
 
@@ -143,85 +152,6 @@ def fit_film_series(
     return replace(
         all_nodes, electrodes=electrodes, coefficients=np.moveaxis(by_node, 3, 0), node_MPa=np.asarray(node_MPa)
     )
-
-
-@dataclass(frozen=True)
-class _SeriesFitter:
-    """Data for fits of series: presses for the fits, and other presses on which the errors are measured.
-
-    Attributes:
-        domain: Working area and range of forces of the contacts.
-        electrodes: Names of the electrodes, in the order of the charges.
-        unit_contact: Contacts of the fit in unit coordinates, shape (n, 3).
-        target: Values of the series at these contacts, ln Q or Q / S, shape (n, n_electrode).
-        log_size: Coefficients of ln S for charges of both signs; None for positive charges.
-        validation: Presses on which the errors are measured.
-        error_unit: Charges by which the errors are divided, shape (n_validation, n_electrode), pC.
-    """
-
-    domain: Domain
-    electrodes: tuple[str, ...]
-    unit_contact: Array
-    target: Array
-    log_size: Array | None
-    validation: LabelledPresses
-    error_unit: Array
-
-    @classmethod
-    def prepare(
-        cls, domain: Domain, electrodes: tuple[str, ...], presses: LabelledPresses, validation: LabelledPresses
-    ) -> "_SeriesFitter":
-        """Return a fitter with the target values of the series, and with the units in which its errors are measured.
-
-        For positive charges Q, the targets are ln Q, and the errors are relative. For charges of both signs, the
-        targets are Q / S. The typical size S of the charges is a fitted function of the force, and `log_size` contains
-        its coefficients.
-
-        Args:
-            domain: Working area and range of forces of the contacts.
-            electrodes: Names of the electrodes, in the order of the charges.
-            presses: Presses to which series will be fitted.
-            validation: Other presses, on which the errors will be measured.
-        """
-        unit_contact = domain.to_unit(presses.contact)
-        if presses.signed:  # the presses have charges of both signs
-            scaled_log_force = unit_contact[:, 2]
-            log_size = _fit_log_size(scaled_log_force, presses.charge)
-            size, _ = series_size(log_size, scaled_log_force)
-            target = presses.charge / size
-            smallest_error_unit = NOISE_CORNER_pC  # otherwise, charges near zero would have large relative errors
-        else:
-            log_size = None
-            target = np.log(presses.charge)
-            smallest_error_unit = 0.0
-        error_unit = np.hypot(validation.charge, smallest_error_unit)  # |Q| if the smallest unit is zero
-        return cls(domain, electrodes, unit_contact, target, log_size, validation, error_unit)
-
-    def fit(self, degree: int, force_degree: int) -> ChargeSeries | None:
-        """Fit a series with the given degrees, and measure its error on the validation presses.
-
-        The fit uses the first presses, at most `ROWS_PER_TERM` for each term of the series.
-
-        Args:
-            degree: Largest total degree in x and y.
-            force_degree: Largest degree in the logarithm of the force.
-
-        Returns:
-            The fitted series with its error; None if there are fewer than `FEWEST_PER_TERM` presses for each term.
-        """
-        smallest_force, largest_force = self.domain.force_range
-        if smallest_force == largest_force:  # presses with a single force determine no slope in the force
-            force_degree = 0
-        n_term = series_term_count(degree, force_degree)
-        if FEWEST_PER_TERM * n_term > len(self.unit_contact):
-            return None
-        used_rows = slice(0, ROWS_PER_TERM * n_term)
-        coefficients = fit_series(self.unit_contact[used_rows], self.target[used_rows], degree, force_degree)
-        series = ChargeSeries(
-            domain=self.domain, electrodes=self.electrodes, coefficients=coefficients[None], log_size=self.log_size
-        )
-        charge_error = series.charges(self.validation.contact) - self.validation.charge
-        return replace(series, charge_std=rms(charge_error / self.error_unit))
 
 
 def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:

@@ -12,10 +12,11 @@ from isocharge.common.errors import PressError
 from isocharge.serve.model.validity import inside_polygon
 from isocharge.simulate import Domain
 
-LEAST_HOLE = 6.0
-"""Radius of the smallest circle around a triangle between places above which it may be left out of the area.
+HULL_RATIO = 0.3
+"""Length above which an edge of the outline bends inwards to further places.
 
-The radius is relative to the distance between neighbouring places."""
+It is relative to the range of the distances between neighbouring places, of which the shortest is 0 and the longest 1.
+"""
 
 LEAST_RANGE = 1.1
 """Smallest ratio of the largest to the smallest force of a domain, which applies even if all forces are equal."""
@@ -132,9 +133,8 @@ def _box_middle(corners: Array) -> Array:
 def outline(places: Array) -> Array:
     """Compute the outline of the area that places cover.
 
-    The area consists of triangles whose corners are places (Delaunay triangulation). Only small triangles are used. The
-    limit of their size is doubled until the area is connected and contains all places. Holes are filled. The outline is
-    then moved outwards by half the median distance between neighbouring places.
+    The outline is the concave hull of the places. It is moved outwards by half the median distance between neighbouring
+    places.
 
     Args:
         places: Positions (x, y), all different, shape (m, 2), mm.
@@ -153,13 +153,6 @@ def outline(places: Array) -> Array:
     # The nearest place is the place itself, and the second nearest is its nearest neighbour.
     distances, _ = cKDTree(places).query(places, 2)
     spacing = float(np.median(distances[:, 1]))
-    triangles = np.array(shapely.delaunay_triangles(shapely.MultiPoint(places)).geoms)
-    half_length = shapely.minimum_bounding_radius(triangles)
-    limit = LEAST_HOLE * spacing
-    area = shapely.MultiPolygon()
-    while area.geom_type != "Polygon" or not shapely.intersects_xy(area, places).all():
-        area = shapely.union_all(triangles[half_length <= limit])
-        limit *= 2.0
-    exterior = shapely.Polygon(area.exterior).simplify(0.0)
+    exterior = shapely.concave_hull(shapely.MultiPoint(places), HULL_RATIO).simplify(0.0)
     enlarged = exterior.buffer(0.5 * spacing, join_style="mitre", mitre_limit=2.0)
     return np.asarray(shapely.get_coordinates(enlarged.normalize().exterior)[:0:-1])

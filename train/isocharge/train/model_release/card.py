@@ -1,7 +1,5 @@
 """Card of a model, which states what the model is for, its errors, its limits, and how to make it again."""
 
-import json
-
 import numpy as np
 
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
@@ -99,34 +97,6 @@ nearly always fit some contact.
 {metadata.made_with["command"] or "(made by a program, see metadata)"}
 ```
 """
-
-
-def hub_block(metadata: ModelMetadata) -> str:
-    """Return the block at the beginning of a card with the kind of the model and its measured errors.
-
-    Model hubs read this block as YAML, of which JSON is a part (https://huggingface.co/docs/hub/model-cards). The block
-    names no licence, because the publisher of a model chooses it.
-
-    Args:
-        metadata: Metadata of the model, with its errors.
-    """
-    metrics = [
-        {"type": name, "name": row.split(" | ")[0], "value": float(f"{metadata.errors[name]:g}")}
-        for name, row in LISTED_ERRORS.items()
-        if name in metadata.errors
-    ]
-    result = {
-        "task": {"type": "tabular-regression"},
-        "dataset": {"name": str(metadata.sensor["name"]), "type": "presses"},
-        "metrics": metrics,
-    }
-    block = {
-        "library_name": "onnx",
-        "pipeline_tag": "tabular-regression",
-        "tags": ["isocharge", "tactile-sensing", "piezoelectric"],
-        "model-index": [{"name": metadata.name, "results": [result]}],
-    }
-    return f"---\n{json.dumps(block, indent=1)}\n---\n\n"
 
 
 def _area_text(fitted: Fitted) -> str:

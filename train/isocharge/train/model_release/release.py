@@ -19,7 +19,7 @@ from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
 from isocharge.serve.model.model_folder import check_target, write_model
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
-from isocharge.train.model_release.card import hub_block, model_card
+from isocharge.train.model_release.card import model_card
 from isocharge.train.model_release.evaluate import evaluate
 from isocharge.train.model_release.graph_check import check_graph
 from isocharge.train.model_release.onnx_graph import write_graph
@@ -108,7 +108,7 @@ def release(
     graph = write_graph(fitted.network, complete_metadata.to_props())
     floors = contact_floors(complete_metadata)
     golden_charges = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, floors)
-    card_text = hub_block(complete_metadata) + card(complete_metadata, fitted)
+    card_text = card(complete_metadata, fitted)
     version_folder = write_model(folder, graph, complete_metadata, golden_charges, card_text, fitted.provenance.files)
     return Release(version_folder, complete_metadata)
 

@@ -14,9 +14,6 @@ CLIPPING_MARGIN = 1.0
 The limits apply to charges of both signs. The distance and the range are differences of asinh(Q / typical charge).
 """
 
-MIN_SINGULAR_VALUE = 1e-12
-"""Smallest singular value by which the whitening divides, so that no division by zero occurs."""
-
 
 @dataclass(frozen=True)
 class WhitenedFeatures:
@@ -103,17 +100,13 @@ def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
     )
 
 
-def whitening(values: Array, min_relative_std: float = 0.0) -> tuple[Array, Array]:
+def whitening(values: Array) -> tuple[Array, Array]:
     """Compute the whitening transform of values by a principal component analysis.
 
-    The covariance of the transformed values (values - mean) @ matrix is the identity matrix, unless a component has a
-    standard deviation below the limit `min_relative_std`.
+    The covariance of the transformed values (values - mean) @ matrix is the identity matrix.
 
     Args:
         values: Values, shape (n, k), where n is at least k.
-        min_relative_std: Smallest standard deviation of a principal component that is scaled to unit variance, relative
-            to the largest standard deviation. A component with a smaller standard deviation is scaled as if it had this
-            smallest standard deviation.
 
     Returns:
         Mean, shape (k,), and matrix, shape (k, k).
@@ -122,7 +115,5 @@ def whitening(values: Array, min_relative_std: float = 0.0) -> tuple[Array, Arra
     # value divided by the square root of the number of values.
     mean = values.mean(axis=0)
     _, singular_values, axes = np.linalg.svd(values - mean, full_matrices=False)
-    largest_singular_value = singular_values[0]  # they are in descending order
-    min_singular_value = max(MIN_SINGULAR_VALUE, min_relative_std * largest_singular_value)
-    inverse_std = np.sqrt(len(values)) / np.maximum(singular_values, min_singular_value)
+    inverse_std = np.sqrt(len(values)) / np.maximum(singular_values, np.finfo(float).eps)
     return mean, axes.T * inverse_std

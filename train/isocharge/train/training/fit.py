@@ -18,15 +18,13 @@ from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.progress import second_thread
 from isocharge.serve.model.charge_file import FILE as CHARGES_FILE
 from isocharge.serve.model.charge_file import charge_map_bytes
-from isocharge.serve.model.charge_series import ChargeSeries
-from isocharge.simulate import Dataset, NoiseModel
+from isocharge.simulate import Dataset
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.descent import TrainingStage
-from isocharge.train.training.exact_search import error_cautions
 from isocharge.train.training.fitted import Fitted, Provenance
 from isocharge.train.training.linear_targets import LinearTargets
 from isocharge.train.training.losses import contact_loss, fresh_noise
@@ -48,8 +46,7 @@ ROUNDED_FRACTION = 0.25
 def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitted:
     """Train a network on presses, and fold it into the form of a release.
 
-    A warning is logged if two contacts of the requested domain have the same charges. Another warning is logged if the
-    errors of the network are clearly larger than the errors of an exact search.
+    A warning is logged if two contacts of the requested domain have the same charges.
 
     Args:
         source: A dataset, simulated or measured, or other training data.
@@ -72,62 +69,40 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
     # The threshold of the misfit needs many good presses. Of few measured presses, those for training are used, too.
     split = trained.split
     good_presses = data.presses.within(split.domain.radius) if data.presses.measured else split.test
-    network = fold_network(trained.network)
-    cautions = split.cautions
-    noise = settings.training.noise_model
-    if _is_noise_known(data, noise):
-        for caution in error_cautions(network, split.test, split.field, noise, settings.training.seed):
-            _log.warning("%s", caution)
-            cautions = (*cautions, caution)
     return Fitted(
-        network=network,
+        network=fold_network(trained.network),
         sensor=data.sensor,
         probes=data.probes,
         domain=split.domain,
-        noise=noise,
-        test=split.test if data.test is None else data.test,
+        noise=settings.training.noise_model,
+        test=split.test,
         good=good_presses,
         sha256=data.sha256,
-        provenance=_provenance(data, split.folded_charges, cautions, settings),
+        provenance=_provenance(data, split, settings),
         requested_domain=data.domain,
-        cautions=cautions,
+        cautions=split.cautions,
         outside=trained.outside,
         yield_force_N=data.yield_force_N,
     )
 
 
-def _is_noise_known(data: TrainingData, noise: NoiseModel) -> bool:
-    """Return whether the charges have noise during the training, and the standard deviation of this noise is known.
-
-    Simulated charges only have the noise that the training adds, unless its standard deviation is zero. Measured
-    charges already contain noise with unknown standard deviations.
-
-    Args:
-        data: Training data.
-        noise: Noise that the training adds.
-    """
-    return not data.presses.measured and noise.white > 0.0
-
-
-def _provenance(
-    data: TrainingData, folded_charges: ChargeSeries | None, cautions: tuple[str, ...], config: FitConfig
-) -> Provenance:
+def _provenance(data: TrainingData, split: Split, config: FitConfig) -> Provenance:
     """Return the provenance of the training data, with the settings of the training and other additional entries.
+
+    If the map from contacts to charges folds, the series of the charges is added as a file.
 
     Args:
         data: Training data, which may contain entries and files of their own.
-        folded_charges: Approximation of the charges by a series, which is added as a file; None if the map from
-            contacts to charges does not fold.
-        cautions: Sentences about the limits of the network.
+        split: Series of the charges, and cautions about the network.
         config: Settings of the training.
     """
     made_with: dict[str, object] = {"config": config.to_dict(), "torch": torch.__version__}
-    if cautions:
-        made_with["cautions"] = list(cautions)
+    if split.cautions:
+        made_with["cautions"] = list(split.cautions)
     made_with.update(data.provenance.made_with)
     files = dict(data.provenance.files)
-    if folded_charges is not None:
-        files[CHARGES_FILE] = charge_map_bytes(folded_charges)
+    if split.folded_charges is not None:
+        files[CHARGES_FILE] = charge_map_bytes(split.folded_charges)
     return replace(data.provenance, made_with=made_with, files=files)
 
 
@@ -175,7 +150,9 @@ def train_network(data: TrainingData, config: FitConfig) -> TrainedNetwork:
         misfit_training = executor.submit(train_misfit)
         linear_targets = None
         has_many_electrodes = network.n_electrode > FEW_ELECTRODES
-        if has_many_electrodes and _is_noise_known(data, training.noise_model):
+        # Measured charges contain noise of unknown size. Linear targets need noise of known size.
+        is_noise_known = not data.presses.measured and training.noise_model.white > 0.0
+        if has_many_electrodes and is_noise_known:
             linear_targets = LinearTargets.compute(split.train, split.field, training.noise_model)
         stage = contact_stage(network, split.train, training.noise_model, training, linear_targets=linear_targets)
         train_perceptron(stage, network.contact, config)

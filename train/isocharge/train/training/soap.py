@@ -6,7 +6,7 @@ separately. In this basis, Adam therefore comes close to a second-order method (
 algorithm 3). The eigenvectors change slowly, and are updated every few steps by one orthogonal iteration.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -19,14 +19,6 @@ BASIS_PERIOD = 10
 
 EPSILON = 1e-10
 """Number that is added to each root mean square of the gradient, so that no division by zero occurs."""
-
-MAX_RATIO = 2.0
-"""Largest ratio of the averaged gradient to its root mean square, in the eigenbasis.
-
-With equal decay rates, the ratio is at most 1, except where an update of the eigenvectors has moved a part of the
-averaged gradient to an entry whose mean square is nearly zero. Such entries arise where the gradient of some weights
-becomes different from zero only during the training. Without the limit, the step would be arbitrarily long.
-"""
 
 
 class Soap:
@@ -90,33 +82,25 @@ class _ParameterState:
         assert gradient is not None
         new_weight = 1.0 - DECAY
         if self.moments:
-            row_moment, column_moment = self.moments
-            row_moment.lerp_(gradient @ gradient.T, new_weight)
-            column_moment.lerp_(gradient.T @ gradient, new_weight)
+            for moment, square in zip(self.moments, (gradient @ gradient.T, gradient.T @ gradient), strict=True):
+                moment.lerp_(square, new_weight)
             if self.step % BASIS_PERIOD == 0:
                 pairs = zip(self.moments, self.bases, strict=True)
                 self.bases = [torch.linalg.qr(moment @ basis).Q for moment, basis in pairs]
         self.step += 1
         self.mean.lerp_(gradient, new_weight)
-        self.square.lerp_(self._rotate(gradient) ** 2, new_weight)
+        self.square.lerp_(_rotate(gradient, self.bases) ** 2, new_weight)
 
         # The moving averages begin at zero. They are therefore divided by the total weight of all gradients so far.
         total_weight = 1.0 - DECAY**self.step
         root_mean_square = torch.sqrt(self.square / total_weight) + EPSILON
-        ratio = self._rotate(self.mean) / (total_weight * root_mean_square)
-        direction = self._rotate_back(ratio.clamp(-MAX_RATIO, MAX_RATIO))
-        self.parameter.add_(direction, alpha=-rate)
+        ratio = _rotate(self.mean, self.bases) / (total_weight * root_mean_square)
+        self.parameter.add_(_rotate(ratio, [basis.T for basis in self.bases]), alpha=-rate)
 
-    def _rotate(self, matrix: Tensor) -> Tensor:
-        """Transform a matrix to the eigenbasis. A vector is returned unchanged."""
-        if not self.bases:
-            return matrix
-        row_basis, column_basis = self.bases
-        return row_basis.T @ matrix @ column_basis
 
-    def _rotate_back(self, matrix: Tensor) -> Tensor:
-        """Transform a matrix from the eigenbasis back to the original basis. A vector is returned unchanged."""
-        if not self.bases:
-            return matrix
-        row_basis, column_basis = self.bases
-        return row_basis @ matrix @ column_basis.T
+def _rotate(matrix: Tensor, bases: Sequence[Tensor]) -> Tensor:
+    """Transform a matrix to the basis of the columns of two matrices. Without bases, return the matrix unchanged."""
+    if not bases:
+        return matrix
+    row_basis, column_basis = bases
+    return row_basis.T @ matrix @ column_basis

@@ -25,7 +25,6 @@ class TrainingData:
         outside: Presses between the domain and the clamp; None if there are none.
         yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
             or above the range of forces.
-        test: Measured presses for measuring errors; None to hold out a part of `presses`.
         provenance: Additional information about the origin of the model, for the release.
         field: Charges as a function of the contact; None to fit them to `presses`.
     """
@@ -37,7 +36,6 @@ class TrainingData:
     sha256: str
     outside: LabelledPresses | None = None
     yield_force_N: float | None = None
-    test: LabelledPresses | None = None
     provenance: Provenance = dataclass_field(default_factory=Provenance)
     field: ChargeSeries | None = None
 
