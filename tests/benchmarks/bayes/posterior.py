@@ -36,9 +36,6 @@ MOVES = 4
 LAST_MOVES = 24
 """Number of further Metropolis steps with the true noise, over which the mean is taken."""
 
-DIFFERENCE_FACTOR = 2.38 / np.sqrt(6.0)
-"""Length of a Metropolis step, relative to the difference of two contacts (ter Braak 2006)."""
-
 
 @dataclass(frozen=True)
 class Posterior:
@@ -151,7 +148,9 @@ class Posterior:
         for _ in range(2):
             others = point[:, half:]
             first, second = (others[:, rng.permutation(half)] for _ in range(2))
-            proposal = point[:, :half] + DIFFERENCE_FACTOR * (first - second)
+            proposal = (
+                point[:, :half] + first - second
+            )  # in three dimensions, the best length of a step is 0.97 times this
             new_level = self._log_likelihood(proposal, charge, noise_factor)
             is_accepted = np.log(rng.random(new_level.shape)) < new_level - level[:, :half]
             moved = np.where(is_accepted[:, :, None], proposal, point[:, :half])
