@@ -1,7 +1,7 @@
 """Training time against error over the Bayes limit: the training, the training without its parts, and scikit-learn.
 
     python tests/benchmarks/bench_fit.py [--sensor three-25um-biaxial] [--radius 8] [--samples 24000] [--presses 1500]
-        [--steps 250,600,1500,2000] [--figure fit.png] [--json]
+        [--steps 250,600,1500,2000] [--json]
 
 Only the contact network is trained. All methods learn from the same simulated presses and estimate the same fresh
 presses with `reference` noise. The time is CPU time of one thread, because a busy machine does not change it much. The
@@ -14,26 +14,27 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
-from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
 import torch
 from bayes.limit import BayesProblem, bayes_estimate
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from shared import arguments, print_results
+from sklearn.compose import TransformedTargetRegressor
+from sklearn.decomposition import PCA
 from sklearn.ensemble import HistGradientBoostingRegressor
 from sklearn.multioutput import MultiOutputRegressor
 from sklearn.neighbors import KNeighborsRegressor
 from sklearn.neural_network import MLPRegressor
-from sklearn_rivals import SubsetProcess, log_charge_regressor
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer
 
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.simulate import ChargeMap, Circle, Domain, Sweep, load_sensor, noise_model
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
 from isocharge.train.data.contact_errors import ContactErrorStatistics
+from isocharge.train.data.presses import LOWEST_CHARGE
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fit import contact_stage, threads_and_seed
 from isocharge.train.training.linear_targets import LinearTargets
@@ -158,40 +159,20 @@ def predictor(network: InverseNetwork) -> Predict:
 REGRESSORS = {
     "k nearest neighbours": KNeighborsRegressor(20, weights="distance"),
     "gradient boosting": MultiOutputRegressor(HistGradientBoostingRegressor(max_iter=300)),
-    "Gaussian process": SubsetProcess(),
     "MLPRegressor": MLPRegressor(hidden_layer_sizes=(96, 96, 96), activation="tanh", max_iter=12, random_state=0),
 }
 """Regressors of scikit-learn by name. Their inputs are whitened logarithms of the charges."""
 
 
 def regressor(case: Case, name: str) -> Predict:
-    """Fit a regressor of scikit-learn."""
-    model = log_charge_regressor(case.domain, regressor=REGRESSORS[name])
+    """Fit a regressor of scikit-learn, whose targets are the contacts in unit coordinates."""
+    logarithms = FunctionTransformer(lambda charge: np.log(np.maximum(charge, LOWEST_CHARGE)))
+    pipeline = make_pipeline(logarithms, PCA(whiten=True), REGRESSORS[name])
+    to_unit, to_contact = case.domain.to_unit, case.domain.to_contact
+    model = TransformedTargetRegressor(pipeline, func=to_unit, inverse_func=to_contact, check_inverse=False)
     with threads_and_seed(1, 0):
         model.fit(case.noisy_train.charge, case.noisy_train.contact)
     return lambda charge: np.asarray(model.predict(charge))
-
-
-def draw(rows: dict[str, dict[str, float]], file: Path) -> None:
-    """Draw the excess over the limit against the CPU time, one panel for the position and one for the force."""
-    figure = Figure(figsize=(9.0, 4.0), layout="constrained")
-    plain_number = FuncFormatter(lambda value, _: f"{value:g}")
-    for axes, quantity in zip(figure.subplots(1, 2), ("position", "force"), strict=True):
-        key = f"{quantity}_over_limit"
-        points = [(row["cpu_s"], 100.0 * (row[key] - 1.0)) for name, row in rows.items() if name.endswith(" steps")]
-        axes.loglog(*zip(*points, strict=True), "o-", label="training")
-        for name in REGRESSORS:
-            if name in rows:
-                axes.loglog(rows[name]["cpu_s"], 100.0 * (rows[name][key] - 1.0), "x", label=name)
-        axes.set_xlabel("CPU time of the training, s")
-        axes.set_ylabel(f"{quantity} rms above the Bayes limit, %")
-        axes.xaxis.set_major_formatter(plain_number)
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter(plain_number)
-        axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.grid(visible=True, which="both", alpha=0.3)
-    axes.legend(fontsize="small")
-    figure.savefig(file, dpi=120)
 
 
 def main() -> None:
@@ -203,7 +184,6 @@ def main() -> None:
         samples=24_000,
         presses=1_500,
         steps="250,600,1500,2000",
-        figure=None,
         json=False,
     )
     case = Case.simulate(asked.sensor, asked.radius, asked.samples, asked.presses)
@@ -223,8 +203,6 @@ def main() -> None:
     for name, fit in fits.items():
         rows[name] = case.measure(fit)
         print(name, rows[name], file=sys.stderr, flush=True)
-    if asked.figure is not None:
-        draw(rows, asked.figure)
     print_results("fit", asked, rows)
 
 

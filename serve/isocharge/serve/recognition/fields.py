@@ -4,8 +4,7 @@ Every division of the bytes of a frame into fields has a score in bits. The scor
 number states how many bits are needed to encode the values of a frame if the previous frame is known. The second number
 is the sum of the `Weights` of the fields. The program chooses the division with the lowest score. Because of the
 weights, a simple division has a lower score than a complicated division. A division is simple, for example, if all
-channels are adjacent and have the same type. The script `tests/benchmarks/fit_recognition.py` fits the weights to
-random boards.
+channels are adjacent and have the same type. The weights were fitted to random boards.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
