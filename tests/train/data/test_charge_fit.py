@@ -1,7 +1,6 @@
 """Tests of the charge series against the simulator, of its folds, and of the nearest contact against SciPy."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +8,7 @@ from scipy.optimize import minimize
 
 from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.serve.model.charge_file import charge_map_from_bytes
-from isocharge.simulate import Domain, Electrode, Sweep, noise_model, read_dataset
-from isocharge.simulate.dataset.sweep import write_sweep
+from isocharge.simulate import Domain, noise_model
 from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.simulate.numerics.disk_least_squares import into_domain
@@ -158,20 +156,9 @@ def test_contacts_far_apart_with_the_same_charges_are_a_caution():
     assert sorted(x_mm) == pytest.approx([-3.0, 3.0], abs=0.5)
 
 
-def test_caution_about_a_fold_is_in_log_card_and_metadata(film, sensor, tmp_path, caplog):
-    """One of the three electrodes is at the centre, where the map folds at a distance of about 0.2 mm."""
-    centres = {"A": (0.0, 0.0), "B": (8.66, 5.0), "C": (-8.66, 5.0)}
-    electrodes = tuple(Electrode.of_square(name, centre, 3.0) for name, centre in centres.items())
-    forward_map = replace(film, sensor=replace(sensor, electrodes=electrodes))
-    dataset = read_dataset(write_sweep(tmp_path / "presses", (forward_map,), Sweep(samples=2_000, radius=8.0)))
-    model = release(fit(dataset, TINY), tmp_path / "models" / "centre")
-    caution, *_ = caplog.messages  # further messages may be about the short training
-    assert "seems to fold about 0." in caution or "seems to fold about 1." in caution
-    assert model.metadata.made_with["cautions"][0] == caution
-    assert f"- {caution}." in (model.folder / "card.md").read_text("utf-8")
-
-
-def test_charge_series_of_the_whole_domain_is_released_if_the_domain_is_reduced(sensor, trained):
+def test_charge_series_of_the_whole_domain_and_a_caution_are_released_if_the_domain_is_reduced(
+    sensor, trained, tmp_path, caplog
+):
     contact = draw_contacts(np.random.default_rng(0), DOMAIN, 3000)
     presses = LabelledPresses(contact, 1000.0 * charges_folded_at(5.0)(*contact.T))
     data = TrainingData(sensor=sensor, probes=("circle:1.0",), domain=DOMAIN, presses=presses, sha256="0" * 64)
@@ -179,8 +166,13 @@ def test_charge_series_of_the_whole_domain_is_released_if_the_domain_is_reduced(
     series = charge_map_from_bytes(fitted.provenance.files["charges.npz"], ("A", "B", "C"))
     assert np.allclose(series.charges(contact), presses.charge, rtol=2e-3)
     assert fitted.domain.radius < 5.2 < series.domain.radius
-    assert "'serve stream --track' follows contacts to 8 mm" in fitted.cautions[0]
     assert trained.split.folded_charges is None
+
+    model = release(fitted, tmp_path / "models" / "folded")
+    [caution] = caplog.messages
+    assert "'serve stream --track' follows contacts to 8 mm" in caution
+    assert model.metadata.made_with["cautions"] == [caution]
+    assert f"- {caution}." in (model.folder / "card.md").read_text("utf-8")
 
 
 FAULTS = {

@@ -245,16 +245,6 @@ def test_ellipses_and_ellipsoids_contain_the_stated_fraction_of_the_contacts(whi
                 assert np.mean(level < 0.95) == pytest.approx(0.95, abs=0.02)
 
 
-def test_the_joint_posterior_passes_a_rank_test(whitened):
-    """Simulation-based calibration (Talts et al. 2018): ranks of the truth among 99 draws, along random directions."""
-    rng = np.random.default_rng(9)
-    _, errors = whitened
-    direction = rng.standard_normal(errors.shape)
-    draws = rng.standard_normal((99, *errors.shape))
-    ranks = np.sum(np.sum(draws * direction, axis=2) < np.sum(errors * direction, axis=1), axis=0)
-    np.testing.assert_allclose(np.bincount(ranks // 10, minlength=10) / len(ranks), 0.1, atol=0.01)
-
-
 def test_the_misfit_of_four_electrodes_is_half_normal(forward_map, truth, predictor):
     """Four charges determine three unknowns, so the misfit is the absolute value of one normal deviate."""
     if len(predictor.metadata.electrodes) != 4:

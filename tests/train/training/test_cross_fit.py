@@ -171,73 +171,31 @@ def test_card_of_a_model_of_measured_presses_states_noise_and_coverage(fitted_pa
     np.testing.assert_allclose(stated, 100.0 * np.array(expected), rtol=1e-2)
 
 
-LONG_PAD_CENTRE_mm = (30.0, 0.0)
-"""Centre of a pad with x from 0 to 60 mm and y from -15 to 15 mm, so that the origin lies on its edge."""
-
-
-def presses_on_long_pad(count, seed):
-    """Draw presses on the long pad, with charges that are linear in x, y and ln F."""
-    rng = np.random.default_rng(seed)
-    place = rng.uniform((0.0, -15.0), (60.0, 15.0), (count, 2))
-    contact = np.column_stack([place, draw_forces(rng, count)])
-    noise = NOISE_pC * rng.standard_normal((count, 4))
-    return measured_presses(contact, linear_charges(contact, LONG_PAD_CENTRE_mm) + noise)
-
-
-def fit_to_long_pad():
-    """Train a network on presses on the long pad."""
-    return fit_presses(presses_on_long_pad(900, 7), "long-pad", QUICKER)
-
-
-@pytest.fixture(scope="module")
-def long_pad(tmp_path_factory):
-    """The folder of a model of the long pad."""
-    folder = tmp_path_factory.mktemp("models") / "long-pad"
-    release(kept(fit_to_long_pad), folder)
-    return folder
-
-
-def test_pressed_area_contains_its_own_presses_and_no_others():
-    contact = presses_on_long_pad(900, 7).contact
-    area = PressedArea.of_contacts(contact)
-    assert area.contains(contact).all()
-    area.check(np.array([[50.0, 0.0, 1.0]]), "pad")
-    outside = np.array([[-20.0, 0.0, 1.0], [50.0, 20.0, 1.0], [50.0, 0.0, 9.0], [np.nan, 0.0, 1.0]])
+def test_pressed_area_contains_its_own_presses_and_no_others(released_pad):
+    """The corner at (40, 15) mm does not belong to the L."""
+    area = model_domain(Predictor(released_pad).metadata)
+    assert area == PressedArea.of_contacts(presses_on_l().contact)
+    assert area.contains(presses_on_l().contact).all()
+    outside = np.array([[-20.0, 0.0, 1.0], [36.0, 10.0, 1.0], [10.0, 0.0, 9.0], [np.nan, 0.0, 1.0]])
     assert not area.contains(outside).any()
-    with pytest.raises(SceneError, match=r"press 0 at \(-20, 0\) mm .* in the pressed area, x from -\d.* to 6\d"):
+    with pytest.raises(SceneError, match=r"press 0 at \(-20, 0\) mm .* in the pressed area, x from -\d.* to 4\d"):
         area.check(outside, "pad")
 
 
-def test_domain_of_a_released_model_is_the_pressed_area(long_pad):
-    domain = model_domain(Predictor(long_pad).metadata)
-    assert domain == kept(fit_to_long_pad).domain
-    assert domain.contains(presses_on_long_pad(900, 7).contact).all()
-
-
-def test_contacts_on_a_pad_beside_the_origin_are_estimated_and_not_flagged(long_pad):
-    """The flags depend on the pressed area and not on the distance from the origin."""
-    predictor = Predictor(long_pad)
-    on_pad = np.array([[50.0, 0.0, 1.0], [5.0, -10.0, 1.0]])
-    beside_pad = np.array([[-20.0, 0.0, 1.0]])
-    charge = linear_charges(np.concatenate([on_pad, beside_pad]), LONG_PAD_CENTRE_mm)
-    contacts = predictor.predict_batch(charge)
-    assert np.hypot(contacts.x_mm[:2] - on_pad[:, 0], contacts.y_mm[:2] - on_pad[:, 1]).max() < 3.0
+def test_flags_of_contacts_depend_on_the_pressed_area_and_not_on_the_distance_from_the_origin(released_pad, fresh):
+    predictor = Predictor(released_pad)
+    contacts = predictor.predict_batch(fresh.charge[:200])
     flags = predictor.validity.batch_flags(contacts)
-    assert flags == [predictor.flags(predictor.predict(row)) for row in charge]
-    assert flags[:2] == [(), ()]
+    assert flags == [predictor.flags(predictor.predict(row)) for row in fresh.charge[:200]]
+    assert sum(not words for words in flags) > 150
     assert "positions from (-" in repr(predictor)
-    assert check_presses(predictor, presses_on_long_pad(200, 8)).position_mm.rms < 1.0  # a short training
-
-
-def test_flags_of_contacts_depend_on_the_distance_from_the_centre_of_the_pad(long_pad):
-    predictor = Predictor(long_pad)
-    contact = Contact(50.0, 0.0, 1.0, 0.1, 0.1, 0.1, 0.1)
-    centre_mm, _ = LONG_PAD_CENTRE_mm
-    radius = np.hypot(30.0, 15.0)
+    contact = Contact(10.0, 0.0, 1.0, 0.1, 0.1, 0.1, 0.1)
+    radius = np.hypot(20.0, 20.0)
+    assert predictor.flags(contact) == ()
     assert predictor.flags(contact._replace(x_mm=-20.0)) == ("outside",)
-    assert predictor.flags(contact._replace(x_mm=centre_mm + 2.8 * radius)) == ("outside",)
-    assert predictor.flags(contact._replace(x_mm=centre_mm + 3.5 * radius)) == ("outside", "beyond")
-    assert predictor.flags(contact._replace(x_mm=centre_mm - 3.5 * radius)) == ("outside", "beyond")
+    assert predictor.flags(contact._replace(x_mm=20.0 + 2.8 * radius)) == ("outside",)
+    assert predictor.flags(contact._replace(x_mm=20.0 + 3.5 * radius)) == ("outside", "beyond")
+    assert predictor.flags(contact._replace(x_mm=20.0 - 3.5 * radius)) == ("outside", "beyond")
 
 
 def test_outline_of_a_square_grid_is_larger_by_half_the_grid_step():
@@ -320,10 +278,6 @@ FAULTY_PRESSES = {
         with_channel(1, lambda charge: charge[:, 0]),
         r"channels 'Q1', 'Q2': expected charges that are linearly independent",
     ),
-    "a copy in single precision": (
-        with_channel(1, lambda charge: charge[:, 0].astype(np.float32).astype(float)),
-        "channels 'Q1', 'Q2': expected charges that are linearly independent",
-    ),
     "a sum of channels": (with_channel(3, lambda charge: charge[:, 0] + charge[:, 2]), "channels 'Q1', 'Q3', 'Q4': "),
     "a charge of 1e37": (
         with_channel(2, in_eighth_press(1e37, 2)),
@@ -331,10 +285,6 @@ FAULTY_PRESSES = {
     ),
     "a position in another unit": (with_contact(0, in_eighth_press(1e6, 0)), r"^line 9, column 'x_mm': .* got 1e\+06"),
     "a force of 1e20": (with_contact(2, in_eighth_press(1e20, 2)), r"^line 9, column 'force_N': .* got 1e\+20"),
-    "a constant channel": (
-        with_channel(2, lambda charge: 0.0 * charge[:, 2]),
-        "channel 'Q3': expected charges that vary, got 0 in all but 0 of 1200 presses; leave the channel out",
-    ),
     "a channel that is constant but for rounding": (
         with_channel(2, lambda charge: 5.0 + 1e-12 * charge[:, 2]),
         "channel 'Q3': expected charges that vary, got 5 in all but 0 of 1200",
@@ -347,7 +297,6 @@ FAULTY_PRESSES = {
         with_contact(1, lambda _: 3.0 + 1e-9 * JITTER),
         "got 1200 places on one line; press beside it, too",
     ),
-    "positions on a line": (with_contact(1, lambda contact: 2.0 * contact[:, 0]), "got 1200 places on one line"),
     "one position": (with_contact(slice(2), lambda _: np.ones((1_200, 2))), "got 1200 at 1; measure more"),
 }
 """Presses of which each has one fault, and the message that names the fault."""
