@@ -137,25 +137,6 @@ def test_fold_of_noisy_charges_is_reported_without_reducing_the_domain(fold_x, r
     assert distances_mm == pytest.approx(reported_mm, abs=0.5)
 
 
-def charges_along_a_nodal_cubic(x, y, force):
-    """Return charges, of which those at x = 3 mm and x = -3 mm are equal although the map has no fold.
-
-    The logarithms of two charges are the coordinates (u^2, u^3 - a^2 u) of a nodal cubic, which crosses itself.
-    """
-    u = 0.1 * x
-    log_ratios = np.stack([0.0 * u, u**2, u * (u**2 - 0.09), 0.1 * y], axis=1)
-    return 1e4 * force[:, None] ** 0.7 * np.exp(log_ratios)
-
-
-def test_contacts_far_apart_with_the_same_charges_are_a_caution():
-    field, presses = fit_field(charges_along_a_nodal_cubic)
-    domain, (caution,) = invertible_domain(field, presses, REFERENCE)
-    assert domain.radius == 8.0
-    assert caution.startswith("contacts far apart can have the same charges: the charges of 0.05 N at (")
-    x_mm = [float(x) for x in re.findall(r"at \((\S+),", caution)]
-    assert sorted(x_mm) == pytest.approx([-3.0, 3.0], abs=0.5)
-
-
 def test_charge_series_of_the_whole_domain_and_a_caution_are_released_if_the_domain_is_reduced(
     sensor, trained, tmp_path, caplog
 ):

@@ -27,7 +27,7 @@ SAME_CONTACT_DECIMALS = 3
 """Decimals of the unit coordinates in which two contacts agree if they count as the same contact."""
 
 OUTLIER = 3.0
-"""Number of standard deviations to which residuals are clipped, because larger residuals are not due to noise."""
+"""Number of standard deviations beyond which residuals count less, because they are not due to noise."""
 
 LEAST_SHARE = 0.01
 """Smallest white noise of a channel, relative to the noise of its gain at a charge of the usual size.
@@ -307,7 +307,7 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
     """Estimate the white noise and the noise of the gain of one channel from residuals.
 
     The likelihood of the residuals is maximised. Their variance is white^2 + gain^2 Q^2. The likelihood is that of a
-    normal distribution, in which residuals beyond `OUTLIER` standard deviations are clipped.
+    normal distribution with longer tails beyond `OUTLIER` standard deviations (Huber 1964, proposal 2).
 
     Args:
         charge: Charges Q without noise, shape (n,), pC.
@@ -323,8 +323,9 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
         """Return the mean negative logarithm of the likelihood, without a constant."""
         white, gain = units * np.exp(log_std)
         variance = np.maximum(white**2 + (gain * charge) ** 2, np.finfo(float).tiny)
-        clipped_square = np.minimum(residual**2 / variance, OUTLIER**2)
-        return float(np.mean(np.log(variance) + clipped_square))
+        square = residual**2 / variance
+        tail = OUTLIER**2 * np.log(np.maximum(square / OUTLIER**2, 1.0))
+        return float(np.mean(np.log(variance) + np.minimum(square, OUTLIER**2) + tail))
 
     return np.asarray(units * np.exp(minimize(loss, [-0.5, -0.5], method="Nelder-Mead").x))
 

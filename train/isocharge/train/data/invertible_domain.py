@@ -6,16 +6,12 @@ from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import DatasetError
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import NoiseModel
-from isocharge.simulate.forward.charge_map import ChargeMap, within
-from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
+from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.train.data.presses import LabelledPresses
 
 MAX_ERROR_OF_CERTAIN_FOLD = 3e-4
 """Largest relative error of the fitted charges at which a fold counts as certain. A poor fit has spurious folds."""
-
-MAX_ERROR_WITHOUT_NOISE = 2e-3
-"""Relative error of a fit above which the charges probably have noise."""
 
 CREDIBLE_FOLD_RATIO = 0.8
 """Largest ratio of the radius of a fold to the radius of the domain at which a fold of a poor fit counts as real.
@@ -26,9 +22,6 @@ SEARCHED_RADIUS_RATIO = 0.98
 """Ratio of the radius within which folds are searched for to the radius of the domain.
 
 At the edge of the domain, the presses do not determine the derivatives of the charges accurately."""
-
-N_PAIR_CONTACTS = 400
-"""Number of contacts for each of which another contact with the same charges is searched for."""
 
 SMALLEST_SHARE = 0.2
 """Smallest ratio of the radius without folds to the radius of the dataset at which a network can be trained."""
@@ -47,9 +40,6 @@ def invertible_domain(
       the domain: the disk is not reduced, and a sentence states where the map seems to fold.
     - Otherwise, the disk is the domain of the field.
 
-    If the charges have little noise and no uncertain fold was found, distant pairs of contacts with the same charges
-    are searched for as well.
-
     Args:
         field: Charge field that was fitted to the presses.
         presses: Presses to which the field was fitted. A sentence states how many of them lie in the disk.
@@ -62,53 +52,23 @@ def invertible_domain(
         DatasetError: If the radius of the disk is less than `SMALLEST_SHARE` of the radius of the field.
     """
     requested_domain = field.domain
-    fold_radius = _fold_radius(field, noise)  # infinity without a fold
-    has_little_noise = field.charge_std < MAX_ERROR_WITHOUT_NOISE  # the error includes the noise of the charges
+    fold_radius = _fold_radius(field, noise)
+    if not fold_radius < requested_domain.radius:
+        return requested_domain, ()
 
     # An inaccurate fit does not prove a fold, so the fold is only reported, and only if it lies well inside the domain.
-    certain_fold_radius = fold_radius
+    # A fold near the edge is probably not real.
     if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
         if fold_radius < CREDIBLE_FOLD_RATIO * requested_domain.radius:
             return requested_domain, (_uncertain_fold_caution(fold_radius, requested_domain.radius),)
-        certain_fold_radius = np.inf  # a fold near the edge is probably not real
-
-    if certain_fold_radius < SMALLEST_SHARE * requested_domain.radius:
+        return requested_domain, ()
+    if fold_radius < SMALLEST_SHARE * requested_domain.radius:
         raise DatasetError(
-            f"the map from contacts to charges folds {certain_fold_radius:g} mm from the centre, of "
+            f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of "
             f"{requested_domain.radius:g} mm asked for: beyond, two contacts give the same charges; add an "
             "electrode, or take a biaxial film"
         )
-    # Reduce the domain to a certain fold, and search for pairs of distant contacts with the same charges.
-    domain = requested_domain
-    cautions = []
-    if certain_fold_radius < requested_domain.radius:
-        domain = requested_domain.within(certain_fold_radius)
-        cautions.append(_fold_caution(field, presses, certain_fold_radius))
-    if has_little_noise:
-        searched_field = within(field, SEARCHED_RADIUS_RATIO * domain.radius)  # the field is inaccurate at the edge
-        cautions += _pair_cautions(searched_field, noise)
-    return domain, tuple(cautions)
-
-
-def _pair_cautions(searched_map: ChargeMap, noise: NoiseModel) -> list[str]:
-    """Return a sentence about pairs of distant contacts with the same charges, if such pairs exist.
-
-    Only contacts with the smallest force of the domain are compared.
-
-    Args:
-        searched_map: Map from contacts to charges, in whose domain pairs are searched for.
-        noise: Noise of good presses. Charges that differ by less than the noise count as equal.
-
-    Returns:
-        A list of one sentence, or an empty list.
-    """
-    smallest_force, _ = searched_map.domain.force_range
-    pairs = find_ambiguous_pairs(searched_map, noise, smallest_force, N_PAIR_CONTACTS)
-    if not pairs.summary:
-        return []
-    # The sentence is continued, so it begins in lower case and has no full stop.
-    sentence = pairs.summary[0].lower() + pairs.summary[1:].removesuffix(".")
-    return [f"{sentence}; no model tells which of them it is; see 'isocharge simulate identify'"]
+    return requested_domain.within(fold_radius), (_fold_caution(field, presses, fold_radius),)
 
 
 def _uncertain_fold_caution(fold_radius: float, requested_radius: float) -> str:

@@ -1,7 +1,8 @@
 """Evaluation of a model and of all other methods on one dataset."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from isocharge.simulate.mechanics.theory import ACCURACY
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.contact_errors import ContactErrorStatistics, rms
 from isocharge.train.data.presses import LabelledPresses, check_enough, domain_of, held_out, is_measured, presses_of
+from isocharge.train.model_release.evaluate import rounded
 from isocharge.train.model_release.release import model_domain
 from isocharge.train.report.methods import FittingTask, Method, fit_methods, model_method
 
@@ -254,11 +256,11 @@ class DatasetEvaluation:
         charge_map = ChargeSpline.of(forward_maps[0])
         cramer_rao = limits_at(charge_map, presses.contact, NOISE)
         limits = {
-            "position_rms_mm": rms(cramer_rao.position),
-            "position_median_mm": float(np.median(cramer_rao.position)),
-            "force_rms_percent": 100.0 * rms(cramer_rao.force),
+            "position_rms_mm": rounded(rms(cramer_rao.position)),
+            "position_median_mm": rounded(np.median(cramer_rao.position)),
+            "force_rms_percent": rounded(100.0 * rms(cramer_rao.force)),
         }
-        return replace(task, charge_map=charge_map), LabelledPresses(presses.contact, noisy_charge), _rounded(limits)
+        return replace(task, charge_map=charge_map), LabelledPresses(presses.contact, noisy_charge), limits
 
 
 def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
@@ -345,13 +347,15 @@ def measure_methods(methods: Sequence[Method], presses: LabelledPresses, seconds
         The records of the methods, in the order of `methods`.
     """
     estimates = [method.estimate(presses.charge) for method in track(methods, "estimating contacts")]
-    contenders = [_single_contender(method, presses.charge) for method in methods]
+    contenders = []
+    for method in methods:
+        calls = cycle([method.call_for(press_charge) for press_charge in presses.charge[:SINGLE_PRESSES]])
+        contenders.append(Contender(method.name, 1, partial(_call_next, calls)))
     timings = take_turns(contenders, len(methods) * seconds)
     records = []
     for method, estimate, timing in zip(methods, estimates, timings, strict=True):
         answered, errors = contact_errors(estimate, presses.contact)
-        duration = _rounded({"us": timing.p50_us})["us"]
-        records.append(MethodRecord(method.name, method.library, answered, errors, duration))
+        records.append(MethodRecord(method.name, method.library, answered, errors, rounded(timing.p50_us)))
     return records
 
 
@@ -370,20 +374,9 @@ def contact_errors(estimate: Array, truth: Array) -> tuple[float, dict[str, floa
     if not has_estimate.any():
         return 0.0, {}
     statistics = ContactErrorStatistics.of(estimate[has_estimate], truth[has_estimate])
-    return float(np.mean(has_estimate)), _rounded(asdict(statistics))
+    return float(np.mean(has_estimate)), {name: rounded(value) for name, value in asdict(statistics).items()}
 
 
-def _rounded(values: dict[str, float]) -> dict[str, float]:
-    """Round each number to four significant digits."""
-    return {name: float(f"{value:.4g}") for name, value in values.items()}
-
-
-def _single_contender(method: Method, charge: Array) -> Contender:
-    """Return the estimate for one press, which is timed. Each call uses the next of the first `SINGLE_PRESSES` presses.
-
-    Args:
-        method: The fitted method.
-        charge: Charges of the test presses, shape (n, n_electrode), pC.
-    """
-    calls = cycle([method.call_for(press_charge) for press_charge in charge[:SINGLE_PRESSES]])
-    return Contender(method.name, 1, lambda: next(calls)())
+def _call_next(calls: Iterator[Callable[[], object]]) -> None:
+    """Call the next function of an iterator."""
+    next(calls)()

@@ -15,14 +15,17 @@ from isocharge.common.structs import Settings, WrongKey, convert, read_toml
 from isocharge.simulate import NoiseModel, noise_model
 from isocharge.train.training.activations import ACTIVATIONS, TANH
 
+Width = Annotated[int, Meta(ge=1, le=4096)]
+Widths = Annotated[tuple[Width, ...], Meta(min_length=1, description="widths from 1 to 4096")]
+Count = Annotated[int, Meta(ge=1, le=10_000_000)]
 
-class DefaultSizes(NamedTuple):
-    """Default values of the settings that depend on the number of electrodes.
+
+class Sizes(NamedTuple):
+    """Sizes of the networks and of their training, of which the defaults depend on the number of electrodes.
 
     Attributes:
-        width: Width of the hidden layers of the contact network.
-        misfit_width: Width of the hidden layers of the misfit network.
-        layers: Number of hidden layers of each network.
+        hidden: Widths of the hidden layers of the contact network.
+        misfit_hidden: Widths of the hidden layers of the misfit network.
         steps: Number of optimiser steps of the contact network.
         misfit_steps: Number of optimiser steps of the misfit network.
         misfit_charges: Number of sets of charges from which the misfit network learns.
@@ -30,42 +33,37 @@ class DefaultSizes(NamedTuple):
             electrodes, because the loss sometimes increases with the full learning rate.
     """
 
-    width: int
-    misfit_width: int
-    layers: int
+    hidden: Widths
+    misfit_hidden: Widths
     steps: int
     misfit_steps: int
     misfit_charges: int
     rate_factor: float
 
     @classmethod
-    def for_electrodes(cls, n_electrode: int) -> "DefaultSizes":
+    def for_electrodes(cls, n_electrode: int) -> "Sizes":
         """Return the default sizes for a number of electrodes."""
         return FEW_ELECTRODE_SIZES if n_electrode <= FEW_ELECTRODES else MANY_ELECTRODE_SIZES
 
 
-FEW_ELECTRODE_SIZES = DefaultSizes(
-    width=96, misfit_width=64, layers=3, steps=1_500, misfit_steps=1_500, misfit_charges=40_000, rate_factor=1.0
+FEW_ELECTRODE_SIZES = Sizes(
+    (96,) * 3, (64,) * 3, steps=1_500, misfit_steps=1_500, misfit_charges=40_000, rate_factor=1.0
 )
 """Default sizes for at most `FEW_ELECTRODES` electrodes."""
 
-MANY_ELECTRODE_SIZES = DefaultSizes(
-    width=128, misfit_width=96, layers=4, steps=6_000, misfit_steps=3_000, misfit_charges=80_000, rate_factor=0.5
+MANY_ELECTRODE_SIZES = Sizes(
+    (128,) * 4, (96,) * 4, steps=6_000, misfit_steps=3_000, misfit_charges=80_000, rate_factor=0.5
 )
 """Default sizes for more electrodes, whose working areas are larger and whose charges have more dimensions."""
-
-Width = Annotated[int, Meta(ge=1, le=4096)]
-Widths = Annotated[tuple[Width, ...], Meta(min_length=1, description="widths from 1 to 4096")]
-Count = Annotated[int, Meta(ge=1, le=10_000_000)]
 
 
 class NetworkConfig(Settings, frozen=True):
     """Sizes and number format of the contact network and of the misfit network.
 
     Attributes:
-        hidden: Widths of the hidden layers of the contact network; None for the width in `DefaultSizes`.
+        hidden: Widths of the hidden layers of the contact network; None for the default.
         misfit_hidden: Widths of the hidden layers of the misfit network, which must have as many hidden layers as the
-            contact network; None for the width in `DefaultSizes`.
+            contact network; None for the default.
         activation: Name of the activation of the hidden layers (`isocharge.train.training.activations`).
         weights: "float32", or "int8" to round the weights between hidden layers to 8 bits and then train the other
             weights further. In C, the rounded weights take a quarter of the memory.
@@ -90,46 +88,30 @@ class NetworkConfig(Settings, frozen=True):
         if self.activation not in ACTIVATIONS:
             raise WrongKey("activation", f"one of {', '.join(ACTIVATIONS)}", self.activation)
 
-    def contact_widths(self, n_electrode: int) -> Widths:
-        """Return the widths of the hidden layers of the contact network.
+    def widths(self, n_electrode: int) -> tuple[Widths, Widths]:
+        """Return the widths of the hidden layers of the contact network and of the misfit network.
+
+        Widths that are not given are defaults. If the widths of only one network are given, the other network has as
+        many layers.
 
         Args:
-            n_electrode: Number of electrodes, which determines the widths if no widths are given.
+            n_electrode: Number of electrodes, which determines the defaults.
         """
-        if self.hidden is not None:
-            return self.hidden
-        sizes = DefaultSizes.for_electrodes(n_electrode)
-        return (sizes.width,) * self._layer_count(sizes)
-
-    def misfit_widths(self, n_electrode: int) -> Widths:
-        """Return the widths of the hidden layers of the misfit network.
-
-        Args:
-            n_electrode: Number of electrodes, which determines the widths if no widths are given.
-        """
-        if self.misfit_hidden is not None:
-            return self.misfit_hidden
-        sizes = DefaultSizes.for_electrodes(n_electrode)
-        return (sizes.misfit_width,) * self._layer_count(sizes)
-
-    def _layer_count(self, sizes: DefaultSizes) -> int:
-        """Return the number of hidden layers: the number of given widths, or the default number if no widths are given.
-
-        Args:
-            sizes: Default sizes, which are used if no widths are given.
-        """
-        given_widths = self.hidden or self.misfit_hidden
-        return sizes.layers if given_widths is None else len(given_widths)
+        default = Sizes.for_electrodes(n_electrode)
+        layer_count = len(self.hidden or self.misfit_hidden or default.hidden)
+        hidden = self.hidden or default.hidden[:1] * layer_count
+        misfit_hidden = self.misfit_hidden or default.misfit_hidden[:1] * layer_count
+        return hidden, misfit_hidden
 
 
 class TrainingConfig(Settings, frozen=True):
     """Settings of the optimisation.
 
     Attributes:
-        steps: Number of optimiser steps of the contact network; None for the number in `DefaultSizes`.
-        misfit_steps: Number of optimiser steps of the misfit network; None for the number in `DefaultSizes`.
-        misfit_charges: Number of sets of charges from which the misfit network learns; None for the number in
-            `DefaultSizes`.
+        steps: Number of optimiser steps of the contact network; None for the default.
+        misfit_steps: Number of optimiser steps of the misfit network; None for the default.
+        misfit_charges: Number of sets of charges from which the misfit network learns; None for the
+            default.
         batch: Number of presses in a batch.
         learning_rate: Largest learning rate of the optimiser SOAP.
         hold_out: Fraction of the positions that are used for testing. If the presses are measured, the same fifth of
@@ -150,11 +132,14 @@ class TrainingConfig(Settings, frozen=True):
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
     threads: Annotated[int, Meta(ge=1, le=64)] = 1
 
-    def sizes(self, n_electrode: int) -> DefaultSizes:
+    def sizes(self, n_electrode: int) -> Sizes:
         """Return the default sizes for a number of electrodes, in which the given settings replace the defaults."""
-        names = ("steps", "misfit_steps", "misfit_charges")
-        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return DefaultSizes.for_electrodes(n_electrode)._replace(**given)
+        default = Sizes.for_electrodes(n_electrode)
+        return default._replace(
+            steps=self.steps or default.steps,
+            misfit_steps=self.misfit_steps or default.misfit_steps,
+            misfit_charges=self.misfit_charges or default.misfit_charges,
+        )
 
     @property
     def noise_model(self) -> NoiseModel:
@@ -174,11 +159,8 @@ class FitConfig(Settings, frozen=True):
 
     def for_electrodes(self, n_electrode: int) -> "FitConfig":
         """Return a copy of the settings, with each missing size replaced by its default for a number of electrodes."""
-        network = replace(
-            self.network,
-            hidden=self.network.contact_widths(n_electrode),
-            misfit_hidden=self.network.misfit_widths(n_electrode),
-        )
+        hidden, misfit_hidden = self.network.widths(n_electrode)
+        network = replace(self.network, hidden=hidden, misfit_hidden=misfit_hidden)
         sizes = self.training.sizes(n_electrode)
         training = replace(
             self.training, steps=sizes.steps, misfit_steps=sizes.misfit_steps, misfit_charges=sizes.misfit_charges
