@@ -9,8 +9,7 @@ from isocharge.train.training.activations import TANH
 from isocharge.train.training.features import logarithmic_features
 from isocharge.train.training.folded_network import ANGLES, FoldedNetwork
 from isocharge.train.training.folding import fold
-from isocharge.train.training.network import LARGEST_INT8
-from isocharge.train.training.perceptron import Layer, Perceptron
+from isocharge.train.training.perceptron import LARGEST_INT8, Layer, Perceptron
 
 TYPICAL_pC = 512.0
 """Charge by which each charge is divided, pC."""

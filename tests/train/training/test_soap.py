@@ -1,6 +1,7 @@
 """The optimiser SOAP: against PyTorch's Adam, and on an ill-conditioned problem."""
 
 import numpy as np
+import pytest
 import torch
 from torch import nn
 
@@ -64,3 +65,21 @@ def test_a_gradient_of_zero_changes_nothing():
     weight = nn.Parameter(torch.ones(4, 3))
     run_soap(weight, lambda parameter: 0.0 * parameter.sum(), 12, rate=0.1)
     torch.testing.assert_close(weight, torch.ones(4, 3))
+
+
+@pytest.mark.parametrize("shape", [(4, 6), (9, 32)])
+def test_rows_that_get_a_gradient_only_later_do_not_cause_long_steps(shape):
+    """Until then, their mean square in the eigenbasis is zero."""
+    random = torch.Generator().manual_seed(0)
+    mean_gradient = torch.randn(shape, generator=random)
+    weight = nn.Parameter(torch.zeros(shape))
+    optimiser = Soap([weight])
+    longest_step = 0.0
+    for step in range(60):
+        weight.grad = mean_gradient + torch.randn(shape, generator=random)
+        if step < 30:
+            weight.grad[2:] = 0.0
+        before = weight.detach().clone()
+        optimiser.step(0.02)
+        longest_step = max(longest_step, (weight.detach() - before).norm().item())
+    assert longest_step <= 0.02 * soap.MAX_RATIO * np.sqrt(weight.numel())

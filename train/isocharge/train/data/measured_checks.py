@@ -30,9 +30,6 @@ FARTHEST = 1_000.0
 LEAST_INDEPENDENCE = 1e-4
 """Smallest ratio of the smallest to the largest singular value of the standardised charges of independent channels."""
 
-LEAST_PARTICIPATION = 1e-2
-"""Smallest coefficient of a channel that takes part in a linear dependence, relative to the largest coefficient."""
-
 
 def check_measured_presses(presses: MeasuredPresses) -> None:
     """Check that a network can be trained on measured presses.
@@ -162,7 +159,7 @@ def _check_independence(channels: Mapping[str, Array]) -> None:
         return
     # The last singular vector contains the coefficients of a combination of the channels that is nearly zero.
     coefficients = np.abs(directions[-1])
-    smallest_coefficient = LEAST_PARTICIPATION * coefficients.max()
+    smallest_coefficient = LEAST_INDEPENDENCE * coefficients.max()
     dependent_names = [
         shown(name)
         for name, coefficient in zip(channels, coefficients, strict=True)

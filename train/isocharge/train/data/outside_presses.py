@@ -27,9 +27,6 @@ N_SECTORS = 36
 N_NEIGHBOURS = 8
 """Number of presses of which the share of a sector is the mean. They are the nearest presses to its middle."""
 
-SHARE_DECIMALS = 2
-"""Number of decimals to which the measured shares of presses are rounded."""
-
 
 @dataclass(frozen=True)
 class OutsidePresses:
@@ -88,7 +85,7 @@ class OutsidePresses:
         direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         middle = distance[:, None, None] * direction  # (x, y), shape (N_RINGS, N_SECTORS, 2)
         _, nearest = cKDTree(self.test.contact[:, :2]).query(middle, N_NEIGHBOURS)
-        shares = is_unnoticed[nearest].mean(axis=-1).round(SHARE_DECIMALS)
+        shares = is_unnoticed[nearest].mean(axis=-1).round(2)
 
         min_force, max_force = self.domain.force_range
         smallest_force = max(min_force, max_force / FORCE_RATIO)

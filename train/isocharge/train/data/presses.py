@@ -258,7 +258,10 @@ def _check_finite(presses: LabelledPresses) -> None:
 
 
 HELD_PARTS = 5
-"""Number of parts of measured presses of which one is held out for the measurement of errors."""
+"""Number of parts of measured presses, of which one is held out for the measurement of errors.
+
+It is also the number of networks of a cross-validation.
+"""
 
 FEWEST_MEASURED = 50
 """Smallest number of measured presses for a training, a report or held-out errors."""

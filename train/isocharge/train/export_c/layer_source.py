@@ -19,14 +19,12 @@ from numpy.typing import NDArray
 from isocharge.common.arrays import Singles
 from isocharge.train.export_c.c_text import c_array
 from isocharge.train.training.activations import Activation
+from isocharge.train.training.perceptron import LARGEST_INT8
 
 N_ROWS = 4
 """Number of rows of the weights whose products are added to the outputs at a time.
 
 The program then reads and writes each output only once for all of these rows."""
-
-LARGEST_INT8 = 127
-"""Largest absolute value of a weight that is rounded to 8 bits, in units of the scale of its column."""
 
 INT8_TOLERANCE = 2.0**-21
 """Largest relative difference between a weight and a multiple of the scale that rounding in float32 can cause."""

@@ -27,9 +27,6 @@ from isocharge.train.training.perceptron import Layer, Perceptron
 OPSET = 17
 """Version of the ONNX operators, which runtimes since 2022 support."""
 
-IR_VERSION = 8
-"""Version of the ONNX file format that belongs to these operators."""
-
 
 @dataclass
 class GraphBuilder:
@@ -121,7 +118,8 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     declared_inputs = _declare({INPUT: n_electrode})
     graph = helper.make_graph(builder.nodes, "isocharge", declared_inputs, _declare(OUTPUTS), builder.constants)
     opset = helper.make_opsetid("", OPSET)
-    return helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="isocharge")
+    ir_version = helper.find_min_ir_version_for([opset])
+    return helper.make_model(graph, opset_imports=[opset], ir_version=ir_version, producer_name="isocharge")
 
 
 def _declare(widths: Mapping[str, int]) -> list[onnx.ValueInfoProto]:

@@ -12,9 +12,6 @@ from isocharge.train.training.fitted import Fitted
 WRONG_STDS = 4.0
 """Error of a coordinate or of the force above which an answer counts as wrong, in reported standard deviations."""
 
-NOISE_SEED = 11
-"""Seed of the noise of the presses."""
-
 
 def unnoticed_presses(fitted: Fitted, metadata: ModelMetadata) -> UnnoticedPresses | None:
     """Measure how often the answer to a press outside the working area is wrong and carries no flag.
@@ -33,7 +30,7 @@ def unnoticed_presses(fitted: Fitted, metadata: ModelMetadata) -> UnnoticedPress
     if outside is None:
         return None
     presses = outside.test
-    contact, std, misfit = fitted.predict(presses.noisy(fitted.misfit_noise, NOISE_SEED))
+    contact, std, misfit = fitted.predict(presses.noisy(fitted.misfit_noise, seed=11))
     is_value_wrong = np.abs(contact - presses.contact) > WRONG_STDS * std  # for x, y and F, shape (n, 3)
     is_wrong = is_value_wrong.any(axis=1)
     is_unnoticed = is_wrong & ~is_flagged(metadata, contact, std, misfit)

@@ -14,6 +14,7 @@ training step, random noise with half of the estimated size is added to the char
 
 import logging
 from dataclasses import replace
+from statistics import NormalDist
 
 import numpy as np
 import torch
@@ -31,6 +32,7 @@ from isocharge.train.data.misfit_charges import draw_charges
 from isocharge.train.data.presses import (
     FEWEST,
     FEWEST_POSITIONS,
+    HELD_PARTS,
     LabelledPresses,
     check_known_columns,
     complete,
@@ -46,9 +48,6 @@ from isocharge.train.training.misfit_training import misfit_stage
 from isocharge.train.training.network import InverseNetwork, Posterior, as_tensor, fold_network
 
 _log = logging.getLogger(__name__)
-
-N_FOLDS = 5
-"""Number of folds of the cross-validation, which is also the number of networks that are trained for it."""
 
 CHANNELS = (3, 32)
 """Smallest and largest number of channels."""
@@ -70,9 +69,6 @@ PRESSES_FILE = "presses.csv"
 UNKNOWN_FORCE_N = 1.0
 """Force that a model states if it was trained on presses without forces, N. Its standard deviation has the same
 size."""
-
-ONE_STD_COVERAGE = 0.6827
-"""Probability that a Gaussian variable is within one standard deviation of its mean."""
 
 
 def fit_presses(
@@ -116,10 +112,10 @@ def fit_presses(
         features = WhitenedFeatures.fit_signed(labelled.charge, noise.transition_charge(labelled.charge))
         # The first network will be returned. The other networks each belong to one fold of the cross-validation.
         network, *fold_networks = (
-            InverseNetwork(domain, features, settings.network, force_std) for _ in range(1 + N_FOLDS)
+            InverseNetwork(domain, features, settings.network, force_std) for _ in range(1 + HELD_PARTS)
         )
         # For the cross-validation, train a network for each fold on the presses of all other folds.
-        fold_of_press = folds_by_place(labelled.contact, N_FOLDS)
+        fold_of_press = folds_by_place(labelled.contact, HELD_PARTS)
         for fold_index, network_of_fold in enumerate(fold_networks):
             fold_config = structs.replace(training, seed=training.seed + fold_index)
             train_presses = labelled[fold_of_press != fold_index]
@@ -177,7 +173,7 @@ def _made_with(settings: FitConfig, presses: LabelledPresses, std_factors: tuple
         "measured": {
             "presses": len(presses),
             "places": len(np.unique(presses.contact[:, :2], axis=0)),
-            "folds": N_FOLDS,
+            "folds": HELD_PARTS,
             "std_factors": [float(f"{factor:.4g}") for factor in std_factors],
         },
     }
@@ -274,8 +270,9 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
         Factors for the position and for the force.
     """
     deviation = np.abs(contact - truth) / std
-    position_factor = np.quantile(deviation[:, :2], ONE_STD_COVERAGE)
-    force_factor = np.quantile(deviation[:, 2], ONE_STD_COVERAGE)
+    one_std_coverage = 2.0 * NormalDist().cdf(1.0) - 1.0
+    position_factor = np.quantile(deviation[:, :2], one_std_coverage)
+    force_factor = np.quantile(deviation[:, 2], one_std_coverage)
     return float(position_factor), float(force_factor)
 
 
@@ -411,7 +408,7 @@ def _cross_validated_misfit(
     unit_contact = domain.to_unit(presses.contact)
     charge_level = noise.level(presses.charge)  # charges on a scale on which the noise has the standard deviation 1
     misfit = np.empty((len(presses), 1))
-    for fold_index in range(N_FOLDS):
+    for fold_index in range(HELD_PARTS):
         is_in_fold = fold_of_press == fold_index
         planes = LocalPlanes.fit(unit_contact[~is_in_fold], charge_level[~is_in_fold])
         residual = planes.residuals(charge_level[is_in_fold])

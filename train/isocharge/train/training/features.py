@@ -8,12 +8,6 @@ from isocharge.common.arrays import Array
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 from isocharge.train.training.charge_features import ChargeFeatures
 
-CLIPPING_MARGIN = 1.0
-"""Distance of the clipping limits from the extreme charges of the presses, relative to the range of these charges.
-
-The limits apply to charges of both signs. The distance and the range are differences of asinh(Q / typical charge).
-"""
-
 
 @dataclass(frozen=True)
 class WhitenedFeatures:
@@ -81,8 +75,8 @@ def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
 def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
     """Return features for charges of both signs: asinh(charge / typical charge) minus its mean over the given charges.
 
-    Before the conversion, each charge is limited to the range of the given charges plus a margin on both sides. The
-    margin is `CLIPPING_MARGIN` times the range of the inverse hyperbolic sines.
+    Before the conversion, each charge is limited to three times the range of the given charges: the inverse hyperbolic
+    sines may exceed their range by its width on both sides.
 
     Args:
         charge: Charges of presses, shape (n, n_electrode), pC.
@@ -91,7 +85,7 @@ def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
     asinh_charge = np.arcsinh(charge / typical)
     lowest = asinh_charge.min(axis=0)
     highest = asinh_charge.max(axis=0)
-    margin = CLIPPING_MARGIN * (highest - lowest)
+    margin = highest - lowest
     return ChargeFeatures(
         typical_pC=typical,
         low_pC=np.sinh(lowest - margin) * typical,

@@ -42,9 +42,6 @@ The noise is not enlarged beyond this standard deviation, either.
 MAX_NOISE_FACTOR = 5.0
 """Largest factor by which the noise of a press is enlarged, dimensionless."""
 
-UNIT_PRECISION = 3.0
-"""Inverse of the variance of a unit coordinate, which is distributed uniformly between -1 and 1."""
-
 
 class TargetBatch(NamedTuple):
     """Charges with noise, and the targets that the network learns from these charges.
@@ -97,7 +94,8 @@ class LinearTargets:
         noise_std = noise.sigma(presses.charge)
         whitened_jacobian = unit_derivatives / noise_std[:, :, None]  # W^(1/2) J
         transposed = whitened_jacobian.swapaxes(1, 2)  # J' W^(1/2), shape (n, 3, n_electrode)
-        precision = transposed @ whitened_jacobian + UNIT_PRECISION * np.eye(3)  # J' W J + P, shape (n, 3, 3)
+        prior_precision = 3.0 * np.eye(3)  # P, of unit coordinates that are uniformly distributed between -1 and 1
+        precision = transposed @ whitened_jacobian + prior_precision  # J' W J + P, shape (n, 3, 3)
         noise_response = np.linalg.solve(precision, transposed / noise_std[:, None, :])
 
         # If the contact is too uncertain, the estimate is not linear, and the noise is not enlarged (factor 1). If the

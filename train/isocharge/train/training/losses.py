@@ -8,10 +8,6 @@ from torch import Tensor
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.training.network import Posterior
 
-STD_EXPONENT = 0.75
-"""Exponent of the variances by which the squared errors of the mean are weighted: 0 gives the likelihood, 1 gives least
-squares."""
-
 MAX_NORMAL_ERROR = 2.0
 """Error in standard deviations above which the loss of the covariance grows with the logarithm of the error instead of
 its square."""
@@ -57,18 +53,16 @@ def mean_loss(posterior: Posterior, target: Tensor) -> Tensor:
 
     The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Therefore, a network
     learns the mean slowly where it overestimates the standard deviation (Seitzer et al., 2022, arXiv 2203.09168). In
-    this loss, the squared errors of a Gaussian likelihood are multiplied by the estimated standard deviation to the
-    power of `2 * STD_EXPONENT`. These factors are scaled so that their mean over the presses is 1.
+    this loss, the squared errors of a Gaussian likelihood are multiplied by the estimated standard deviation. These
+    factors are scaled so that their mean over the presses is 1.
 
     Args:
         posterior: Estimated unit coordinates with their standard deviations.
         target: Unit coordinates that the mean should have, shape (n, 3).
     """
-    log_std = posterior.log_std.detach()
-    mean_of_factors = torch.exp(2.0 * STD_EXPONENT * log_std).mean(dim=0)
-    # The factor std^(2 STD_EXPONENT), divided by the variance of the Gaussian likelihood
-    weight = torch.exp((2.0 * STD_EXPONENT - 2.0) * log_std) / mean_of_factors
-    return 0.5 * (weight * (posterior.mean - target) ** 2).sum(dim=1)
+    std = torch.exp(posterior.log_std.detach())
+    squares = (posterior.mean - target) ** 2 / (std * std.mean(dim=0))
+    return 0.5 * squares.sum(dim=1)
 
 
 def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:

@@ -28,10 +28,7 @@ from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.folded_network import LOG_FORCE, LOG_STD, MEAN, MISFIT_UNIT, FoldedNetwork
 from isocharge.train.training.folding import TURN, fold, linear_answer_map
-from isocharge.train.training.perceptron import Layer, Perceptron
-
-LARGEST_INT8 = 127
-"""Largest absolute value of the integers by which weights are represented in 8 bits."""
+from isocharge.train.training.perceptron import LARGEST_INT8, Layer, Perceptron
 
 FIRST_LAYER_SLOPES = (0.5, 3.5)
 """Smallest and largest norm of the initial weights of a unit in a sharpened first layer.
@@ -41,12 +38,6 @@ The inputs of the layer have unit variance.
 
 FORCE_OUTPUTS = [LOG_FORCE.start, LOG_STD.stop - 1, TURN.start + 1, TURN.start + 2]
 """Outputs of the contact perceptron for ln F, for the logarithm of its standard deviation and for its correlations."""
-
-MIN_LENGTH = 1e-9
-"""Smallest length of a residual by which the compression divides, so that no division by zero occurs."""
-
-MIN_SCALE = 1e-30
-"""Smallest scale by which the rounding divides, so that no division by zero occurs."""
 
 
 class Posterior(NamedTuple):
@@ -158,7 +149,7 @@ class TrainablePerceptron(nn.Module):
         for matrix in self.hidden_matrices():
             weights = matrix.detach()  # shares its memory with the matrix, so that `copy_` below changes the matrix
             scale = weights.abs().amax(dim=1, keepdim=True) / LARGEST_INT8  # shape (n_output, 1)
-            integers = torch.round(weights / scale.clamp(min=MIN_SCALE))
+            integers = torch.round(weights / scale.clamp(min=torch.finfo(weights.dtype).tiny))
             weights.copy_(integers * scale)
             matrix.requires_grad_(False)
 
@@ -245,8 +236,8 @@ def compress_length(residual: Tensor) -> Tensor:
     Returns:
         Vectors with the directions of the residuals and the compressed lengths, shape (..., n_electrode).
     """
-    length: Tensor = torch.linalg.vector_norm(residual, dim=-1, keepdim=True)
-    return residual * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=MIN_LENGTH))
+    length = torch.linalg.vector_norm(residual, dim=-1, keepdim=True)
+    return nn.functional.normalize(residual, dim=-1) * torch.asinh(length / MISFIT_UNIT)
 
 
 def as_tensor(values: Array) -> Tensor:

@@ -13,6 +13,9 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.train.training.activations import Activation
 
+LARGEST_INT8 = 127
+"""Largest absolute value of the integers by which weights are represented in 8 bits, in units of their scale."""
+
 
 class Layer(NamedTuple):
     """Weights of a linear layer, which computes inputs @ weight + bias.

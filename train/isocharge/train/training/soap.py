@@ -20,6 +20,13 @@ BASIS_PERIOD = 10
 EPSILON = 1e-10
 """Number that is added to each root mean square of the gradient, so that no division by zero occurs."""
 
+MAX_RATIO = 2.0
+"""Largest ratio of the averaged gradient to its root mean square, in the eigenbasis.
+
+With equal decay rates, the ratio is at most 1, except where an update of the eigenvectors has moved a part of the
+averaged gradient to an entry whose mean square is nearly zero. Without the limit, the step would be arbitrarily long.
+"""
+
 
 class Soap:
     """The optimiser SOAP. Parameters with one dimension, such as biases, are trained by Adam.
@@ -95,6 +102,7 @@ class _ParameterState:
         total_weight = 1.0 - DECAY**self.step
         root_mean_square = torch.sqrt(self.square / total_weight) + EPSILON
         ratio = _rotate(self.mean, self.bases) / (total_weight * root_mean_square)
+        ratio.clamp_(-MAX_RATIO, MAX_RATIO)
         self.parameter.add_(_rotate(ratio, [basis.T for basis in self.bases]), alpha=-rate)
 
 
