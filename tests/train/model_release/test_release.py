@@ -24,11 +24,10 @@ from isocharge.train import (
     NetworkConfig,
     TrainingConfig,
     evaluate,
-    fit,
     load_config,
     release,
 )
-from isocharge.train.data.presses import draw_contacts, held_out
+from isocharge.train.data.presses import draw_contacts
 from isocharge.train.model_release.evaluate import simulated_errors
 from kept import kept
 
@@ -255,22 +254,3 @@ def test_the_misfit_of_four_electrodes_is_half_normal(forward_map, truth, predic
     tolerance = 0.4 if predictor.metadata.name.endswith("-student") else 0.15
     for probability in (0.5, 0.9, 0.95, 0.99):
         assert np.quantile(misfit, probability) == pytest.approx(halfnorm.ppf(probability), rel=tolerance)
-
-
-def test_the_errors_of_a_model_of_measured_presses_are_those_on_held_out_presses(dataset, tmp_path):
-    """The charges are 20 % larger than the simulated ones and have a noise of 3 %; no noise is added to them."""
-    rng = np.random.default_rng(3)
-    charge = 1.2 * dataset.samples.charge_pC * np.exp(0.03 * rng.standard_normal(dataset.samples.charge_pC.shape))
-    measured = replace(dataset, samples=replace(dataset.samples, charge_pC=charge), manifest={})
-    model = release(fit(measured, QUICK), tmp_path / "models" / "mine")
-    errors = model.metadata.errors
-    card = (model.folder / "card.md").read_text("utf-8")
-    contact = np.column_stack([dataset.samples.x_mm, dataset.samples.y_mm, dataset.samples.force_N])
-    held = held_out(contact)
-    off = np.stack(Predictor(model.folder).predict_batch(charge[held]), axis=1)[:, :2] - contact[held, :2]
-    assert errors["measured_presses"] == held.sum()
-    assert errors["position_median_mm"] == pytest.approx(np.median(np.hypot(*off.T)), rel=1e-3)
-    assert f"on {held.sum()} measured presses that were not used in the training" in card
-    assert "serve check" in card
-    assert "These figures compare with the simulator" not in card
-    assert not [name for name in errors if name.startswith("clean_")]

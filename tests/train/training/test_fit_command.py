@@ -1,10 +1,15 @@
 """The command `train fit` with a dataset: what it imports, and what it keeps if the release is refused."""
 
+import json
+import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
+from isocharge.cli.train import fit as fit_command
+from isocharge.common.errors import PressError
 from isocharge.serve import load_model
 
 SHORT_CONFIG = """
@@ -39,3 +44,23 @@ finally:
     metadata = load_model(version_folder).metadata
     assert metadata.yield_force_N == pytest.approx(0.866, abs=0.01)
     assert metadata.unnoticed.to_mm == pytest.approx(42.8, abs=0.01)
+
+
+def test_a_measured_dataset_is_trained_as_presses_alone(dataset_folder, dataset, tmp_path, command, monkeypatch):
+    """A measured dataset has no settings of a simulator."""
+    shutil.copytree(dataset_folder, tmp_path / "measured")
+    manifest = tmp_path / "measured" / "manifest.json"
+    table = json.loads(manifest.read_text())
+    del table["solver"]
+    manifest.write_text(json.dumps(table))
+    given = []
+
+    def refuse(presses, *_, **__):
+        given.append(presses)
+        raise PressError("no training in this test")
+
+    monkeypatch.setattr(fit_command, "fit_presses", refuse)
+    _, _, err = command("train", "fit", tmp_path / "measured", "-o", tmp_path / "model")
+    assert "no training in this test" in err
+    np.testing.assert_array_equal(given[0].charge_pC, dataset.samples.charge_pC)
+    assert given[0].electrodes == ("A", "B", "C")

@@ -24,6 +24,7 @@ from isocharge.common.errors import InputError
 from isocharge.serve import MeasuredPresses
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import (
+    Dataset,
     built_in_sensors,
     load_sensor,
     parse_probe,
@@ -31,6 +32,7 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.sensor.probe import PROBE_HELP
 from isocharge.train import FitConfig, TrainingData, fit, fit_presses, load_config
+from isocharge.train.data.presses import is_measured, measured_presses_of
 from isocharge.train.training.cross_fit import usable_presses
 
 DEFAULT_PROBE = "circle:1.0"
@@ -113,9 +115,16 @@ def fit_command(
             f"calibrate {shlex.quote(str(press_file))} --sensor {sensor} -o {shlex.quote(str(output))}`, or leave "
             "--sensor out to train a network on the presses alone"
         )
+    if dataset is not None and sensor is not None:
+        raise InputError("expected either a DATASET folder or --sensor SENSOR, got both; leave one of them out")
     fit_config = load_config(config) if config else FitConfig()
+    loaded_dataset = read_dataset(dataset) if dataset is not None and press_file is None else None
+    presses: MeasuredPresses | None = None
     if press_file is not None:
         presses = _read_presses_of_unknown_sensor(press_file, radius, position_std_mm, force_std)
+    elif loaded_dataset is not None and is_measured(loaded_dataset):
+        presses = usable_presses(measured_presses_of(loaded_dataset))
+    if presses is not None:
         version_folder = check_target(output, version, presses.electrodes)
         sensor_name = output.resolve().name  # the sensor has no other name than that of the model
         pressing_probes = tuple(probe or ["unknown"])
@@ -128,7 +137,7 @@ def fit_command(
         # Refuse an unsuitable model folder before the simulation, which takes a while.
         check_target(output, version, load_sensor(sensor).electrode_names)
     with shown_progress():
-        data = _read_or_simulate_data(dataset, sensor, notations, radius)
+        data = _prepare_data(loaded_dataset, sensor, notations, radius)
     version_folder = check_target(output, version, data.sensor.electrode_names)
     train_and_release(partial(fit, data, fit_config), version_folder, json=json)
 
@@ -139,22 +148,20 @@ def _is_sensor(argument: Path) -> bool:
     return is_built_in or argument.suffix.lower() == ".toml"
 
 
-def _read_or_simulate_data(dataset: Path | None, sensor: str | None, notations: list[str], radius: str) -> TrainingData:
-    """Read training data from a dataset folder, or simulate training data for a sensor.
+def _prepare_data(dataset: Dataset | None, sensor: str | None, notations: list[str], radius: str) -> TrainingData:
+    """Convert a simulated dataset to training data, or simulate training data for a sensor.
 
     Args:
-        dataset: Dataset folder; None to simulate presses.
-        sensor: Name or file of the sensor; None to read the dataset.
+        dataset: The dataset; None to simulate presses.
+        sensor: Name or file of the sensor; None to use the dataset.
         notations: Notations of the probes of the simulated presses.
         radius: Largest distance of the simulated presses from the centre: a number of mm, or "auto".
 
     Raises:
-        InputError: If both the dataset and the sensor are given, or neither.
+        InputError: If neither the dataset nor the sensor is given.
     """
-    if dataset is not None and sensor is not None:
-        raise InputError("expected either a DATASET folder or --sensor SENSOR, got both; leave one of them out")
     if dataset is not None:
-        data = TrainingData.of(read_dataset(dataset))
+        data = TrainingData.of(dataset)
         if data.yield_force_N is not None:
             say(f"caution: PVDF yields beyond {data.yield_force_N:g} N, and a dent stays")
         return data

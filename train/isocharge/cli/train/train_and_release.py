@@ -48,12 +48,7 @@ def _errors_sentence(metadata: ModelMetadata) -> str:
     if "force_rms_percent" in errors:
         force_words = f"force {errors['force_rms_percent']:g} % rms"
     press_count = errors.get("measured_presses")
-    condition = ""
-    if press_count:
-        # The metadata of a model that was trained on presses alone contain the number of folds of the cross-validation.
-        is_cross_validated = "folds" in metadata.made_with.get("measured", {})
-        kind = "at places that were left out" if is_cross_validated else "that were not used for training"
-        condition = f"on {press_count:.0f} measured presses {kind}, "
+    condition = f"on {press_count:.0f} measured presses at places that were left out, " if press_count else ""
     return (
         f"{condition}position error {errors['position_median_mm']:g} mm median, "
         f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "

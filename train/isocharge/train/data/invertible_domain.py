@@ -13,11 +13,6 @@ from isocharge.train.data.presses import LabelledPresses
 MAX_ERROR_OF_CERTAIN_FOLD = 3e-4
 """Largest relative error of the fitted charges at which a fold counts as certain. A poor fit has spurious folds."""
 
-CREDIBLE_FOLD_RATIO = 0.8
-"""Largest ratio of the radius of a fold to the radius of the domain at which a fold of a poor fit counts as real.
-
-Spurious folds lie near the edge of the domain, because there are presses on only one side of the edge."""
-
 SEARCHED_RADIUS_RATIO = 0.98
 """Ratio of the radius within which folds are searched for to the radius of the domain.
 
@@ -33,12 +28,8 @@ def invertible_domain(
     """Return the disk on which a network is trained, and sentences for the user about ambiguous contacts.
 
     At a fold, the map from contacts to charges turns back, so that contacts on both sides of the fold have the same
-    charges. There are three cases:
-
-    - The fit is accurate and shows a fold: the disk is reduced to the radius of the fold, and a sentence states this.
-    - The fit is inaccurate, because there are few presses or the charges have noise, and it shows a fold well inside
-      the domain: the disk is not reduced, and a sentence states where the map seems to fold.
-    - Otherwise, the disk is the domain of the field.
+    charges. If an accurate fit shows a fold, the disk is reduced to the radius of the fold, and a sentence states this.
+    Otherwise, the disk is the domain of the field.
 
     Args:
         field: Charge field that was fitted to the presses.
@@ -52,16 +43,12 @@ def invertible_domain(
         DatasetError: If the radius of the disk is less than `SMALLEST_SHARE` of the radius of the field.
     """
     requested_domain = field.domain
+    if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
+        return requested_domain, ()
     fold_radius = _fold_radius(field, noise)
     if not fold_radius < requested_domain.radius:
         return requested_domain, ()
 
-    # An inaccurate fit does not prove a fold, so the fold is only reported, and only if it lies well inside the domain.
-    # A fold near the edge is probably not real.
-    if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
-        if fold_radius < CREDIBLE_FOLD_RATIO * requested_domain.radius:
-            return requested_domain, (_uncertain_fold_caution(fold_radius, requested_domain.radius),)
-        return requested_domain, ()
     if fold_radius < SMALLEST_SHARE * requested_domain.radius:
         raise DatasetError(
             f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of "
@@ -69,21 +56,6 @@ def invertible_domain(
             "electrode, or take a biaxial film"
         )
     return requested_domain.within(fold_radius), (_fold_caution(field, presses, fold_radius),)
-
-
-def _uncertain_fold_caution(fold_radius: float, requested_radius: float) -> str:
-    """Return a sentence about a fold that the fit shows inside the domain but cannot prove.
-
-    Args:
-        fold_radius: Distance of the fold from the centre, mm.
-        requested_radius: Radius of the domain, mm.
-    """
-    return (
-        f"the map from contacts to charges seems to fold about {fold_radius:.2g} mm from the centre, where two "
-        "contacts give the same charges; the presses cannot tell it for certain, and the model is trained "
-        f"across it, up to {requested_radius:g} mm; see 'isocharge simulate identify', then ask for a smaller "
-        "radius or add an electrode"
-    )
 
 
 def _fold_caution(field: ChargeSeries, presses: LabelledPresses, fold_radius: float) -> str:

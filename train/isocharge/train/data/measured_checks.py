@@ -9,11 +9,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import DatasetError, PressError, shown
-from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.simulate import Dataset
+from isocharge.common.errors import PressError, shown
+from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses
 from isocharge.train.data.channel_noise import usual_size
-from isocharge.train.data.measured_sensor import LEAST_RANGE, PressedArea
+from isocharge.train.data.measured_sensor import PressedArea
 
 LEAST_VARIATION = 1e-6
 """Smallest difference from the median that counts as a variation, relative to the largest charge of the channel."""
@@ -54,41 +53,6 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
     _check_far_value(presses, "force_N", force, compared_values=1.0 / force)
     _check_independence(channels)
     PressedArea.of_contacts(presses.contact)  # raises if the positions enclose no area
-
-
-def check_measured_dataset(dataset: Dataset) -> None:
-    """Check that a network can be trained on a dataset of measured presses.
-
-    The error messages number the samples of the dataset from 0.
-
-    Args:
-        dataset: The dataset.
-
-    Raises:
-        DatasetError: If `check_measured_presses` would raise an error, if a number is too large for a file of presses,
-            or if all presses have nearly the same force.
-    """
-    samples = dataset.samples
-    count = len(samples)
-    try:
-        presses = MeasuredPresses(
-            contact=np.column_stack([samples.x_mm, samples.y_mm, samples.force_N]),
-            charge_pC=samples.charge_pC,
-            position_std_mm=np.full(count, POSITION_STD_MM),  # the checks do not use the standard deviations
-            force_std=np.full(count, FORCE_STD),
-            electrodes=tuple(dataset.sensor.electrode_names),
-            lines=tuple(range(count)),
-            row_noun="sample",
-        )
-        check_measured_presses(presses)
-    except PressError as error:
-        raise DatasetError(str(error)) from error
-    weakest_N, strongest_N = samples.force_N.min(), samples.force_N.max()
-    if strongest_N < LEAST_RANGE * weakest_N:
-        raise DatasetError(
-            f"expected forces that vary, got {weakest_N:.4g} to {strongest_N:.4g} N in all {count} presses; press with "
-            "several forces, or train on the presses as a CSV file, from which a model learns x and y alone"
-        )
 
 
 def _check_variation(name: str, charge: Array) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import DatasetError, PressError, cut, shown
 from isocharge.common.files import sha256_of
-from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses
+from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor, parse_probe
 from isocharge.train.data.channel_noise import Noise
 
@@ -329,6 +329,21 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
     samples = Samples(x_mm, y_mm, force_N, probe_column, orientation_deg, complete_presses.charge_pC)
     manifest: dict[str, object] = {}  # measured presses have no settings of a simulator
     return Dataset(sensor, samples, manifest, presses_sha256(complete_presses))
+
+
+def measured_presses_of(dataset: Dataset) -> MeasuredPresses:
+    """Return the presses of a measured dataset with the default standard deviations. The lines are numbered from 0."""
+    samples = dataset.samples
+    count = len(samples)
+    return MeasuredPresses(
+        contact=LabelledPresses.of(dataset).contact,
+        charge_pC=samples.charge_pC,
+        position_std_mm=np.full(count, POSITION_STD_MM),
+        force_std=np.full(count, FORCE_STD),
+        electrodes=tuple(dataset.sensor.electrode_names),
+        lines=tuple(range(count)),
+        row_noun="sample",
+    )
 
 
 def complete(presses: MeasuredPresses) -> Booleans:

@@ -141,8 +141,6 @@ def _presses_text(metadata: ModelMetadata) -> str:
             f"of their answers. The standard deviations were multiplied by {factors} for forces, so that the 68 % "
             "intervals contain 68 % of these presses"
         )
-    if HELD_PRESSES in metadata.errors:
-        return "measured presses that were not used in the training. No noise was added to these presses"
     return (
         "simulated presses that were not used in the training, with that noise. The forces are log-uniform, and the "
         "positions are uniform over the working area"

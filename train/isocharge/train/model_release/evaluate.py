@@ -73,13 +73,10 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
         errors |= _coverages(contact[:, :n_plane], std[:, :n_plane], test_presses.contact[:, :n_plane])
         errors = {name: error for name, error in errors.items() if not name.startswith("force_")}
     errors[HELD_PRESSES] = float(len(test_presses))
-    if not fitted.good.measured and isinstance(fitted.noise, NoiseModel):
-        return errors | misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)
     if fitted.cross_validated is not None:
-        good_misfits = fitted.cross_validated.misfit
-    else:
-        _, _, good_misfits = fitted.predict(fitted.good.charge)
-    return errors | _misfit_percentiles(good_misfits)
+        return errors | _misfit_percentiles(fitted.cross_validated.misfit)
+    assert isinstance(fitted.noise, NoiseModel)  # noise of channels belongs to a network of measured presses
+    return errors | misfit_errors(fitted.predict, fitted.test, fitted.noise, seed)
 
 
 def simulated_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int = 1) -> dict[str, float]:

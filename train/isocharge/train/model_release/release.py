@@ -107,7 +107,7 @@ def release(
 
     graph = write_graph(fitted.network, complete_metadata.to_props())
     floors = contact_floors(complete_metadata)
-    golden_charges = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, floors)
+    golden_charges = check_graph(graph, fitted.network.outputs, fitted.test, fitted.misfit_noise, floors)
     card_text = card(complete_metadata, fitted)
     version_folder = write_model(folder, graph, complete_metadata, golden_charges, card_text, fitted.provenance.files)
     return Release(version_folder, complete_metadata)

@@ -150,7 +150,6 @@ def fit_presses(
         domain=domain,
         noise=noise,
         test=labelled,
-        good=labelled,
         sha256=presses_sha256(usable),
         provenance=Provenance(made_with=made_with, files={PRESSES_FILE: presses_text(usable).encode()}),
         requested_domain=domain,

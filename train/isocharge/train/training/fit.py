@@ -49,7 +49,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
     A warning is logged if two contacts of the requested domain have the same charges.
 
     Args:
-        source: A dataset, simulated or measured, or other training data.
+        source: A simulated dataset, or other training data.
         config: Sizes, steps, noise and seed; None for the defaults.
 
     Returns:
@@ -66,9 +66,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
     settings = checked_config.for_electrodes(n_electrode)
     trained = train_network(data, settings)
 
-    # The threshold of the misfit needs many good presses. Of few measured presses, those for training are used, too.
     split = trained.split
-    good_presses = data.presses.within(split.domain.radius) if data.presses.measured else split.test
     return Fitted(
         network=fold_network(trained.network),
         sensor=data.sensor,
@@ -76,7 +74,6 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         domain=split.domain,
         noise=settings.training.noise_model,
         test=split.test,
-        good=good_presses,
         sha256=data.sha256,
         provenance=_provenance(data, split, settings),
         requested_domain=data.domain,
@@ -135,11 +132,7 @@ def train_network(data: TrainingData, config: FitConfig) -> TrainedNetwork:
             _log.warning("%s", caution)
         features = split.features(misfit_noise(training.noise_model))
         network = InverseNetwork(split.domain, features, config.network)
-        outside = (
-            None
-            if data.presses.measured
-            else OutsidePresses.of(split.domain, data.presses, data.outside, training.seed)
-        )
+        outside = OutsidePresses.of(split.domain, data.presses, data.outside, training.seed)
 
         def train_misfit() -> None:
             """Train the misfit perceptron on examples from the working area and from the rest of the film."""
@@ -150,9 +143,7 @@ def train_network(data: TrainingData, config: FitConfig) -> TrainedNetwork:
         misfit_training = executor.submit(train_misfit)
         linear_targets = None
         has_many_electrodes = network.n_electrode > FEW_ELECTRODES
-        # Measured charges contain noise of unknown size. Linear targets need noise of known size.
-        is_noise_known = not data.presses.measured and training.noise_model.white > 0.0
-        if has_many_electrodes and is_noise_known:
+        if has_many_electrodes and training.noise_model.white > 0.0:
             linear_targets = LinearTargets.compute(split.train, split.field, training.noise_model)
         stage = contact_stage(network, split.train, training.noise_model, training, linear_targets=linear_targets)
         train_perceptron(stage, network.contact, config)

@@ -54,7 +54,6 @@ class Fitted:
         domain: Contacts for which the network was trained.
         noise: Noise for which the network was trained.
         test: Presses for measuring errors. The network was trained on other presses, unless `cross_validated` is given.
-        good: Presses without faults, whose misfits determine the threshold of the alarm.
         sha256: Checksum of the training data.
         provenance: Additional information for the release.
         requested_domain: Contacts for which a network was requested. This domain is larger than `domain` if the map
@@ -75,7 +74,6 @@ class Fitted:
     domain: Domain
     noise: Noise
     test: LabelledPresses
-    good: LabelledPresses
     sha256: str
     provenance: Provenance
     requested_domain: Domain

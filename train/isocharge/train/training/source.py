@@ -1,11 +1,11 @@
-"""Training data of a network: simulated presses, or measured presses."""
+"""Training data of a network: simulated presses."""
 
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 
+from isocharge.common.errors import DatasetError
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import Dataset, Domain, Sensor
-from isocharge.train.data.measured_checks import check_measured_dataset
 from isocharge.train.data.presses import LabelledPresses, domain_of, outside_presses_of, presses_of, yield_force_of
 from isocharge.train.training.fitted import Provenance
 
@@ -19,8 +19,7 @@ class TrainingData:
         probes: Notations of the probes.
         domain: Contacts for which a network is requested. The network gets a smaller domain if the map from contacts to
             charges folds.
-        presses: Presses for training. Noise is added to the charges during the training. For measured presses, this is
-            a regularisation.
+        presses: Presses for training. Noise is added to the charges during the training.
         sha256: Checksum of the presses.
         outside: Presses between the domain and the clamp; None if there are none.
         yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
@@ -41,14 +40,17 @@ class TrainingData:
 
     @classmethod
     def of(cls, dataset: Dataset) -> "TrainingData":
-        """Convert a simulated or measured dataset to training data.
+        """Convert a simulated dataset to training data.
 
         Raises:
-            DatasetError: If the dataset cannot train a network, for example because of a copied channel.
+            DatasetError: If the dataset has too few presses or electrodes, or is measured.
         """
         presses = presses_of(dataset)
         if presses.measured:
-            check_measured_dataset(dataset)
+            raise DatasetError(
+                "expected simulated presses, got a measured dataset, whose manifest has no settings of a simulator; "
+                "train with `isocharge train fit DATASET`, or with `fit_presses` in Python"
+            )
         return cls(
             sensor=dataset.sensor,
             probes=tuple(sorted({str(probe) for probe in dataset.samples.probe})),

@@ -9,7 +9,7 @@ from isocharge.train.data.channel_noise import ChannelNoise
 from isocharge.train.data.charge_fit import fit_charge_series
 from isocharge.train.data.invertible_domain import invertible_domain
 from isocharge.train.data.misfit_charges import misfit_noise
-from isocharge.train.data.presses import LabelledPresses, held_out, split_by_position
+from isocharge.train.data.presses import LabelledPresses, split_by_position
 from isocharge.train.training.config import TrainingConfig
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.source import TrainingData
@@ -66,13 +66,7 @@ class Split:
         is_folded = domain != data.domain  # `invertible_domain` reduces the domain only if the map folds
         used_presses = presses.within(domain.radius) if is_folded else presses
 
-        # Positions alone determine which measured presses are used for the test, so that each command uses the same.
-        if presses.measured:
-            is_test = held_out(used_presses.contact)
-            train, test = used_presses[~is_test], used_presses[is_test]
-        else:
-            train, test = split_by_position(used_presses, training.hold_out, training.seed)
-
+        train, test = split_by_position(used_presses, training.hold_out, training.seed)
         field = within(whole_field, domain.radius) if is_folded else whole_field
         folded_charges = replace(whole_field, is_folded=True) if is_folded else None
         return cls(domain, train, test, field, cautions, folded_charges)
