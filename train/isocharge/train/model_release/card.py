@@ -104,11 +104,7 @@ def _area_text(fitted: Fitted) -> str:
     if isinstance(fitted.domain, PressedArea):
         width, height = np.ptp(np.array(fitted.domain.corners), axis=0)
         return f"{width:.4g} mm x {height:.4g} mm, the outline of the presses; corners in the metadata"
-    text = f"within {fitted.domain.radius:g} mm of the centre"
-    requested = fitted.requested_domain
-    if requested != fitted.domain:
-        text += f" ({requested.radius:g} mm were requested; farther out two contacts can have the same charges)"
-    return text
+    return f"within {fitted.domain.radius:g} mm of the centre"
 
 
 def _forces_text(metadata: ModelMetadata) -> str:

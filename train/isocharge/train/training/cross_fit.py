@@ -152,7 +152,6 @@ def fit_presses(
         test=labelled,
         sha256=presses_sha256(usable),
         provenance=Provenance(made_with=made_with, files={PRESSES_FILE: presses_text(usable).encode()}),
-        requested_domain=domain,
         cross_validated=cross_validated,
         is_force_constant=force_std is not None,
     )

@@ -75,32 +75,27 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         noise=settings.training.noise_model,
         test=split.test,
         sha256=data.sha256,
-        provenance=_provenance(data, split, settings),
-        requested_domain=data.domain,
+        provenance=_provenance(split, settings),
         cautions=split.cautions,
         outside=trained.outside,
         yield_force_N=data.yield_force_N,
     )
 
 
-def _provenance(data: TrainingData, split: Split, config: FitConfig) -> Provenance:
-    """Return the provenance of the training data, with the settings of the training and other additional entries.
-
-    If the map from contacts to charges folds, the series of the charges is added as a file.
+def _provenance(split: Split, config: FitConfig) -> Provenance:
+    """Return the settings and the cautions of a training, and the series of the charges if the map folds.
 
     Args:
-        data: Training data, which may contain entries and files of their own.
         split: Series of the charges, and cautions about the network.
         config: Settings of the training.
     """
     made_with: dict[str, object] = {"config": config.to_dict(), "torch": torch.__version__}
     if split.cautions:
         made_with["cautions"] = list(split.cautions)
-    made_with.update(data.provenance.made_with)
-    files = dict(data.provenance.files)
+    files = {}
     if split.folded_charges is not None:
         files[CHARGES_FILE] = charge_map_bytes(split.folded_charges)
-    return replace(data.provenance, made_with=made_with, files=files)
+    return Provenance(made_with, files)
 
 
 @dataclass(frozen=True)

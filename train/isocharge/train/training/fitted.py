@@ -56,8 +56,6 @@ class Fitted:
         test: Presses for measuring errors. The network was trained on other presses, unless `cross_validated` is given.
         sha256: Checksum of the training data.
         provenance: Additional information for the release.
-        requested_domain: Contacts for which a network was requested. This domain is larger than `domain` if the map
-            from contacts to charges folds, which means that different contacts have the same charges.
         cautions: Sentences that users of the network should read.
         cross_validated: Answers to the charges of `test` by networks that were not trained on these presses; None if
             `network` itself was not trained on them.
@@ -76,7 +74,6 @@ class Fitted:
     test: LabelledPresses
     sha256: str
     provenance: Provenance
-    requested_domain: Domain
     cautions: tuple[str, ...] = ()
     cross_validated: Answers | None = None
     outside: OutsidePresses | None = None

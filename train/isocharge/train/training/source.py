@@ -1,13 +1,11 @@
 """Training data of a network: simulated presses."""
 
 from dataclasses import dataclass
-from dataclasses import field as dataclass_field
 
 from isocharge.common.errors import DatasetError
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import Dataset, Domain, Sensor
 from isocharge.train.data.presses import LabelledPresses, domain_of, outside_presses_of, presses_of, yield_force_of
-from isocharge.train.training.fitted import Provenance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +22,6 @@ class TrainingData:
         outside: Presses between the domain and the clamp; None if there are none.
         yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
             or above the range of forces.
-        provenance: Additional information about the origin of the model, for the release.
         field: Charges as a function of the contact; None to fit them to `presses`.
     """
 
@@ -35,7 +32,6 @@ class TrainingData:
     sha256: str
     outside: LabelledPresses | None = None
     yield_force_N: float | None = None
-    provenance: Provenance = dataclass_field(default_factory=Provenance)
     field: ChargeSeries | None = None
 
     @classmethod
