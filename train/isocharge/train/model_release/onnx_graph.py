@@ -6,11 +6,11 @@ Therefore, only the writer defines the structure of the graph. The reader refuse
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+import onnx.parser
+from onnx import helper, numpy_helper
 
 from isocharge.common.errors import ModelError, cut
 from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS
@@ -30,44 +30,31 @@ OPSET = 17
 
 @dataclass
 class GraphBuilder:
-    """Builder of a graph, which collects nodes and constants in the order in which they are added."""
+    """Builder of a graph, which collects nodes and constants in the order in which they are added.
 
-    nodes: list[onnx.NodeProto] = field(default_factory=list)
+    The nodes are lines in the textual syntax of ONNX, and a tensor is represented by its name.
+    """
+
+    nodes: list[str] = field(default_factory=list)
     constants: list[onnx.TensorProto] = field(default_factory=list)
 
-    def add(self, operator: str, *inputs: str, to: str = "", **attributes: Any) -> str:
-        """Add a node with one result, and return the name of the result.
+    def add(self, operator: str, *inputs: str, to: str = "") -> str:
+        """Add a node, and return the name of its result.
 
         Args:
-            operator: ONNX operator of the node.
+            operator: ONNX operator of the node, with its attributes in angle brackets.
             *inputs: Names of the tensors that are the inputs of the node.
-            to: Name of the result; empty for a generated name.
-            **attributes: Attributes of the node.
+            to: Name of the result, or several names with commas between them; empty for a generated name.
         """
         result_name = to or f"t{len(self.nodes)}"
-        self.add_many(operator, *inputs, to=(result_name,), **attributes)
+        self.nodes.append(f"{result_name} = {operator} ({', '.join(inputs)})")
         return result_name
-
-    def add_many(self, operator: str, *inputs: str, to: tuple[str, ...], **attributes: Any) -> tuple[str, ...]:
-        """Add a node with several results, which get the names in `to`, and return these names."""
-        self.nodes.append(helper.make_node(operator, list(inputs), list(to), **attributes))
-        return to
 
     def constant(self, values: object, dtype: type = np.float32) -> str:
         """Add a constant tensor, and return its generated name."""
         name = f"c{len(self.constants)}"
         self.constants.append(numpy_helper.from_array(np.array(values, dtype=dtype, order="C"), name))
         return name
-
-    def split(self, data: str, widths: Mapping[str, int]) -> tuple[str, ...]:
-        """Add a node that splits the columns of a tensor into parts, and return the names of the parts.
-
-        Args:
-            data: Name of the tensor.
-            widths: Number of columns of each part, by the name of the part.
-        """
-        sizes = self.constant(tuple(widths.values()), np.int64)
-        return self.add_many("Split", data, sizes, to=tuple(widths), axis=1)
 
 
 def write_graph(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
@@ -91,16 +78,18 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     """Return the ONNX model of a network, without metadata.
 
     The outputs of the perceptron are called answers. The nodes after the perceptron convert the answers into the
-    outputs of the graph: the contact, its standard deviations, the correlations and the misfit. In this function, a
-    tensor is represented by its name.
+    outputs of the graph: the contact, its standard deviations, the correlations and the misfit.
 
     Args:
         network: The network.
     """
     builder = GraphBuilder()
     n_electrode = network.features.n_electrode
+    features = _add_features(builder, network.features)
+    answers = _add_perceptron(builder, features, network.layers)
 
     # Split the answers: x and y, the logarithms of the force and of the three standard deviations, the angles that
+<<<<<<< HEAD
     # determine the correlations, and the misfit vector. The exponentials of the limited logarithms are the force and
     # the standard deviations. A result of a split has the name of an output of the graph, so it needs no further node.
     widths = {"plane": 2, "logs": 4, "angles": len(COSINES_TO_CORRELATIONS), "misfit_vector": n_electrode}
@@ -110,31 +99,30 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     force, _ = builder.split(builder.add("Exp", limited_logarithms), {"force": 1, "contact_std": 3})
     builder.add("Concat", position, force, to="contact", axis=1)
     cosines = builder.add("Cos", angles)
+=======
+    # determine the correlations, and the misfit vector. The exponentials of the logarithms are the force and the
+    # standard deviations. A result of a split has the name of an output of the graph, so it needs no further node.
+    widths = builder.constant((2, 4, len(COSINES_TO_CORRELATIONS), n_electrode), np.int64)
+    builder.add("Split <axis = 1>", answers, widths, to="plane, logs, angles, misfit_vector")
+    exponentials = builder.add("Exp", "logs")
+    builder.add("Split <axis = 1>", exponentials, builder.constant((1, 3), np.int64), to="force, contact_std")
+    builder.add("Concat <axis = 1>", "plane", "force", to="contact")
+    cosines = builder.add("Cos", "angles")
+>>>>>>> 6f1f943b (Write the graph of a network in the textual syntax of ONNX, which its parser reads)
     builder.add("MatMul", cosines, builder.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
     # The length of the misfit vector is asinh(misfit / MISFIT_UNIT).
-    compressed_misfit = builder.add("ReduceL2", misfit_vector, axes=[1], keepdims=1)
+    compressed_misfit = builder.add("ReduceL2 <axes = [1], keepdims = 1>", "misfit_vector")
     builder.add("Mul", builder.add("Sinh", compressed_misfit), builder.constant(MISFIT_UNIT), to="misfit")
 
-    declared_inputs = _declare({INPUT: n_electrode})
-    graph = helper.make_graph(builder.nodes, "isocharge", declared_inputs, _declare(OUTPUTS), builder.constants)
-    opset = helper.make_opsetid("", OPSET)
-    ir_version = helper.find_min_ir_version_for([opset])
-    return helper.make_model(graph, opset_imports=[opset], ir_version=ir_version, producer_name="isocharge")
-
-
-def _declare(widths: Mapping[str, int]) -> list[onnx.ValueInfoProto]:
-    """Return the declarations of float32 tensors [n, width].
-
-    Args:
-        widths: Width of each tensor by its name.
-    """
-    return [helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["n", width]) for tensor, width in widths.items()]
-
-
-def _add_answers(builder: GraphBuilder, network: FoldedNetwork) -> str:
-    """Add nodes that compute the features and the perceptron of a network, and return the name of its answers."""
-    features = _add_features(builder, network.features)
-    return _add_perceptron(builder, features, network.layers)
+    outputs = ", ".join(f"float[n, {width}] {name}" for name, width in OUTPUTS.items())
+    model = onnx.parser.parse_model(
+        f'<ir_version: 8, opset_import: ["" : {OPSET}], producer_name: "isocharge">\n'
+        f"isocharge (float[n, {n_electrode}] {INPUT}) => ({outputs}) {{\n" + "\n".join(builder.nodes) + "\n}"
+    )
+    for node in model.graph.node:
+        node.ClearField("domain")  # the parser states the empty domain, and `onnx.helper` does not
+    model.graph.initializer.extend(builder.constants)
+    return model
 
 
 def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
