@@ -7,7 +7,6 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
-from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.identifiability.ambiguous_pairs import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import find_folds
@@ -116,6 +115,8 @@ def working_area(
     Raises:
         SceneError: If the map has fewer than three electrodes.
     """
+    from isocharge.simulate.forward.charge_spline import with_fast_derivatives  # imports the solver
+
     check_electrode_count(len(charge_map.electrodes))
     charge_map = with_fast_derivatives(charge_map)
     search_radius = charge_map.domain.radius
