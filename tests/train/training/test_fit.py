@@ -27,7 +27,7 @@ from isocharge.train.training.split import Split
 def stage_with_factor(factor, steps=400):
     """Return the training of a small network whose loss is multiplied by a function of the fraction of the steps."""
     torch.manual_seed(0)
-    network = TrainablePerceptron(2, (4, 4), 1, 1)
+    network = TrainablePerceptron(2, (4, 4), 1)
 
     def loss(progress, random):
         inputs = torch.rand(8, 2, generator=random)
@@ -193,7 +193,7 @@ def test_the_loss_of_the_covariance_has_small_gradients_where_errors_are_nearly_
 
 def test_the_units_of_a_sharpened_layer_bend_among_the_inputs():
     torch.manual_seed(0)
-    perceptron = TrainablePerceptron(3, (400, 8), 4, 4)
+    perceptron = TrainablePerceptron(3, (400, 8), 4)
     perceptron.sharpen_first_layer()
     first, *_ = perceptron.linear_layers()
     slope = first.weight.norm(dim=1)

@@ -89,26 +89,15 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     answers = _add_perceptron(builder, features, network.layers)
 
     # Split the answers: x and y, the logarithms of the force and of the three standard deviations, the angles that
-<<<<<<< HEAD
     # determine the correlations, and the misfit vector. The exponentials of the limited logarithms are the force and
     # the standard deviations. A result of a split has the name of an output of the graph, so it needs no further node.
-    widths = {"plane": 2, "logs": 4, "angles": len(COSINES_TO_CORRELATIONS), "misfit_vector": n_electrode}
-    position, logarithms, angles, misfit_vector = builder.split(_add_answers(builder, network), widths)
-    limits = (builder.constant(-LARGEST_LOGARITHM), builder.constant(LARGEST_LOGARITHM))
-    limited_logarithms = builder.add("Clip", logarithms, *limits)
-    force, _ = builder.split(builder.add("Exp", limited_logarithms), {"force": 1, "contact_std": 3})
-    builder.add("Concat", position, force, to="contact", axis=1)
-    cosines = builder.add("Cos", angles)
-=======
-    # determine the correlations, and the misfit vector. The exponentials of the logarithms are the force and the
-    # standard deviations. A result of a split has the name of an output of the graph, so it needs no further node.
     widths = builder.constant((2, 4, len(COSINES_TO_CORRELATIONS), n_electrode), np.int64)
     builder.add("Split <axis = 1>", answers, widths, to="plane, logs, angles, misfit_vector")
-    exponentials = builder.add("Exp", "logs")
+    limits = (builder.constant(-LARGEST_LOGARITHM), builder.constant(LARGEST_LOGARITHM))
+    exponentials = builder.add("Exp", builder.add("Clip", "logs", *limits))
     builder.add("Split <axis = 1>", exponentials, builder.constant((1, 3), np.int64), to="force, contact_std")
     builder.add("Concat <axis = 1>", "plane", "force", to="contact")
     cosines = builder.add("Cos", "angles")
->>>>>>> 6f1f943b (Write the graph of a network in the textual syntax of ONNX, which its parser reads)
     builder.add("MatMul", cosines, builder.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
     # The length of the misfit vector is asinh(misfit / MISFIT_UNIT).
     compressed_misfit = builder.add("ReduceL2 <axes = [1], keepdims = 1>", "misfit_vector")

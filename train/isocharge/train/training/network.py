@@ -59,34 +59,29 @@ class TrainablePerceptron(nn.Module):
 
     The logarithm of the force is nearly a linear function of the logarithms of the charges. The network must estimate
     the logarithm of the force with an error of about a thousandth of its range. The skip layer learns the linear part
-    of this function, so that the hidden layers only need to learn the nonlinear part. Outputs without a skip layer
-    remain bounded for any inputs.
+    of this function, so that the hidden layers only need to learn the nonlinear part.
 
     Args:
         n_input: Number of inputs.
         hidden: Widths of the hidden layers.
         n_output: Number of outputs.
-        n_skip: Number of outputs with a skip layer, which are the first ones.
         activation: Activation of the hidden layers.
     """
 
-    def __init__(
-        self, n_input: int, hidden: tuple[int, ...], n_output: int, n_skip: int, activation: Activation = TANH
-    ) -> None:
+    def __init__(self, n_input: int, hidden: tuple[int, ...], n_output: int, activation: Activation = TANH) -> None:
         """Create the layers with random weights. The weights of the skip layer are zero.
 
         Args:
             n_input: Number of inputs.
             hidden: Widths of the hidden layers.
             n_output: Number of outputs.
-            n_skip: Number of outputs with a skip layer.
             activation: Activation of the hidden layers.
         """
         super().__init__()
         self.activation = activation
         widths = (n_input, *hidden, n_output)
         self.layers = nn.ModuleList([nn.Linear(n_in, n_out) for n_in, n_out in pairwise(widths)])
-        self.skip = nn.Linear(n_input, n_skip, bias=False)
+        self.skip = nn.Linear(n_input, n_output, bias=False)
         nn.init.zeros_(self.skip.weight)
 
     def sharpen_first_layer(self) -> None:
@@ -121,15 +116,13 @@ class TrainablePerceptron(nn.Module):
         value = inputs
         for layer in hidden:
             value = activation(layer(value))
-        outputs: Tensor = last(value)
-        return outputs + nn.functional.pad(self.skip(inputs), (0, last.out_features - self.skip.out_features))
+        outputs: Tensor = last(value) + self.skip(inputs)
+        return outputs
 
     def to_numpy(self) -> Perceptron:
         """Return a copy of the perceptron as NumPy arrays in double precision."""
         *hidden, last = (Layer(_to_numpy(layer.weight.T), _to_numpy(layer.bias)) for layer in self.linear_layers())
-        skip = np.zeros((self.skip.in_features, last.bias.size))
-        skip[:, : self.skip.out_features] = _to_numpy(self.skip.weight.T)
-        return Perceptron(tuple(hidden), last, skip, self.activation)
+        return Perceptron(tuple(hidden), last, _to_numpy(self.skip.weight.T), self.activation)
 
     def linear_layers(self) -> list[nn.Linear]:
         """Return the hidden layers and the output layer, from first to last."""
@@ -187,9 +180,9 @@ class InverseNetwork(nn.Module):
         n_electrode = self.n_electrode
         activation = ACTIVATIONS[config.activation]
         widths, misfit_widths = config.widths(n_electrode)
-        self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop, MEAN.stop, activation)
+        self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop, activation)
         self.contact.sharpen_first_layer()
-        self.misfit_vector = TrainablePerceptron(n_electrode, misfit_widths, n_electrode, n_electrode, activation)
+        self.misfit_vector = TrainablePerceptron(n_electrode, misfit_widths, n_electrode, activation)
         self.output_factor = nn.Buffer(torch.ones(TURN.stop))
         self.output_offset = nn.Buffer(torch.zeros(TURN.stop))
         if force_std is not None:
