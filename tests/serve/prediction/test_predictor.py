@@ -173,21 +173,10 @@ def test_warning_about_an_implausible_contact_is_logged_once(models, film, caplo
     assert "1.125e+07 N cannot be a measurement" in message
 
 
-def test_repr_of_a_contact_is_rounded():
-    contact = Contact(2.9941, -1.9932, 1.00043, 0.0349, 0.034, 0.0028, math.nan)
-    assert repr(contact) == "Contact(x_mm=2.994 +- 0.035, y_mm=-1.993 +- 0.034, force_N=1 +- 0.0028, misfit=nan)"
-
-
 def test_order_of_the_fields_of_a_contact_is_fixed():
     """Other programs, such as exported C code, read the values by their positions."""
     names = ("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit")
     assert Contact._fields == Contacts._fields == (*names, "xy_correlation", "xF_correlation", "yF_correlation")
-
-
-def test_repr_of_a_predictor_shows_its_domain(predictor):
-    assert repr(predictor) == (
-        "Predictor(linear/1: sensor linear-film, charges A B C (pC), positions up to 8 mm, forces 0.05 to 2 N)"
-    )
 
 
 def test_predictor_answers_rightly_in_several_threads(film, predictor):

@@ -32,14 +32,12 @@ class ColumnRule:
 
     Attributes:
         description: Description of a correct cell for messages, such as "a force in N".
-        minimum: Smallest number that is accepted.
         maximum: Largest number that is accepted.
         is_positive: Whether only numbers above zero are accepted.
         may_be_empty: Whether empty cells are accepted.
     """
 
     description: str
-    minimum: float = -LARGEST
     maximum: float = LARGEST
     is_positive: bool = False
     may_be_empty: bool = True
@@ -54,7 +52,7 @@ class ColumnRule:
             Whether each value violates the rule, shape (n,).
         """
         # Comparisons with NaN are false, so these comparisons accept empty cells.
-        is_violation = (values < self.minimum) | (values > self.maximum)
+        is_violation = (values < -LARGEST) | (values > self.maximum)
         if self.is_positive:
             is_violation |= values <= 0.0
         if not self.may_be_empty:

@@ -3,9 +3,8 @@
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_layout
@@ -44,10 +43,8 @@ def _draw_error(axes: Any, result: CalibrationResult) -> None:
     """
     x, y, _ = spread_contacts(result.problem.domain, N_CONTACTS).T
     error_mm = result.sensitivity.position_errors_mm(result.film.covariance)
-    points = axes.scatter(x, y, c=error_mm, norm=LogNorm(), s=60)
-    axes.figure.colorbar(
-        points, ax=axes, label="position error by the film, mm", ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g"
-    )
+    points = axes.scatter(x, y, c=error_mm, s=60)
+    axes.figure.colorbar(points, ax=axes, label="position error by the film, mm")
     error = result.film_error
     sensor, _ = result.sensor_and_probe
     title = f"{len(result.presses)} presses leave {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force"
