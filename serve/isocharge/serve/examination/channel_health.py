@@ -11,12 +11,6 @@ from isocharge.serve.signal_chain.gain import LARGEST_PC
 MAINS_HZ = (50.0, 60.0)
 """Frequencies at which hum is searched for, Hz."""
 
-MIN_SAMPLES_PER_PERIOD = 2.2
-"""Smallest frame rate at which a hum is estimated, in samples per period: 10 % above the Nyquist rate."""
-
-MIN_HUM_TIME_S = 0.5
-"""Shortest time from which hum is estimated, s. Its resolution of 2 Hz separates 50 from 60 Hz."""
-
 
 @dataclass(frozen=True)
 class ChannelHealth:
@@ -47,7 +41,14 @@ class ChannelHealth:
     unusable_value: str = ""
 
 
-def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz: float) -> ChannelHealth:
+def measure_channel_health(
+    name: str,
+    charge_pC: Array,
+    times_s: Array,
+    rate_Hz: float,
+    min_samples_per_period: float = 2.2,
+    min_hum_time_s: float = 0.5,
+) -> ChannelHealth:
     """Measure the offset, the noise, the drift and the hum of a channel while the film is at rest.
 
     A constant, a slope (the drift) and the hum at each mains frequency are fitted to the values by least squares. The
@@ -59,6 +60,10 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
         charge_pC: Values, shape (n,), pC, or in the unit of the board if the gain is not known.
         times_s: Times since the first frame, shape (n,), s.
         rate_Hz: Frames per second, Hz.
+        min_samples_per_period: Smallest frame rate at which a hum is estimated. The default is 10 % above the Nyquist
+            rate.
+        min_hum_time_s: Shortest time from which hum is estimated, s. The resolution of the default is 2 Hz, which
+            separates 50 from 60 Hz.
 
     Returns:
         The number of unusable values, and the other results, which are None if the channel has no usable value.
@@ -76,7 +81,7 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
     columns = [np.ones_like(usable_times_s), usable_times_s]
     hum_columns: dict[float, int] = {}  # first column of each hum
     for hum_Hz in MAINS_HZ:
-        if usable_times_s[-1] > MIN_HUM_TIME_S and rate_Hz > MIN_SAMPLES_PER_PERIOD * hum_Hz:
+        if usable_times_s[-1] > min_hum_time_s and rate_Hz > min_samples_per_period * hum_Hz:
             hum_columns[hum_Hz] = len(columns)
             phase = 2.0 * np.pi * hum_Hz * usable_times_s
             columns += [np.cos(phase), np.sin(phase)]

@@ -20,9 +20,6 @@ from isocharge.serve.live.device import Device
 from isocharge.serve.port.source import Port
 from isocharge.serve.signal_chain.channels import channel_index
 
-MIN_ADVANTAGE = 1.1
-"""Smallest ratio of the largest normalised change under a press to the change of any other channel, dimensionless."""
-
 
 @dataclass(frozen=True)
 class ElectrodeCheck:
@@ -99,7 +96,7 @@ def check_electrodes(
     )
 
 
-def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
+def assign_channels(changes: Array, electrodes: Sequence[str], min_advantage: float = 1.1) -> list[int]:
     """For each electrode, find the channel that changes most under the press near the electrode.
 
     The changes depend on the forces of the presses and on the gains of the channels. To remove these effects, the rows
@@ -108,6 +105,8 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
     Args:
         changes: Change of each channel under the press near each electrode, shape (electrodes, channels), any unit.
         electrodes: Names of the electrodes.
+        min_advantage: Smallest ratio of the largest normalised change under a press to the change of any other
+            channel.
 
     Returns:
         Column of the channel for each electrode.
@@ -124,7 +123,7 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
     columns = [int(column) for column in np.argmax(normalised, axis=1)]
     for row, column in enumerate(columns):
         other_changes = np.delete(normalised[row], column)  # empty if there is only one channel
-        if other_changes.size and normalised[row, column] < MIN_ADVANTAGE * other_changes.max():
+        if other_changes.size and normalised[row, column] < min_advantage * other_changes.max():
             raise PressCheckError(
                 f"the press near electrode {electrodes[row]} changes two channels by almost the same amount; press "
                 "closer to the electrode, with a thinner probe, and try again"
@@ -185,6 +184,7 @@ class _PressReader:
         self._ask = ask
         self._timeout_s = timeout_s
         self._blocks: list[Array] = []  # values of the blocks since the end of the previous press
+        self._previous_change = np.zeros(len(channels))  # change of the channels under the previous press
 
     def press_near(self, electrode: str) -> Array:
         """Ask for a press, wait until it has begun and ended, and return the change of the channels at its peak.
@@ -211,10 +211,20 @@ class _PressReader:
             press = self._find_press()
             if press is not None and press.end is not None:
                 self._blocks = self._blocks[press.end :]
+                self._previous_change = press.change
                 return press.change
 
     def _find_press(self) -> Press | None:
-        """Return the first press in the blocks; None if no press has begun."""
+        """Return the first press in the blocks; None if no press has begun.
+
+        The first blocks are dropped while the charges still fall after the previous press.
+        """
+        direction = np.sign(self._previous_change)
+        while len(self._blocks) > 1:
+            first_level, second_level = (np.median(block, axis=0) for block in self._blocks[:2])
+            if direction @ (second_level - first_level) >= 0.0:
+                break
+            del self._blocks[0]
         levels = np.array([np.median(block, axis=0) for block in self._blocks])
         return find_press(levels, channel_noise(np.vstack(self._blocks)))
 

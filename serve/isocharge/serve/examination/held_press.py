@@ -27,24 +27,17 @@ STEADY_SHARE = 0.02
 """Largest relative change of the charge of a steady press, dimensionless."""
 
 
-MIN_RESIDUAL_RATIO = 9.0
-"""Smallest ratio of the sums of the squared residuals of two laws for which the better law is reported.
-
-With a smaller ratio, variations in the force of a hand could decide which law is reported.
-"""
-
-
 @dataclass(frozen=True)
 class HeldPress:
     """A press that was held during the port check.
 
     Attributes:
-        begin_s: Time at which the press began, s since the first frame.
+        rest_end_s: Time at which the rest before the press ends, s since the first frame.
         tau_s: Time constant of the leak that explains the decrease of the charge, s; None if it is not a leak.
         description: Sentence that describes whether and how the charge of the press changes.
     """
 
-    begin_s: float
+    rest_end_s: float
     tau_s: float | None
     description: str
 
@@ -84,7 +77,7 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     charge = component[settled_block:end_block] - rest.mean()
     begin_s = BLOCK_S * begin_block
     tau_s, description = _describe(block_times_s[settled_block:end_block] - begin_s, charge, drift_per_s)
-    return HeldPress(begin_s, tau_s, description)
+    return HeldPress(BLOCK_S * rest_blocks, tau_s, description)
 
 
 def _describe(held_times_s: Reals, charge: Reals, drift_per_s: float) -> tuple[float | None, str]:
@@ -112,12 +105,14 @@ def _describe(held_times_s: Reals, charge: Reals, drift_per_s: float) -> tuple[f
     return tau_s, f"a held press changes by {100.0 * change:.2g} %: {cause}"
 
 
-def _cause_of_change(held_s: Reals, charge: Reals) -> tuple[float | None, str]:
+def _cause_of_change(held_s: Reals, charge: Reals, min_residual_ratio: float = 9.0) -> tuple[float | None, str]:
     """Determine why the charge of a press with a constant force changes.
 
     Args:
         held_s: Times since the beginning of the press, shape (n,), s.
         charge: Positive charge of the press at these times, shape (n,), in any unit.
+        min_residual_ratio: Smallest ratio of the sums of the squared residuals of two laws for which the better law is
+            reported. With a smaller ratio, variations in the force of a hand could decide which law is reported.
 
     Returns:
         The time constant of the leak with two significant digits, s, or None if the cause is not a leak, and the cause
@@ -125,10 +120,10 @@ def _cause_of_change(held_s: Reals, charge: Reals) -> tuple[float | None, str]:
     """
     leak_slope_per_s, leak_residual = _fit_line(held_s, np.log(charge))
     creep_slope, creep_residual = _fit_line(np.log(held_s), np.log(charge))
-    if leak_slope_per_s < 0.0 and creep_residual > MIN_RESIDUAL_RATIO * leak_residual:
+    if leak_slope_per_s < 0.0 and creep_residual > min_residual_ratio * leak_residual:
         tau_s = float(f"{-1.0 / leak_slope_per_s:.2g}")
         return tau_s, f"the amplifier leaks: put [leak] tau_s = {tau_s:g} into a device file"
-    if creep_slope < 0.0 and leak_residual > MIN_RESIDUAL_RATIO * creep_residual:
+    if creep_slope < 0.0 and leak_residual > min_residual_ratio * creep_residual:
         lost_percent = 100.0 * (1.0 - 10.0**creep_slope)
         return None, (
             f"the film creeps by {lost_percent:.2g} % in each decade of time, which is not corrected: set no [leak] "

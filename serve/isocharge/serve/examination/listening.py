@@ -19,9 +19,6 @@ from isocharge.serve.signal_chain.channels import channel_names
 BAUDS = (115200, 921600, 1000000, 2000000, 460800, 230400, 57600, 38400, 19200, 9600)
 """Baud rates to try, in this order, bit/s."""
 
-TRY_S = 1.0
-"""Time of listening at a baud rate before the next one is tried, s."""
-
 MIN_SPAN_S = 1e-3
 """Smallest time span of received bytes, s. It keeps rates finite."""
 
@@ -81,6 +78,7 @@ def listen(
     request: Request | None,
     has_frames: Callable[[ReceivedData], bool],
     wait: float = 0.0,
+    try_s: float = 1.0,
 ) -> ReceivedData:
     """Find the baud rate of a port, and listen to the port at this baud rate.
 
@@ -89,11 +87,12 @@ def listen(
 
     Args:
         url: The port.
-        bauds: Baud rates to try, bit/s, each for `TRY_S`.
+        bauds: Baud rates to try, bit/s.
         seconds: Time of listening at the right baud rate, s.
         request: Request that the board needs; None if the board sends frames by itself.
         has_frames: Function that returns whether most of the bytes are frames.
         wait: Time to wait until the port can be opened, s.
+        try_s: Time of listening at a baud rate before the next one is tried, s.
 
     Returns:
         The bytes at the chosen baud rate, which is the first of `bauds` if no baud rate is suitable.
@@ -105,7 +104,7 @@ def listen(
     chosen_baud = bauds[0]
     if has_speed(url) and len(bauds) > 1:
         for baud in bauds:
-            received = _listen_at_baud(url, baud, TRY_S, request, wait)
+            received = _listen_at_baud(url, baud, try_s, request, wait)
             if not received.chunks:
                 return received
             if has_frames(received):

@@ -20,12 +20,6 @@ from isocharge.serve.signal_chain.tare import TareRule
 CLEAN_SHARE = 0.99
 """Smallest share of bytes in good frames with a good cable and the right baud rate, dimensionless."""
 
-HUM_LIMIT_PC = 0.5
-"""Largest harmless amplitude of hum, pC. It is below the noise of the film."""
-
-DRIFT_LIMIT_PC_PER_S = 2.0
-"""Largest harmless drift, pC/s."""
-
 
 def transmission_sentences(capture: Capture, *, uses_telnet: bool) -> Iterator[str]:
     """Yield one sentence if no frames were received, or for each fault of the transmission.
@@ -105,7 +99,13 @@ def unit_sentences(unit: str) -> Iterator[str]:
     )
 
 
-def channel_sentences(channels: Sequence[ChannelHealth], unit: str, device: Device) -> Iterator[str]:
+def channel_sentences(
+    channels: Sequence[ChannelHealth],
+    unit: str,
+    device: Device,
+    max_drift_pC_per_s: float = 2.0,
+    max_hum_pC: float = 0.5,
+) -> Iterator[str]:
     """Yield a sentence for each problem of a channel that prevents a tare or makes contacts inaccurate.
 
     A tare is the measurement of the charges at rest. It requires a small noise and a small offset of each channel. The
@@ -115,6 +115,8 @@ def channel_sentences(channels: Sequence[ChannelHealth], unit: str, device: Devi
         channels: Offset, noise, drift and hum of each channel.
         unit: Unit of the channels.
         device: Settings of the board.
+        max_drift_pC_per_s: Largest harmless drift, pC/s.
+        max_hum_pC: Largest harmless amplitude of hum, pC. The default is below the noise of the film.
     """
     rule = device.rule(TareRule) or TareRule()  # the defaults if the device file has no tare
     if device.front_end == "current":  # a current of any size at rest is an offset
@@ -142,13 +144,13 @@ def channel_sentences(channels: Sequence[ChannelHealth], unit: str, device: Devi
                 f"{rule.offset_limit_pC:g} pC: remove what lies on the film; if the amplifier rests at this value, "
                 "subtract it with [gain] offset, which --write puts into the device file"
             )
-        if abs(channel.drift_pC_per_s) > DRIFT_LIMIT_PC_PER_S:
+        if abs(channel.drift_pC_per_s) > max_drift_pC_per_s:
             yield (
                 f"{name} drifts by {channel.drift_pC_per_s:.2g} pC/s, so that an untouched film may seem touched: "
                 "let the amplifier warm up, or put [leak] with the time constants of the amplifiers into a device file"
             )
         for frequency_Hz, hum_pC in zip(MAINS_HZ, channel.hum_pC, strict=True):
-            if hum_pC is not None and hum_pC > HUM_LIMIT_PC:
+            if hum_pC is not None and hum_pC > max_hum_pC:
                 yield f"{name} has a hum of {hum_pC:.2g} pC: set [hum] frequency_Hz = {frequency_Hz:g} in a device file"
 
 
@@ -158,9 +160,8 @@ def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress
     The force seems to change because the amplifiers leak. Touches are computed in any case.
 
     - If the device file contains time constants of a leak, each frame must contain the time of a clock of the device.
-    - If the user has held a press during the check, the settings that correct the press are requested, unless the
-      device file contains them.
     - If no press was held, the time constants of the amplifiers are requested, unless the device file contains them.
+      A press that was held shows whether they are needed, and its description states them.
 
     Args:
         capture: The frames, at least one.
@@ -173,10 +174,7 @@ def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress
             "send the time of a device clock in each frame (t_us, t_ms or t_s): without it the leak is corrected with "
             "the arrival times, which jitter"
         )
-    if held_press is not None:
-        if held_press.tau_s is not None and "leak" not in device.table:
-            yield f"put [leak] tau_s = {held_press.tau_s:g} into a device file"
-    elif device.rule(LeakRule) is None and device.front_end != "current":
+    if held_press is None and device.rule(LeakRule) is None and device.front_end != "current":
         yield (
             "state the time constants of the amplifiers in a device file ([leak] tau_s): without them the force of a "
             "held press seems to decrease. The time constants follow from the circuit. To measure them instead, listen "

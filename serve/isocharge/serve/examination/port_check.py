@@ -34,9 +34,6 @@ from isocharge.serve.signal_chain.gain import Gain, GainRule
 RIGHT_BAUD_SHARE = 0.5
 """Smallest share of bytes in good frames at the right baud rate, dimensionless."""
 
-PRESS_MARGIN_S = 0.2
-"""Time before the beginning of a held press that does not count as rest, s, because the force is already rising."""
-
 
 @dataclass(frozen=True)
 class Examination:
@@ -203,10 +200,9 @@ def examine_received(
     if not capture.frames or uses_telnet:
         return examination
 
-    # The last moments before a held press do not count as rest, because the force is already rising.
     values, times_s = capture.values()
     held_press = find_held_press(values, times_s)
-    rest_end_s = math.inf if held_press is None else held_press.begin_s - PRESS_MARGIN_S
+    rest_end_s = math.inf if held_press is None else held_press.rest_end_s
     is_rest = times_s < rest_end_s
 
     # If no gain is stated, the values remain as the board sends them. With a gain, they are converted to pC.

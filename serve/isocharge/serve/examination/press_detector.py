@@ -22,22 +22,6 @@ BLOCK_S = 0.1
 CHANGE_BLOCKS = 5
 """Number of blocks within which a touch changes the values, which is half a second."""
 
-CHANGE_SIGMAS = 20.0
-"""Smallest change within half a second that counts as a touch, in standard deviations of the noise of one frame."""
-
-MIN_NOISE_PC = 1.0
-"""Smallest noise of a channel in pC. The smallest touch is then 20 pC; 0.01 N on a film of 25 um cause 40 pC."""
-
-MAX_SLOW_CHANGE_PC = 100.0
-"""Largest change during the whole time without a touch, pC. It is the largest offset that a tare accepts."""
-
-RELEASE_SHARE = 0.3
-"""Share of the largest change below which the change must fall at the end of a press, dimensionless.
-
-Most of the fall must happen within half a second, because a leaking amplifier loses the charge of a held press slowly.
-The share is not smaller, because after the release such an amplifier returns to rest slowly.
-"""
-
 
 class Press(NamedTuple):
     """A press in a sequence of blocks.
@@ -53,7 +37,7 @@ class Press(NamedTuple):
     change: Array
 
 
-def find_press(levels: Array, noise: Array) -> Press | None:
+def find_press(levels: Array, noise: Array, sigmas: float = 20.0, release_share: float = 0.3) -> Press | None:
     """Find the first press in a sequence of blocks.
 
     A press begins when a channel changes within half a second by much more than its noise. A press ends when most of
@@ -62,11 +46,15 @@ def find_press(levels: Array, noise: Array) -> Press | None:
     Args:
         levels: Median of each channel in each block, shape (blocks, channels), in any unit.
         noise: Noise of each channel in one frame, shape (channels,).
+        sigmas: Smallest change within half a second with which a press begins, in standard deviations of the noise.
+        release_share: Share of the largest change below which the change must fall at the end of a press. The change
+            must also fall by this share within half a second, because a leaking amplifier loses the charge of a held
+            press slowly. The share is not smaller, because after the release such an amplifier returns to rest slowly.
 
     Returns:
         The press; None if no press begins.
     """
-    min_change = CHANGE_SIGMAS * noise
+    min_change = sigmas * noise
     earlier_blocks = np.maximum(np.arange(len(levels)) - CHANGE_BLOCKS, 0)
     begins_press = (np.abs(levels - levels[earlier_blocks]) > min_change).any(axis=1)
     if not begins_press.any():
@@ -77,8 +65,8 @@ def find_press(levels: Array, noise: Array) -> Press | None:
 
     # Sum of the changes, in which a channel counts as negative if it has another sign than at the largest change
     total = changes @ np.sign(changes[peak])
-    is_low = total < RELEASE_SHARE * total[peak]
-    is_falling = total[earlier_blocks] - total > RELEASE_SHARE * total[peak]
+    is_low = total < release_share * total[peak]
+    is_falling = total[earlier_blocks] - total > release_share * total[peak]
     is_gone = (np.abs(changes) <= min_change).all(axis=1)
     is_released = (is_low & is_falling) | is_gone
     is_released[: peak + 1] = False
@@ -100,7 +88,9 @@ class TouchFound(NamedTuple):
     time_s: float
 
 
-def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | None:
+def find_touch(
+    values: Array, times_s: Array, unit_is_pC: bool, min_noise_pC: float = 1.0, max_slow_change_pC: float = 100.0
+) -> TouchFound | None:
     """Search for a touch in the values of a film that should be at rest.
 
     If the values are in pC, a large slow change is a touch, too.
@@ -110,6 +100,10 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
         times_s: Times since the first frame, shape (n,), s.
         unit_is_pC: Whether the values are charges in pC. Otherwise the smallest change of a touch is derived from the
             noise only.
+        min_noise_pC: Smallest noise of a channel in pC. With the default, the smallest touch is 20 pC. A press of 0.01
+            N on a film of 25 um causes 40 pC.
+        max_slow_change_pC: Largest change during the whole time without a touch, pC. The default is the largest offset
+            that a tare accepts.
 
     Returns:
         The channel with the largest total change. None if the film is not touched, or if the time is too short.
@@ -121,10 +115,10 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
     smoothed = np.nan_to_num(np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0), posinf=0.0, neginf=0.0)
     noise = channel_noise(values)
     if unit_is_pC:
-        noise = np.maximum(noise, MIN_NOISE_PC)
+        noise = np.maximum(noise, min_noise_pC)
     press = find_press(smoothed, noise)
     total_changes = np.ptp(smoothed, axis=0)
-    is_slow_touch = unit_is_pC and bool((total_changes > MAX_SLOW_CHANGE_PC).any())
+    is_slow_touch = unit_is_pC and bool((total_changes > max_slow_change_pC).any())
     if press is None and not is_slow_touch:
         return None
     column = int(np.argmax(total_changes))

@@ -18,12 +18,6 @@ from isocharge.serve.signal_chain.channels import Channels, stated_unit
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.tare import TareRule
 
-QUIET_SHARE = 0.1
-"""Smallest noise of a channel that is connected to an electrode, relative to the median noise of the channels."""
-
-LARGEST_NOISE_V = 0.02
-"""Largest noise of a board that sends volts, V. Charges of a film in pC have more noise."""
-
 ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Names of the electrodes if there is no model."""
 
@@ -72,7 +66,7 @@ def propose(
     return table
 
 
-def unit_of(capture: Capture) -> str:
+def unit_of(capture: Capture, max_noise_V: float = 0.02) -> str:
     """Return the unit of the values of a board whose gain is unknown: "pC", "counts", "V", or a unit in the names.
 
     The unit is guessed from the names and the values of the channels. The first rule that applies determines the unit.
@@ -85,6 +79,7 @@ def unit_of(capture: Capture) -> str:
 
     Args:
         capture: The frames that were received. Without frames, the result is "pC".
+        max_noise_V: Largest noise of a board that sends volts, V. Charges of a film in pC have more noise.
     """
     units = {stated_unit(name) for name in capture.names}
     if len(units) == 1 and units != {""}:
@@ -97,10 +92,12 @@ def unit_of(capture: Capture) -> str:
         return "counts"
     largest_noise = max(estimate_noise(column) for column in finite_rows.T)
     names_state_volts = all(name.endswith("V") for name in capture.names)
-    return "V" if names_state_volts or 0.0 < largest_noise <= LARGEST_NOISE_V else "pC"
+    return "V" if names_state_volts or 0.0 < largest_noise <= max_noise_V else "pC"
 
 
-def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...]) -> dict[str, int]:
+def _choose_channels(
+    capture: Capture, values: Array, electrodes: tuple[str, ...], min_noise_share: float = 0.1
+) -> dict[str, int]:
     """Choose the channel of each electrode.
 
     If there are channels with the names of the electrodes, these channels are chosen. If the channels have other names,
@@ -111,6 +108,7 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
         capture: The frames.
         values: Values of all channels, shape (n, channels).
         electrodes: Electrodes of the model; empty for any model.
+        min_noise_share: Smallest noise of a channel that is connected to an electrode, relative to the median noise.
 
     Returns:
         Position of the channel in the frame by the name of the electrode; empty if there are too few channels.
@@ -119,7 +117,7 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
     noise = np.array([estimate_noise(column) for column in values.T])
     noise[2 * np.isfinite(values).sum(axis=0) <= len(values)] = 0.0
     usual_noise = np.median(noise[noise > 0.0]) if noise.any() else 0.0
-    candidates = np.flatnonzero(noise >= QUIET_SHARE * usual_noise).tolist()
+    candidates = np.flatnonzero(noise >= min_noise_share * usual_noise).tolist()
     if not electrodes:
         electrodes = tuple(ELECTRODES[: len(candidates)])  # A, B, C, ...
     try:

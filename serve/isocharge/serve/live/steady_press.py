@@ -19,12 +19,6 @@ from isocharge.common.arrays import Array
 from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE
 from isocharge.serve.frames.frame import Frame
 
-CHECKS_PER_WINDOW = 10
-"""Number of times that a window is examined within its length.
-
-A board may send thousands of frames per second, so that it would take too long to examine the window at every frame.
-"""
-
 PORT_LOST = "the port was lost: do not touch the film until it is tared"
 """Reason for which a press is refused if the port was lost."""
 
@@ -33,9 +27,6 @@ NO_REST_BEFORE_PRESS = (
     "help, the amplifier leaks: state its time constant in the section [leak] of a device file"
 )
 """Reason for which a press is refused if the film was not at rest before the press."""
-
-MIN_REST_FRAMES = 3
-"""Smallest number of frames at rest that must precede a press."""
 
 
 class Phase(StrEnum):
@@ -112,6 +103,12 @@ class Press:
     """Time since the touch after which a press is refused if it is not steady yet, s. A longer press would have a
     larger error of the leak correction."""
 
+    CHECKS_PER_WINDOW = 10
+    """Number of times that a window is examined within its length. At every frame it would take too long."""
+
+    MIN_REST_FRAMES = 3
+    """Smallest number of frames at rest that must precede a press."""
+
     MIN_HELD_S = 0.1
     """Shortest duration of a press, s. Shorter touches are ignored."""
 
@@ -142,7 +139,7 @@ class Press:
         self.begin_s = begin_s
         self.end_s = begin_s
         self.reason = ""
-        self._has_rest = len(rest_charges_pC) >= MIN_REST_FRAMES
+        self._has_rest = len(rest_charges_pC) >= self.MIN_REST_FRAMES
         self.rest_pC = np.mean(rest_charges_pC, axis=0) if rest_charges_pC else np.zeros(len(electrodes))
         self._window: deque[Frame] = deque()  # the latest frames
         self._last_check_s = begin_s  # time at which the window was last examined
@@ -172,7 +169,7 @@ class Press:
 
         # The window is examined several times within its length, but not in each frame, which would take too long.
         is_window_full = held_s >= self.WINDOW_S and len(self._window) >= self.MIN_FRAMES
-        if is_window_full and self.end_s - self._last_check_s >= self.WINDOW_S / CHECKS_PER_WINDOW:
+        if is_window_full and self.end_s - self._last_check_s >= self.WINDOW_S / self.CHECKS_PER_WINDOW:
             self._last_check_s = self.end_s
             press = self._examine_window(frame.noise_pC)
             if press is not None:

@@ -26,9 +26,6 @@ from isocharge.serve.signal_chain.stage import Stage
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule
 
-BYTES_TO_RECOGNISE = 8192
-"""If a stream contains no intact frame in more than this number of bytes, an error is raised."""
-
 LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
 """Flags of a frame without a record that are added to the next record. They describe events before the next record."""
 
@@ -176,7 +173,7 @@ class ReadingStream:
         Raises:
             ChargeError: If a frame has no value for an electrode.
             TareError: If the film is touched during the whole search for a tare.
-            NoFramesError: If the stream has contained no intact frame in more than `BYTES_TO_RECOGNISE` bytes.
+            NoFramesError: If the stream has contained no intact frame in many bytes.
         """
         if chunk.outage_s > 0.0:
             self._reconnect()
@@ -199,7 +196,7 @@ class ReadingStream:
         """
         self._check_recognised(max_bytes=-1)  # raises an error without a frame, even if no bytes have arrived
 
-    def _check_recognised(self, max_bytes: int = BYTES_TO_RECOGNISE) -> None:
+    def _check_recognised(self, max_bytes: int = 8192) -> None:
         """Raise an error if the parser has found no intact frame in more than `max_bytes` bytes.
 
         Raises:

@@ -18,17 +18,11 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.frames.frame_field import ByteOrder
 from isocharge.serve.recognition.framing import INTACT_SHARE, Bytes, usual_bytes
 
-STEADY_SPREAD = 0.7
-"""Largest deviation of a regular step of a counter or clock from the median step, relative to the median step."""
-
 CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
     tick_rate_Hz: ("t_us", 1e6 / tick_rate_Hz)
     for tick_rate_Hz in (100.0, 1e4, 1e5, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6)
 }
 """Name of the field, and value of one tick in the unit of that name, by the tick rate of a clock, Hz."""
-
-CLOCK_RATE_TOLERANCE = 0.06
-"""Largest relative deviation of a tick rate from a usual tick rate. It is large, because frames arrive in bursts."""
 
 PLAUSIBLE_MAGNITUDES = (1e-7, 1e8)
 """Smallest and largest typical magnitude of a floating-point channel."""
@@ -37,28 +31,31 @@ TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "f32", "f64")
 """Types of numbers, as in device files."""
 
 
-def steady_step(steps: Array) -> float:
+def steady_step(steps: Array, max_deviation: float = 0.7) -> float:
     """Return the mean of the regular steps of a counter or clock, or 0 if too few steps are regular.
 
     A step is regular if it is close to the median step. For example, a step across a lost frame is not regular.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
+        max_deviation: Largest deviation of a regular step from the median step, relative to the median step.
     """
     median_step = np.median(steps)
-    is_regular = np.abs(steps - median_step) <= STEADY_SPREAD * median_step
+    is_regular = np.abs(steps - median_step) <= max_deviation * median_step
     regular_steps = steps[is_regular]
     if len(regular_steps) < INTACT_SHARE * len(steps):
         return 0.0
     return float(regular_steps.mean())
 
 
-def identify_clock(steps: Array, frame_rate_Hz: float) -> tuple[str, float] | None:
+def identify_clock(steps: Array, frame_rate_Hz: float, tolerance: float = 0.06) -> tuple[str, float] | None:
     """Identify a clock by comparing its tick rate with the usual tick rates of boards.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
         frame_rate_Hz: Number of frames per second, Hz.
+        tolerance: Largest relative deviation of a tick rate from a usual tick rate. It is large, because frames
+            arrive in bursts.
 
     Returns:
         The name of the field, which is `t_s`, `t_ms` or `t_us`, and the duration of one tick in the unit of this name.
@@ -68,7 +65,7 @@ def identify_clock(steps: Array, frame_rate_Hz: float) -> tuple[str, float] | No
     tick_rate_Hz = ticks_per_frame * frame_rate_Hz
     deviations = {usual_tick_rate_Hz: abs(tick_rate_Hz / usual_tick_rate_Hz - 1.0) for usual_tick_rate_Hz in CLOCKS}
     nearest_tick_rate_Hz = min(deviations, key=deviations.__getitem__)
-    return CLOCKS[nearest_tick_rate_Hz] if deviations[nearest_tick_rate_Hz] < CLOCK_RATE_TOLERANCE else None
+    return CLOCKS[nearest_tick_rate_Hz] if deviations[nearest_tick_rate_Hz] < tolerance else None
 
 
 @dataclass(frozen=True)

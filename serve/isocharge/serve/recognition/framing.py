@@ -46,9 +46,6 @@ COVERED_SHARE = 0.4
 MAX_CONSTANT_BYTES = 16
 """Largest number of constant bytes that are tried as the beginning of a frame, or of the bytes under a checksum."""
 
-MAX_FRAME_LENGTHS = 3
-"""Number of frame lengths that are tried."""
-
 
 class FrameDivision(NamedTuple):
     """Division of a stream into windows of bytes, one window for each frame. All frames have the same length.
@@ -172,17 +169,17 @@ def _most_common_length(frames: Sequence[bytes]) -> tuple[int, int]:
     return Counter(map(len, frames)).most_common(1)[0]
 
 
-def _synchronised_frames(stream: Bytes) -> Iterator[FrameDivision]:
+def _synchronised_frames(stream: Bytes, max_lengths: int = 3) -> Iterator[FrameDivision]:
     """Yield divisions of a stream into frames that begin at a repeated byte or a repeated pair of bytes.
 
     If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. Frames are
     therefore assumed to begin at every repetition of a byte or pair. The score of this assumption is the share of the
     stream that these frames would cover. For each frame length, the byte or pair with the highest score is chosen. The
-    divisions with the
-    `MAX_FRAME_LENGTHS` highest scores are yielded.
+    divisions with the highest scores are yielded.
 
     Args:
         stream: Bytes of the stream, shape (n,).
+        max_lengths: Largest number of divisions.
     """
     single_bytes = stream.astype(np.int64)
     byte_pairs = 256 * single_bytes[:-1] + single_bytes[1:]
@@ -204,7 +201,7 @@ def _synchronised_frames(stream: Bytes) -> Iterator[FrameDivision]:
         """
         return -round(best_score[length], 1), length
 
-    best_lengths = sorted(best_score, key=best_first)[:MAX_FRAME_LENGTHS]
+    best_lengths = sorted(best_score, key=best_first)[:max_lengths]
     for length in best_lengths:
         yield FrameDivision(SYNC, stream, best_starts[length], length)
 
@@ -242,9 +239,6 @@ def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray
         if covered_positions >= COVERED_SHARE * len(codes):
             yield distance, positions[code_distance_pairs == pair]
 
-
-MAX_CHECKED_FRAMES = 24
-"""Largest number of different frames from which a checksum is recognised."""
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
 """Byte orders that are tried."""
@@ -298,17 +292,18 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
                 yield first_check
 
 
-def _drawn_rows(rows: Bytes) -> Bytes:
-    """Draw at most `MAX_CHECKED_FRAMES` different frames at random.
+def _drawn_rows(rows: Bytes, max_count: int = 24) -> Bytes:
+    """Draw different frames at random, from which a checksum is recognised.
 
     The first frames of the sorted array would be unsuitable. They differ in a few bits only, so a wrong checksum could
     fit all of them by chance. The result is always the same for the same frames.
 
     Args:
         rows: Bytes of the frames, shape (n, length).
+        max_count: Largest number of frames.
     """
     different_rows = np.unique(rows, axis=0)  # sorted
-    drawn_indices = np.random.default_rng(0).permutation(len(different_rows))[:MAX_CHECKED_FRAMES]
+    drawn_indices = np.random.default_rng(0).permutation(len(different_rows))[:max_count]
     return np.asarray(different_rows[drawn_indices])
 
 
