@@ -196,8 +196,8 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
     draw_electrodes(left, forward_map.sensor, names=False)
     draw_section(middle, equilibrium)
     true_contact, contact = followed.transpose(1, 2, 0)  # each of shape (3, n)
-    right.plot(true_contact[0], true_contact[1], ".", color=PRESSED, ms=4.0, label="pressed")
-    right.plot(contact[0], contact[1], ".", color=FELT, ms=1.0, label="estimated")
+    right.plot(true_contact[0], true_contact[1], ".", color=PRESSED, ms=1.5, zorder=3, label="pressed")
+    right.plot(contact[0], contact[1], ".", color=FELT, ms=3.0, label="estimated")
     right.legend(loc="upper right")
     draw_layout(right, forward_map.sensor, forward_map.domain.radius, "live contacts, through the port")
 
