@@ -67,12 +67,6 @@ def test_points_off_the_film_raise_scene_error(made_up, read):
     read(solved, np.array([(0.0, 45.0)]))
 
 
-# Made-up fields
-
-
-# Real ones
-
-
 def test_vertical_forces_balance_round_the_probe(film):
     """The stress on a circle around the probe balances the force, F = integral of (S grad w) . n h ds.
 

@@ -79,8 +79,7 @@ class Geometry:
         rule = _quadrature(template.resolution.order)
         gradient, determinant = _film_gradient(rule.derivatives[:, None], points)
         weights = determinant * rule.weights
-        node_jacobian = _jacobian(rule.node_derivatives[:, None], points)
-        mass = node_jacobian.determinant * rule.node_weights
+        mass = _determinant(rule.node_derivatives[:, None], points) * rule.node_weights
 
         # Integrate the pressure times each basis function over the elements of the footprint.
         footprint = template.footprint
@@ -378,23 +377,10 @@ def _integrate_pressure(order: int, points: Complexes, pressure: Pressure) -> Ar
     """
     xi, eta, reference_weights = gauss_reference_square(PRESSURE_POINTS)
     values, derivatives = tensor_basis(order, xi, eta)
-    film_weights = _jacobian(derivatives[:, None], points).determinant * reference_weights
+    film_weights = _determinant(derivatives[:, None], points) * reference_weights
     quadrature_points = points @ values.T  # film points, shape (n_element, n_point)
     force_at_points = pressure(quadrature_points) * film_weights
     return np.asarray(force_at_points @ values)
-
-
-class _Jacobian(NamedTuple):
-    """Derivatives of the film coordinates (x, y) with respect to the local coordinates (xi, eta) of elements.
-
-    Each array has the shape (n_element, n_point). The field `determinant` is the determinant of the four derivatives.
-    """
-
-    x_xi: Array
-    x_eta: Array
-    y_xi: Array
-    y_eta: Array
-    determinant: Array
 
 
 @lru_cache(maxsize=16)
@@ -419,7 +405,7 @@ def _quadrature(order: int) -> _Quadrature:
     return _Quadrature(values, derivatives, weights, node_derivatives, node_weights)
 
 
-def _film_gradient(derivatives: Array, points: np.ndarray) -> tuple[Array, Array]:
+def _film_gradient(derivatives: Array, points: Complexes) -> tuple[Array, Array]:
     """Compute the derivatives of the basis functions with respect to the film coordinates.
 
     Args:
@@ -432,31 +418,35 @@ def _film_gradient(derivatives: Array, points: np.ndarray) -> tuple[Array, Array
         Derivatives with respect to (X1, X2), shape (n_element, n_point, 2, n_local). Determinant of the Jacobian, shape
         (n_element, n_point).
     """
-    # The inverse of the Jacobian has the rows (y_eta, -y_xi) and (-x_eta, x_xi), divided by the determinant. The first
-    # row belongs to X1, and the second row to X2.
-    jacobian = _jacobian(derivatives, points)
-    determinant = jacobian.determinant
-    adjugate = np.stack([jacobian.y_eta, -jacobian.y_xi, -jacobian.x_eta, jacobian.x_xi], axis=-1)
-    inverse = (adjugate / determinant[..., None]).reshape(*determinant.shape, 2, 2)
-
-    # Sum over the local coordinate b, for each element e, point p, film coordinate a and node n.
-    gradient = np.einsum("epab,bepn->epan", inverse, derivatives)
-    return gradient, determinant
+    # With the derivatives z_xi and z_eta of the film points z = x + iy, the determinant is the imaginary part of
+    # conj(z_xi) z_eta. The derivatives of a function f are f_x + i f_y = i (z_xi f_eta - z_eta f_xi) / determinant.
+    z_xi, z_eta = _point_derivatives(derivatives, points)
+    determinant = (np.conj(z_xi) * z_eta).imag
+    f_xi, f_eta = derivatives
+    complex_gradient = 1j * (z_xi[..., None] * f_eta - z_eta[..., None] * f_xi) / determinant[..., None]
+    return np.stack([complex_gradient.real, complex_gradient.imag], axis=2), determinant
 
 
-def _jacobian(derivatives: Array, points: np.ndarray) -> _Jacobian:
-    """Compute the Jacobian of the map from the reference element to the film.
+def _determinant(derivatives: Array, points: Complexes) -> Array:
+    """Compute the determinant of the Jacobian of the map from the reference element to the film.
 
     Args:
-        derivatives: Derivatives of the basis functions with respect to (xi, eta), shape
-            (2, n_element, n_point, n_local). The second axis may have the length 1 if the derivatives are the same for
-            all elements.
+        derivatives: Derivatives of the basis functions; see `_film_gradient`.
+        points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
+
+    Returns:
+        Determinants, shape (n_element, n_point).
+    """
+    z_xi, z_eta = _point_derivatives(derivatives, points)
+    return np.asarray((np.conj(z_xi) * z_eta).imag)
+
+
+def _point_derivatives(derivatives: Array, points: Complexes) -> Complexes:
+    """Compute the derivatives of film points with respect to (xi, eta), shape (2, n_element, n_point).
+
+    Args:
+        derivatives: Derivatives of the basis functions; see `_film_gradient`.
         points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
     """
-    # Sum over the nodes n, for each local coordinate k (xi or eta), element e and point p. The real part of the result
-    # contains the derivatives of x, and the imaginary part contains the derivatives of y.
-    point_derivatives = np.einsum("kepn,en->kep", derivatives, points)
-    x_xi, x_eta = point_derivatives.real
-    y_xi, y_eta = point_derivatives.imag
-    determinant = x_xi * y_eta - x_eta * y_xi
-    return _Jacobian(x_xi, x_eta, y_xi, y_eta, determinant)
+    # Sum over the nodes n, for each local coordinate k (xi or eta), element e and point p.
+    return np.asarray(np.einsum("kepn,en->kep", derivatives, points))
