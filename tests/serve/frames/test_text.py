@@ -109,11 +109,6 @@ def test_header_names_the_columns():
     assert [(frame.seq, frame.t_us) for frame in frames] == [(0, 0), (1, 1000), (2, 2000), (3, 3000)]
 
 
-def test_repeated_header_after_a_reset_of_the_board_is_ignored():
-    frames = feed("A,B", "1,2", "3,4", "5,6", "A,B", "7,8")
-    assert [frame.values for frame in frames] == [(1, 2), (3, 4), (5, 6), (7, 8)]
-
-
 def test_columns_are_named_by_the_device_file():
     frames = feed("7,12.5,801", "8,13.5,801", "9,14.5,801", parser=TextParser(("seq", "t_ms", "A")))
     assert frames[1] == Frame(8, 13500, (801.0,), names=("A",))
@@ -198,10 +193,22 @@ def test_message_does_not_replace_the_header(message, is_after_header):
     assert [frame.names for frame in frames] == [("b", "a", "c", "d") if is_after_header else ()] * 4
 
 
-def test_hexadecimal_numbers():
-    frames = feed("0x7FF0 0x8001 0x8011", "0x7FF1 0x8001 0x8011", "0x7FF2 0x8001 0x8011")
-    assert frames[0].values == (0x7FF0, 0x8001, 0x8011)
-    assert feed("7,0x1F", "8,-0x20", "9,0x0")[1].values == (8, -32)
+MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready", "load:0x3fff0018,len:4"] + ["rst:0x1,boot:0x13"] * 2
+
+
+@pytest.mark.parametrize(
+    ("lines", "values"),
+    [
+        (["A,B", "1,2", "3,4", "5,6", "A,B", "7,8"], [(1, 2), (3, 4), (5, 6), (7, 8)]),
+        ([*MESSAGES, "1,2,3", "4,5,6", "7,8,9"], [(1, 2, 3), (4, 5, 6), (7, 8, 9)]),
+        (["READ 1", "0,2", "READ 1", "1,2", "READ 1", "2,2"], [(0, 2), (1, 2), (2, 2)]),
+        (["0x7FF0 0x8001", "0x7FF1 0x8001", "0x7FF2 0x8011"], [(0x7FF0, 0x8001), (0x7FF1, 0x8001), (0x7FF2, 0x8011)]),
+        (["7,0x1F", "8,-0x20", "9,0x0"], [(7, 31), (8, -32), (9, 0)]),
+    ],
+    ids=["a header after a reset", "messages of a board that starts", "an echo", "hexadecimal", "mixed"],
+)
+def test_lines_that_are_frames(lines, values):
+    assert [frame.values for frame in feed(*lines)] == values
 
 
 def test_time_of_day_is_the_clock_which_wraps_at_midnight():
@@ -238,17 +245,6 @@ def test_values_that_are_not_numbers_or_out_of_range_are_not_finite():
 def test_header_names_the_columns_that_contain_numbers(header, line, names):
     frames = feed("booting ...", header, *(line.format(n=1000 + 7 * n) for n in range(4)))
     assert frames[-1].names == names
-
-
-def test_messages_of_a_board_that_starts_are_no_frames():
-    messages = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready", "load:0x3fff0018,len:4"]
-    frames = feed(*messages, *["rst:0x1,boot:0x13"] * 2, "1,2,3", "4,5,6", "7,8,9")
-    assert [frame.values for frame in frames] == [(1, 2, 3), (4, 5, 6), (7, 8, 9)]
-
-
-def test_echo_with_a_number_between_the_frames_is_dropped():
-    frames = feed(*(line for n in range(5) for line in ("READ 1", f"{n},2,3")))
-    assert [frame.values[0] for frame in frames] == [0, 1, 2, 3, 4]
 
 
 def cycles_of_lines(count):
