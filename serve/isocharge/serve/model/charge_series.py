@@ -28,7 +28,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.polynomial import chebyshev
+from numpy.polynomial import chebyshev, polynomial
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
@@ -277,26 +277,20 @@ def _limited_exp(logarithm: Array) -> Array:
 def interpolation_weights(nodes: Array, points: Array) -> tuple[Array, Array]:
     """Compute the weights of a polynomial interpolation between nodes (Lagrange), and their derivatives.
 
-    Outside the range of the nodes, the interpolation is continued linearly.
-
     Args:
         nodes: Nodes, shape (n_node,), ascending.
-        points: Points at which values are interpolated, shape (n,).
+        points: Points at which values are interpolated, shape (n,), in the range of the nodes.
 
     Returns:
         Weights of the values at the nodes, and the derivatives of the weights with respect to the points, each of shape
         (n, n_node).
     """
-    clipped = np.clip(points, nodes[0], nodes[-1])
-    # With the Vandermonde matrix V of the nodes, the weights of a point p are (1, p, p^2, ...) V^-1.
     scale = max(float(np.abs(nodes).max()), 1e-12)  # of all powers, so that the matrix is well conditioned
-    powers = np.arange(nodes.size)
-    inverse = np.linalg.inv(np.power.outer(nodes / scale, powers))
-    point_powers = np.power.outer(clipped / scale, powers)
-    power_slopes = np.zeros_like(point_powers)
-    power_slopes[:, 1:] = powers[1:] * point_powers[:, :-1] / scale
-    slopes = power_slopes @ inverse
-    return point_powers @ inverse + (points - clipped)[:, None] * slopes, slopes
+    # Each column contains the coefficients of the polynomial that is 1 at one node, and 0 at the others.
+    node_polynomials = np.linalg.inv(polynomial.polyvander(nodes / scale, nodes.size - 1))
+    weights = polynomial.polyval(points / scale, node_polynomials)
+    slopes = polynomial.polyval(points / scale, polynomial.polyder(node_polynomials)) / scale
+    return np.asarray(weights.T, dtype=float), np.asarray(slopes.T, dtype=float)
 
 
 def _continued(values: Array, excess: Array) -> Array:

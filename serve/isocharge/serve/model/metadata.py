@@ -97,19 +97,11 @@ class UnnoticedPresses(Struct, frozen=True, kw_only=True):
             raise WrongKey("share", "as many sectors in every ring", sector_counts)
 
     @property
-    def ring_edges_mm(self) -> Array:
-        """Radii of the circles between the rings, shape (n_ring + 1,), mm."""
-        return np.linspace(self.from_mm, self.to_mm, len(self.share) + 1)
-
-    @property
-    def ring_shares(self) -> Array:
-        """Share of unnoticed presses in each ring, from 0 to 1, shape (n_ring,)."""
-        return np.asarray(np.mean(self.share, axis=1))
-
-    @property
     def total_share(self) -> float:
         """Share of unnoticed presses between the two circles, from 0 to 1. The rings are weighted by their areas."""
-        return float(np.average(self.ring_shares, weights=np.diff(self.ring_edges_mm**2)))
+        edges_mm = np.linspace(self.from_mm, self.to_mm, len(self.share) + 1)
+        ring_shares = np.mean(self.share, axis=1)
+        return float(np.average(ring_shares, weights=np.diff(edges_mm**2)))
 
     @property
     def summary(self) -> str:

@@ -108,8 +108,8 @@ def robust_estimate(
     start_contacts: Array,
     *,
     measured: MeasuredContacts | None = None,
-    contact_bounds: tuple[Array, Array] = (np.full(3, -np.inf), np.full(3, np.inf)),
-    state_bounds: tuple[Array, Array] | None = None,
+    contact_bounds: tuple[Array, Array] | tuple[float, float] = (-np.inf, np.inf),
+    state_bounds: tuple[Array, Array] | tuple[float, float] = (-np.inf, np.inf),
     freedom: float = 4.0,
     max_steps: int = 20,
     tolerance: float = 1e-3,
@@ -138,7 +138,7 @@ def robust_estimate(
     rejected = 0
     for _ in range(max_steps):
         state_step, contact_step = problem.step(point, damping)
-        state = _clipped(point.state + state_step, state_bounds)
+        state = np.clip(point.state + state_step, *state_bounds)
         contacts = np.clip(point.contacts + contact_step, *contact_bounds)
         trial = problem.evaluate(state, contacts)
         if not trial.cost <= point.cost:  # also if the cost is not a number
@@ -162,11 +162,6 @@ def robust_estimate(
         chi2=point.chi2,
         cost=point.cost,
     )
-
-
-def _clipped(state: Array, bounds: tuple[Array, Array] | None) -> Array:
-    """Move a state into its bounds."""
-    return state if bounds is None else np.clip(state, *bounds)
 
 
 class _Point(NamedTuple):
