@@ -23,7 +23,6 @@ from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.forward.derivative_maps import SideForceMap
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.placed_mesh import Geometry, place
-from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template
 from kept import kept
 
@@ -45,15 +44,7 @@ class Mesh:
     """A template that is placed on a film of unit radius."""
 
     template: Template
-    placement: Placement
     geometry: Geometry
-    points: np.ndarray
-    """(X1, X2) of the nodes, shape (n_node, 2)."""
-
-    @property
-    def inside(self) -> np.ndarray:
-        """True for the nodes that are not on the rim, shape (n_node,)."""
-        return ~self.template.on_rim
 
     def random_field(self, seed: int, components: int = 3) -> np.ndarray:
         """Return independent random values at the nodes, shape (n_node, components).
@@ -64,18 +55,6 @@ class Mesh:
         field[self.template.on_rim, :3] = 0.0
         field[self.template.on_axis, 1:2] = 0.0
         return field
-
-
-def _mesh(probe: Probe, at: tuple[float, float], resolution: Resolution) -> Mesh:
-    mesh = place(Film(1.0, 1e-3, 1.0, 0.3), probe, at, resolution, 0.05)
-    points = np.stack([mesh.node_points.real, mesh.node_points.imag], axis=1)
-    return Mesh(mesh.template, mesh.placement, mesh.geometry, points)
-
-
-@pytest.fixture(scope="session")
-def mesh_of() -> Callable[[Probe, tuple[float, float], Resolution], Mesh]:
-    """Function that returns a mesh for a probe, its position in film radii, and a resolution."""
-    return _mesh
 
 
 PROBES = {
@@ -89,7 +68,8 @@ PROBES = {
 @pytest.fixture(scope="session", params=PROBES.values(), ids=PROBES.keys())
 def mesh(request: pytest.FixtureRequest) -> Mesh:
     """A small mesh for each kind of template, with thin rings at the rim and a probe away from the centre."""
-    return _mesh(request.param, (0.4, 0.0), Resolution(3, 8, 2, 1))
+    placed = place(Film(1.0, 1e-3, 1.0, 0.3), request.param, (0.4, 0.0), Resolution(3, 8, 2, 1), 0.05)
+    return Mesh(placed.template, placed.geometry)
 
 
 def assembled(mesh: Template, matrix: np.ndarray) -> np.ndarray:

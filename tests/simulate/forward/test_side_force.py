@@ -126,6 +126,6 @@ def test_invalid_side_forces_raise_scene_errors(film, side_force):
         press(film, PROBE, (3.0, 0.0), 1.0, side_force=side_force)
 
 
-def test_a_linear_theory_with_a_side_force_raises_a_scene_error(film):
+def test_invalid_coefficient_of_friction_raises_a_scene_error(film):
     with pytest.raises(SceneError, match=r"coefficient from 0 to 1, got 1\.5"):
         friction_force(press(film, PROBE, (3.0, 0.0), 0.01), 1.5)

@@ -44,6 +44,12 @@ def test_very_uneven_pretension_has_an_accurate_mesh_under_a_small_force():
     np.testing.assert_allclose(chosen, expected, atol=3e-4 * expected.max())
 
 
+@pytest.mark.parametrize("wrong", [(1, 8, 4, 0), (4, 3, 4, 0), (4, 8, 0, 0), (4, 8, 4, -1)])
+def test_resolution_rejects_values_out_of_range(wrong):
+    with pytest.raises(ValueError, match=f"got {wrong[0]}, {wrong[1]}, {wrong[2]}, {wrong[3]}"):
+        Resolution(*wrong)
+
+
 # Two meshes
 
 SCENES = {
