@@ -1,7 +1,8 @@
 """Available kinds of outputs, and the class that writes records to all outputs of a command."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import ExitStack
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Self
@@ -117,6 +118,8 @@ class Outputs:
         self._kinds = {target: kinds[target] for target in other_targets + stdout_targets}
         self._context = context
         self._outputs: dict[str, Output] = {}
+        self._stack = ExitStack()  # closes or discards all outputs, the latest first
+        self._is_discarded = False
         self.not_written: dict[str, int | None] = {}
 
     def __enter__(self) -> Self:
@@ -129,7 +132,8 @@ class Outputs:
             try:
                 output = kind.open(target, self._context)
             except BaseException as error:
-                self._discard()
+                self._is_discarded = True
+                self.close()
                 if isinstance(error, Exception):
                     raise output_error(error, target)  # noqa: B904  # the cause is set
                 raise
@@ -137,6 +141,7 @@ class Outputs:
             if self._context.is_live and kind.may_block:
                 output = self._queued(output, target, kind)
             self._outputs[target] = output
+            self._stack.callback(self._close_or_discard, target, output)
         return self
 
     def _queued(self, output: Output, target: str, kind: OutputKind) -> QueuedOutput:
@@ -158,10 +163,8 @@ class Outputs:
         If an exception has ended a replay, the outputs are discarded instead of closed, and their incomplete files are
         removed.
         """
-        if error is not None and not self._context.is_live:
-            self._discard()
-        else:
-            self.close()
+        self._is_discarded = error is not None and not self._context.is_live
+        self.close()
 
     @property
     def has_incomplete_file(self) -> bool:
@@ -188,41 +191,34 @@ class Outputs:
         """Close all open outputs, and store in `not_written` how many records each output has not received.
 
         Raises:
-            BaseException: The first error that occurred, or Ctrl-C. All other outputs are closed before it is raised.
+            BaseException: An error that occurred, or Ctrl-C. All other outputs are closed before it is raised.
         """
-        errors: list[BaseException] = []
-        for target, output in self._remove_each():
-            try:
-                output.close()
-            except KeyboardInterrupt as interruption:
-                errors.append(interruption)
-            except Exception as error:
-                errors.append(output_error(error, target))
-            # Only a queue can lose records without raising an error.
-            if isinstance(output, QueuedOutput) and output.has_failed:
-                self.not_written[target] = None  # the number is unknown, because the output has stopped
-            elif isinstance(output, QueuedOutput) and output.lost > 0:
-                self.not_written[target] = output.lost
-        if errors:
-            raise errors[0]
+        self._stack.close()
 
-    def _discard(self) -> None:
-        """Discard all open outputs, because they have not received all records.
+    def _close_or_discard(self, target: str, output: Output) -> None:
+        """Close an output, or discard it if a replay was stopped, because it has not received all records.
 
-        An error of an output is written to the log, because the error that has ended the command is more important.
+        An error while an output is discarded is written to the log, because the error that has ended the command is
+        more important.
+
+        Raises:
+            Exception: The error of the output, if it cannot be closed.
         """
-        for target, output in self._remove_each():
+        if self._is_discarded:
             try:
                 discard(output)
             except Exception as error:
                 log.error("%s", output_error(error, target))
             if not self._kinds[target].writes_nothing:
                 self.not_written[target] = None  # the number of missing records is unknown
-
-    def _remove_each(self) -> Iterator[tuple[str, Output]]:
-        """Remove the open outputs one by one, the latest first, and yield each output with its target.
-
-        An output is removed before the caller closes it, so that no output is closed twice.
-        """
-        while self._outputs:
-            yield self._outputs.popitem()
+            return
+        try:
+            output.close()
+        except Exception as error:
+            raise output_error(error, target)  # noqa: B904  # the cause is set
+        finally:
+            # Only a queue can lose records without raising an error.
+            if isinstance(output, QueuedOutput) and output.has_failed:
+                self.not_written[target] = None  # the number is unknown, because the output has stopped
+            elif isinstance(output, QueuedOutput) and output.lost > 0:
+                self.not_written[target] = output.lost
