@@ -3,10 +3,9 @@
 A board of 1 kHz plays on a pseudo-terminal; `isocharge serve stream --live --record` follows it. Rounds without viewers
 and rounds with three (one of which stalls) take turns in one run; each stream is a process of its own, as is the board
 and the viewers. Reported: the reader's latency (last byte to record), the frames that the recording misses, the age of
-the newest sample when a viewer has it. With --browser, headless Chromium is one of the viewers and says how old its
-pictures are and how many a second it draws.
+the newest sample when a viewer has it.
 
-    python tests/benchmarks/bench_live.py --rounds 4 --seconds 10 [--browser] [--rate-hz 1000]
+    python tests/benchmarks/bench_live.py --rounds 4 --seconds 10 [--rate-hz 1000]
 """
 
 import http.client
@@ -27,9 +26,6 @@ import bench_stream
 import numpy as np
 from shared import arguments, percentiles, print_results
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from headless_chromium import start_chromium
 from isocharge.serve import Recording, Script, wander
 
 SHARES = (50, 95, 99)
@@ -65,19 +61,6 @@ def _watch(place, stalls, seconds):
     return ages
 
 
-def browse(url, seconds):
-    """Chromium's view: ages of its pictures (ms), and pictures a second."""
-    with start_chromium() as browser:
-        page = browser.new_page(viewport={"width": 1280, "height": 820})
-        page.goto(url)
-        page.wait_for_timeout(3000)
-        page.evaluate("isocharge.page.ages.length = 0")
-        page.wait_for_timeout(1e3 * seconds)
-        ages = page.evaluate("isocharge.page.ages")
-        rate = page.evaluate("(({starts: s}) => 1000 * (s.length - 1) / (s.at(-1) - s[0]))(isocharge.page)")
-    return ages, rate
-
-
 @contextmanager
 def following(port, folder, name, *words):
     """A stream that follows the port and has its tare; the URL of its page."""
@@ -97,24 +80,24 @@ def following(port, folder, name, *words):
         process.wait(30)
 
 
-def one_round(port, viewers, seconds, folder, name, in_browser):
-    """Follow the port for a while: latencies (us), lost frames, ages (s), and what the browser says."""
+def one_round(port, viewers, seconds, folder, name):
+    """Follow the port for a while: latencies (us), lost frames and ages (s)."""
     path, (ours, theirs) = folder / f"{name}.rec", multiprocessing.Pipe(duplex=False)
     words = ["--live", "127.0.0.1:0"] if viewers else []
     with following(port, folder, name, "--record", path, *words) as url:
-        watching = multiprocessing.Process(target=watch, args=(url, viewers - in_browser, seconds, theirs))
+        watching = multiprocessing.Process(target=watch, args=(url, viewers, seconds, theirs))
         if viewers:
             watching.start()
-        browsed = browse(url, seconds) if in_browser else time.sleep(seconds)
+        time.sleep(seconds)
         ages = ours.recv() if viewers else []
     latencies = np.array([us for event in Recording(path).events() for us in event.latencies_us])
     lines = (json.loads(line) for line in path.open() if line.startswith('{"timestamp"'))
     seq = np.array([line["seq"] for line in lines])
-    return latencies, int(((np.diff(seq) - 1) % 65536).sum()), ages, browsed
+    return latencies, int(((np.diff(seq) - 1) % 65536).sum()), ages
 
 
 def main():
-    options, results = arguments(__doc__, rounds=4, seconds=10.0, rate_Hz=1000.0, browser=False, json=False), {}
+    options, results = arguments(__doc__, rounds=4, seconds=10.0, rate_Hz=1000.0, json=False), {}
     pipe, far = multiprocessing.Pipe()
     board = multiprocessing.get_context("spawn").Process(
         target=bench_stream.board, args=(far, 3, presses(options.rate_Hz), 0), daemon=True
@@ -123,16 +106,14 @@ def main():
     port, p99 = pipe.recv(), {0: [], 3: []}
     with tempfile.TemporaryDirectory() as folder:
         for number, viewers in product(range(options.rounds), (0, 3)):
-            in_browser, name = options.browser and viewers > 0, f"round {number}, {viewers} viewers"
-            latencies, lost, ages, browsed = one_round(port, viewers, options.seconds, Path(folder), name, in_browser)
+            name = f"round {number}, {viewers} viewers"
+            latencies, lost, ages = one_round(port, viewers, options.seconds, Path(folder), name)
             p99[viewers].append(float(np.percentile(latencies, 99)))
             results[name] = {
                 "latency_us": percentiles(latencies, SHARES),
                 "records, lost": (len(latencies), lost),
                 "age_ms": percentiles(1e3 * np.array(ages), SHARES),
             }
-            if browsed:
-                results[name] |= {"picture_age_ms": percentiles(browsed[0], SHARES), "pictures_per_s": browsed[1]}
     ratios = np.array(p99[3]) / p99[0]
     results["p99 with three viewers over without, by round"] = ratios.round(2).tolist()
     pipe.send("enough")

@@ -1,12 +1,12 @@
 // The page: connects, hands samples to the film, draws, and takes keys and buttons.
 
 import { Connection } from "./connection.js";
-import { FilmView, percentile, setText } from "./film.js";
+import { FilmView, setText } from "./film.js";
 import { onTheme } from "./theme.js";
 import { Timeline } from "./timeline.js";
 
 const SLOW_MS = 500, PACE_MS = 20, RAREST = 8, LONGEST_MS = 80;
-const page = { film: null, timeline: null, isPaused: false, isNew: false, pictures: 0, cost: 0, pace: 16, every: 1, ages: [], starts: [] };
+const page = { film: null, timeline: null, isPaused: false, pictures: 0, cost: 0, pace: 16, every: 1 };
 const connection = new Connection({ session, samples, state, error, position, link, door });
 const nowMs = () => performance.now();
 
@@ -22,7 +22,6 @@ function session(content, isNew) {
 }
 
 function samples(message) {
-  page.isNew = message.samples.length > 0;
   page.film.take(message, nowMs());
 }
 
@@ -83,8 +82,6 @@ let slowMs = 0, beganMs = 0, heavyMs = 0;
 function picture() {
   requestAnimationFrame(picture);
   const began = nowMs(), number = page.pictures++;
-  page.starts.push(began);
-  if (page.starts.length > 240) page.starts.splice(0, 120);
   page.pace += 0.05 * (Math.min(began - beganMs, 200) - page.pace);
   beganMs = began;
   const isDue = began - heavyMs > LONGEST_MS, heavy = {
@@ -92,7 +89,6 @@ function picture() {
   };
   if (heavy.traces) heavyMs = began;
   if (!page.isPaused) page.film?.draw(began, heavy);
-  if (page.isNew) noteAge();
   if (began - slowMs > SLOW_MS) showSlow(began);
   page.cost += 0.1 * (nowMs() - began - page.cost);
 }
@@ -105,19 +101,6 @@ function showSlow(began) {
   if (!page.isPaused) page.film?.showSlow(began);
 }
 
-/** The age of what was drawn, where both clocks are the same machine's, is for tests. */
-function noteAge() {
-  page.isNew = false;
-  const { latest } = page.film.history;
-  if (!latest || page.timeline) return;
-  const channel = new MessageChannel();
-  channel.port1.onmessage = () => {
-    page.ages.push(performance.timeOrigin + performance.now() - 1000 * latest.t);
-    if (page.ages.length > 1200) page.ages.splice(0, 600);
-  };
-  channel.port2.postMessage(null);
-}
-
 addEventListener("keydown", key);
 onTheme(() => page.film?.refresh());
 addEventListener("resize", () => { page.film?.refresh(); page.timeline?.drawTrack(); });
@@ -126,6 +109,6 @@ document.getElementById("door").addEventListener("submit", (event) => {
   event.preventDefault();
   connection.enter(event.target.querySelector("input").value);
 });
-globalThis.isocharge = { page, connection, percentile };
+globalThis.isocharge = { page, connection };
 connection.open();
 requestAnimationFrame(picture);
