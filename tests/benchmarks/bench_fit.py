@@ -74,7 +74,7 @@ class Case:
         problem = BayesProblem(load_sensor(sensor_name), Circle(1.0), radius, noise=NOISE)
         charge_map = problem.forward_map()
         contact = Sweep(radius, problem.force_range, n_sample, 0).contacts()
-        truth = Sweep(radius, problem.force_range, n_press, 1, sampling="random").contacts()
+        truth = Sweep(radius, problem.force_range, n_press, 1).contacts()
         charge = NOISE.add(charge_map.charges(truth), np.random.default_rng(2))
         estimate, _ = bayes_estimate(problem, charge, charge_map=charge_map)
         return cls(

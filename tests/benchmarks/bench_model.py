@@ -48,7 +48,7 @@ class ModelCase:
         metadata = self.predictor.metadata
         corners = np.array(metadata.working_area_mm) @ [1.0, 1j]
         self.radius = float(np.abs(0.5 * (corners + np.roll(corners, 1))).min())
-        sweep = Sweep(self.radius, metadata.force_range_N, MAX_PRESSES, seed, sampling="random")
+        sweep = Sweep(self.radius, metadata.force_range_N, MAX_PRESSES, seed)
         self.presses = sweep.contacts()
         sensor = sensor_from_dict(metadata.sensor)
         self.film = ForwardMap.build(sensor, Circle(1.0), self.radius + MARGIN_mm, metadata.force_range_N)

@@ -99,7 +99,7 @@ def measure(sensor: Sensor, probe: Circle, n_sample: int, n_press: int) -> dict[
     seconds = time.process_time() - started
 
     radius = fitted.domain.radius
-    truth = Sweep(radius, DEFAULT_FORCE_RANGE, n_press, 1, sampling="random").contacts()
+    truth = Sweep(radius, DEFAULT_FORCE_RANGE, n_press, 1).contacts()
     charge = NOISE.add(charge_map.charges(truth), np.random.default_rng(2))
     estimate, std, _ = fitted.predict(charge)
     limit_estimate, _ = bayes_estimate(BayesProblem(sensor, probe, radius), charge, charge_map=charge_map)

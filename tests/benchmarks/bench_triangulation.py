@@ -16,7 +16,7 @@ RADIUS, FORCES = 8.0, (0.05, 2.0)
 
 def main() -> None:
     """Three and four electrodes, clean and noisy, unknown force."""
-    contact = Sweep(RADIUS, FORCES, arguments(__doc__, presses=2000).presses, sampling="random").contacts()
+    contact = Sweep(RADIUS, FORCES, arguments(__doc__, presses=2000).presses).contacts()
     solved = ForwardMap.build(load_sensor("three-25um-biaxial"), Polygon.triangle(4.0), 10.0, FORCES)
     for layout in ("three", "four"):
         film = replace(solved, sensor=load_sensor(f"{layout}-25um-biaxial"))

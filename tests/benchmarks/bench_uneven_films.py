@@ -33,7 +33,7 @@ SAMPLES = 100_000
 
 def direct_errors(forward_map: ForwardMap, sensor: Sensor, count: int) -> np.ndarray:
     """Compare the charges of random presses with direct solves, and return the largest error of each press."""
-    sweep = Sweep(RADIUS_mm, FORCES_N, samples=count, seed=7, sampling="random", orientation="random")
+    sweep = Sweep(RADIUS_mm, FORCES_N, samples=count, seed=7, orientation="random")
     presses = sweep.over([forward_map.probe])
     interpolated = forward_map.charges(presses.contact, presses.rotation)
     errors = []

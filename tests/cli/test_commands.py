@@ -98,7 +98,7 @@ def ends(is_so) -> bool:
 
 
 def test_sweep_writes_its_presses_and_warns_of_the_stress(command, tmp_path):
-    words = ["--samples", 300, "--sampling", "random", "--orientation", "random", "--workers", 1]
+    words = ["--samples", 300, "--orientation", "random", "--workers", 1]
     code, _, err = command(*SMALL, *words, "-o", tmp_path / "presses")
     assert code == 0
     assert f"300 presses in {tmp_path / 'presses'}" in err

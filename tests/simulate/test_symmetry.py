@@ -72,7 +72,9 @@ def test_rotation_of_press_and_layout_keeps_the_charges(probe):
     """The electrodes are polygons that are rotated like the press. The charges of a biaxial film have no axes."""
     sensor = sensor_of("four-25um-biaxial")
     angle = -2.5
-    polygons = tuple(replace(electrode, square=False) for electrode in sensor.electrodes)
+    polygons = tuple(
+        replace(electrode, corners=electrode.corners[1:] + electrode.corners[:1]) for electrode in sensor.electrodes
+    )
     c, s = np.cos(angle), np.sin(angle)
     rotated_polygons = tuple(
         replace(electrode, corners=tuple((c * x - s * y, s * x + c * y) for x, y in electrode.corners))

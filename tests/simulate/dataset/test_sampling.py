@@ -18,7 +18,6 @@ sweeps = st.builds(
     samples=st.integers(3, 700),
     seed=st.integers(0, 2**40),
     orientation=st.sampled_from(["fixed", "random"]),
-    sampling=st.sampled_from(["sobol", "random"]),
 )
 
 
@@ -37,10 +36,9 @@ def test_presses_lie_within_the_ranges_and_have_the_requested_number(sweep, coun
     np.testing.assert_array_equal(presses.probe, np.arange(sweep.samples) % count)
 
 
-@pytest.mark.parametrize("sampling", ["sobol", "random"])
-def test_presses_are_uniform_over_the_disk_and_in_the_logarithm_of_the_force(sampling):
+def test_presses_are_uniform_over_the_disk_and_in_the_logarithm_of_the_force():
     """The square of the distance and the angle are uniform, and independent of each other."""
-    x, y, force = Sweep(samples=4000, seed=1, force_range=(0.05, 2.0), sampling=sampling).contacts().T
+    x, y, force = Sweep(samples=4000, seed=1, force_range=(0.05, 2.0)).contacts().T
     assert stats.kstest(np.log(force), "uniform", args=(np.log(0.05), np.log(40.0))).pvalue > 0.05
     squared = (x**2 + y**2) / 64.0
     angle = np.arctan2(y, x)
@@ -60,12 +58,11 @@ def test_sobol_presses_have_a_smaller_discrepancy_than_random_presses():
         assert stats.qmc.discrepancy(unit) < 0.1 * stats.qmc.discrepancy(chance)
 
 
-@pytest.mark.parametrize("sampling", ["sobol", "random"])
-def test_presses_depend_on_seed_and_probe(sampling):
-    first, again, other = (Sweep(samples=100, seed=seed, sampling=sampling).contacts() for seed in (5, 5, 6))
+def test_presses_depend_on_seed_and_probe():
+    first, again, other = (Sweep(samples=100, seed=seed).contacts() for seed in (5, 5, 6))
     np.testing.assert_array_equal(first, again)
     assert np.all(first != other)
-    two = Sweep(samples=100, sampling=sampling).over((Circle(1.0), Circle(1.0))).contact
+    two = Sweep(samples=100).over((Circle(1.0), Circle(1.0))).contact
     assert np.all(two[::2] != two[1::2])
 
 
@@ -80,7 +77,6 @@ def test_presses_depend_on_seed_and_probe(sampling):
         ({"samples": 0}, "samples: expected at least 1, got 0"),
         ({"samples": 10_000_001}, "samples: expected at most 10000000, got 10000001"),
         ({"orientation": "Random"}, "orientation: expected 'fixed' or 'random', got 'Random'"),
-        ({"sampling": "polar"}, "sampling: expected 'sobol' or 'random', got 'polar'"),
         ({"force_range": (0.0, 1.0)}, "force: expected 0 < smallest <= largest force"),
         ({"force_range": (2.0, 1.0)}, "force: expected 0 < smallest <= largest force"),
         ({"force_range": (1.0, np.inf)}, "force: expected 0 < smallest <= largest force"),

@@ -93,7 +93,7 @@ def test_manifest_and_card_describe_the_dataset(dataset):
         for name, count in zip(names, (5, 3), strict=True)
     ]
     card = (dataset / "README.md").read_text()
-    for part in ("# presses\n", "8 presses", "`three-25um-biaxial`", "circle:1.0", "| seed | 3 |", *COLUMNS):
+    for part in ("# presses\n", "8 presses", "`three-25um-biaxial`", "circle:1.0", '"seed": 3', *COLUMNS):
         assert part in card
 
 

@@ -46,8 +46,8 @@ def test_new_squares_are_named_anticlockwise_with_unused_letters(sensor):
         pytest.param({"keep": ("A", "A")}, "expected different names", id="duplicate kept name"),
         pytest.param({"keep": ("A", "B", "C", "D")}, "nothing to place", id="all electrodes kept"),
         pytest.param({"keep": ("Q",)}, "no electrode 'Q'", id="unknown kept electrode"),
-        pytest.param({"gap": -1.0}, "gap: expected a length from 0 mm", id="negative gap"),
-        pytest.param({"side": 0.0}, "side: expected a length", id="side of zero"),
+        pytest.param({"gap": -1.0}, "gap: expected at least 0 mm, got -1 mm", id="negative gap"),
+        pytest.param({"side": 0.0}, "side: expected at least 0.01 mm, got 0 mm", id="side of zero"),
         pytest.param({"noise": NoiseModel("mine", 0.0, 1e-3)}, "expected white noise above 0", id="no white noise"),
         pytest.param({"goal": "best"}, "goal: expected worst or rms, got 'best'", id="unknown goal"),
         pytest.param(
@@ -70,7 +70,7 @@ def test_impossible_design_case_raises_input_error(sensor, changes, message):
 
 
 def test_negative_nuisance_raises_input_error():
-    with pytest.raises(InputError, match="pretension: expected a number from 0"):
+    with pytest.raises(InputError, match="pretension: expected at least 0, got -1"):
         Nuisances(pretension=-1.0)
 
 

@@ -1,6 +1,6 @@
 """Command `isocharge simulate design`, which searches for electrode positions with small position errors."""
 
-from typing import Annotated, cast
+from typing import Annotated
 
 import typer
 
@@ -34,10 +34,9 @@ def design_command(
         int, typer.Option("--electrodes", metavar="N", help="Number of electrodes, 3 to 8, including kept ones.")
     ],
     goal: Annotated[
-        str,
+        Goal,
         typer.Option(
             "--goal",
-            metavar="worst|rms",
             help="Quantity to minimise: the largest error, or the root mean square of the errors.",
         ),
     ] = "worst",
@@ -85,7 +84,7 @@ def design_command(
         load_sensor(sensor),
         electrodes,
         radius,
-        goal=cast(Goal, goal),
+        goal=goal,
         keep=tuple(name for name in kept_names if name),
         probe=footprint,
         force=force,

@@ -86,6 +86,6 @@ def identify_command(
     # Print the results and a summary in sentences, which state the working area.
     limits = "limits_in_working_area"
     show_result(results if json else {limits: results[limits]}, json=json)
-    say(identification.summary)
+    say(identification.area.summary)
     if identification.mirror is not None:
         say(identification.mirror.summary)

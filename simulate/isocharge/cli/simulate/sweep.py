@@ -44,10 +44,6 @@ def sweep_command(
         Literal["fixed", "random"],
         typer.Option("--orientation", help="Angle of the probe: as given, or random for each press."),
     ] = "fixed",
-    sampling: Annotated[
-        Literal["sobol", "random"],
-        typer.Option("--sampling", help="Sampling of positions and forces."),
-    ] = "sobol",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the presses. Equal seeds give equal data.")] = 0,
     stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
@@ -65,7 +61,7 @@ def sweep_command(
     warn_of_stress(film_sensor.film, probes, max_force, stress_limit)
     with shown_progress(), executor_for(workers, cluster) as executor:
         largest_distance = sweep_radius(radius, film_sensor, probes, force)
-        sweep = Sweep(largest_distance, force, samples, seed, orientation, sampling)
+        sweep = Sweep(largest_distance, force, samples, seed, orientation)
         run_sweep(output, film_sensor, probes, sweep, executor=executor)
     manifest = json_module.loads((output / "manifest.json").read_text())
     say(f"{manifest['samples']} presses in {output}")

@@ -1,14 +1,9 @@
 """Sampling of the presses of a sweep: their positions, forces, probes and orientations.
 
-There are two kinds of sampling:
-
-    sobol   scrambled Sobol points, which cover the domain more evenly than independent random numbers (Owen 1998), with
-            a separate sequence for each probe
-    random  independent random numbers
-
-The positions are uniformly distributed over the disk, and so are the logarithms of their
-forces over the range of forces. A sweep is a simulation of many presses. If it has several probes, successive presses
-cycle through the probes.
+The presses are scrambled Sobol points, which cover the domain more evenly than independent random numbers (Owen 1998),
+with a separate sequence for each probe. The positions are uniformly distributed over the disk, and so are the
+logarithms of their forces over the range of forces. A sweep is a simulation of many presses. If it has several probes,
+successive presses cycle through the probes.
 """
 
 from collections.abc import Sequence
@@ -29,14 +24,8 @@ MAX_SAMPLES = 10_000_000
 FULL_TURN = 2.0 * np.pi
 """Angle of a full turn, rad."""
 
-SAMPLING_DESCRIPTIONS = {
-    "sobol": "scrambled Sobol, uniform over the disk, log-uniform in force",
-    "random": "independent, uniform over the disk, log-uniform in force",
-}
-"""Description of each kind of sampling in the manifest of a dataset."""
-
-Sampling = Literal["sobol", "random"]
-"""Name of a kind of sampling."""
+SAMPLING = "scrambled Sobol, uniform over the disk, log-uniform in force"
+"""Description of the sampling in the manifest of a dataset."""
 
 OUTSIDE_PROBE = -1
 """Index of the round probe of the presses outside the disk, which is the last of all probes."""
@@ -83,7 +72,6 @@ class Sweep:
         seed: Seed of the random numbers.
         orientation: "fixed" if all presses have the orientation of the given probes, "random" for orientations over a
             full turn.
-        sampling: Kind of sampling: "sobol" or "random".
         outside: Number of additional presses between the disk and the clamp; 0 for none.
     """
 
@@ -92,7 +80,6 @@ class Sweep:
     samples: int = 20_000
     seed: int = 0
     orientation: Orientation = "fixed"
-    sampling: Sampling = "sobol"
     outside: int = 16_384
 
     def __post_init__(self) -> None:
@@ -113,8 +100,6 @@ class Sweep:
             raise SceneError(f"force: expected 0 < smallest <= largest force in N, got {min_force:g} and {max_force:g}")
         if self.orientation not in get_args(Orientation):
             raise SceneError(f"orientation: expected 'fixed' or 'random', got {self.orientation!r}")
-        if self.sampling not in get_args(Sampling):
-            raise SceneError(f"sampling: expected 'sobol' or 'random', got {self.sampling!r}")
 
     def contacts(self) -> Array:
         """Return the contacts (x, y, F) of a sweep with one probe, shape (n, 3), mm and N."""
@@ -124,7 +109,7 @@ class Sweep:
         """Return presses between the disk of the sweep and a larger circle.
 
         The positions are uniformly distributed over the ring, and the logarithms of the forces over the range of
-        forces. Except for random sampling, the presses are Sobol points.
+        forces.
 
         Args:
             outer_radius: Radius of the larger circle, mm.
@@ -164,7 +149,7 @@ class Sweep:
         return presses
 
     def _draw(self, count: int, probe_index: int) -> SweepPresses:
-        """Draw the presses of one probe with Sobol points or random numbers.
+        """Draw the presses of one probe.
 
         The positions are uniformly distributed over the disk. The logarithms of the forces are uniformly distributed
         over the range of forces. The rotations are uniformly distributed over a full turn, or zero if the orientation
@@ -195,9 +180,6 @@ class Sweep:
             force and the rotation of a press.
         """
         rng = np.random.default_rng([self.seed, *stream])
-        if self.sampling == "random":
-            return rng.random((count, 4))
-
         # A Sobol sequence is balanced if the number of points is a power of two. Draw the next larger power of two, and
         # use the first `count` points. A probe may have no presses if there are more probes than presses.
         log2_count = int(np.ceil(np.log2(max(count, 2))))

@@ -15,7 +15,7 @@ presses has the same format, but its manifest has no entries `solver` and `seed`
 
 import io
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -45,6 +45,9 @@ COLUMNS = {
     "charge_pC": "touch charge of each electrode, pC, electrodes in the manifest's order",
 }
 """Names of the columns of a shard, and their descriptions in the manifest and in the data card."""
+
+ORIGIN_KEYS = ("probes", "ranges", "sampling", "noise", "seed", "solver", "outside", "yield_force_N")
+"""Entries of the manifest about the origin of the samples that the data card repeats."""
 
 MAX_SHARD_BYTES = 1 << 26
 """Largest size of the file of a shard, bytes."""
@@ -178,9 +181,7 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
         name: Name of the dataset.
         manifest: Content of the file `manifest.json` of the dataset.
     """
-    probes = manifest.get("probes", [])
-    ranges = manifest.get("ranges", {})
-    settings = _flattened_items({key: manifest.get(key, {}) for key in ("solver", "outside")})
+    origin = {key: manifest[key] for key in ORIGIN_KEYS if key in manifest}
     lines = [
         "---",  # metadata for data hubs: https://huggingface.co/docs/hub/datasets-cards
         f"pretty_name: {json.dumps(name)}",
@@ -200,31 +201,14 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
         "|---|---|",
         *(f"| `{column}` | {meaning} |" for column, meaning in COLUMNS.items()),
         "",
-        "| what | value |",
-        "|---|---|",
-        f"| probes | {', '.join(probes)} |",
-        *(f"| {quantity} | {limits} |" for quantity, limits in ranges.items()),
-        *(f"| {key} | {manifest[key]} |" for key in ("sampling", "noise", "seed", "yield_force_N") if key in manifest),
-        *(f"| {key.replace(' ', ': ', 1)} | {setting} |" for key, setting in settings),
+        "```json",
+        json.dumps(origin, indent=2),
+        "```",
         "",
         "Read it with `isocharge.simulate.read_dataset(folder)`, which checks every shard's checksum.",
         "",
     ]
     return "\n".join(lines)
-
-
-def _flattened_items(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the keys and values of nested tables as pairs.
-
-    If a value is in an inner table, the keys that lead to this value are joined by spaces. For example, {"a": {"b": 1}}
-    yields ("a b", 1).
-    """
-    for key, value in table.items():
-        if isinstance(value, dict):
-            for inner_keys, inner_value in _flattened_items(value):
-                yield f"{key} {inner_keys}", inner_value
-        else:
-            yield key, value
 
 
 def _check_samples(samples: Samples, n_electrode: int, shard_label: str) -> None:

@@ -21,7 +21,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.common.files import new_folder, refuse_existing
 from isocharge.common.progress import report, reporting_as, second_thread
-from isocharge.simulate.dataset.sampling import SAMPLING_DESCRIPTIONS, Sweep, SweepPresses
+from isocharge.simulate.dataset.sampling import SAMPLING, Sweep, SweepPresses
 from isocharge.simulate.dataset.shards import (
     Samples,
     write_dataset,
@@ -194,7 +194,7 @@ def _manifest_entries(maps: Sequence[ForwardMap], whole_film: ForwardMap | None,
             "force_N": list(sweep.force_range),
             "orientation": sweep.orientation,
         },
-        "sampling": SAMPLING_DESCRIPTIONS[sweep.sampling],
+        "sampling": SAMPLING,
         "seed": sweep.seed,
         "noise": "clean",
         "solver": {

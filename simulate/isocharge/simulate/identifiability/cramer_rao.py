@@ -115,6 +115,6 @@ def _invert(information: Array) -> Array:
     eigenvalues, eigenvectors = np.linalg.eigh(information / matrix_scale)  # the diagonal elements are 1
     inverse_eigenvalues = 1.0 / np.maximum(eigenvalues, MIN_EIGENVALUE)
 
-    # If V contains the eigenvectors, the inverse of each scaled matrix (index n) is V diag(1 / eigenvalues) V'.
-    scaled_inverse = np.einsum("nik,nk,njk->nij", eigenvectors, inverse_eigenvalues, eigenvectors)
+    # If V contains the eigenvectors, the inverse of each scaled matrix is V diag(1 / eigenvalues) V'.
+    scaled_inverse = (eigenvectors * inverse_eigenvalues[:, None, :]) @ eigenvectors.swapaxes(1, 2)
     return np.asarray(scaled_inverse / matrix_scale)

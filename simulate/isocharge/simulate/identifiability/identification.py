@@ -153,29 +153,6 @@ class Identification:
         )
         return cls(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inner_maps)
 
-    @property
-    def determined_share(self) -> float:
-        """Fraction of the area of the searched disk where the position error is within its limit for all forces.
-
-        The disk includes the regions on both sides of folds. Contacts on opposite sides of a fold may have the same
-        charges. In this case, other information, such as preceding frames, is necessary to distinguish the contacts.
-        """
-        is_allowed = np.all([limits.position <= self.area.error for limits in self.maps], axis=0)
-        return float(np.average(is_allowed.mean(axis=1), weights=self.maps[0].rings.distance))
-
-    @property
-    def summary(self) -> str:
-        """Sentences about the working area, and about the larger area in which preceding frames are needed."""
-        area = self.area
-        if not (len(area.folds) or len(area.pairs)):
-            return area.summary
-        return (
-            f"{area.summary} If preceding frames distinguish contacts with the same charges, the position error is at "
-            f"most {area.error:.3g} mm on {100.0 * self.determined_share:.0f} % of the disk of "
-            f"{area.search_radius:.3g} mm that was searched. The working area is "
-            f"{100.0 * (area.radius / area.search_radius) ** 2:.0f} % of this disk."
-        )
-
     def to_dict(self) -> dict[str, Any]:
         """Return the results as a dictionary for JSON, in which an infinite radius is None."""
         area = self.area
@@ -193,8 +170,7 @@ class Identification:
                 "unfolded_radius_mm": area.unambiguous_radius,
                 "error_mm": area.error,
                 "searched_mm": area.search_radius,
-                "determined_share": self.determined_share,
-                "words": self.summary,
+                "words": area.summary,
             },
             "mirror_region": None if self.mirror is None else self.mirror.to_dict(),
             "limits_in_working_area": [limits.statistics() for limits in self.inner_maps],

@@ -9,11 +9,13 @@ from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import InputError
 from isocharge.simulate.forward.family import check_family
+from isocharge.simulate.identifiability.cramer_rao import cramer_rao
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import NOISE_LEVELS
 from isocharge.simulate.numerics.disk import lattice, square_grid
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor, electrode_index
+from isocharge.simulate.sensor.size_check import check_range
 
 MIN_ELECTRODES = 3
 """Smallest number of electrodes of a design."""
@@ -52,8 +54,7 @@ class Nuisances:
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"nuisance {name}: expected a number from 0, got {value}")
+            check_range(f"nuisance {name}", value, (0.0, np.inf), "", InputError)
 
 
 NO_NUISANCES = Nuisances(probe_radius=0.0, pretension=0.0, gain=0.0)
@@ -123,9 +124,9 @@ class DesignCase:
                 "of a press are three unknowns"
             )
         check_family(self.sensor.film, self.probe, Domain(self.radius, (self.force, self.force)))
-        _check_length("gap", self.gap, minimum=0.0)
-        _check_length("rim", self.rim, minimum=0.0)
-        _check_length("side", self.square_side, minimum=1e-2)
+        check_range("gap", self.gap, (0.0, np.inf), "mm", InputError)
+        check_range("rim", self.rim, (0.0, np.inf), "mm", InputError)
+        check_range("side", self.square_side, (1e-2, np.inf), "mm", InputError)
         if not self.noise.white > 0.0:
             raise InputError(
                 f"noise {self.noise.name!r}: expected white noise above 0, because errors have no lower limit "
@@ -259,6 +260,23 @@ class DesignCase:
         pairs = np.triu_indices(len(positions), 1)
         return np.concatenate([self.clearance(positions), self.pair_clearance(positions, positions)[pairs]])
 
+    def position_errors(self, rows: Array, nuisances: Nuisances) -> Array:
+        """Compute the Cramer-Rao limit of the position of each press with uncertain nuisance parameters.
+
+        The parameters of a press are x, y, ln F, the probe radius and the pretension. The uncertainty of the gains is
+        added to the noise.
+
+        Args:
+            rows: Rows of a charge table, which contain charges and their derivatives, shape (n_press, n_electrode, 6).
+            nuisances: Standard deviations of the parameters that are not known exactly.
+
+        Returns:
+            Root mean square errors, shape (n_press,), mm.
+        """
+        noise = replace(self.noise, gain=float(np.hypot(self.noise.gain, nuisances.gain)))
+        nuisance_changes = rows[..., 4:] * [nuisances.probe_radius, nuisances.pretension]
+        return cramer_rao(rows[..., 0], rows[..., 1:4], noise, nuisance_changes).position
+
     def layout(self, positions: Array) -> Sensor:
         """Create the sensor that has the kept electrodes and new squares at given positions.
 
@@ -305,18 +323,3 @@ def _side_of(square: Electrode) -> float:
     """Return the side of a square electrode, mm."""
     lower_left, lower_right, *_ = square.corners
     return float(lower_right[0] - lower_left[0])
-
-
-def _check_length(name: str, value: float, minimum: float) -> None:
-    """Raise an error if a length is not finite or is smaller than a minimum.
-
-    Args:
-        name: Name of the length in the error message.
-        value: Length to be checked, mm.
-        minimum: Smallest allowed length, mm.
-
-    Raises:
-        InputError: If the length is not allowed.
-    """
-    if not (np.isfinite(value) and value >= minimum):
-        raise InputError(f"{name}: expected a length from {minimum:g} mm, got {value} mm")

@@ -17,7 +17,6 @@ from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase
 from isocharge.simulate.layout.charge_table import ChargeTable
-from isocharge.simulate.layout.position_error import ErrorModel
 from isocharge.simulate.layout.search import MAX_FINALISTS, MIN_DIFFERENCE, Layout, Search, random_layouts
 from isocharge.simulate.sensor.sensor import Sensor
 
@@ -216,6 +215,6 @@ def error_map(case: DesignCase, table: ChargeTable, sensor: Sensor) -> ErrorMap:
         Position errors for the noise alone, and for the noise together with the nuisances.
     """
     charge_rows = table.rows(case.fine_grid, sensor.electrodes)
-    error_by_noise = np.sqrt(ErrorModel.of(case.noise, NO_NUISANCES).squared_errors(charge_rows))
-    error_with_nuisances = np.sqrt(ErrorModel.of(case.noise, case.nuisances).squared_errors(charge_rows))
+    error_by_noise = case.position_errors(charge_rows, NO_NUISANCES)
+    error_with_nuisances = case.position_errors(charge_rows, case.nuisances)
     return ErrorMap(case.fine_grid, error_by_noise, error_with_nuisances)

@@ -11,7 +11,6 @@ errors on a fine grid, which are selected again after each improvement.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy  # loads each of its subpackages on first use
@@ -20,7 +19,6 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
 from isocharge.simulate.layout.case import DesignCase
 from isocharge.simulate.layout.charge_table import ChargeTable, PressedFilm
-from isocharge.simulate.layout.position_error import ErrorModel
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.sensor import Electrode
 
@@ -112,11 +110,6 @@ class Search:
     case: DesignCase
     table: ChargeTable
 
-    @cached_property
-    def model(self) -> ErrorModel:
-        """Error model with the nuisances of the case."""
-        return ErrorModel.of(self.case.noise, self.case.nuisances)
-
     def errors(self, positions: Array) -> Array:
         """Compute the position error of each press of the fine grid, shape (n_press,), mm.
 
@@ -124,7 +117,7 @@ class Search:
             positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
         """
         electrodes = self.case.layout(positions).electrodes
-        return np.sqrt(self.model.squared_errors(self.table.rows(self.case.fine_grid, electrodes)))
+        return self.case.position_errors(self.table.rows(self.case.fine_grid, electrodes), self.case.nuisances)
 
     def minimised_error(self, positions: Array) -> float:
         """Compute the largest error or the root mean square of the errors on the fine grid, mm.
@@ -188,10 +181,10 @@ class Search:
 
         def log_mean(new_rows: Array) -> float:
             """Return the logarithm of the power mean for rows of the new squares, shape (n_press, n_new, 6)."""
-            squared_error = self.model.squared_errors(np.concatenate([new_rows, kept_rows], axis=1))
-            largest = squared_error.max()  # the powers of the ratios neither overflow nor all underflow
-            mean_power = np.mean((squared_error / largest) ** (0.5 * power))
-            return float(0.5 * np.log(largest) + np.log(mean_power) / power)
+            rows = np.concatenate([new_rows, kept_rows], axis=1)
+            error = self.case.position_errors(rows, self.case.nuisances)
+            largest = error.max()  # the powers of the ratios neither overflow nor all underflow
+            return float(np.log(largest) + np.log(np.mean((error / largest) ** power)) / power)
 
         def objective(coordinates: Array) -> tuple[float, Array]:
             """Return the logarithm of the power mean, and its derivatives with respect to x1, y1, x2, y2, ..."""

@@ -231,23 +231,26 @@ class FilmPrior:
         # The shift may use half of the gap between the electrodes and the rim, and an oval clamp the other half. Each
         # of them has two components.
         largest_shift = 0.5 * self._rim_gap / math.sqrt(2.0)
+        largest_oval = largest_shift / self.sensor.film.radius
         largest_of = {
-            **dict.fromkeys(("shift_x", "shift_y"), largest_shift),
-            **dict.fromkeys(("oval_x", "oval_xy"), largest_shift / self.sensor.film.radius),
+            "shift_x": largest_shift,
+            "shift_y": largest_shift,
+            "oval_x": largest_oval,
+            "oval_xy": largest_oval,
         }
         film_properties = []
         for one in FILM_PROPERTIES:
-            largest = min(largest_of.get(one.name, math.inf), one.limits[1])
-            has_smaller_bounds = one.name in largest_of and largest < one.limits[1]
-            film_properties.append(replace(one, bounds=(-largest, largest)) if has_smaller_bounds else one)
+            largest = largest_of.get(one.name, math.inf)
+            if largest < one.limits[1]:
+                one = replace(one, bounds=(-largest, largest))
+            film_properties.append(one)
+
         probe_properties = []
         if isinstance(self.probe, Circle):
             radius = self.probe.radius
-            largest = MAX_RADIUS_DEVIATION * radius
+            bounds = (-MAX_RADIUS_DEVIATION * radius, MAX_RADIUS_DEVIATION * radius)
             std = min(0.3, 0.3 * radius)
-            probe_properties.append(
-                FilmProperty("probe_radius", "radius of the probe", "mm", std, 0.01, bounds=(-largest, largest))
-            )
+            probe_properties.append(FilmProperty("probe_radius", "radius of the probe", "mm", std, 0.01, bounds=bounds))
         gains = [
             FilmProperty(f"gain {name}", f"ln of the gain of {name}", "1", 0.05, 0.005)
             for name in self.sensor.electrode_names

@@ -81,14 +81,12 @@ class Electrode:
     Attributes:
         name: Name of the electrode in the sensor file.
         corners: Corners of the pad, which is the first polygon of metal on the front.
-        square: Whether `of_square` created the electrode. The edge readout accepts only such electrodes.
         more: Further polygons of metal on the front, such as traces. Overlapping areas count once.
         back: Polygons of metal on the back. If there are none, the back is completely covered with metal.
     """
 
     name: str
     corners: Corners
-    square: bool = False
     more: tuple[Corners, ...] = ()
     back: tuple[Corners, ...] = ()
 
@@ -116,7 +114,7 @@ class Electrode:
         bottom = y - half_side
         top = y + half_side
         corners = ((left, bottom), (right, bottom), (right, top), (left, top))
-        return cls(name, corners, square=True)
+        return cls(name, corners)
 
     def with_trace(self, path: Corners, width: float) -> "Electrode":
         """Return a copy of the electrode with an additional trace on the front.
@@ -131,7 +129,17 @@ class Electrode:
         outline = to_corners(trace_outline(to_complex(np.array(path)), width))
         polygon = tuple((float(x), float(y)) for x, y in outline)
         check_polygon(f"trace of electrode {self.name!r}", polygon)
-        return replace(self, square=False, more=(*self.more, polygon))
+        return replace(self, more=(*self.more, polygon))
+
+    @cached_property
+    def square(self) -> bool:
+        """Whether the electrode is like one that `of_square` creates. The edge readout accepts only such electrodes."""
+        if self.more or self.back or len(self.corners) != 4:
+            return False
+        (left, _), (right, _), *_ = self.corners
+        side = right - left
+        square = Electrode.of_square(self.name, self.centre, side)
+        return side > 0.0 and np.allclose(self.corners, square.corners, rtol=0.0, atol=1e-9 * side)
 
     @property
     def front(self) -> tuple[Corners, ...]:
@@ -411,8 +419,8 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
         electrodes: Electrodes of the layout.
 
     Raises:
-        SensorError: If a polygon crosses itself, an electrode collects no charge or is too small, a declared square has
-            the wrong corners, or two electrodes overlap.
+        SensorError: If a polygon crosses itself, an electrode collects no charge or is too small, or two electrodes
+            overlap.
     """
     for electrode in electrodes:
         name = f"electrode {electrode.name!r}"
@@ -420,18 +428,6 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
             raise SensorError(f"{name}: its front and its back have no area in common, so nothing collects; move one")
         corners = np.array(electrode.corners)
         check_range(name, float(np.ptp(corners, axis=0).max()), (MIN_EXTENT, np.inf), "mm", SensorError)
-
-        # An electrode that is declared as a square must have the corners of a square, and no further metal.
-        lower_left, lower_right, *_ = corners
-        side = float(lower_right[0] - lower_left[0])
-        expected_corners = Electrode.of_square(electrode.name, electrode.centre, side).corners
-        is_pad_only = not (electrode.more or electrode.back)
-        is_square = len(corners) == 4 and np.allclose(corners, expected_corners, rtol=0.0, atol=1e-9 * side)
-        if electrode.square and not (is_pad_only and is_square):
-            raise SensorError(
-                f"{name}: expected the corners of a square along the axes, got {corners.tolist()} mm; make squares "
-                "with Electrode.of_square"
-            )
     for first, second in combinations(electrodes, 2):
         if shapely.relate_pattern(first.region, second.region, INTERIORS_INTERSECT):
             raise SensorError(f"electrodes {first.name!r} and {second.name!r} overlap; move one of them")

@@ -19,7 +19,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes
 from isocharge.common.errors import SceneError
-from isocharge.simulate.numerics.polygon import shared_area, to_complex
+from isocharge.simulate.numerics.polygon import area_of, shared_area, to_complex, to_corners
 from isocharge.simulate.sensor.size_check import check_range
 
 NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
@@ -34,11 +34,8 @@ MIN_SIDE = 1e-3
 CORE_SHARE = 0.45 * math.sqrt(2.0)
 """Ratio of the distance of a corner of the core polygon from the centroid to that of the boundary, dimensionless."""
 
-OUTLINE_POINTS = 180
-"""Number of points by which the outline of a curved footprint is drawn."""
-
-FINE_OUTLINE_POINTS = 1024
-"""Number of boundary points from which the reach and the covered area of a curved footprint are computed."""
+OUTLINE_POINTS = 1024
+"""Number of points of the outline of a curved footprint, whose area is accurate to 1e-5."""
 
 
 @dataclass(frozen=True)
@@ -201,22 +198,25 @@ class Probe(ABC):
         """
         return replace(self, angle=self.angle + angle)  # type: ignore[type-var]
 
-    @abstractmethod
     def farthest_distance(self, at: tuple[float, float]) -> float:
-        """Return the distance from the centre of the film to the farthest point of the footprint, mm.
+        """Return the distance from the centre of the film to the farthest point of the outline, mm.
 
         Args:
             at: Position (x, y) of the centroid relative to the centre of the film, mm.
         """
+        return float(np.abs(complex(*at) + self.outline).max())
 
-    @abstractmethod
     def covered_area(self, corners: Array, at: complex) -> float:
         """Return the area that the footprint and a convex polygon have in common, mm^2.
+
+        The area of a curved footprint is that of its outline, times the ratio of both areas.
 
         Args:
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
             at: Position of the centroid of the footprint as x + iy, mm.
         """
+        outline_area = area_of(to_corners(self.outline))
+        return shared_area(to_complex(corners), at + self.outline) * self.area / outline_area
 
     @property
     def has_uniform_pressure(self) -> bool:
@@ -271,28 +271,13 @@ class CurvedProbe(Probe):
     @property
     def outline(self) -> Complexes:
         """Points x + iy of the boundary at evenly spaced parameters, shape (OUTLINE_POINTS,), mm."""
-        return self._boundary_points(OUTLINE_POINTS)
+        return self.boundary(2.0 * np.pi * np.arange(OUTLINE_POINTS) / OUTLINE_POINTS)
 
     def core(self, unit: float) -> Complexes:
         """Return the corners x + iy of the core polygon in multiples of `unit` (mm), shape (n_corner,)."""
         n_corner = self.topology.n_corner
         parameter = 2.0 * np.pi * (np.arange(n_corner) + 0.5) / n_corner
         return np.asarray(CORE_SHARE * self.boundary(parameter) / unit)
-
-    def farthest_distance(self, at: tuple[float, float]) -> float:
-        """Return the distance from the centre of the film to the farthest point of the boundary, mm."""
-        return float(np.abs(complex(*at) + self._boundary_points(FINE_OUTLINE_POINTS)).max())
-
-    def covered_area(self, corners: Array, at: complex) -> float:
-        """Return the area that the footprint and a convex polygon have in common, mm^2.
-
-        The curved boundary of the footprint is approximated by a polygon with `FINE_OUTLINE_POINTS` corners.
-        """
-        return shared_area(to_complex(corners), at + self._boundary_points(FINE_OUTLINE_POINTS))
-
-    def _boundary_points(self, count: int) -> Complexes:
-        """Return points x + iy of the boundary at evenly spaced parameters, shape (count,), mm."""
-        return self.boundary(2.0 * np.pi * np.arange(count) / count)
 
 
 def check_angle(angle: float) -> None:

@@ -12,7 +12,6 @@ from isocharge.simulate.numerics.polygon import (
     centroid_of,
     is_convex,
     min_edge_cross_product,
-    shared_area,
     to_complex,
 )
 from isocharge.simulate.sensor.probe_shapes.base import (
@@ -200,11 +199,3 @@ class Polygon(Probe):
     def contains(self, points: Complexes) -> Booleans:
         """Return whether each point x + iy (mm, relative to the centroid) lies in the polygon."""
         return np.asarray(min_edge_cross_product(self.outline, points) >= 0.0)
-
-    def farthest_distance(self, at: tuple[float, float]) -> float:
-        """Return the distance from the centre of the film to the farthest corner, mm."""
-        return float(np.abs(complex(*at) + self.outline).max())
-
-    def covered_area(self, corners: Array, at: complex) -> float:
-        """Return the area that the footprint and a convex polygon have in common, mm^2."""
-        return shared_area(to_complex(corners), at + self.outline)
