@@ -163,7 +163,7 @@ def test_settings_of_single_electrodes_move_with_their_channels():
         "gain": {"pC_per_unit": {"A": 0.1, "B": 0.2, "C": 0.3}, "offset": 5},
         "tare": {"frames": 50},
     }
-    result = ElectrodeCheck(table["channels"], {"A": "2", "B": "1", "C": "3"}, np.eye(3), ())
+    result = ElectrodeCheck(table["channels"], {"A": "2", "B": "1", "C": "3"}, ())
     assert corrected_table(table, result) == {
         "name": "board",
         "channels": {"A": "2", "B": "1", "C": "3"},

@@ -28,13 +28,11 @@ class ElectrodeCheck:
     Attributes:
         expected: Assumed channel of each electrode, by the name of the electrode.
         found: Channel of each electrode that the presses show, by the name of the electrode.
-        changes: Change of each channel under each press, shape (electrodes, channels), in the unit of the board.
         inverted: Channels whose charge falls under a press.
     """
 
     expected: Mapping[str, str]
     found: Mapping[str, str]
-    changes: Array
     inverted: tuple[str, ...]
 
     @property
@@ -71,7 +69,7 @@ def check_electrodes(
         timeout_s: Time to wait for each press, s.
 
     Returns:
-        The assumed and the found channel of each electrode, the changes of the channels, and the inverted channels.
+        The assumed and the found channel of each electrode, and the inverted channels.
 
     Raises:
         PressCheckError: If a press does not come in time, or the presses do not distinguish the channels.
@@ -91,9 +89,7 @@ def check_electrodes(
         found_channels[electrodes[press]] = channel
         if changes[press, column] < 0.0:
             inverted_channels.append(channel)
-    return ElectrodeCheck(
-        expected=dict(channels), found=found_channels, changes=changes, inverted=tuple(inverted_channels)
-    )
+    return ElectrodeCheck(expected=dict(channels), found=found_channels, inverted=tuple(inverted_channels))
 
 
 def assign_channels(changes: Array, electrodes: Sequence[str], min_advantage: float = 1.1) -> list[int]:

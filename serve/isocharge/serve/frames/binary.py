@@ -13,6 +13,7 @@ import struct
 from cobs import cobs
 
 from isocharge.serve.frames.frame import ChecksumError, Frame, StuffedParser
+from isocharge.serve.frames.stuffing import cobs_decode
 
 FORMAT = "binary frames of isocharge"
 """Description of the format, for the user."""
@@ -64,10 +65,7 @@ def decode_frame(stuffed_frame: bytes) -> Frame:
         ChecksumError: If the CRC is wrong.
         ValueError: If the bytes are not a frame of this version.
     """
-    try:
-        data: bytes = cobs.decode(stuffed_frame)
-    except cobs.DecodeError as error:
-        raise ValueError(f"the bytes are not encoded with COBS: {error}") from error
+    data = cobs_decode(stuffed_frame)
     if len(data) < HEADER.size + CRC.size:
         raise ValueError("the frame is shorter than a frame without charges")
     body = data[: -CRC.size]  # header and charges

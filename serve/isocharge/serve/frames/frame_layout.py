@@ -231,21 +231,10 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         for position, constant in self.constants:
             if not data.startswith(constant, position):
                 raise ValueError(f"the constant at byte {position} is wrong")
-        numbers = self.body.unpack_from(data, len(self.sync))
-        if self.three_byte_fields:  # `struct` has unpacked these fields as bytes
-            return self.columns.frame(self._convert_three_byte_fields(numbers))
+        numbers: list[Any] = list(self.body.unpack_from(data, len(self.sync)))
+        for position, is_signed in self.three_byte_fields:  # `struct` has unpacked these fields as bytes
+            numbers[position] = int.from_bytes(numbers[position], self.byte_order, signed=is_signed)
         return self.columns.frame(numbers)
-
-    def _convert_three_byte_fields(self, numbers: tuple[Any, ...]) -> list[Any]:
-        """Convert the fields of three bytes to integers. All other numbers stay the same.
-
-        Args:
-            numbers: Value of each field as `struct` has unpacked it, which is bytes for a field of three bytes.
-        """
-        converted = list(numbers)
-        for position, is_signed in self.three_byte_fields:
-            converted[position] = int.from_bytes(numbers[position], self.byte_order, signed=is_signed)
-        return converted
 
     def frame_of_zeros(self) -> Frame:
         """Return a frame in which all numbers are 0."""
