@@ -36,9 +36,6 @@ The reach is the largest distance of a point of the footprint from its centroid.
 considerably if the press moves by the reach.
 """
 
-MIN_CELLS = 8
-"""Smallest number of cells of a spline along x or y."""
-
 MAX_CELLS = 200
 """Largest number of cells of a spline along x or y, which limits the time of the fit to a few seconds."""
 
@@ -48,12 +45,6 @@ EXTRA_FORCE_NODES = 2
 The charges that d33 causes are proportional to the force, and not to the squared amplitude. With the additional nodes,
 the relative error of these charges is at most 1e-4.
 """
-
-CHECK_COUNT = 400
-"""Number of presses at which the splines are compared with the forward map."""
-
-LOG_FORCE_STEP = 1e-4
-"""Step of the central difference with respect to ln F, where F is the force, dimensionless."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +157,9 @@ class ChargeSpline:
         charge, position_derivative, log_force_derivative = self.first_order(contact[:, :2], contact[:, 2])
         return charge, np.concatenate([position_derivative, log_force_derivative[..., None]], axis=2)
 
-    def first_order(self, position: Array, force: Array | float) -> tuple[Array, Array, Array]:
+    def first_order(
+        self, position: Array, force: Array | float, log_force_step: float = 1e-4
+    ) -> tuple[Array, Array, Array]:
         """Compute the charges of presses, and the derivatives of the charges.
 
         Positions outside the disk are accepted, because an iterative solver may try such positions.
@@ -174,6 +167,7 @@ class ChargeSpline:
         Args:
             position: Positions (x, y), shape (n, 2), mm. Positions outside the disk are moved to its edge.
             force: Forces, shape (n,) or a number, N.
+            log_force_step: Step of the central difference with respect to ln F, where F is the force, dimensionless.
 
         Returns:
             Charges, shape (n, n_electrode), pC. Derivatives with respect to (x, y), shape (n, n_electrode, 2), pC/mm.
@@ -184,9 +178,9 @@ class ChargeSpline:
         position = onto_disk(position, self.domain.radius)
         log_force = np.log(np.broadcast_to(force, len(position)))
         weights = self.force_weights(log_force)
-        weights_above = self.force_weights(log_force + LOG_FORCE_STEP)
-        weights_below = self.force_weights(log_force - LOG_FORCE_STEP)
-        weight_slopes = (weights_above - weights_below) / (2.0 * LOG_FORCE_STEP)
+        weights_above = self.force_weights(log_force + log_force_step)
+        weights_below = self.force_weights(log_force - log_force_step)
+        weight_slopes = (weights_above - weights_below) / (2.0 * log_force_step)
 
         # Only the scaled charges depend on the position.
         scaled_charge = self.scaled_charges(position)
@@ -316,24 +310,27 @@ class _ScaledCharges:
         return np.asarray(scaled_charge + scaled_pressure_charge)
 
 
-def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.interpolate.NdBSpline":
+def _fit_disk(
+    samples: _ScaledCharges, radius: float, spacing: float, min_cells: int = 8
+) -> "scipy.interpolate.NdBSpline":
     """Fit a spline to the scaled charges of all electrodes over the disk.
 
     Args:
         samples: Scaled charges to which the spline is fitted.
         radius: Radius of the disk, mm.
         spacing: Largest distance between the knots, mm.
+        min_cells: Smallest number of cells of a spline along x or y.
 
     Returns:
         Spline in x and y that returns scaled charges, shape (n_force, n_electrode), pC.
     """
-    cells = int(np.clip(np.ceil(2.0 * radius / spacing), MIN_CELLS, MAX_CELLS))
+    cells = int(np.clip(np.ceil(2.0 * radius / spacing), min_cells, MAX_CELLS))
     knots = spline_knots(-radius, radius, cells)
     position = radius * disk_positions(cells)
     return fit_spline(position, samples.charges_at(position), (knots, knots))
 
 
-def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:
+def _largest_error(spline: ChargeSpline, forward_map: ForwardMap, count: int = 400) -> float:
     """Compute the largest relative error of a spline at evenly distributed presses.
 
     The presses differ from the presses to which the spline was fitted.
@@ -341,13 +338,14 @@ def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:
     Args:
         spline: Finished spline whose error is computed.
         forward_map: Forward map that the spline approximates.
+        count: Number of presses at which the splines are compared with the forward map.
 
     Returns:
         The largest error of a charge, relative to the largest charge of the same press, dimensionless.
     """
-    position = spline.domain.radius * sunflower(CHECK_COUNT)
+    position = spline.domain.radius * sunflower(count)
     # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly.
-    log_force_fraction = np.arange(CHECK_COUNT) * 0.618 % 1.0
+    log_force_fraction = np.arange(count) * 0.618 % 1.0
     min_force, max_force = spline.domain.force_range
     force = np.clip(min_force * (max_force / min_force) ** log_force_fraction, min_force, max_force)
     contact = np.stack([position.real, position.imag, force], axis=1)

@@ -27,17 +27,8 @@ from isocharge.simulate.sensor.probe import Probe
 UNDEFORMED_RADIUS = 0.5
 """Radius within which the mesh of an oval film is the same as the mesh of a circular film, in film radii."""
 
-PRESSURE_POINTS = 32
-"""Number of integration points in each direction of an element for a pressure that is not uniform."""
-
 Pressure = Callable[[Complexes], Array]
 """Function that returns the pressure at film points x + iy, in the shape of the points."""
-
-INVERSE_STEPS = 8
-"""Number of Newton steps of `from_oval`.
-
-After this number of steps, the error is of the order of rounding errors for oval parameters up to e = 0.05.
-"""
 
 
 @dataclass(frozen=True)
@@ -304,7 +295,7 @@ def to_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
     return np.asarray(points * (1.0 + _displacement_ratio(radius) * rim_displacement))
 
 
-def from_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
+def from_oval(points: Complexes, oval: complex | Complexes, newton_steps: int = 8) -> Complexes:
     """Convert points of an oval film into points of a circular film. This function is the inverse of `to_oval`.
 
     The radius of each point on the circular film is computed by Newton's method with an approximate slope.
@@ -313,6 +304,8 @@ def from_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
         points: Points x + iy of the oval film, any shape, in film radii.
         oval: Shape e exp(2 i alpha) of the clamp, a number or an array that broadcasts with the points; see
             `PlacedMesh`.
+        newton_steps: Number of Newton steps of `from_oval`. After this number of steps, the error is of the order of
+            rounding errors for oval parameters up to e = 0.05.
 
     Returns:
         Points x + iy of the circular film, same shape, in film radii.
@@ -322,7 +315,7 @@ def from_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
     oval_radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
     rim_displacement = (np.conj(oval) * (points / oval_radius) ** 2).real  # e cos(2 (angle - alpha))
     radius = oval_radius
-    for _ in range(INVERSE_STEPS):
+    for _ in range(newton_steps):
         displacement_ratio = _displacement_ratio(radius)
         residual = radius * (1.0 + displacement_ratio * rim_displacement) - oval_radius
         # If d(r) is the displacement ratio at the radius r, the derivative of r d(r) is d + r d', which is 7 d at the
@@ -364,18 +357,20 @@ class _Quadrature(NamedTuple):
     node_weights: Array
 
 
-def _integrate_pressure(order: int, points: Complexes, pressure: Pressure) -> Array:
+def _integrate_pressure(order: int, points: Complexes, pressure: Pressure, points_per_side: int = 32) -> Array:
     """Integrate the product of the pressure and each basis function over each element.
 
     Args:
         order: Order of the elements.
         points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
         pressure: Function that returns the pressure at film points.
+        points_per_side: Number of integration points in each direction of an element for a pressure that is not
+            uniform.
 
     Returns:
         Integrals, shape (n_element, n_local).
     """
-    xi, eta, reference_weights = gauss_reference_square(PRESSURE_POINTS)
+    xi, eta, reference_weights = gauss_reference_square(points_per_side)
     values, derivatives = tensor_basis(order, xi, eta)
     film_weights = _determinant(derivatives[:, None], points) * reference_weights
     quadrature_points = points @ values.T  # film points, shape (n_element, n_point)

@@ -14,21 +14,6 @@ from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks
 from isocharge.simulate.mesh.placement import Placement
 
-MAX_NEWTON_STEPS = 20
-"""Largest number of Newton steps with which a point inside the innermost circle is located."""
-
-NEGLIGIBLE_STEP = 1e-13
-"""Change of the local coordinates below which Newton's method ends, dimensionless."""
-
-OVERSHOOT = 0.1
-"""Largest distance of the local coordinates of a point from the range from 0 to 1 in Newton's method."""
-
-ELEMENT_TOLERANCE = 1e-9
-"""Distance of a local coordinate from the range from 0 to 1 above which another element is tried."""
-
-ANGULAR_STEP = 1e-5
-"""Step of the angular coordinate for the derivative of the sides of an element by central differences."""
-
 
 def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
     """Find the elements that contain film points, and the local coordinates of the points in their elements.
@@ -134,7 +119,9 @@ def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
     return np.asarray(circle_angle + depth * (rim_angle - circle_angle))
 
 
-def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
+def _locate_inside(
+    placement: Placement, blocks: Blocks, points: Complexes, tolerance: float = 1e-9
+) -> tuple[Integers, Array, Array]:
     """Find the elements that contain points inside the innermost circle.
 
     A straight line is drawn through each side of an element. The signed distance of a point from the line is positive
@@ -147,6 +134,7 @@ def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> t
         placement: n placements, one for each point.
         blocks: The elements.
         points: Film points x + iy, shape (n,), in film radii.
+        tolerance: Distance of a local coordinate from the range from 0 to 1 above which another element is tried.
 
     Returns:
         Index of the element, and radial and angular coordinate in the element from 0 to 1, each of shape (n,).
@@ -162,7 +150,7 @@ def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> t
     angular = np.full(points.shape, np.inf)
     for candidate in candidates.T:
         # Select the points whose element has not been found yet.
-        selected = np.flatnonzero(_overshoot(radial, angular) > ELEMENT_TOLERANCE)
+        selected = np.flatnonzero(_overshoot(radial, angular) > tolerance)
         if selected.size == 0:
             break
         tried = candidate[selected]
@@ -210,7 +198,15 @@ def _inner_corners(placement: Placement, blocks: Blocks) -> Complexes:
 
 
 def _local_coordinates(
-    placement: Placement, blocks: Blocks, points: Complexes, element: Integers, corners: Complexes
+    placement: Placement,
+    blocks: Blocks,
+    points: Complexes,
+    element: Integers,
+    corners: Complexes,
+    max_steps: int = 20,
+    negligible_step: float = 1e-13,
+    max_overshoot: float = 0.1,
+    difference_step: float = 1e-5,
 ) -> tuple[Array, Array]:
     """Compute the local coordinates of points in given elements inside the innermost circle by Newton's method.
 
@@ -223,6 +219,12 @@ def _local_coordinates(
         points: Film points x + iy, shape (n,), in film radii.
         element: Index of the element that contains each point, shape (n,).
         corners: Corners of these elements, shape (n, 4); see `_inner_corners`.
+        max_steps: Largest number of Newton steps with which a point inside the innermost circle is located.
+        negligible_step: Change of the local coordinates below which Newton's method ends, dimensionless.
+        max_overshoot: Largest distance of the local coordinates of a point from the range from 0 to 1 in Newton's
+            method.
+        difference_step: Step of the angular coordinate for the derivative of the sides of an element by central
+            differences.
 
     Returns:
         Radial coordinate and angular coordinate, each of shape (n,). They are between 0 and 1 for points inside the
@@ -230,27 +232,27 @@ def _local_coordinates(
     """
     radial = np.full(points.shape, 0.5)
     angular = np.full(points.shape, 0.5)
-    for _ in range(MAX_NEWTON_STEPS):
+    for _ in range(max_steps):
         # Evaluate the sides at the angular coordinate, and before and after it for the central differences.
-        shifted_angular = angular[:, None] + np.array([0.0, -ANGULAR_STEP, ANGULAR_STEP])
+        shifted_angular = angular[:, None] + np.array([0.0, -difference_step, difference_step])
         inner, outer = _side_points(placement, blocks, element, corners, shifted_angular)
         shifted_points = inner + radial[:, None] * (outer - inner)
         current, before, after = shifted_points.T
         residual = current - points
         radial_derivative = outer[:, 0] - inner[:, 0]
-        angular_derivative = (after - before) / (2.0 * ANGULAR_STEP)
+        angular_derivative = (after - before) / (2.0 * difference_step)
 
         # Newton step for two unknowns by Cramer's rule. The determinant of two plane vectors is the imaginary part of
         # the product of the conjugate of the first vector and the second vector.
         determinant = (np.conj(radial_derivative) * angular_derivative).imag
         radial_step = -(np.conj(residual) * angular_derivative).imag / determinant
         angular_step = -(np.conj(radial_derivative) * residual).imag / determinant
-        new_radial = np.clip(radial + radial_step, -OVERSHOOT, 1.0 + OVERSHOOT)
-        new_angular = np.clip(angular + angular_step, -OVERSHOOT, 1.0 + OVERSHOOT)
+        new_radial = np.clip(radial + radial_step, -max_overshoot, 1.0 + max_overshoot)
+        new_angular = np.clip(angular + angular_step, -max_overshoot, 1.0 + max_overshoot)
         largest_step = max(np.abs(new_radial - radial).max(), np.abs(new_angular - angular).max())
         radial = new_radial
         angular = new_angular
-        if largest_step < NEGLIGIBLE_STEP:
+        if largest_step < negligible_step:
             break
     return radial, angular
 

@@ -26,21 +26,18 @@ residuals r, shape (m, k), and their derivatives dr/du, shape (m, 3, k).
 MIN_CHANGE = 1e-7
 """Default value for the change of |r|^2 below which the iteration ends, relative to 1 + |r|^2."""
 
-INITIAL_DAMPING = 1e-4
-"""Damping of the first step, relative to the mean of the diagonal of J'J."""
-
-DAMPING_DECREASE = 0.2
-"""Factor of the damping after a step that lowers |r|^2, dimensionless."""
-
-DAMPING_INCREASE = 8.0
-"""Factor of the damping after a rejected step, dimensionless."""
-
 EDGE_TOLERANCE = 1e-9
 """Distance from an edge of D below which a point counts as lying on the edge."""
 
 
 def minimise(
-    evaluate: ResidualFunction, start: Array, max_steps: int = 60, min_change: float = MIN_CHANGE
+    evaluate: ResidualFunction,
+    start: Array,
+    max_steps: int = 60,
+    min_change: float = MIN_CHANGE,
+    initial_damping: float = 1e-4,
+    damping_decrease: float = 0.2,
+    damping_increase: float = 8.0,
 ) -> tuple[Array, Array]:
     """Find a local minimum of each problem by damped Gauss-Newton steps, which begin at a given starting point.
 
@@ -55,6 +52,9 @@ def minimise(
         start: Starting points, shape (n, 3). Points outside D are replaced by the nearest point of D.
         max_steps: Largest number of steps.
         min_change: Change of |r|^2 below which the iteration ends, relative to 1 + |r|^2.
+        initial_damping: Damping of the first step, relative to the mean of the diagonal of J'J.
+        damping_decrease: Factor of the damping after a step that lowers |r|^2, dimensionless.
+        damping_increase: Factor of the damping after a rejected step, dimensionless.
 
     Returns:
         Points in D, shape (n, 3), and the residuals at these points, shape (n, k).
@@ -63,7 +63,7 @@ def minimise(
     active = np.arange(len(start))  # indices of the problems whose iteration has not ended
     residual, slopes = (np.array(values) for values in evaluate(active, point))  # r and dr/du
     squared_norm = (residual**2).sum(axis=1)  # |r|^2, shape (n,)
-    damping = np.full(len(point), INITIAL_DAMPING)
+    damping = np.full(len(point), initial_damping)
     for _ in range(max_steps):
         if not active.size:
             break
@@ -77,7 +77,7 @@ def minimise(
         residual[accepted] = trial_residual[is_accepted]
         slopes[accepted] = trial_slopes[is_accepted]
         squared_norm[accepted] = trial_squared_norm[is_accepted]
-        damping[active] *= np.where(is_accepted, DAMPING_DECREASE, DAMPING_INCREASE)
+        damping[active] *= np.where(is_accepted, damping_decrease, damping_increase)
         active = active[np.abs(change) >= min_change]
     return point, residual
 

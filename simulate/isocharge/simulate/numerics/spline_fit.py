@@ -8,24 +8,6 @@ from scipy.sparse.linalg import splu
 from isocharge.common.arrays import Array
 from isocharge.simulate.numerics.disk import lattice
 
-SMOOTHING = 5e-3
-"""Weight of the third differences of the spline coefficients in the fit, dimensionless.
-
-The third differences determine the coefficients in regions without points.
-"""
-
-POSITIONS_PER_CELL = 1.6
-"""Number of positions per cell to which a spline is fitted."""
-
-POSITIONS_PER_EDGE_CELL = 2.0
-"""Number of additional positions on the edge of the disk to which a spline is fitted, per cell along the edge."""
-
-EDGE_RADIUS = 1.0 - 1e-12
-"""Distance of the positions on the edge of the disk from the centre, in radii of the disk, dimensionless.
-
-This distance is less than 1 by more than the rounding error. The positions therefore lie in the disk.
-"""
-
 
 def spline_knots(low: float, high: float, cells: int) -> Array:
     """Return the knots of a cubic spline that divide an interval into equal cells.
@@ -90,16 +72,18 @@ def _design_matrix(position: Array, knots: tuple[Array, Array]) -> csr_array:
     return csr_array((entries.data, entries.indices, entries.indptr), shape=(len(position), n_coefficient))
 
 
-def _penalty_matrix(x_count: int, y_count: int) -> sparray:
+def _penalty_matrix(x_count: int, y_count: int, smoothing: float = 5e-3) -> sparray:
     """Return the matrix that converts spline coefficients into their weighted third differences along x and along y.
 
     Args:
         x_count: Number of coefficients along x, which is the first axis of the coefficients.
         y_count: Number of coefficients along y.
+        smoothing: Weight of the third differences of the spline coefficients in the fit, dimensionless. The third
+            differences determine the coefficients in regions without points.
     """
     x_differences = kron(_third_differences(x_count), eye_array(y_count))
     y_differences = kron(eye_array(x_count), _third_differences(y_count))
-    return SMOOTHING * vstack([x_differences, y_differences])
+    return smoothing * vstack([x_differences, y_differences])
 
 
 def _third_differences(count: int) -> dia_array:
@@ -107,13 +91,21 @@ def _third_differences(count: int) -> dia_array:
     return diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
 
 
-def disk_positions(cells: int) -> Array:
+def disk_positions(
+    cells: int, per_cell: float = 1.6, per_edge_cell: float = 2.0, edge_radius: float = 1.0 - 1e-12
+) -> Array:
     """Return positions on the unit disk to which a spline is fitted.
 
     The positions are the points of a lattice in the disk, and points on the edge of the disk.
 
     Args:
         cells: Number of cells of the spline along the diameter of the disk.
+        per_cell: Number of positions per cell to which a spline is fitted.
+        per_edge_cell: Number of additional positions on the edge of the disk to which a spline is fitted, per cell
+            along the edge.
+        edge_radius: Distance of the positions on the edge of the disk from the centre, in radii of the disk,
+            dimensionless. This distance is less than 1 by more than the rounding error. The positions therefore lie in
+            the disk.
 
     Returns:
         Positions (x, y), shape (n, 2), in radii of the disk.
@@ -122,11 +114,11 @@ def disk_positions(cells: int) -> Array:
     # enough positions if there are only a few cells.
     cells_in_disk = np.pi * (0.5 * cells) ** 2
     cells_along_edge = np.pi * cells
-    inner_count = int(POSITIONS_PER_CELL * cells_in_disk) + 16
-    edge_count = int(POSITIONS_PER_EDGE_CELL * cells_along_edge) + 8
+    inner_count = int(per_cell * cells_in_disk) + 16
+    edge_count = int(per_edge_cell * cells_along_edge) + 8
 
-    # Positions are complex numbers x + iy. EDGE_RADIUS moves the points on the edge slightly into the disk.
+    # Positions are complex numbers x + iy. edge_radius moves the points on the edge slightly into the disk.
     inner_positions = lattice(inner_count)
-    edge_positions = np.exp(2j * np.pi * np.arange(edge_count) / edge_count) * EDGE_RADIUS
+    edge_positions = np.exp(2j * np.pi * np.arange(edge_count) / edge_count) * edge_radius
     complex_positions = np.concatenate([inner_positions, edge_positions])
     return np.stack([complex_positions.real, complex_positions.imag], axis=1)

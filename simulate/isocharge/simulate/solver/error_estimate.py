@@ -47,15 +47,6 @@ MODE_SHARE_WEIGHT = 0.1
 PATCH_RINGS = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8)
 """Radii of the rings on which square patches are placed to compare the charges of two meshes, in film radii."""
 
-PATCHES_PER_RING = 12
-"""Number of patches on each ring."""
-
-PATCH_SIDE = 1.0 / 15.0
-"""Side of the patches, in film radii."""
-
-PATCH_POINTS = 6
-"""Number of Gauss points along the side of a patch."""
-
 WRINKLE_SHARE = 1e-3
 """Ratio of the compression to the largest stress above which a warning is given, dimensionless."""
 
@@ -155,7 +146,7 @@ def estimated_error(equilibrium: Equilibrium) -> float:
     return mesh_error(equilibrium) + modelling_error(equilibrium.film, equilibrium.force, equilibrium.theory)
 
 
-def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
+def relative_difference(one: Equilibrium, other: Equilibrium, patches_per_ring: int = 12) -> float:
     """Compute the largest relative difference between two equilibria of the same press.
 
     The function compares the deflections at the probe, and the charges that square patches of the film would collect.
@@ -166,13 +157,14 @@ def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     Args:
         one: First equilibrium.
         other: Second equilibrium. The differences are relative to its deflection and its charges.
+        patches_per_ring: Number of patches on each ring.
 
     Returns:
         Relative difference, dimensionless.
     """
-    # Centres x + iy of the patches, shape (n_ring, PATCHES_PER_RING), mm
+    # Centres x + iy of the patches, shape (n_ring, patches_per_ring), mm
     film_radius = one.film.radius
-    unit_circle = np.exp(2j * np.pi * np.arange(PATCHES_PER_RING) / PATCHES_PER_RING)
+    unit_circle = np.exp(2j * np.pi * np.arange(patches_per_ring) / patches_per_ring)
     rings_around_centre = film_radius * np.array(PATCH_RINGS)[:, None] * unit_circle
     ring_around_footprint = complex(*one.at) + one.probe.reach * unit_circle
     patch_centres = np.concatenate([rings_around_centre, ring_around_footprint[None]])
@@ -190,12 +182,16 @@ def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     return max(charge_difference, deflection_difference)
 
 
-def _patch_charges(equilibrium: Equilibrium, centres: Array) -> Array:
+def _patch_charges(
+    equilibrium: Equilibrium, centres: Array, relative_side: float = 1.0 / 15.0, points_per_side: int = 6
+) -> Array:
     """Compute the charge per area of each square patch, for a biaxial film and for a uniaxial film.
 
     Args:
         equilibrium: The solved press.
         centres: Centres x + iy of the patches, shape (n_ring, n_patch), mm.
+        relative_side: Side of the patches, in film radii.
+        points_per_side: Number of Gauss points along the side of a patch.
 
     Returns:
         Charges per area in arbitrary units, shape (n_ring, n_patch, 2). The last axis is the kind of film. The part of
@@ -203,8 +199,8 @@ def _patch_charges(equilibrium: Equilibrium, centres: Array) -> Array:
     """
     # Integration points of all patches. The coordinates xi and eta range from -1 to 1.
     film_radius = equilibrium.film.radius
-    xi, eta, weights = gauss_reference_square(PATCH_POINTS)
-    half_side = 0.5 * PATCH_SIDE * film_radius
+    xi, eta, weights = gauss_reference_square(points_per_side)
+    half_side = 0.5 * relative_side * film_radius
     complex_points = (centres[:, :, None] + half_side * (xi + 1j * eta)).ravel()
     points = np.stack([complex_points.real, complex_points.imag], axis=1)
 

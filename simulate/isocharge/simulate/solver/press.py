@@ -47,12 +47,6 @@ DIFFERENT_EQUILIBRIUM = 0.1
 A film that wrinkles has many equilibria.
 """
 
-FIRST_LOAD_SHARE = 0.0625
-"""Share of the full load in the first load step, if the solve with the full load fails."""
-
-MAX_LOAD_STEPS = 12
-"""Largest number of load steps."""
-
 
 def press(
     film: Film,
@@ -311,7 +305,13 @@ def _solve_nonlinear(
 
 
 def _solve_by_load_steps(
-    case: LoadCase, failed: NewtonResult, geometry: Geometry, solver: Assembly, first_field: Array
+    case: LoadCase,
+    failed: NewtonResult,
+    geometry: Geometry,
+    solver: Assembly,
+    first_field: Array,
+    first_load_share: float = 0.0625,
+    max_load_steps: int = 12,
 ) -> NewtonResult:
     """Solve a press for increasing forces, because the solve with the full force has failed.
 
@@ -325,6 +325,8 @@ def _solve_by_load_steps(
         geometry: Integration rules of the elements.
         solver: Linear solver for the mesh.
         first_field: First iterate of the solve with the first force, shape (n_node, 3).
+        first_load_share: Share of the full load in the first load step, if the solve with the full load fails.
+        max_load_steps: Largest number of load steps.
 
     Returns:
         Result of a successful solve with the full force. If there is none, `failed` with the total number of
@@ -334,8 +336,8 @@ def _solve_by_load_steps(
     force_factor = 2.0  # ratio of the next force to `solved_force`
     iterations = failed.iterations
     field = first_field
-    force = FIRST_LOAD_SHARE * case.force
-    for _ in range(MAX_LOAD_STEPS):
+    force = first_load_share * case.force
+    for _ in range(max_load_steps):
         # An equilibrium with a smaller force is close to the solution, so full Newton steps are allowed at once.
         full_steps_below = np.inf if solved_force else UNSTABILISED_BELOW
         elastic = _elastic_film(case, geometry, force)
