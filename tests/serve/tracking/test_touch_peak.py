@@ -1,7 +1,6 @@
 """Tests of the average charges of a touch near its largest force."""
 
 import numpy as np
-import pytest
 
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.tracking.touch_peak import MAX_AVERAGED_FRAMES, TouchPeak
@@ -33,12 +32,3 @@ def test_long_touch_is_averaged_over_the_first_frames_only():
     charges = steady + changed
     peak = peak_of([contact(1.0)] * len(charges), charges)
     np.testing.assert_allclose(peak.mean_charge_pC, [100.0])
-
-
-def test_average_reduces_independent_noise_by_the_square_root_of_the_number_of_frames():
-    rng = np.random.default_rng(7)
-    means = []
-    for _ in range(400):
-        noisy_charges = 500.0 + rng.standard_normal((16, 4))
-        means.append(peak_of([contact(1.0)] * 16, noisy_charges).mean_charge_pC)
-    assert np.std(means) == pytest.approx(1.0 / 4.0, rel=0.1)

@@ -40,33 +40,26 @@ FLOORS = {
 }
 """Floor for each column of an output, in the unit of the column. Below it, differences are compared absolutely."""
 
-REFERENCE_RADIUS_MM = 20.0
-"""Radius of the working area up to which the floors of x and y are constant, mm. Above it, they grow in proportion."""
-
-REFERENCE_FORCE_N = 2.0
-"""Largest force up to which the floor of the force is constant, N. Above it, the floor grows in proportion."""
+RANGE_SHARE = 0.05
+"""Floor of x, y and the force relative to the range of the model, if this is more than the floor in `FLOORS`."""
 
 
 def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
     """Return the floors of x (mm), y (mm) and the force (N) for the outputs `contact` and `contact_std` of a model.
 
     A computed output may differ from the stored output by a tolerance, which is proportional to the magnitude of the
-    output. Below the floor, the tolerance is constant.
-
-    For a small film, the floors have the values in `FLOORS`. The floors of x and y grow in proportion to the radius of
-    the working area above `REFERENCE_RADIUS_MM`, and are at least the rms position error of the model. The floor of the
-    force grows in proportion to the largest force above `REFERENCE_FORCE_N`.
+    output. Below the floor, the tolerance is constant. The floors of x and y are at least the rms position error of the
+    model.
 
     Args:
         metadata: Metadata of the model.
     """
-    x_floor_mm, y_floor_mm, force_floor_N = FLOORS["contact"]
+    position_floor_mm, _, force_floor_N = FLOORS["contact"]
     radius_mm = max(math.hypot(x_mm, y_mm) for x_mm, y_mm in metadata.working_area_mm)
     position_rms_mm = metadata.errors.get("position_rms_mm", 0.0)
     _min_force_N, max_force_N = metadata.force_range_N
-    position_factor = max(1.0, radius_mm / REFERENCE_RADIUS_MM, position_rms_mm / x_floor_mm)
-    force_factor = max(1.0, max_force_N / REFERENCE_FORCE_N)
-    return x_floor_mm * position_factor, y_floor_mm * position_factor, force_floor_N * force_factor
+    position_floor_mm = max(position_floor_mm, RANGE_SHARE * radius_mm, position_rms_mm)
+    return position_floor_mm, position_floor_mm, max(force_floor_N, RANGE_SHARE * max_force_N)
 
 
 @dataclass(frozen=True)

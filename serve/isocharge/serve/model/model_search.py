@@ -74,7 +74,7 @@ def repositories(models: Path | None = None) -> list[Path]:
 
 def model_names(root: Path) -> list[str]:
     """Return the names of the models in a repository, which is a folder of models, in alphabetical order."""
-    return sorted(folder.name for folder in _subfolders(root) if _versions(folder))
+    return sorted(folder.name for folder in _subfolders(root) if version_folders(folder))
 
 
 def _released_models() -> Path:
@@ -102,23 +102,18 @@ def _version_folder(path: Path) -> Path | None:
         return path.parent
     if (path / "model.onnx").is_file():
         return path
-    versions = _versions(path)
-    if not versions:
-        return None
-    return path / str(max(versions))
+    versions = version_folders(path)
+    return versions[max(versions)] if versions else None
 
 
 def version_folders(folder: Path) -> dict[int, Path]:
     """Return the version folders of a model by their version numbers, in ascending order.
 
-    A version folder is a subfolder of the model folder whose name is the version number.
+    A version folder is a subfolder of the model folder whose name is the version number. The result is empty if the
+    path is not a folder.
     """
-    return {version: folder / str(version) for version in sorted(_versions(folder))}
-
-
-def _versions(folder: Path) -> list[int]:
-    """Return the version numbers of a model in any order. The list is empty if the path is not a folder."""
-    return [int(entry.name) for entry in _subfolders(folder) if VERSION.fullmatch(entry.name)]
+    versions = sorted(int(entry.name) for entry in _subfolders(folder) if VERSION.fullmatch(entry.name))
+    return {version: folder / str(version) for version in versions}
 
 
 def _subfolders(folder: Path) -> list[Path]:

@@ -35,9 +35,6 @@ from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.tracking.touch_peak import TouchPeak
 
-FEWEST_TOUCHES = 8
-"""Number of touches before the first correction of contacts."""
-
 GAIN_STD = 0.01
 """Standard deviation of the change of a gain before the first touch, relative to the gain."""
 
@@ -49,9 +46,6 @@ SMALLEST_STD = 1e-4
 
 MAX_DEVIATION = 20.0
 """Largest magnitude of an unknown, in standard deviations before the first touch."""
-
-FORCE_MARGIN = 1.5
-"""Factor by which the force of a touch may exceed the range of forces of the charge map."""
 
 MAX_MEAN_SQUARE = 3.0
 """Largest mean squared distance of the latest touches from the predicted touches, for a film that is not lost."""
@@ -152,8 +146,8 @@ class FilmFollower:
         radius_mm = series.domain.radius
         smallest_N, largest_N = series.domain.force_range
         self._contact_bounds = (
-            np.array([-radius_mm, -radius_mm, math.log(smallest_N / FORCE_MARGIN)]),
-            np.array([radius_mm, radius_mm, math.log(largest_N * FORCE_MARGIN)]),
+            np.array([-radius_mm, -radius_mm, math.log(smallest_N)]),
+            np.array([radius_mm, radius_mm, math.log(largest_N)]),
         )
         self.reset()
 
@@ -246,7 +240,7 @@ class FilmFollower:
         self.is_lost = self._mean_square > MAX_MEAN_SQUARE or bool(at_end[0] or at_end[self._offset])
         if self.is_lost and not was_lost:
             self._start_estimate()  # the film may have changed suddenly, so earlier touches do not help
-        elif not self.is_lost and self._touch_count >= FEWEST_TOUCHES:
+        elif not self.is_lost:
             self._apply_estimate()
             self._conversion_contact = None  # the stored conversion belongs to the earlier state
 
