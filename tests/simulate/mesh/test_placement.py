@@ -50,7 +50,7 @@ def presses(draw) -> tuple[Probe, tuple[float, float], Resolution, float]:
     distance = share * (RADIUS - probe.reach)
     at = (distance * np.cos(angle), distance * np.sin(angle))
     try:
-        case = LoadCase.of(FILM, probe, at, 1e-3, SolveSettings(theory=FULL, layer=layer))
+        case = LoadCase(FILM, probe, at, 1e-3, SolveSettings(theory=FULL, layer=layer))
         resolution = choose_mesh(case).resolution
     except SceneError:
         assume(False)
@@ -133,4 +133,4 @@ def test_footprint_elements_have_the_area_centroid_and_load_of_the_probe(scene):
 def test_ellipse_too_near_the_rim_is_refused():
     ellipse = Ellipse(16.0, 16.0 * 0.999, 0.0)
     with pytest.raises(SceneError, match=r"comes within 0\.1\d* mm of the rim: expected at least 1\.6 mm"):
-        LoadCase.of(FILM, ellipse, (36.85, 0.0), 1e-3, SolveSettings(theory=FULL, layer=0.1))
+        LoadCase(FILM, ellipse, (36.85, 0.0), 1e-3, SolveSettings(theory=FULL, layer=0.1))

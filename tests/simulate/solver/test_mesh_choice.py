@@ -105,7 +105,7 @@ def test_mesh_error_bounds_the_difference_from_a_finer_mesh(scene):
     ],
 )
 def test_needs_second_mesh_near_the_rim_and_for_large_probes(probe, distance, accuracy, needed):
-    case = LoadCase.of(FILM, probe, (distance, 0.0), 1.0, SolveSettings(accuracy=accuracy))
+    case = LoadCase(FILM, probe, (distance, 0.0), 1.0, SolveSettings(accuracy=accuracy))
     assert needs_second_mesh(case) == needed
 
 

@@ -185,12 +185,7 @@ class Blocks:
         The elements are those of the core polygon, followed by one or two layers of elements that surround the core
         polygon up to the innermost circle.
         """
-        core_elements = [
-            self._core_element(corner, radial_index, angular_index)
-            for corner in range(self.n_meshed)
-            for radial_index in range(self.n_half_edge)
-            for angular_index in range(self.n_half_edge)
-        ]
+        core_elements = [element for corner in range(self.n_meshed) for element in self._core_elements(corner)]
         zero = np.zeros(self.n_corner + 1)
 
         # The first layer has a straight inner side on the core polygon, and an outer side that may be curved. Both
@@ -198,24 +193,20 @@ class Blocks:
         first_layer = [[first, last, zero, zero] for first, last in pairwise(self.core_outline)]
         n_second_layer = self.n_sector * (self.n_layer - 1)  # 0 if there is only one layer
         second_layer = [[zero, zero, zero, zero] for _ in range(n_second_layer)]
-        return np.array(core_elements + first_layer + second_layer)
+        return np.array([*core_elements, *first_layer, *second_layer])
 
-    def _core_element(self, corner: int, radial_index: int, angular_index: int) -> list[Array]:
-        """Return the corners of one element of the core polygon.
+    def _core_elements(self, corner: int) -> Array:
+        """Return the corners of the elements in the quadrilateral that belongs to a corner of the core polygon.
 
-        The quadrilateral of a corner lies between the corner, the centroid of the core polygon, and the middles of both
-        adjacent edges. Each quadrilateral consists of n_half_edge * n_half_edge elements.
+        The quadrilateral lies between the corner, the centroid of the core polygon, and the middles of both adjacent
+        edges. It consists of n_half_edge * n_half_edge elements.
 
         Args:
-            corner: Index of the corner of the core polygon whose quadrilateral contains the element.
-            radial_index: Index of the element along the side from the centroid to the middle of the edge before the
-                corner.
-            angular_index: Index of the element along the side from the centroid to the middle of the edge after the
-                corner.
+            corner: Index of the corner of the core polygon.
 
         Returns:
-            First and last corner of the inner side, and first and last corner of the outer side, each as weights of
-            shape (n_corner + 1,).
+            First and last corner of the inner side, and first and last corner of the outer side of each element, as
+            weights, shape (n_half_edge^2, 4, n_corner + 1).
         """
         # Corners of the quadrilateral. There are `n_half_edge` steps along the outline between a middle and a corner.
         centroid = np.eye(self.n_corner + 1)[-1]
@@ -224,15 +215,13 @@ class Blocks:
         corner_point = self.core_outline[start + self.n_half_edge]
         middle_after = self.core_outline[start + 2 * self.n_half_edge]
 
-        # Corners of the element in the coordinates of the quadrilateral, which are numbers from 0 to 1
-        inner = radial_index / self.n_half_edge
-        outer = (radial_index + 1) / self.n_half_edge
-        first = angular_index / self.n_half_edge
-        last = (angular_index + 1) / self.n_half_edge
-        return [
-            _bilinear(centroid, middle_after, middle_before, corner_point, radial, angular)
-            for radial, angular in ((inner, first), (inner, last), (outer, first), (outer, last))
-        ]
+        # Interpolate bilinearly on the grid of the corners of all elements, from the inner to the outer side.
+        fraction = np.linspace(0.0, 1.0, self.n_half_edge + 1)[:, None]
+        inner_side = centroid + fraction * (middle_after - centroid)
+        outer_side = middle_before + fraction * (corner_point - middle_before)
+        grid = inner_side + fraction[:, None] * (outer_side - inner_side)  # shape (radial, angular, n_corner + 1)
+        element_corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]], axis=2)
+        return element_corners.reshape(-1, 4, self.n_corner + 1)
 
     def rotated(self, steps: int, steps_per_turn: int) -> Integers:
         """Return how the elements are renumbered by a rotation of the probe that maps the mesh onto itself.
@@ -271,25 +260,3 @@ class Blocks:
         is_reflected = (points.imag < 0.0) & self.half
         meshed_points = points.real + 1j * np.abs(points.imag) if self.half else points
         return meshed_points, is_reflected
-
-
-def _bilinear(
-    inner_first: Array, inner_last: Array, outer_first: Array, outer_last: Array, radial: float, angular: float
-) -> Array:
-    """Interpolate bilinearly between the four corners of a quadrilateral.
-
-    Args:
-        inner_first: First corner of the inner side, as weights of the corners and of the centroid of the core polygon,
-            shape (n_corner + 1,).
-        inner_last: Last corner of the inner side, same shape.
-        outer_first: First corner of the outer side, same shape.
-        outer_last: Last corner of the outer side, same shape.
-        radial: Coordinate from 0 on the inner side to 1 on the outer side.
-        angular: Coordinate from 0 at the first corners to 1 at the last corners.
-
-    Returns:
-        Weights of the point with these coordinates, shape (n_corner + 1,).
-    """
-    inner_point = inner_first + angular * (inner_last - inner_first)
-    outer_point = outer_first + angular * (outer_last - outer_first)
-    return (1.0 - radial) * inner_point + radial * outer_point

@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from time import process_time
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 
@@ -191,71 +191,40 @@ def layer_for(film: Film, force: float) -> float:
 
 @dataclass(frozen=True)
 class LoadCase:
-    """A press with all settings of its solve except the resolution of the mesh.
+    """A press, which is checked when the object is created.
 
     Attributes:
         film: The film.
         probe: The probe.
         at: Centroid (x, y) of the footprint, mm.
         force: Force, N.
-        theory: Terms of the film theory.
-        layer: Total width of the thin rings at the rim, in film radii.
-        accuracy: Largest allowed relative error of a charge.
-        tolerance: Ratio of the out-of-balance force to the load at which the solve has converged.
-        began: Reading of the CPU clock of the process at the beginning of the work on the press, s.
+        settings: Settings of the solve.
         side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N.
+        began: Reading of the CPU clock of the process at the beginning of the work on the press, s.
     """
 
     film: Film
     probe: Probe
     at: tuple[float, float]
     force: float
-    theory: Theory
-    layer: float
-    accuracy: float
-    tolerance: float
-    began: float
+    settings: SolveSettings
     side_force: tuple[float, float] = (0.0, 0.0)
+    began: float = field(default_factory=process_time)
 
-    @classmethod
-    def of(
-        cls,
-        film: Film,
-        probe: Probe,
-        at: tuple[float, float],
-        force: float,
-        settings: SolveSettings,
-        side_force: tuple[float, float] = (0.0, 0.0),
-    ) -> Self:
-        """Check a press, and choose the width of the thin rings if the setting is "auto".
-
-        Args:
-            film: The film.
-            probe: The probe.
-            at: Centroid (x, y) of the footprint, mm.
-            force: Force, N.
-            settings: Settings of the solve.
-            side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N.
+    def __post_init__(self) -> None:
+        """Check the press.
 
         Raises:
             SceneError: If the press cannot exist.
         """
-        began = process_time()
-        check_press(film, probe, at, force)
-        check_side_force(side_force, force)
-        layer = layer_for(film, force) if settings.layer == "auto" else settings.layer
-        return cls(
-            film=film,
-            probe=probe,
-            at=at,
-            force=force,
-            theory=settings.theory,
-            layer=layer,
-            accuracy=settings.accuracy,
-            tolerance=settings.tolerance,
-            began=began,
-            side_force=side_force,
-        )
+        check_press(self.film, self.probe, self.at, self.force)
+        check_side_force(self.side_force, self.force)
+
+    @property
+    def layer(self) -> float:
+        """Total width of the thin rings at the rim, in film radii."""
+        layer = self.settings.layer
+        return layer_for(self.film, self.force) if layer == "auto" else layer
 
     def place(self, resolution: Resolution) -> PlacedMesh:
         """Create the mesh under this press with a given resolution."""
@@ -276,7 +245,7 @@ def choose_mesh(case: LoadCase) -> PlacedMesh:
     for resolution in _candidate_resolutions(case):
         mesh = case.place(resolution)
         error = shape_error(mesh)
-        if error <= 0.5 * case.accuracy:  # the other half is for the omitted terms of the theory
+        if error <= 0.5 * case.settings.accuracy:  # the other half is for the omitted terms of the theory
             return mesh
 
     # No mesh is sufficient. The last mesh, which is the finest, is still used if its error is moderate.
@@ -297,7 +266,7 @@ def needs_second_mesh(case: LoadCase) -> bool:
     is_large = not case.probe.topology.fills_circle and case.probe.reach > RELIABLE_REACH * radius
     is_near_rim = farthest_distance(case.film, case.probe, case.at) > RELIABLE_RADIUS * radius
     has_back_pressure = case.film.has_back_pressure
-    return is_large or is_near_rim or has_back_pressure or case.accuracy < ACCURACY
+    return is_large or is_near_rim or has_back_pressure or case.settings.accuracy < ACCURACY
 
 
 def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
@@ -338,8 +307,8 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     is_crowded = not probe.topology.fills_circle and enclosing_extent > film.radius
 
     # A better accuracy than the default `ACCURACY` requires a higher polynomial order. The factors are empirical.
-    extra_order = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.accuracy)))
-    first_order = 5 if case.theory.bending else 4
+    extra_order = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.settings.accuracy)))
+    first_order = 5 if case.settings.theory.bending else 4
 
     # A small radius of the innermost circle and the stretch of the conformal map require more rings (empirical
     # factors).
@@ -349,7 +318,7 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
         order=first_order + extra_order,
         around=16 if is_crowded or _is_very_uneven(film, case.force) else 8,
         rings=max(3, rings) + extra_order // 2,
-        rim=_thin_ring_count(placement, case.layer) if case.theory.bending else 0,
+        rim=_thin_ring_count(placement, case.layer) if case.settings.theory.bending else 0,
     )
     for order_increase, around_factor in REFINEMENTS:
         order = first_resolution.order + order_increase

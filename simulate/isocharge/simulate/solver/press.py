@@ -81,7 +81,7 @@ def press(
         SceneError: If the press cannot exist, or if the mesh is too distorted.
         SolveError: If the solve fails and `throw` is True.
     """
-    case = LoadCase.of(film, probe, at, force, settings, side_force)
+    case = LoadCase(film, probe, at, force, settings, side_force)
     with single_threaded_blas():
         if settings.resolution != "auto":
             solved = _solve(case, case.place(settings.resolution), start)
@@ -112,7 +112,7 @@ def needed_resolution(
         SceneError: If the press cannot exist, or if every mesh for the press is too distorted.
         SolveError: If two meshes must be compared and no equilibrium is found.
     """
-    case = LoadCase.of(film, probe, at, force, settings)
+    case = LoadCase(film, probe, at, force, settings)
     if settings.resolution != "auto":
         return settings.resolution
     if needs_second_mesh(case):
@@ -152,7 +152,7 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
             break  # the equilibrium on the previous mesh is the result
         error = relative_difference(solved, finer_equilibrium)
         solved = replace(finer_equilibrium, iterations=iterations, proven_error=error)
-        if error <= 0.5 * case.accuracy:
+        if error <= 0.5 * case.settings.accuracy:
             break
 
     # If the charges differ very much, the two meshes have different equilibria.
@@ -193,7 +193,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
         at=case.at,
         force=case.force,
         side_force=case.side_force,
-        theory=case.theory,
+        theory=case.settings.theory,
         mesh=mesh,
         field=result.field,
         groups=elastic.groups,
@@ -205,7 +205,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
     )
     if case.film.static_pressure == 0.0:
         return equilibrium
-    return _with_rest(equilibrium, case.tolerance)
+    return _with_rest(equilibrium, case.settings.tolerance)
 
 
 def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
@@ -265,7 +265,7 @@ def _elastic_film(case: LoadCase, geometry: Geometry, force: float) -> ElasticFi
     groups = DimensionlessGroups.of(
         case.film,
         force,
-        bending=case.theory.bending,
+        bending=case.settings.theory.bending,
         angle=direction,
         side_force=(force_factor * side_x, force_factor * side_y),
     )
@@ -298,7 +298,7 @@ def _solve_nonlinear(
         default_field += _static_start(mesh, elastic.groups)
 
     first_field = _first_field(start, mesh.template, default_field)
-    result = solve_newton(elastic, solver, first_field, case.tolerance)
+    result = solve_newton(elastic, solver, first_field, case.settings.tolerance)
     if result.converged:
         return result
     return _solve_by_load_steps(case, result, mesh.geometry, solver, default_field)
@@ -341,7 +341,7 @@ def _solve_by_load_steps(
         # An equilibrium with a smaller force is close to the solution, so full Newton steps are allowed at once.
         full_steps_below = np.inf if solved_force else UNSTABILISED_BELOW
         elastic = _elastic_film(case, geometry, force)
-        result = solve_newton(elastic, solver, field, case.tolerance, full_steps_below)
+        result = solve_newton(elastic, solver, field, case.settings.tolerance, full_steps_below)
         iterations += result.iterations
         if result.converged and force == case.force:
             message = f"converged in {iterations} steps, the load in parts"
