@@ -60,8 +60,7 @@ def shape_error(mesh: PlacedMesh) -> float:
 
     The elements approximate the conformal map by polynomials, so the area of the mesh differs slightly from the area of
     the film. The predicted error is the square root of the relative difference between the area of the mesh and the
-    area of the film. The largest error of a charge is about a third of the predicted error
-    (`tests/benchmarks/bench_hard_cases.py`).
+    area of the film. The largest error of a charge of random presses is about a third of the predicted error.
 
     Args:
         mesh: Mesh of the press.
