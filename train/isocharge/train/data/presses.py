@@ -145,11 +145,13 @@ def domain_of(dataset: Dataset) -> Domain:
     try:
         radius = float(ranges.get("radius_mm", sample_radius))
         min_force, max_force = (float(force) for force in ranges.get("force_N", sample_forces))
+        if not (0.0 < min_force <= max_force and radius > 0.0):
+            raise ValueError
     except (AttributeError, TypeError, ValueError) as error:
-        raise DatasetError(f"manifest ranges: expected radius_mm and force_N [MIN, MAX], got {ranges!r}") from error
+        raise DatasetError(
+            f"manifest ranges: expected positive radius_mm and force_N [MIN, MAX], got {ranges!r}"
+        ) from error
 
-    if not (0.0 < min_force <= max_force and radius > 0.0):
-        raise DatasetError(f"manifest ranges: expected positive radius_mm and force_N [MIN, MAX], got {ranges!r}")
     domain = Domain(radius, (min_force, max_force))
     if not domain.contains(LabelledPresses.of(dataset).contact).all():
         raise DatasetError(

@@ -19,7 +19,7 @@ OutputFunction = Callable[[Array], tuple[Array, ...]]
 N_GOLDEN = 64
 """Number of golden vectors of a model.
 
-Half of the charges belong to presses without noise, a quarter to presses with noise, and a quarter are extreme."""
+Three quarters of the charges belong to presses with noise, and a quarter are extreme."""
 
 TOLERANCES = {"contact": 1e-4, "contact_std": 1e-4, CORRELATION: 2e-3, "misfit": 2e-3}
 """Largest relative difference of each output between the graph (float32) and the network.
@@ -93,7 +93,7 @@ def _choose_golden_charges(
     Args:
         compute_exact: Function that computes the outputs of the network in double precision.
         presses: Presses without noise.
-        noise: Noise that is added to some of the charges.
+        noise: Noise that is added to the charges.
 
     Returns:
         Charges of presses, shape (n, n_electrode), and extreme charges, shape (m, n_electrode), pC.
@@ -102,15 +102,12 @@ def _choose_golden_charges(
     position_std = std[:, 0] + std[:, 1]  # a measure of the uncertainty of x and y
     well_determined_presses = presses[np.flatnonzero(position_std <= np.median(position_std))]
 
-    # Half of the golden vectors are presses without noise. A quarter are every second of these presses, with noise.
-    chosen_rows = np.linspace(0, len(well_determined_presses) - 1, N_GOLDEN // 2).astype(int)
-    chosen_presses = well_determined_presses[chosen_rows]
-    second_presses = chosen_presses[np.arange(0, len(chosen_presses), 2)]
-    press_charge = np.concatenate([chosen_presses.charge, second_presses.noisy(noise, seed=2)])
+    chosen_rows = np.linspace(0, len(well_determined_presses) - 1, 3 * N_GOLDEN // 4).astype(int)
+    press_charge = well_determined_presses[chosen_rows].noisy(noise, seed=2)
 
     # The last quarter has charges of presses times factors from 0.001 to 1000, zero charges and negative charges.
-    factor = np.geomspace(1e-3, 1e3, len(second_presses))
-    extreme_charge = second_presses.charge * factor[:, None]  # one factor for all charges of a press
+    factor = np.geomspace(1e-3, 1e3, N_GOLDEN // 4)
+    extreme_charge = press_charge[: len(factor)] * factor[:, None]  # one factor for all charges of a press
     extreme_charge[0] = 0.0
     extreme_charge[1] = -extreme_charge[1]
     return press_charge.astype(np.float32), extreme_charge.astype(np.float32)

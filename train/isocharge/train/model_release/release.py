@@ -30,7 +30,7 @@ N_CORNERS = 64
 """Number of corners of the polygon that represents a round working area."""
 
 CORNER_TOLERANCE_mm = 2e-3
-"""Largest difference between a coordinate of a corner and that of a regular polygon for a round working area, mm.
+"""Largest difference between the distances of two corners of a round working area from the origin, mm.
 
 The corners in the metadata are rounded to 0.0001 mm.
 """
@@ -153,15 +153,10 @@ def model_domain(metadata: ModelMetadata) -> Domain:
     """
     corners = np.array(metadata.working_area_mm)
 
-    # The distance of an edge from the origin is the cross product of the edge and one of its corners, divided by the
-    # length of the edge.
-    edges = np.roll(corners, -1, axis=0) - corners
-    cross_product = edges[:, 0] * corners[:, 1] - edges[:, 1] * corners[:, 0]
-    edge_distance = np.abs(cross_product) / np.hypot(edges[:, 0], edges[:, 1])
-
-    radius = round(float(edge_distance.min()), 3)
-    disk_corners = np.array(_disk_polygon(radius))
-    is_disk = corners.shape == disk_corners.shape and np.abs(corners - disk_corners).max() < CORNER_TOLERANCE_mm
+    # The corners of a regular polygon around the origin have equal distances, and so have the centres of its edges.
+    edge_centres = 0.5 * (corners + np.roll(corners, -1, axis=0))
+    radius = round(float(np.hypot(*edge_centres.T).min()), 3)
+    is_disk = len(corners) == N_CORNERS and np.ptp(np.hypot(*corners.T)) < CORNER_TOLERANCE_mm
     if is_disk:
         return Domain(radius, metadata.force_range_N)
     return PressedArea.of_corners(corners, metadata.force_range_N)
