@@ -34,9 +34,8 @@ def follow(t_us, arrived_s):
 
 def test_device_clock_unwraps():
     t_us = np.arange(2**32 - 50_000, 2**32 + 50_000, 1000)
-    clock, times = follow(t_us, START_S + t_us * 1e-6)
+    _, times = follow(t_us, START_S + t_us * 1e-6)
     assert [time.device_us for time in times] == t_us.tolist()
-    assert clock.restarts == 0
     assert [time.dt_s for time in times] == pytest.approx([0.0] + [1e-3] * 99)
 
 
@@ -57,9 +56,8 @@ def test_fit_follows_the_rate_and_smooths_the_jitter(ppm):
 def test_clock_of_a_device_that_restarts():
     t_us = np.concatenate([np.arange(1000) * 1000, np.arange(1000) * 1000])
     arrived_s = START_S + np.arange(2000) * 1e-3
-    clock, times = follow(t_us, arrived_s)
+    _, times = follow(t_us, arrived_s)
     host_s = np.array([time.host_s for time in times])
-    assert clock.restarts == 1
     assert times[1000].dt_s == 0.0
     assert np.abs(host_s - arrived_s).max() < 1e-3
 
@@ -68,9 +66,8 @@ def test_clock_of_a_device_that_jumps_ahead():
     """After a jump by twelve minutes, the host time follows the arrivals, and no step is longer than the others."""
     t_us = np.arange(2000) * 1000
     t_us[1000:] += 700_000_000
-    clock, times = follow(t_us, START_S + np.arange(2000) * 1e-3)
+    _, times = follow(t_us, START_S + np.arange(2000) * 1e-3)
     np.testing.assert_allclose(np.diff([time.host_s for time in times]), 1e-3, atol=1e-3)
-    assert clock.restarts == 1
     assert max(time.dt_s for time in times) == pytest.approx(1e-3)
 
 
@@ -85,7 +82,6 @@ def test_times_never_decrease():
         t_us = [4000 * int(number % 7000) for number in range(start, stop)]
         host_s += [time.host_s for time in read(clock, chunk_at(0.004 * stop + delay_s), t_us, MODULUS)]
     assert np.diff(host_s).min() >= 0.0
-    assert clock.restarts == 1
 
 
 def test_readings_of_one_chunk_are_spread_by_the_device_clock():
@@ -122,7 +118,6 @@ def test_wall_clock_that_is_set_changes_no_step(jump_s, has_clock):
     assert [time.dt_s for time in times[1:]] == pytest.approx([0.005] * 399)
     np.testing.assert_allclose(np.diff([time.clock_s for time in times]), 0.005, atol=1e-6)
     assert times[-1].host_s - START_S == pytest.approx(1.995 + jump_s, abs=0.2)
-    assert clock.restarts == 0
 
 
 def test_chunks_without_a_monotonic_time_are_timed_by_their_arrivals():

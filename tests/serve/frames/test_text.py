@@ -371,7 +371,6 @@ def test_clock_in_text_that_wraps(name, unit, modulus):
         frames = feed(f"{name}:{sent:.6f},A:1", parser=parser)
         clock.stamp(Chunk(b"", 0.0, 0), frames, parser.t_us_modulus)
         times_us += [frame.device_us for frame in frames]
-    assert clock.restarts == 0
     step_us = 5 * unit if name == "t_us" else 5000.0
     np.testing.assert_allclose(np.diff(times_us), step_us, atol=1.1)
 

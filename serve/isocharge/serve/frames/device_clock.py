@@ -42,13 +42,11 @@ class DeviceClock:
 
     Attributes:
         rate: Seconds of the host per second of the device.
-        restarts: Number of times that the clock of the device jumped back, or jumped ahead of the arrival time.
     """
 
     def __init__(self) -> None:
         """Start without a reading."""
         self.rate = 1.0
-        self.restarts = 0
         self._latest_chunk: Chunk | None = None
         self._monotonic_s = 0.0  # arrival of the latest chunk; it does not jump if the wall clock is set
         self.reset()
@@ -134,7 +132,6 @@ class DeviceClock:
         # time, which contains no information about the clock.
         is_new_arrival = self._chunk_arrival_s not in (None, arrival_s)
         if self._fitted_us is not None and is_new_arrival and predicted_s - arrival_s > MAX_DEVIATION_s:
-            self.restarts += 1
             self._fitted_us = None  # discards the fit
             step_us = 0  # the time since the previous reading is unknown
 
@@ -239,7 +236,6 @@ class DeviceClock:
             if step_us < modulus // 2:
                 self._device_us += step_us
                 return step_us
-            self.restarts += 1
 
         # This is the first reading after a start of the device.
         self._device_us = t_us
