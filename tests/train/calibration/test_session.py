@@ -64,7 +64,7 @@ def test_session_reports_its_errors_and_continues_with_saved_presses(problem, sy
     rig.press(3)
     session = rig.session
     error = session.result.film_error
-    assert f"errors of {error.position_mm:.2g} mm and {error.force_percent:.2g} %;" in session.summary[0]
+    assert f"errors of {error.position_mm:.2g} mm and {error.force_percent:.2g} %" in session.summary[0]
     assert [presses.lines for presses in rig.saved] == [(1,), (1, 2), (1, 2, 3)]
     assert not session.enough
     continued = PressSession(problem, save=rig.saved.append, presses=rig.saved[2], until=10.0)

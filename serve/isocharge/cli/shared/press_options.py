@@ -9,6 +9,16 @@ from isocharge.cli.shared.terminal import say
 from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses
 from isocharge.serve.presses.number_table import ignored_columns_message
 
+SensorOption = Annotated[
+    str,
+    typer.Option("--sensor", metavar="SENSOR", help="Name of a built-in sensor, or a TOML file that describes it."),
+]
+
+RadiusOption = Annotated[
+    float,
+    typer.Option("--radius", metavar="MM", help="Radius of the working area, mm: the largest distance of a press."),
+]
+
 PositionStdOption = Annotated[
     float,
     typer.Option(

@@ -9,7 +9,13 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.options import JsonOption, StressLimitOption, refuse, worker_count
-from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
+from isocharge.cli.shared.press_options import (
+    ForceStdOption,
+    PositionStdOption,
+    RadiusOption,
+    SensorOption,
+    read_press_file,
+)
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
@@ -25,10 +31,7 @@ from isocharge.train.calibration.folder import (
 
 
 def calibrate_command(
-    sensor: Annotated[
-        str,
-        typer.Option("--sensor", metavar="SENSOR", help="Name of a built-in sensor, or a TOML file that describes it."),
-    ],
+    sensor: SensorOption,
     file: Annotated[
         Path | None,
         typer.Argument(
@@ -48,10 +51,7 @@ def calibrate_command(
         ),
     ] = None,
     probe: ProbeOption = "circle:1.0",
-    radius: Annotated[
-        float,
-        typer.Option("--radius", metavar="MM", help="Radius of the working area, mm: the largest distance of a press."),
-    ] = DEFAULT_RADIUS,
+    radius: RadiusOption = DEFAULT_RADIUS,
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
     next_count: Annotated[

@@ -11,7 +11,7 @@ import typer
 
 from isocharge.cli.shared.options import DeviceOption, StressLimitOption, worker_count
 from isocharge.cli.shared.port_hints import no_frames_advice_added
-from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
+from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, RadiusOption, SensorOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue
@@ -32,10 +32,7 @@ def press_command(
     port: Annotated[
         str, typer.Option("--port", metavar="URL", help="Port of the sensor: device path or pyserial URL.")
     ],
-    sensor: Annotated[
-        str,
-        typer.Option("--sensor", metavar="SENSOR", help="Name of a built-in sensor, or a TOML file that describes it."),
-    ],
+    sensor: SensorOption,
     output: Annotated[
         Path,
         typer.Option(
@@ -46,10 +43,7 @@ def press_command(
         ),
     ],
     probe: ProbeOption = "circle:1.0",
-    radius: Annotated[
-        float,
-        typer.Option("--radius", metavar="MM", help="Radius of the working area, mm: the largest distance of a press."),
-    ] = DEFAULT_RADIUS,
+    radius: RadiusOption = DEFAULT_RADIUS,
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
     device: DeviceOption = None,

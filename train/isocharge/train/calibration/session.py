@@ -258,13 +258,7 @@ class PressSession:
             return (f"No film explains these presses: {self.refusal}",)
         if self.result is None:
             return ()
-        film_error = self.result.film_error
-        noise_error = self.result.sensitivity.noise_error
-        error_sentence = (
-            f"The uncertainty of the film causes errors of {film_error.position_mm:.2g} mm and "
-            f"{film_error.force_percent:.2g} %; noise alone causes {noise_error.position_mm:.2g} mm and "
-            f"{noise_error.force_percent:.2g} %."
-        )
+        error_sentence = self.result.summary[0]
         bad_sentences = [
             f"Press {number}, {describe_press(self.presses.contact[number - 1])}, does not agree with the others "
             "and is left out. Were its position and its force as stated?"
