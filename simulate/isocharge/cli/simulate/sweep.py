@@ -1,6 +1,5 @@
 """Command `isocharge simulate sweep`, which writes a dataset of many simulated presses."""
 
-import json as json_module
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -63,5 +62,4 @@ def sweep_command(
         largest_distance = sweep_radius(radius, film_sensor, probes, force)
         sweep = Sweep(largest_distance, force, samples, seed, orientation)
         run_sweep(output, film_sensor, probes, sweep, executor=executor)
-    manifest = json_module.loads((output / "manifest.json").read_text())
-    say(f"{manifest['samples']} presses in {output}")
+    say(f"{samples} presses in {output}")

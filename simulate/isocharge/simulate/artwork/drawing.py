@@ -21,7 +21,7 @@ with require("design"):
     from ezdxf.addons.drawing.svg import SVGBackend
     from ezdxf.document import Drawing
 
-LAYERS = {"FILM": 7, "ELECTRODES": 1, "RULER": 8, "NAMES": 8}
+LAYERS = {"FILM": 7, "ELECTRODES": 1, "NAMES": 8}
 """Names of the layers of a drawing, and their colours in the AutoCAD colour index."""
 
 BACK_COLOUR = 5
@@ -29,12 +29,6 @@ BACK_COLOUR = 5
 
 This layer exists only if the sensor file describes the metal of the back.
 """
-
-RULER_LENGTH = 50.0
-"""Length of the ruler in a drawing, mm. The ruler shows whether a print has the correct scale."""
-
-RULER_OFFSET = 4.0
-"""Distance of the ruler from the rim of the film, mm."""
 
 TEXT_HEIGHT = 2.0
 """Height of the letters in a drawing, mm."""
@@ -44,7 +38,7 @@ MARGIN = 5.0
 
 
 def draw_layout(sensor: Sensor) -> Drawing:
-    """Create a drawing of the film, the electrodes, their names, the metal of the back, and a ruler.
+    """Create a drawing of the film, the electrodes, their names, and the metal of the back.
 
     The electrodes are closed polylines at their nominal positions. The layer `BACK` exists only if the back is not
     completely covered with metal.
@@ -76,14 +70,6 @@ def draw_layout(sensor: Sensor) -> Drawing:
         document.layers.add("BACK", color=BACK_COLOUR)
     for polygon in back_polygons:
         space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "BACK"})
-
-    # Draw a ruler below the film, with a label whose letters are below the line.
-    ruler_y = -sensor.film.radius - RULER_OFFSET
-    attributes = {"layer": "RULER"}
-    space.add_line((-0.5 * RULER_LENGTH, ruler_y), (0.5 * RULER_LENGTH, ruler_y), dxfattribs=attributes)
-    text = f"{RULER_LENGTH:g} mm along x, the drawn direction"
-    label = space.add_text(text, height=TEXT_HEIGHT, dxfattribs=attributes)
-    label.set_placement((-0.5 * RULER_LENGTH, ruler_y - 1.5 * TEXT_HEIGHT))
     return document
 
 

@@ -123,12 +123,6 @@ class Film:
         return self.deviator != (0.0, 0.0) or self.young_ratio != 1.0 or self.shear is not None
 
     @property
-    def asymmetries(self) -> dict[str, object]:
-        """Names and values of the attributes that make the film differ from an axisymmetric film."""
-        names = ("deviator", "young_ratio", "shear", "axis", "oval", "oval_axis")
-        return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(Film, name)}
-
-    @property
     def is_axisymmetric(self) -> bool:
         """Whether the properties of the film remain unchanged if the film is rotated about its centre."""
         return not self.is_anisotropic and self.oval == 0.0
