@@ -294,20 +294,7 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_electrode, n_field), pC.
         """
-        x, y, force = contact.T
-        position = x + 1j * y
-        orientation = np.zeros(1)  # the same for all presses, because a circular probe has no orientation
-        rule = readout or self._coarse_rule
-
-        # The same rule is used for all pairs of a press and an electrode.
-        all_pairs = np.ones((position.size, len(rule.count)), dtype=bool)
-        charges = np.empty((position.size, len(rule.count), is_odd.size))
-        with single_threaded_blas():  # faster for the many small matrices of a chunk
-            for start in range(0, position.size, CHUNK_SIZE):
-                chunk = slice(start, start + CHUNK_SIZE)
-                rules = ((rule, all_pairs[chunk]),)
-                charges[chunk] = self._integrate_fields(position[chunk], force[chunk], orientation, is_odd, rules)
-        return charges
+        return self._field_charges(contact, np.zeros(len(contact)), is_odd, rule=readout or self._coarse_rule)
 
     def stress_charges_by_force(self, position: Array) -> Array:
         """Compute the charges that the stress causes at given positions, for all forces of the family at once.
@@ -325,27 +312,20 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_force, n_electrode), pC.
         """
-        # Integrate all fields of the stacked map for chunks of presses. All fields have the symmetry
-        # of the stress.
-        complex_position = position[:, 0] + 1j * position[:, 1]
-        stacked_map = self._stacked_forces
-        first_force = stacked_map.family.force[0]
-        is_odd = EVEN_FIELD.repeat(self.family.force.size)
-        orientation = np.zeros(1)  # the probe keeps its orientation for all presses
-        chunk_size = max(1, CHUNK_SIZE // self.family.force.size)  # a press of the stacked map has n_force fields
-        charges = []
-        with single_threaded_blas():  # faster for the many small matrices of a chunk
-            for start in range(0, complex_position.size, chunk_size):
-                chunk = complex_position[start : start + chunk_size]
-                rules = self._select_rules(chunk)
-                force = np.full(chunk.size, first_force)
-                charges.append(stacked_map._integrate_fields(chunk, force, orientation, is_odd, rules))
+        # Integrate all fields of the stacked map. All fields have the symmetry of the stress.
+        n_force = self.family.force.size
+        first_force = self.family.force[0]
+        contact = np.column_stack([position, np.full(len(position), first_force)])
+        chunk_size = max(1, CHUNK_SIZE // n_force)  # a press of the stacked map has n_force fields
+        charges = self._stacked_forces._field_charges(
+            contact, np.zeros(len(contact)), EVEN_FIELD.repeat(n_force), chunk_size=chunk_size
+        )
 
         # The stacked map multiplies all fields by the stress unit of the first force. Replace it by the unit of the
         # force to which the field belongs. The stress unit is proportional to the squared amplitude.
         film = self.sensor.film
         unit_ratio = amplitude_squared(film, self.family.force) / amplitude_squared(film, first_force)
-        charge_by_force = np.concatenate(charges).swapaxes(1, 2)  # shape (n, n_force, n_electrode)
+        charge_by_force = charges.swapaxes(1, 2)  # shape (n, n_force, n_electrode)
         return np.asarray(charge_by_force * unit_ratio[:, None])
 
     def pressure_charges(self, position: Array) -> Array:
@@ -379,7 +359,8 @@ class ForwardMap:
     def _unchecked_charges(self, contact: Array, orientation: Array) -> Array:
         """Compute the charges of presses that lie in the domain or slightly outside the domain.
 
-        The presses are evaluated in chunks, which limits the required memory.
+        The charges that the stress causes and the charges that the contact pressure causes are added. Then the
+        crosstalk is added.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -389,31 +370,46 @@ class ForwardMap:
             Charges, shape (n, n_electrode), pC.
         """
         position = contact[:, 0] + 1j * contact[:, 1]
-        charge = np.empty((len(contact), len(self.electrodes)))
-        with single_threaded_blas():
-            for start in range(0, len(contact), CHUNK_SIZE):
-                chunk = slice(start, start + CHUNK_SIZE)
-                charge[chunk] = self._chunk_charges(position[chunk], contact[chunk, 2], orientation[chunk])
-        return charge
+        charge: Array = self._field_charges(contact, orientation, EVEN_FIELD)[..., 0]
+        charge += contact[:, 2:] * self._pressure_charges(position, orientation)
+        return self.sensor.calibration.read(charge)
 
-    def _chunk_charges(self, position: Complexes, force: Array, orientation: Array) -> Array:
-        """Compute the charges of one chunk of presses.
+    def _field_charges(
+        self,
+        contact: Array,
+        orientation: Array,
+        is_odd: Booleans,
+        rule: ReadoutPoints | None = None,
+        chunk_size: int = CHUNK_SIZE,
+    ) -> Array:
+        """Compute the charges of each stress field in the table, without the crosstalk.
 
-        The charges that the stress causes and the charges that the contact pressure causes are added. Then the
-        crosstalk is added.
+        The presses are evaluated in chunks, which limits the required memory.
 
         Args:
-            position: Positions x + iy, shape (n,), mm.
-            force: Forces, shape (n,), N.
+            contact: Presses (x, y, F), shape (n, 3), mm and N.
             orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
+            is_odd: Whether each field is odd; see `field_charges`.
+            rule: Integration rule for all electrodes. If None, a rule is selected for each press and electrode.
+            chunk_size: Number of presses that are evaluated at once.
 
         Returns:
-            Charges, shape (n, n_electrode), pC.
+            Charges, shape (n, n_electrode, n_field), pC.
         """
-        rules = self._select_rules(position)
-        charge: Array = self._integrate_fields(position, force, orientation, EVEN_FIELD, rules)[..., 0]
-        charge += force[:, None] * self._pressure_charges(position, orientation)
-        return self.sensor.calibration.read(charge)
+        position = contact[:, 0] + 1j * contact[:, 1]
+        n_electrode = len(self.electrodes) if rule is None else len(rule.count)
+        charges = np.empty((len(contact), n_electrode, is_odd.size))
+        with single_threaded_blas():  # faster for the many small matrices of a chunk
+            for start in range(0, len(contact), chunk_size):
+                chunk = slice(start, start + chunk_size)
+                if rule is None:
+                    rules = self._select_rules(position[chunk])
+                else:
+                    rules = ((rule, np.ones(charges[chunk].shape[:2], dtype=bool)),)
+                charges[chunk] = self._integrate_fields(
+                    position[chunk], contact[chunk, 2], orientation[chunk], is_odd, rules
+                )
+        return charges
 
     def _pressure_charges(self, position: Complexes, orientation: Array) -> Array:
         """Compute the charges per force that the contact pressure causes.
@@ -454,8 +450,7 @@ class ForwardMap:
         Args:
             position: Positions x + iy, shape (n,), mm.
             force: Forces, shape (n,), N.
-            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad; shape (1,) if it is
-                the same for all presses.
+            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
             is_odd: Whether each field of the table is odd with respect to a reflection in the direction of the press,
                 shape (n_field,).
             rules: Pairs of an integration rule and an array, shape (n, n_electrode), that is True where a press and an
@@ -478,8 +473,7 @@ class ForwardMap:
         Args:
             position: Positions x + iy, shape (n,), mm.
             force: Forces, shape (n,), N.
-            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad; shape (1,) if it is
-                the same for all presses.
+            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
 
         Returns:
             The interpolated fields, with the position of the mesh under each press.
