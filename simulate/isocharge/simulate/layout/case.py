@@ -208,7 +208,7 @@ class DesignCase:
         """Compute the margin with which each square satisfies the distance rules.
 
         The distance between a square and the rim of the film must be at least `self.rim`. The gap between a square and
-        each bounding box of a kept electrode must be at least `self.gap`.
+        the bounding box of each part of a kept electrode must be at least `self.gap`.
 
         Args:
             positions: Centres (x, y) of the squares, shape (n, 2), mm.
@@ -224,11 +224,10 @@ class DesignCase:
         clearances = [self.sensor.film.inner_radius - self.rim - corner_distance]
 
         for electrode in self.kept_electrodes:
-            lower_left_corners, upper_right_corners = electrode.boxes
-            for lower_left, upper_right in zip(lower_left_corners, upper_right_corners, strict=True):
-                # Compute the gaps along x and y, shape (n, 2). A gap is negative if the square and the box overlap
+            for part in electrode.metal:
+                # Compute the gaps along x and y, shape (n, 2). A gap is negative if the square and the part overlap
                 # along this axis. It is sufficient if one gap is large enough, so the larger gap counts.
-                axis_gaps = np.maximum(lower_left - positions, positions - upper_right) - half_side
+                axis_gaps = np.maximum(part.min(axis=0) - positions, positions - part.max(axis=0)) - half_side
                 clearances.append(axis_gaps.max(axis=1) - self.gap)
         return np.asarray(np.min(clearances, axis=0))
 

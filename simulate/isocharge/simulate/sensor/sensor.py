@@ -209,13 +209,6 @@ class Electrode:
         """Region of the film that the metal on the front covers."""
         return shapely.union_all([shapely.Polygon(part) for part in self.metal])
 
-    @cached_property
-    def boxes(self) -> tuple[Array, Array]:
-        """Lower left and upper right corners of the bounding boxes of `metal`, each of shape (n_part, 2), mm."""
-        low = np.array([part.min(axis=0) for part in self.metal])
-        high = np.array([part.max(axis=0) for part in self.metal])
-        return low, high
-
     @property
     def centre(self) -> tuple[float, float]:
         """Centre (x, y) of the electrode, mm. It is the mean of the corners of the pad."""
