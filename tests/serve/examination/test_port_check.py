@@ -57,6 +57,18 @@ def missing_for_held_presses(report):
     return " / ".join(report.missing_for_held_presses)
 
 
+def test_of_a_touched_film_only_the_touch_is_reported():
+    """The offset, the noise and the drift of a pressed film would lead to wrong advice."""
+
+    def pressed_frame(number):
+        press = 400.0 if number > 150 else 0.0
+        return encode_frame(Frame(number, 5000 * number, (5.0 + press, 2.0 * press - 6.0, 7.0)))
+
+    report = examine_received(received(pressed_frame), device=AT_REST, electrodes=FOUR[:3])
+    assert "as under a touch; take the finger away" in report.touch
+    assert report.missing == (report.touch,)
+
+
 def test_check_of_a_healthy_board():
     report = examine_received(received(charges()), device=AT_REST, electrodes=("A", "B", "C"))
     assert (report.baud, report.format, report.missing) == (115200, "binary frames of isocharge", ())
