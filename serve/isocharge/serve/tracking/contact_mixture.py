@@ -73,6 +73,9 @@ The distance is large, because an error of a gain displaces the fold. The contac
 SPLIT_DISTANCE = 2.5
 """Distance of an added component from the component that extends across a fold, in standard deviations."""
 
+SPLIT_VARIANCE_RATIO = 0.25
+"""Variance of a component added at a fold along the axis of the split, relative to the original component."""
+
 SEPARATE_DISTANCE = 3.0
 """Distance, in standard deviations, above which components on the same side of a fold are different contacts."""
 
@@ -243,8 +246,11 @@ def _split_at_fold(components: Components, half_axis: Array) -> Components:
         half_axis: Changes of the state, as `_half_axis` returns them.
     """
     log_weight = components.log_weight[0] - 0.5 * SPLIT_DISTANCE**2  # density of the most probable component there
-    both_sides = components.select([0, 0])
-    added = Components(both_sides.mean + SPLIT_DISTANCE * half_axis, both_sides.covariance, np.full(2, log_weight))
+    change, _ = half_axis
+    narrow_covariance = components.covariance[0] - (1.0 - SPLIT_VARIANCE_RATIO) * np.outer(change, change)
+    added = Components(
+        components.mean[0] + SPLIT_DISTANCE * half_axis, np.array([narrow_covariance] * 2), np.full(2, log_weight)
+    )
     return components.joined(added)
 
 
