@@ -66,7 +66,7 @@ def stress_sum(forward_map, contact, points_mm):
     points = np.stack([points_mm.real.ravel(), points_mm.imag.ravel()], axis=1)
     weights = np.tile([1.0, 1.0, 0.0], (len(points), 1, 1))
     readout = ReadoutPoints(points[:, None], weights, np.ones(len(points), dtype=int))
-    return forward_map.field_charges(np.array([contact]), EVEN_FIELD, readout)[0, :, 0].reshape(points_mm.shape)
+    return forward_map.field_charges(np.array([contact]), EVEN_FIELD, rule=readout)[0, :, 0].reshape(points_mm.shape)
 
 
 def table(values):

@@ -27,7 +27,6 @@ Example:
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -35,7 +34,6 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.family import Family, NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.forward.readout import FINE, ReadoutPoints
 from isocharge.simulate.mechanics.film_temperature import tension_change
 from isocharge.simulate.mechanics.scaling import amplitude_squared, side_force_unit
 from isocharge.simulate.sensor.film import Surface
@@ -145,11 +143,8 @@ class FilmSlopes:
         # The axes of an even field are along and across the direction of the press, at the angle t from the x axis.
         # The axes of an odd field are rotated by 45 degrees from them. Rotate both to the axes x and y.
         twice_angle = 2.0 * np.arctan2(contact[:, 1], contact[:, 0])[:, None]
-        cosine = np.cos(twice_angle)
-        sine = np.sin(twice_angle)
-        for (x_name, xy_name), (even, odd) in even_and_odd.items():
-            derivatives[x_name] = cosine * even - sine * odd
-            derivatives[xy_name] = sine * even + cosine * odd
+        for names, (even, odd) in even_and_odd.items():
+            derivatives.update(zip(names, _to_axes(even, odd, twice_angle), strict=True))
         return derivatives
 
     def tension_jacobian(self, contact: Array) -> Array:
@@ -242,7 +237,7 @@ class SideForceMap:
             SceneError: If a press lies outside the domain.
         """
         contact = self.film.domain.check(contact, "side forces")
-        scaled_charges = self.fields.field_charges(contact, SIDE_FORCE_IS_ODD, self._readout)
+        scaled_charges = self.fields.field_charges(contact, SIDE_FORCE_IS_ODD)
 
         # The stress fields are derivatives with respect to the side force in units of `force_unit`.
         film = self.film.sensor.film
@@ -253,10 +248,9 @@ class SideForceMap:
         # y. Each derivative has the shape (n, n_electrode), and the angle has the shape (n, 1).
         along_press, across_press = np.moveaxis(charge_per_newton, 2, 0)
         angle = np.arctan2(contact[:, 1], contact[:, 0])[:, None]
-        x_derivative = np.cos(angle) * along_press - np.sin(angle) * across_press
-        y_derivative = np.sin(angle) * along_press + np.cos(angle) * across_press
         calibration = self.film.sensor.calibration
-        return np.stack([calibration.read(x_derivative), calibration.read(y_derivative)], axis=2)
+        derivatives = [calibration.read(one) for one in _to_axes(along_press, across_press, angle)]
+        return np.stack(derivatives, axis=2)
 
     def friction_forces(self, contact: Array, coefficient: float) -> Array:
         """Compute the side forces that a probe on a vertical stage exerts on the film by friction.
@@ -304,13 +298,21 @@ class SideForceMap:
         # For each press (index n) and electrode (e), sum over the components x and y of the side force (k).
         return np.asarray(np.einsum("nek,nk->ne", self.jacobian(contact), side_force))
 
-    @cached_property
-    def _readout(self) -> ReadoutPoints:
-        """Integration points of the electrodes.
 
-        The fine integration rule is used, because the stress fields of a side force change rapidly near the probe.
-        """
-        return ReadoutPoints.of(self.film.sensor, FINE)
+def _to_axes(even: Array, odd: Array, angle: Array) -> tuple[Array, Array]:
+    """Rotate derivatives from the frame of each press to the axes x and y.
+
+    Args:
+        even: Derivatives that belong to the even field, shape (n, n_electrode).
+        odd: Derivatives that belong to the odd field, shape (n, n_electrode).
+        angle: Angle of the rotation, shape (n, 1), rad.
+
+    Returns:
+        Both components, each of shape (n, n_electrode).
+    """
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    return cosine * even - sine * odd, sine * even + cosine * odd
 
 
 def _side_force_changes(solved: Equilibrium, surface: Surface) -> Array:

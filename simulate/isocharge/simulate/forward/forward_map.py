@@ -278,24 +278,6 @@ class ForwardMap:
         n_stepped = len(contact) * 2 * contact.shape[1]  # two steps of each variable
         return differences(partial(self._unchecked_charges, orientation=np.zeros(n_stepped)), contact)
 
-    def field_charges(self, contact: Array, is_odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
-        """Compute the charges of each stress field in the table, for a circular probe.
-
-        The result includes neither the crosstalk nor the charges that the contact pressure causes.
-
-        Args:
-            contact: Presses (x, y, F) in the domain, shape (n, 3), mm and N.
-            is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
-                (n_field,). A row of the table contains the values of all fields at one node, then those at the next
-                node.
-            readout: Integration points of the charges. If None, the coarse integration rule is used for all
-                electrodes, because fields that are small corrections need little accuracy.
-
-        Returns:
-            Charges, shape (n, n_electrode, n_field), pC.
-        """
-        return self._field_charges(contact, np.zeros(len(contact)), is_odd, rule=readout or self._coarse_rule)
-
     def stress_charges_by_force(self, position: Array) -> Array:
         """Compute the charges that the stress causes at given positions, for all forces of the family at once.
 
@@ -317,9 +299,7 @@ class ForwardMap:
         first_force = self.family.force[0]
         contact = np.column_stack([position, np.full(len(position), first_force)])
         chunk_size = max(1, CHUNK_SIZE // n_force)  # a press of the stacked map has n_force fields
-        charges = self._stacked_forces._field_charges(
-            contact, np.zeros(len(contact)), EVEN_FIELD.repeat(n_force), chunk_size=chunk_size
-        )
+        charges = self._stacked_forces.field_charges(contact, EVEN_FIELD.repeat(n_force), chunk_size=chunk_size)
 
         # The stacked map multiplies all fields by the stress unit of the first force. Replace it by the unit of the
         # force to which the field belongs. The stress unit is proportional to the squared amplitude.
@@ -370,26 +350,30 @@ class ForwardMap:
             Charges, shape (n, n_electrode), pC.
         """
         position = contact[:, 0] + 1j * contact[:, 1]
-        charge: Array = self._field_charges(contact, orientation, EVEN_FIELD)[..., 0]
+        charge: Array = self.field_charges(contact, EVEN_FIELD, orientation)[..., 0]
         charge += contact[:, 2:] * self._pressure_charges(position, orientation)
         return self.sensor.calibration.read(charge)
 
-    def _field_charges(
+    def field_charges(
         self,
         contact: Array,
-        orientation: Array,
         is_odd: Booleans,
+        orientation: Array | None = None,
         rule: ReadoutPoints | None = None,
         chunk_size: int = CHUNK_SIZE,
     ) -> Array:
-        """Compute the charges of each stress field in the table, without the crosstalk.
+        """Compute the charges of each stress field in the table.
 
-        The presses are evaluated in chunks, which limits the required memory.
+        The result includes neither the crosstalk nor the charges that the contact pressure causes. The presses are
+        evaluated in chunks, which limits the required memory.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
-            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
-            is_odd: Whether each field is odd; see `field_charges`.
+            is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
+                (n_field,). A row of the table contains the values of all fields at one node, then those at the next
+                node.
+            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad; None for no
+                rotation.
             rule: Integration rule for all electrodes. If None, a rule is selected for each press and electrode.
             chunk_size: Number of presses that are evaluated at once.
 
@@ -397,6 +381,8 @@ class ForwardMap:
             Charges, shape (n, n_electrode, n_field), pC.
         """
         position = contact[:, 0] + 1j * contact[:, 1]
+        if orientation is None:
+            orientation = np.zeros(len(contact))
         n_electrode = len(self.electrodes) if rule is None else len(rule.count)
         charges = np.empty((len(contact), n_electrode, is_odd.size))
         with single_threaded_blas():  # faster for the many small matrices of a chunk

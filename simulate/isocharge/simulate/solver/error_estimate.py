@@ -214,11 +214,8 @@ def _patch_charges(
     mean_stress = np.einsum("rapc,p->rac", patch_stress, 0.25 * weights)
 
     # The coefficients d31 and d32 of a biaxial film are equal. On a uniaxial film, d31 is about ten times d32.
-    s11 = mean_stress[..., 0]
-    s22 = mean_stress[..., 1]
-    biaxial_charge = s11 + s22
-    uniaxial_charge = 10.0 * s11 + s22
-    return np.stack([biaxial_charge, uniaxial_charge], axis=-1)
+    coefficients = np.array([[1.0, 10.0], [1.0, 1.0]])  # one column for each kind of film
+    return np.asarray(mean_stress[..., :2] @ coefficients)
 
 
 def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
