@@ -315,5 +315,6 @@ def _play_on_page(
     records = play(on_marker=lambda marker: page.add_marker(*marker))
     write_records(records, [outputs.write, feed.write], latencies)
     outputs.close()  # now, because the page stays open until Ctrl-C, which would discard files that are not closed
+    feed.update_state()  # with the counters of the whole recording
     page.update(is_complete=True)
     threading.Event().wait()  # sleeps until Ctrl-C, because nothing sets the event

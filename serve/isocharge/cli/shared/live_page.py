@@ -207,23 +207,24 @@ class PageFeed:
         self._stream = stream
         self._new_recorder = new_recorder
         self._last_state_s = 0.0
+        self._latest_record: PredictionRecord | None = None
         if stream is not None:
             page.act = self._carry_out
 
     def write(self, record: PredictionRecord) -> None:
         """Add a record to the page. From time to time, also update the state of the stream."""
         self._page.add(record)
+        self._latest_record = record
         now_s = time.monotonic()
         if now_s - self._last_state_s > STATE_INTERVAL_S:
             self._last_state_s = now_s
-            self._update_state(record)
+            self.update_state()
 
-    def _update_state(self, record: PredictionRecord) -> None:
-        """Update the counters and the state of the stream on the page.
-
-        Args:
-            record: The latest record.
-        """
+    def update_state(self) -> None:
+        """Update the counters and the state of the stream on the page, unless the stream has no record yet."""
+        record = self._latest_record
+        if record is None:
+            return
         recorder = self._stream.recorder if self._stream else None
         self._page.update(
             counters=self._touch.totals()._asdict() | {"reconnects": self._touch.counts.outages},
