@@ -71,6 +71,7 @@ def test_digits_in_words_are_no_numbers(text):
     ("text", "values"),
     [
         ("A: - 3.5, B: 2.5", (-3.5, 2.5)),
+        ("A: + 3.5, B: - 2.5", (3.5, -2.5)),  # a board that prints each sign and then the magnitude
         ("- 3, -4,- 5", (-3.0, -4.0, -5.0)),
         ("(- 3.5; 2)", (-3.5, 2.0)),
         ("A - 3.5 B - 2", (3.5, 2.0)),

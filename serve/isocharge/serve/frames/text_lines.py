@@ -138,7 +138,7 @@ def clean_text(text: str) -> str:
     if "\x1b" in text:
         text = re.sub(r"\x1b\[[0-9;]*m", "", text)  # removes the colours that loggers use
     text = text.strip().replace("\N{MINUS SIGN}", "-")  # programs with some locales, such as Swedish, write this sign
-    text = re.sub(r"(^|[:=,;(\[] *)- +(?=[.0-9])", r"\1-", text)  # a sign apart from its number, as in `A: - 3.5`
+    text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text)  # a sign apart from its number, as in `A: - 3.5`
     if text[:1] == ">":
         content, _, flags = text.partition("|")
         name, _, values = content.partition(":")
