@@ -8,6 +8,7 @@ import pytest
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Film, Polygon, SolveSettings, Theory, load_sensor, press, touch_charge
 from isocharge.simulate.mechanics.theory import modelling_error, theory_by_name
+from isocharge.simulate.solver.error_estimate import estimated_error
 
 MEMBRANE = Theory(bending=False)
 
@@ -38,10 +39,21 @@ def test_modelling_error_is_an_upper_bound_of_the_effect_of_bending():
         same_mesh = SolveSettings(theory=MEMBRANE, resolution=full.mesh.resolution, layer=full.mesh.layer)
         exact = touch_charge(sensor, full)
         charge = touch_charge(sensor, press(film, probe, at, force, same_mesh))
-        assert np.abs(charge - exact).max() / np.abs(exact).max() <= modelling_error(film, force, MEMBRANE)
+        assert np.abs(charge - exact).max() / np.abs(exact).max() <= modelling_error(film, probe, force, MEMBRANE)
 
 
 def test_modelling_error_is_zero_with_bending_and_infinite_for_a_thick_membrane():
     film = load_sensor("three-25um-biaxial").film
-    assert modelling_error(film, 1.0, Theory(bending=True)) == 0.0
-    assert modelling_error(replace(film, thickness=1.0), 1.0, MEMBRANE) == np.inf
+    assert modelling_error(film, Circle(1.0), 1.0, Theory(bending=True)) == 0.0
+    assert modelling_error(replace(film, thickness=1.0), Circle(1.0), 1.0, MEMBRANE) == np.inf
+
+
+@pytest.mark.parametrize(("pretension", "thickness"), [(0.0, 0.11), (0.5, 0.11), (5.0, 0.025)])
+def test_estimated_error_of_a_membrane_holds_for_an_electrode_beside_a_small_probe(pretension, thickness):
+    sensor = load_sensor("four-25um-biaxial")
+    sensor = replace(sensor, film=replace(sensor.film, pretension=pretension, thickness=thickness))
+    at = (0.0, -9.5)
+    exact = touch_charge(sensor, press(sensor.film, Circle(1.0), at, 0.05))
+    membrane = press(sensor.film, Circle(1.0), at, 0.05, SolveSettings(theory=MEMBRANE))
+    error = np.abs(touch_charge(sensor, membrane) - exact).max() / np.abs(exact).max()
+    assert error <= estimated_error(membrane)

@@ -25,7 +25,7 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.forward.readout import thermal_charge
 from isocharge.simulate.mechanics.film_temperature import warmed
-from isocharge.simulate.mechanics.theory import check_strains, theory_by_name
+from isocharge.simulate.mechanics.theory import theory_by_name
 from isocharge.simulate.solver.error_estimate import estimated_error, summary
 from isocharge.simulate.solver.friction import check_friction, friction_force
 
@@ -93,7 +93,6 @@ def point_command(
 
     settings = SolveSettings(accuracy=accuracy, theory=theory_by_name(theory))
     film = film_sensor.film
-    check_strains(film, force)
     position = parse_position(at)
     equilibrium = press(film, footprint, position, force, settings, side_force=applied_side_force)
     if friction:

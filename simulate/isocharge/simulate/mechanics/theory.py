@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared, slenderness
 from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.probe import Probe
 
 ACCURACY = 1e-3
 """Default target of the relative error of a charge, dimensionless."""
@@ -73,14 +74,18 @@ def bending_length(film: Film, force: float) -> float:
     return float(np.sqrt(groups.bending / tension))
 
 
-def modelling_error(film: Film, force: float, theory: Theory) -> float:
+def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
     """Estimate the relative error that omitted bending causes in a charge.
 
-    The error is larger under a small probe if the film has a large pretension.
+    The error has two parts. The first part is proportional to the bending length at the clamp. The second part is
+    proportional to the squared ratio of the bending length at the footprint to the reach R of the footprint, and is
+    larger if most of the tension at the footprint is pretension. The slope w' of the film at the footprint follows from
+    the vertical force 2 pi R h S w' = F and the induced stress S = E w'^2 / 2, so that w'^3 = F / (pi R h E).
 
     Args:
-        film: The film.
-        force: Force of the press, N.
+        film: The film, with Young's modulus E and thickness h.
+        probe: The probe, whose footprint has the reach R.
+        force: Force F of the press, N.
         theory: The theory.
 
     Returns:
@@ -89,7 +94,14 @@ def modelling_error(film: Film, force: float, theory: Theory) -> float:
     if theory.bending:
         return 0.0
     length = bending_length(film, force)
-    return BENDING_WEIGHT * length if length <= MAX_MEMBRANE_BENDING_LENGTH else np.inf
+    if length > MAX_MEMBRANE_BENDING_LENGTH:
+        return np.inf
+    slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young))
+    pretension_strain = max(film.pretension, 0.0) / film.young
+    strain = pretension_strain + 0.5 * slope**2
+    squared_length_ratio = slenderness(film) / strain * (film.radius / probe.reach) ** 2
+    probe_weight = 0.5 + 5.0 * pretension_strain / strain  # empirical, for an electrode beside the footprint
+    return float(BENDING_WEIGHT * length + probe_weight * squared_length_ratio)
 
 
 def check_strains(film: Film, force: float) -> None:

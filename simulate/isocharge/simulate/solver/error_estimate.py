@@ -142,7 +142,8 @@ def estimated_error(equilibrium: Equilibrium) -> float:
     Returns:
         Relative error, which is infinite if the theory cannot describe the film.
     """
-    return mesh_error(equilibrium) + modelling_error(equilibrium.film, equilibrium.force, equilibrium.theory)
+    bending_error = modelling_error(equilibrium.film, equilibrium.probe, equilibrium.force, equilibrium.theory)
+    return mesh_error(equilibrium) + bending_error
 
 
 def relative_difference(one: Equilibrium, other: Equilibrium, patches_per_ring: int = 12) -> float:
