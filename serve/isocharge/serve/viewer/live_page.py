@@ -183,7 +183,7 @@ class LivePage:
         return False
 
     def answer(self, method: str, path: str, headers: Headers, body: bytes, _client: Client = None) -> Response:
-        """Answer one request. The arguments are those of `isocharge.serve.network.protocol.Handler.answer`."""
+        """Answer one request; see `Handler.answer` in `isocharge.serve.network.protocol.handler`."""
         try:
             return self._check_and_answer(method, path, header_values(headers), body)
         except Exception as error:  # every error is sent to the client
