@@ -55,12 +55,15 @@ def test_a_measured_dataset_is_trained_as_presses_alone(dataset_folder, dataset,
     manifest.write_text(json.dumps(table))
     given = []
 
-    def refuse(presses, *_, **__):
-        given.append(presses)
+    def refuse(presses, sensor_name, _, *, probes):
+        given.extend((presses, sensor_name, probes))
         raise PressError("no training in this test")
 
     monkeypatch.setattr(fit_command, "fit_presses", refuse)
     _, _, err = command("train", "fit", tmp_path / "measured", "-o", tmp_path / "model")
     assert "no training in this test" in err
-    np.testing.assert_array_equal(given[0].charge_pC, dataset.samples.charge_pC)
-    assert given[0].electrodes == ("A", "B", "C")
+    presses, sensor_name, probes = given
+    np.testing.assert_array_equal(presses.charge_pC, dataset.samples.charge_pC)
+    assert presses.electrodes == ("A", "B", "C")
+    assert sensor_name == dataset.sensor.name
+    assert probes == ("circle:1.0",)

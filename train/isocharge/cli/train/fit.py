@@ -120,15 +120,17 @@ def fit_command(
     fit_config = load_config(config) if config else FitConfig()
     loaded_dataset = read_dataset(dataset) if dataset is not None and press_file is None else None
     presses: MeasuredPresses | None = None
+    sensor_name = output.resolve().name  # the sensor of a file of presses has no other name than that of the model
+    pressing_probes = set(probe or ["unknown"])
     if press_file is not None:
         presses = _read_presses_of_unknown_sensor(press_file, radius, position_std_mm, force_std)
     elif loaded_dataset is not None and is_measured(loaded_dataset):
         presses = usable_presses(measured_presses_of(loaded_dataset))
+        sensor_name = loaded_dataset.sensor.name
+        pressing_probes = set(map(str, loaded_dataset.samples.probe))
     if presses is not None:
         version_folder = check_target(output, version, presses.electrodes)
-        sensor_name = output.resolve().name  # the sensor has no other name than that of the model
-        pressing_probes = tuple(probe or ["unknown"])
-        train = partial(fit_presses, presses, sensor_name, fit_config, probes=pressing_probes)
+        train = partial(fit_presses, presses, sensor_name, fit_config, probes=tuple(sorted(pressing_probes)))
         train_and_release(train, version_folder, json=json)
         return
 
