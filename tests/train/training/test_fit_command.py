@@ -67,3 +67,17 @@ def test_a_measured_dataset_is_trained_as_presses_alone(dataset_folder, dataset,
     assert presses.electrodes == ("A", "B", "C")
     assert sensor_name == dataset.sensor.name
     assert probes == ("circle:1.0",)
+
+
+def test_each_caution_about_a_file_of_presses_is_printed_once(tmp_path, command):
+    (tmp_path / "short.toml").write_text(SHORT_CONFIG)
+    rng = np.random.default_rng(0)
+    position = rng.uniform(-8.0, 8.0, (500, 2))
+    charge = 100.0 * np.exp(position @ [[0.1, -0.1, 0.0], [0.0, 0.1, -0.1]]) + rng.standard_normal((500, 3))
+    table = np.column_stack([position, charge])
+    np.savetxt(tmp_path / "presses.csv", table, delimiter=",", header="x_mm,y_mm,p,q,r", comments="")
+    words = (tmp_path / "presses.csv", "--config", tmp_path / "short.toml", "-o", tmp_path / "model")
+    code, _, err = command("train", "fit", *words)
+    assert code == 0, err
+    assert "no press has a known force" in err
+    assert err.count("caution: ") == 1

@@ -33,7 +33,6 @@ from isocharge.simulate import (
 from isocharge.simulate.sensor.probe import PROBE_HELP
 from isocharge.train import FitConfig, TrainingData, fit, fit_presses, load_config
 from isocharge.train.data.presses import is_measured, measured_presses_of
-from isocharge.train.training.cross_fit import usable_presses
 
 DEFAULT_PROBE = "circle:1.0"
 """Notation of the probe if `--probe` is not given."""
@@ -125,7 +124,7 @@ def fit_command(
     if press_file is not None:
         presses = _read_presses_of_unknown_sensor(press_file, radius, position_std_mm, force_std)
     elif loaded_dataset is not None and is_measured(loaded_dataset):
-        presses = usable_presses(measured_presses_of(loaded_dataset))
+        presses = measured_presses_of(loaded_dataset)
         sensor_name = loaded_dataset.sensor.name
         pressing_probes = set(map(str, loaded_dataset.samples.probe))
     if presses is not None:
@@ -189,13 +188,13 @@ def _read_presses_of_unknown_sensor(
 
     Raises:
         InputError: If `--radius` is given.
-        PressError: If the presses are too few or not usable.
+        PressError: If the file cannot be read.
     """
     if radius != DEFAULT_RADIUS_TEXT:
         raise InputError(
             f"--radius: belongs to --sensor, got {radius} without --sensor; leave it out, because the working area is "
             "then the area of the presses"
         )
-    presses = usable_presses(read_press_file(file, None, position_std_mm, force_std))
+    presses = read_press_file(file, None, position_std_mm, force_std)
     say(f"{file}: {len(presses)} presses of the channels {', '.join(presses.electrodes)}")
     return presses
