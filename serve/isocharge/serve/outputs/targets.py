@@ -214,6 +214,9 @@ class Outputs:
             return
         try:
             output.close()
+        except KeyboardInterrupt:  # in a replay, the file is then removed
+            self.not_written[target] = None
+            raise
         except Exception as error:
             raise output_error(error, target)  # noqa: B904  # the cause is set
         finally:
