@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -70,7 +71,7 @@ SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1"]
 
 
 def test_a_stopped_sweep_leaves_no_file_and_no_process(tmp_path):
-    """The command is stopped at the first of many shards."""
+    """The command and its workers get SIGTERM at the first of many shards, as from a service manager."""
     process = subprocess.Popen(
         [sys.executable, "-m", "isocharge.cli", *SMALL, "--samples", "1000000", "--workers", "2", "-o", "presses"],
         cwd=tmp_path,
@@ -79,7 +80,7 @@ def test_a_stopped_sweep_leaves_no_file_and_no_process(tmp_path):
         start_new_session=True,
     )
     assert ends(lambda: not list(tmp_path.glob(".*.draft/shard-00000.npz")))
-    process.terminate()
+    os.killpg(process.pid, signal.SIGTERM)
     _, err = process.communicate(timeout=60)
     assert process.returncode not in (0, None)
     assert "Traceback" not in err

@@ -196,7 +196,7 @@ def _abandon(pool: ProcessPoolExecutor) -> None:
 
     # End the workers, and wait until the manager has noticed that they ended.
     for worker in workers:
-        worker.terminate()
+        worker.kill()
     _wait_until(lambda: not manager.is_alive())
 
     # If a job is still being sent, close the reading end of its pipe in this process, so that the sending fails.
@@ -216,11 +216,11 @@ def _wait_until(condition: Callable[[], bool]) -> None:
 def _initialise_worker() -> None:
     """Prepare a new worker process.
 
-    The worker ignores interrupts, because the parent process handles interrupts. The worker ends if the parent process
-    ends.
+    The worker ignores the signals that end a command, because the parent process handles them. A service manager sends
+    SIGTERM to all processes at once. The worker ends if the parent process ends.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
