@@ -223,6 +223,15 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
         content = match[2] if kind == "time" else match[0]  # the second group is a time without its date
         is_after_blank = text[match.start() - 1 : match.start()].isspace()
         tokens.append(_Token(kind, content.strip(), match.start(), is_after_blank))
+
+    # In pairs of numbers, such as `1:801,2:799`, the first number of each pair is a name.
+    shape = "".join("#" if token.kind in _NUMBER_KINDS else token.content for token in tokens)
+    if re.fullmatch(r"(?:#[:=]#[,;]*)+", shape):
+        is_name = [token.content in ":=" for token in tokens[1:]] + [False]
+        tokens = [
+            token._replace(kind="key") if is_name_of_next else token
+            for token, is_name_of_next in zip(tokens, is_name, strict=True)
+        ]
     return tokens
 
 
