@@ -124,6 +124,20 @@ def test_changes_of_the_film_and_of_a_gain_are_followed(series, tmp_path, change
         assert np.sqrt(np.mean(before**2)) > 0.08
 
 
+@pytest.mark.parametrize("change_MPa", [0.3, -0.3])
+def test_a_sudden_change_is_followed_after_a_few_touches(series, tmp_path, change_MPa):
+    """After forty touches without a change, the pretension is known so well that a change is a surprise."""
+    rng = np.random.default_rng(1)
+    model = model_in(tmp_path, series)
+    directions = np.array([0.7, -0.8])
+    _, charge_before = touches(series, np.array([0.0, *directions]), np.ones(4), rng, 40)
+    contact, charge = touches(series, np.array([change_MPa, *directions]), np.ones(4), rng, 60)
+    follower = followed(model, np.concatenate([charge_before, charge[:6]]), rng)
+    relative, normalised = force_errors(follower, model, contact[6:], NOISE.add(charge[6:], rng))
+    assert np.sqrt(np.mean(relative**2)) < 0.05
+    assert np.mean(np.abs(normalised) < 2.0) > 0.85
+
+
 def test_contacts_are_corrected_from_the_first_touch(series, tmp_path):
     rng = np.random.default_rng(8)
     model = model_in(tmp_path, series)

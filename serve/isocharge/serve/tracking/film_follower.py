@@ -30,7 +30,7 @@ from isocharge.common.errors import ModelError
 from isocharge.serve.model.charge_file import FILE, read_charge_map
 from isocharge.serve.model.contact import Contact, is_close
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.model.robust_estimate import ModelValues, Prior, robust_estimate
+from isocharge.serve.model.robust_estimate import ModelValues, Prior, RobustEstimate, robust_estimate
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.tracking.touch_peak import TouchPeak
@@ -49,6 +49,9 @@ MAX_DEVIATION = 20.0
 
 MAX_MEAN_SQUARE = 3.0
 """Largest mean squared distance of the latest touches from the predicted touches, for a film that is not lost."""
+
+SURPRISING_SQUARE = 6.0
+"""Squared distance of a touch from the predicted touch above which the pretension may have changed suddenly."""
 
 MEMORY_TOUCHES = 16
 """Number of touches after which the weight of a touch in this mean has decreased to 1/e."""
@@ -218,17 +221,10 @@ class FilmFollower:
         model_error_pC = self._series.charge_std * charge_pC
         variance_pC2 = self.predictor.metadata.noise.variance(charge_pC) + model_error_pC**2
         covariance_pC2 = np.diag(variance_pC2) + np.outer(touch_offset_pC, touch_offset_pC)
-        start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
-        estimate = robust_estimate(
-            self._values,
-            charge_pC[np.newaxis],
-            covariance_pC2[np.newaxis],
-            Prior(self._state, self._covariance),
-            self._state,
-            start,
-            contact_bounds=self._contact_bounds,
-            state_bounds=(self._lowest, self._highest),
-        )
+        estimate = self._estimate(charge_pC, covariance_pC2)
+        if 2.0 * estimate.cost > SURPRISING_SQUARE:
+            self._covariance[0, 0] += self._series.tension_std_MPa**2
+            estimate = self._estimate(charge_pC, covariance_pC2)
         self._state = estimate.state
         self._covariance = estimate.covariance
         self._touch_count += 1
@@ -243,6 +239,25 @@ class FilmFollower:
         elif not self.is_lost:
             self._apply_estimate()
             self._conversion_contact = None  # the stored conversion belongs to the earlier state
+
+    def _estimate(self, charge_pC: Array, covariance_pC2: Array) -> RobustEstimate:
+        """Return the most probable state and contact of a touch, if the present estimate of the state is the prior.
+
+        Args:
+            charge_pC: Touch charges, shape (n_electrode,), pC.
+            covariance_pC2: Covariance of their errors, shape (n_electrode, n_electrode), pC^2.
+        """
+        start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
+        return robust_estimate(
+            self._values,
+            charge_pC[np.newaxis],
+            covariance_pC2[np.newaxis],
+            Prior(self._state, self._covariance),
+            self._state,
+            start,
+            contact_bounds=self._contact_bounds,
+            state_bounds=(self._lowest, self._highest),
+        )
 
     def _apply_estimate(self) -> None:
         """Correct contacts for the mean of the state, if the pretension may not have changed at all.
