@@ -171,7 +171,7 @@ def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
 
 
 BAD = [
-    (("simulate", "point", SENSOR, "--force", "-1"), 2, "SceneError: force: expected at least 1e-12 N, got -1 N"),
+    (("simulate", "point", SENSOR, "--force", "-1"), 2, "SceneError: force: expected a positive number of newtons"),
     (("simulate", "point", SENSOR, "--at", "44.5,0"), 2, "SceneError: probe off the film: centre (44.5, 0) mm"),
     (("simulate", "point", SENSOR, "--side-force", "0.1"), 2, "InputError: --side-force: expected two numbers in N"),
     (

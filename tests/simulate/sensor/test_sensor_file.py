@@ -101,7 +101,7 @@ def test_sensor_file_keys_are_converted_to_attributes(tmp_path):
     path.write_text(WHOLE)
     assert load_sensor(path) == Sensor(
         "mine",
-        Film(30.0, 9 * 1e-3, 2500.0, 0.34, 0.5),
+        Film(30.0, 0.009, 2500.0, 0.34, 0.5),
         Piezo(20.0, 2.0, -30.0, -30.0),
         (Electrode.of_square("A", (0.0, -10.0), 3.0), Electrode.of_square("B", (8.660254, 5.0), 3.0)),
         "edge",

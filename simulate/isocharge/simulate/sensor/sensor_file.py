@@ -71,17 +71,17 @@ class FilmTable(Settings, frozen=True):
 
 FILM_ATTRIBUTES = {
     "radius_mm": ("radius", 1.0),
-    "thickness_um": ("thickness", 1e-3),
+    "thickness_um": ("thickness", 1e3),
     "poisson": ("poisson", 1.0),
-    "shear_GPa": ("shear", 1e3),
-    "axis_deg": ("axis", math.radians(1.0)),
+    "shear_GPa": ("shear", 1e-3),
+    "axis_deg": ("axis", math.degrees(1.0)),
     "oval": ("oval", 1.0),
-    "oval_axis_deg": ("oval_axis", math.radians(1.0)),
+    "oval_axis_deg": ("oval_axis", math.degrees(1.0)),
     "back_volume_mm3": ("back_volume", 1.0),
-    "static_pressure_Pa": ("static_pressure", 1e-6),
-    "ring_expansion_ppm_per_K": ("ring_expansion", 1e-6),
+    "static_pressure_Pa": ("static_pressure", 1e6),
+    "ring_expansion_ppm_per_K": ("ring_expansion", 1e6),
 }
-"""Attribute of `Film` for each key of the section `film` with one number, and the unit of the key in that of `Film`."""
+"""Attribute of `Film` for each key of the section `film` with one number, and its unit in units of the key."""
 
 
 class PiezoTable(Settings, frozen=True):
@@ -272,7 +272,7 @@ def film_to_dict(film: Film) -> dict[str, Any]:
         film: Film to be converted.
     """
     numbers = {
-        key: None if getattr(film, attribute) is None else tidy(getattr(film, attribute) / unit)
+        key: None if getattr(film, attribute) is None else tidy(getattr(film, attribute) * unit)
         for key, (attribute, unit) in FILM_ATTRIBUTES.items()
     }
     half_difference, shear_tension = film.deviator
@@ -415,7 +415,7 @@ def _film(table: FilmTable) -> Film:
     mean_tension = tension_11 if tension_11 == tension_22 else 0.5 * (tension_11 + tension_22)
 
     numbers: dict[str, Any] = {
-        attribute: None if getattr(table, key) is None else getattr(table, key) * unit
+        attribute: None if getattr(table, key) is None else getattr(table, key) / unit
         for key, (attribute, unit) in FILM_ATTRIBUTES.items()
     }
     expansion = table.expansion_ppm_per_K
@@ -426,7 +426,7 @@ def _film(table: FilmTable) -> Film:
         pretension=mean_tension,
         deviator=(0.5 * (tension_11 - tension_22), tension_12),
         young_ratio=young_1 / young_2,
-        expansion=None if expansion is None else (1e-6 * expansion[0], 1e-6 * expansion[1]),
+        expansion=None if expansion is None else (expansion[0] / 1e6, expansion[1] / 1e6),
         **numbers,
     )
 
