@@ -11,6 +11,8 @@ The charges of four electrodes have one degree of freedom more than a contact (x
 changes, for example because the room becomes warmer by 1 K, no contact explains the charges of touches exactly. Each
 touch therefore updates the state: the estimate from the earlier touches is the Gaussian prior, and the most probable
 state and contact of the touch are found together (an iterated extended Kalman filter, whose contact has no prior).
+Before each touch, the covariance of the state moves a little towards that before the first touch. A sudden change of
+the film is therefore followed within about twenty touches.
 
 The network was trained for the film as it was calibrated. The charges of a frame are therefore converted into charges
 that the same contact would cause on the calibrated film, and the network computes the contact from the converted
@@ -30,7 +32,7 @@ from isocharge.common.errors import ModelError
 from isocharge.serve.model.charge_file import FILE, read_charge_map
 from isocharge.serve.model.contact import Contact, is_close
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.model.robust_estimate import ModelValues, Prior, RobustEstimate, robust_estimate
+from isocharge.serve.model.robust_estimate import ModelValues, Prior, robust_estimate
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.tracking.touch_peak import TouchPeak
@@ -50,8 +52,12 @@ MAX_DEVIATION = 20.0
 MAX_MEAN_SQUARE = 3.0
 """Largest mean squared distance of the latest touches from the predicted touches, for a film that is not lost."""
 
-SURPRISING_SQUARE = 6.0
-"""Squared distance of a touch from the predicted touch above which the pretension may have changed suddenly."""
+FADING_TOUCHES = 256
+"""Number of touches after which the knowledge from a touch would have decreased to 1/e.
+
+With a larger number, a sudden change of a film that did not change before is hardly noticed. With a smaller one, forces
+are less accurate.
+"""
 
 MEMORY_TOUCHES = 16
 """Number of touches after which the weight of a touch in this mean has decreased to 1/e."""
@@ -217,14 +223,22 @@ class FilmFollower:
         elapsed_hours = max(clock_s - self._latest_touch_s, 0.0) / SECONDS_PER_HOUR
         self._latest_touch_s = clock_s
         self._covariance[0, 0] += self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
+        self._covariance += (np.diag(self._initial_std**2) - self._covariance) / FADING_TOUCHES
         touch_offset_pC = self._offset_std_pC * self._offset_ratio
         model_error_pC = self._series.charge_std * charge_pC
         variance_pC2 = self.predictor.metadata.noise.variance(charge_pC) + model_error_pC**2
         covariance_pC2 = np.diag(variance_pC2) + np.outer(touch_offset_pC, touch_offset_pC)
-        estimate = self._estimate(charge_pC, covariance_pC2)
-        if 2.0 * estimate.cost > SURPRISING_SQUARE:
-            self._covariance[0, 0] += self._series.tension_std_MPa**2
-            estimate = self._estimate(charge_pC, covariance_pC2)
+        start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
+        estimate = robust_estimate(
+            self._values,
+            charge_pC[np.newaxis],
+            covariance_pC2[np.newaxis],
+            Prior(self._state, self._covariance),
+            self._state,
+            start,
+            contact_bounds=self._contact_bounds,
+            state_bounds=(self._lowest, self._highest),
+        )
         self._state = estimate.state
         self._covariance = estimate.covariance
         self._touch_count += 1
@@ -239,25 +253,6 @@ class FilmFollower:
         elif not self.is_lost:
             self._apply_estimate()
             self._conversion_contact = None  # the stored conversion belongs to the earlier state
-
-    def _estimate(self, charge_pC: Array, covariance_pC2: Array) -> RobustEstimate:
-        """Return the most probable state and contact of a touch, if the present estimate of the state is the prior.
-
-        Args:
-            charge_pC: Touch charges, shape (n_electrode,), pC.
-            covariance_pC2: Covariance of their errors, shape (n_electrode, n_electrode), pC^2.
-        """
-        start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
-        return robust_estimate(
-            self._values,
-            charge_pC[np.newaxis],
-            covariance_pC2[np.newaxis],
-            Prior(self._state, self._covariance),
-            self._state,
-            start,
-            contact_bounds=self._contact_bounds,
-            state_bounds=(self._lowest, self._highest),
-        )
 
     def _apply_estimate(self) -> None:
         """Correct contacts for the mean of the state, if the pretension may not have changed at all.
