@@ -106,6 +106,15 @@ def test_any_text_is_a_probe_or_a_scene_error(text):
 CORNERS = "expected 3 to 64 corners"
 
 
+@pytest.mark.timeout(10)
+@pytest.mark.parametrize("end", ["", "!"])
+def test_thousands_of_corners_are_refused_at_once(end):
+    """The regular expression reads each number in one way only, so a wrong end is found without trying others."""
+    with pytest.raises(SceneError, match="probe") as caught:
+        parse_probe("polygon:0,0" + ";10,10;20,30" * 5_000 + end)
+    assert len(str(caught.value)) < 1_000
+
+
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [

@@ -22,7 +22,7 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate.numerics.polygon import area_of, shared_area, to_complex, to_corners
 from isocharge.simulate.sensor.size_check import check_range
 
-NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 """Regular expression of a decimal number in the notation of a probe."""
 
 MIN_REACH = 0.02

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes
-from isocharge.common.errors import SceneError
+from isocharge.common.errors import SceneError, cut
 from isocharge.simulate.numerics.polygon import (
     area_of,
     centroid_of,
@@ -70,11 +70,11 @@ class Polygon(Probe):
         has_two_columns = corners.ndim == 2 and corners.shape[1:] == (2,)
         is_list_of_points = has_two_columns and 3 <= len(corners) <= MAX_CORNERS and np.isfinite(corners).all()
         if not is_list_of_points:
-            raise SceneError(f"probe: expected 3 to {MAX_CORNERS} corners (x, y), got {self.corners}")
+            raise SceneError(f"probe: expected 3 to {MAX_CORNERS} corners (x, y), got {cut(str(self.corners))}")
         check_angle(self.angle)
         if not is_convex(corners):
             raise SceneError(
-                f"probe: expected a convex polygon with its corners anticlockwise, got {corners.tolist()} mm"
+                f"probe: expected a convex polygon with its corners anticlockwise, got {cut(str(corners.tolist()))} mm"
             )
         rounding_tolerance = 1e-9 * np.linalg.norm(corners, axis=1).max()
         if not np.linalg.norm(centroid_of(corners)) <= rounding_tolerance:
@@ -97,7 +97,7 @@ class Polygon(Probe):
         """
         # Invalid corners have no centroid and are not shifted. The constructor then raises the error.
         points = np.asarray(corners, dtype=float)
-        is_table = points.ndim == 2 and points.shape[0] >= 3 and points.shape[1] == 2
+        is_table = points.ndim == 2 and 3 <= len(points) <= MAX_CORNERS and points.shape[1] == 2
         if is_table and np.isfinite(points).all() and is_convex(points):
             points = points - centroid_of(points)
         return cls(tuple((float(x), float(y)) for x, y in points), angle, name)
