@@ -69,6 +69,13 @@ def test_of_a_touched_film_only_the_touch_is_reported():
     assert report.missing == (report.touch,)
 
 
+def test_values_beyond_single_precision_are_infinite():
+    rng = np.random.default_rng(1)
+    lines = (f"A:{value:g},B:{value:g},C:1.5\n".encode() for value in rng.uniform(0.5e308, 1.7e308, 400))
+    report = examine_received(received(lambda _: next(lines)))
+    assert "channel A is inf in 400 frames, which is not a charge" in missing(report)
+
+
 def test_check_of_a_healthy_board():
     report = examine_received(received(charges()), device=AT_REST, electrodes=("A", "B", "C"))
     assert (report.baud, report.format, report.missing) == (115200, "binary frames of isocharge", ())

@@ -14,6 +14,7 @@ from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
 from isocharge.serve.live.device import Device
 from isocharge.serve.port.serial_line import UDP_SCHEME, Request
 from isocharge.serve.port.source import Chunk, Port, has_speed
+from isocharge.serve.presses.number_table import LARGEST
 from isocharge.serve.signal_chain.channels import channel_names
 
 BAUDS = (115200, 921600, 1000000, 2000000, 460800, 230400, 57600, 38400, 19200, 9600)
@@ -190,7 +191,8 @@ class Capture:
         Frames with another number of channels are left out, because the values form one array.
 
         Returns:
-            Values, shape (n, channels), and times since the first of these frames, shape (n,), s.
+            Values, shape (n, channels), and times since the first of these frames, shape (n,), s. A value that a model
+            cannot read in single precision is infinite.
         """
         channel_count = len(self.frames[-1].values)
         rows = []
@@ -199,7 +201,10 @@ class Capture:
             if len(frame.values) == channel_count:
                 rows.append(frame.values)
                 times_s.append(time_s)
-        return np.array(rows, dtype=float), np.array(times_s) - times_s[0]
+        values = np.array(rows, dtype=float)
+        is_too_large = np.abs(values) > LARGEST
+        values[is_too_large] = np.copysign(np.inf, values[is_too_large])
+        return values, np.array(times_s) - times_s[0]
 
 
 def read_frames(received: ReceivedData, device: Device) -> Capture:
