@@ -8,7 +8,7 @@ import pytest
 
 from isocharge.common.errors import OutputError, OutputExists
 from isocharge.common.files import AtomicWriter, bounded_lines, new_file, read_whole
-from isocharge.serve.presses.number_text import parse_number
+from isocharge.serve.presses.number_table import parse_number
 
 
 def test_a_file_is_read_whole(tmp_path):

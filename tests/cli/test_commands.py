@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from isocharge.cli.demo.full_demo import run_demo
-from isocharge.cli.demo.played_area import played_radius_mm
+from isocharge.cli.demo.live_film import played_radius_mm
 from isocharge.cli.shared.terminal import shown_progress
 from isocharge.common.progress import report
 from isocharge.common.toml_text import to_toml

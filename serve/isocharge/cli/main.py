@@ -17,7 +17,7 @@ from isocharge.cli.shared.terminal import open_closed_streams, say, show, warnin
 from isocharge.cli.simulate.app import simulate_app
 from isocharge.cli.train.app import train_app
 from isocharge.common.errors import InputError, IsochargeError
-from isocharge.common.versions import package_version
+from isocharge.common.extras import package_version
 
 app = lazy_group(
     "Compute the position and the force of a contact on a piezoelectric tactile film from the charges of three to "

@@ -9,10 +9,9 @@ The packages are arranged in the order in which they process a frame. `serve/REA
 
 from typing import TYPE_CHECKING
 
-from isocharge.common.lazy_names import lazy_names
+from isocharge.common.extras import lazy_names
 
 if TYPE_CHECKING:
-    from isocharge.serve.asgi import asgi_app
     from isocharge.serve.examination.port_check import Examination, examine
     from isocharge.serve.frames.binary import BinaryParser, encode_frame
     from isocharge.serve.frames.formats import AutoParser
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from isocharge.serve.model.model_search import find_labelled_model, find_model
     from isocharge.serve.model.predictor import Predictor
     from isocharge.serve.model.validity import Validity
+    from isocharge.serve.network.http.application import asgi_app
     from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
     from isocharge.serve.port.source import Chunk, Port, open_source
     from isocharge.serve.prediction.press_check import PressCheck, check_presses

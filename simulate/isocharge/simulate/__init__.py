@@ -13,8 +13,7 @@ Example:
 
 from typing import TYPE_CHECKING
 
-from isocharge.common.extras import require
-from isocharge.common.lazy_names import lazy_names
+from isocharge.common.extras import lazy_names, require
 
 with require("simulate"):
     import scipy  # noqa: F401 (all modules need it; the error names the extra)

@@ -21,10 +21,10 @@ from isocharge.common.files import sha256_of
 from isocharge.serve.network.address import Token
 from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.grpc.messages import SERVICE
+from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.routes import ROUTES
-from isocharge.serve.network.traffic import RequestLog, Traffic
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 import numpy as np
 
 from isocharge.serve.model.contact import Contact
-from isocharge.serve.tracking.touch_peak import MAX_AVERAGED_FRAMES, TouchPeak
+from isocharge.serve.tracking.film_follower import MAX_AVERAGED_FRAMES, TouchPeak
 
 
 def contact(force_N, x_mm=1.0):

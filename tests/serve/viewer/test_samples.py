@@ -10,8 +10,15 @@ from hypothesis import strategies as st
 
 from isocharge.serve import flags
 from isocharge.serve.record.record import OtherContact, TrackedContact, Tracking
-from isocharge.serve.viewer.samples import FLAG_BITS, coalesce, sample_type, sample_values
-from isocharge.serve.viewer.tape import OVERVIEW_PIECES, RecordedTape, Tape
+from isocharge.serve.viewer.tape import (
+    FLAG_BITS,
+    OVERVIEW_PIECES,
+    RecordedTape,
+    Tape,
+    coalesce,
+    sample_type,
+    sample_values,
+)
 
 TYPE = sample_type(("A", "B", "C"))
 

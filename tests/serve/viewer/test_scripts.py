@@ -11,7 +11,7 @@ import pytest
 
 from isocharge.serve import find_model, load_model
 from isocharge.serve.viewer.film_description import describe_film
-from isocharge.serve.viewer.samples import sample_type, sample_values
+from isocharge.serve.viewer.tape import sample_type, sample_values
 from isocharge.simulate import Circle, Film, deflection, press
 from isocharge.simulate.sensor.sensor_file import film_to_dict
 

@@ -16,8 +16,7 @@ Example:
 
 from typing import TYPE_CHECKING
 
-from isocharge.common.extras import require
-from isocharge.common.lazy_names import lazy_names
+from isocharge.common.extras import lazy_names, require
 
 with require("train"):
     import scipy  # noqa: F401 (all modules need it; the error names the extra)

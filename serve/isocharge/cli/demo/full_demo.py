@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from isocharge.cli.demo.played_area import DEFAULT_SENSOR, played_radius_mm
+from isocharge.cli.demo.live_film import DEFAULT_SENSOR, played_radius_mm
 from isocharge.cli.shared.terminal import say, show_result, shown_progress, this_command
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.arrays import Array

@@ -1,17 +1,40 @@
-"""Demo of the live page with a virtual sensor and a released model."""
+"""Demo of the live page with a virtual sensor and a released model, and the area in which the presses of a demo lie."""
 
 from contextlib import ExitStack, closing
 from functools import partial
 
-from isocharge.cli.demo.played_area import DEFAULT_SENSOR, played_radius_mm
+import numpy as np
+
 from isocharge.cli.shared.live_page import PageFeed, live_page, warnings_on_page
 from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
-from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE
-from isocharge.serve import Port, Predictor, Recorder, TouchStream
+from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.errors import ModelError
+from isocharge.serve import Port, Predictor, Recorder, TouchStream, find_model, load_model
 from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.network.address import Address
 from isocharge.simulate import Circle, ForwardMap, load_sensor
+
+DEFAULT_SENSOR = "three-25um-biaxial"
+"""Name of the sensor of the demo, and of its released model."""
+
+
+def played_radius_mm(sensor: str) -> float:
+    """Return the largest distance of a press of the demo from the centre of the film, mm.
+
+    If there is a released model with the name of the sensor, the distance is the radius of the working area of this
+    model. Otherwise, the distance is `DEFAULT_RADIUS`.
+
+    Args:
+        sensor: Name of the sensor.
+    """
+    try:
+        model = load_model(find_model(sensor))
+    except ModelError:
+        return DEFAULT_RADIUS
+
+    corners_mm = np.array(model.metadata.working_area_mm)  # shape (n, 2), around the centre of the film
+    return round(float(np.hypot(*corners_mm.T).min()), 2)
 
 
 def show_live_film(address: Address, seconds: float | None, sensor_name: str | None = None) -> None:

@@ -20,7 +20,7 @@ from isocharge.serve import Examination, Port, Predictor, device_from_table, exa
 from isocharge.serve.examination.electrode_check import ElectrodeCheck, check_electrodes, corrected_table
 from isocharge.serve.examination.listening import BAUDS
 from isocharge.serve.port.serial_line import Request
-from isocharge.serve.presses.number_text import parse_number
+from isocharge.serve.presses.number_table import parse_number
 
 HEAD = "Written by `isocharge serve doctor` from what came through a port; the keys are in serve/docs/device_file.md."
 """First line of a device file."""

@@ -25,9 +25,9 @@ from isocharge.common.extras import require
 from isocharge.serve.network.address import Address, Tls, Token, check_exposure
 from isocharge.serve.network.browser_check import BrowserCheck
 from isocharge.serve.network.http import Application, HttpServer
+from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import ModelStore, open_model_store
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.traffic import RequestLog, Traffic
 from isocharge.serve.outputs.writer_queue import WriterQueue
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from msgspec import structs
 
-from isocharge.cli.shared.optional_values import DEFAULT_LIVE_ADDRESS
+from isocharge.cli.shared.lazy import DEFAULT_LIVE_ADDRESS
 from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError, shown
 from isocharge.common.extras import require

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from isocharge.common.errors import InputError
-from isocharge.serve.presses.number_text import parse_number
+from isocharge.serve.presses.number_table import parse_number
 
 SensorArgument = Annotated[
     str, typer.Argument(metavar="SENSOR", help="Name of a built-in sensor, or a TOML file that describes one.")

@@ -25,6 +25,7 @@ from isocharge.serve.model.validity import Validity
 from isocharge.serve.prediction.agreement import (
     TEST_SIGNIFICANCE,
     Agreement,
+    StdFactor,
     binomial_distribution,
     chi_squared_deviate,
 )
@@ -37,7 +38,6 @@ from isocharge.serve.prediction.press_errors import (
     misfit_limit,
     press_errors,
 )
-from isocharge.serve.prediction.std_factor import StdFactor
 from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
 
 MIN_PRESSES = 3

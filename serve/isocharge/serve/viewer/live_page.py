@@ -28,6 +28,7 @@ from isocharge.serve.flags import MEANINGS
 from isocharge.serve.network.address import Address, ServerLimits, Tls, Token
 from isocharge.serve.network.browser_check import BrowserCheck, header_values
 from isocharge.serve.network.http import Application, HttpServer
+from isocharge.serve.network.metrics import Client
 from isocharge.serve.network.protocol.handler import Headers
 from isocharge.serve.network.protocol.response import (
     PAGE_HEADERS,
@@ -36,10 +37,8 @@ from isocharge.serve.network.protocol.response import (
     json_response,
     response_of,
 )
-from isocharge.serve.network.traffic import Client
 from isocharge.serve.record.record import PredictionRecord
-from isocharge.serve.viewer.samples import FLAG_BITS, coalesce, sample_type, sample_values
-from isocharge.serve.viewer.tape import RecordedTape, Tape
+from isocharge.serve.viewer.tape import FLAG_BITS, RecordedTape, Tape, coalesce, sample_type, sample_values
 
 SESSION_PATH = "/session.json"
 """Path of the description of the stream and its film."""

@@ -16,7 +16,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.serve.presses.number_text import parse_number
+from isocharge.serve.presses.number_table import parse_number
 from isocharge.train.calibration.calibrate import calibrate, solve_even
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.estimator import FEW_PRESSES

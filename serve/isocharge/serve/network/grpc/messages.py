@@ -15,8 +15,14 @@ from google.protobuf.message_factory import GetMessageClass
 from isocharge.common.errors import RequestError
 from isocharge.common.structs import convert
 from isocharge.serve.network.model_store import LoadedVersion
-from isocharge.serve.network.protocol.bodies import InferBody
-from isocharge.serve.network.protocol.inference import FLAGS, InferRequest, Rows, binary_tensor, check_request
+from isocharge.serve.network.protocol.inference import (
+    FLAGS,
+    InferBody,
+    InferRequest,
+    Rows,
+    binary_tensor,
+    check_request,
+)
 
 SERVICE = "inference.GRPCInferenceService"
 """Full name of the gRPC service."""

@@ -22,10 +22,10 @@ from google.protobuf.message import DecodeError, Message
 
 from isocharge.common.errors import RequestError, TooMany
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE, read_request, write_response
+from isocharge.serve.network.metrics import Exchange
 from isocharge.serve.network.protocol import Handler, describe
 from isocharge.serve.network.protocol.inference import answer_inference
 from isocharge.serve.network.protocol.response import client_message, statuses
-from isocharge.serve.network.traffic import Exchange
 
 METHODS_WITHOUT_TOKEN = ("ServerLive", "ServerReady")
 """Names of the methods that clients may call without a token."""

@@ -6,13 +6,17 @@ framework would only be called in addition.
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable, MutableMapping
+from collections.abc import Awaitable, Callable, Iterable, MutableMapping
+from pathlib import Path
 from typing import Any, Protocol
 
-from isocharge.serve.network.address import ServerLimits
+from isocharge.serve.network.address import ServerLimits, Token
+from isocharge.serve.network.browser_check import BrowserCheck
+from isocharge.serve.network.metrics import Client
+from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.handler import Headers
 from isocharge.serve.network.protocol.response import Response
-from isocharge.serve.network.traffic import Client
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -68,6 +72,33 @@ class Application:
             response = self.handler.answer(*request)
         await send({"type": "http.response.start", "status": response.status, "headers": response.headers})
         await send({"type": "http.response.body", "body": response.body})
+
+
+def asgi_app(models: Path | None = None, *, token: str | None = None, allowed_hosts: Iterable[str] = ()) -> Application:
+    """Load models, and return an ASGI application that serves them with the Open Inference Protocol.
+
+    The limits of connections belong to the server that runs the program. The application itself limits the size of a
+    request, and checks the token and the headers of browsers.
+
+    Args:
+        models: Folder of the models. By default, all repositories are searched, as `isocharge serve http` does.
+        token: Secret that clients must send as `Authorization: Bearer TOKEN`. By default, requests need no token.
+        allowed_hosts: Host names by which browsers reach the program, in addition to IP addresses and `localhost`. With
+            a token, every host name is accepted.
+
+    Raises:
+        MissingExtra: If the extra `http` is not installed.
+        InputError: If the token or a host name cannot be used.
+        ModelError: If there is no model, or no version passes its checks.
+
+    Example:
+        >>> from starlette.applications import Starlette  # doctest: +SKIP
+        >>> from starlette.routing import Mount  # doctest: +SKIP
+        >>> app = Starlette(routes=[Mount("/touch", asgi_app(token="s3cret"))])  # doctest: +SKIP
+    """
+    secret = None if token is None else Token(token)
+    browser_check = BrowserCheck(allowed_hosts=allowed_hosts, any_host=secret is not None)
+    return Application(Handler(open_model_store(models), token=secret, browser_check=browser_check))
 
 
 async def _read_body(receive: Receive, max_bytes: int) -> bytes | None:

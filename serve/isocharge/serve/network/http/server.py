@@ -1,4 +1,9 @@
-"""HTTP server on uvicorn that limits connections, and that other code can stop.
+"""HTTP server on uvicorn that limits the size and the duration of requests, and that other code can stop.
+
+uvicorn limits neither the size of headers and trailers, nor the time in which a request must arrive, nor the time in
+which a client must read its response. It also queues any number of requests that a client sends without waiting for
+responses. `Connection` closes connections that exceed such a limit. The server regularly calls `close_if_overdue`,
+which compares the deadlines with the present time, because a timer for each request would take more time.
 
 The signals of the process are left to the program that runs the server.
 """
@@ -8,14 +13,187 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn
 
 import uvicorn
 import uvloop
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
 from isocharge.serve.network.address import Address, ServerLimits, Tls
-from isocharge.serve.network.http.connection import Connection
-from isocharge.serve.network.traffic import Traffic
+from isocharge.serve.network.metrics import Exchange, Traffic
+from isocharge.serve.network.protocol.response import refusal
+
+
+class RequestRefused(Exception):
+    """Exception that stops the parser after a request was refused."""
+
+
+class Connection(HttpToolsProtocol):
+    """One connection of the server.
+
+    Attributes:
+        deadline: Time by which the client must send further data, s, on the clock of the event loop.
+        write_deadline: Time by which the client must have read its responses, s.
+    """
+
+    def __init__(self, limits: ServerLimits, traffic: Traffic, **uvicorn_arguments: Any) -> None:
+        """Create the state of a new connection.
+
+        Args:
+            limits: Limits of the connection and of its requests.
+            traffic: Counters, in which requests that are not passed to the application are counted.
+            uvicorn_arguments: Arguments that uvicorn passes to its protocols.
+        """
+        super().__init__(**uvicorn_arguments)
+        self.deadline = math.inf
+        self.write_deadline = math.inf
+        self._limits = limits
+        self._traffic = traffic
+        self._is_reading = False  # whether a request has begun and is not complete
+        self._pending_bytes = 0  # bytes since the latest complete head, part of a body, or complete request
+        self._max_head_bytes = 0  # upper bound of the size of the head that is being parsed
+
+    def connection_made(self, transport: Any) -> None:
+        """Begin the connection. If there are too many connections, end the oldest one that has not sent a request.
+
+        If every other connection has sent a request, the new connection is refused.
+        """
+        super().connection_made(transport)
+        self.deadline = self.loop.time() + self._limits.header_seconds
+        if len(self.connections) > self._limits.connections and not self._end_oldest_unused():
+            self.refuse(503, f"all {self._limits.connections} connections are taken; try again later")
+
+    def _end_oldest_unused(self) -> bool:
+        """End the oldest other connection that has not sent a request, and return whether there was such a connection.
+
+        The oldest connection is the connection with the earliest deadline.
+        """
+        others = [other for other in self.connections if isinstance(other, Connection) and other is not self]
+        unused = [other for other in others if other.cycle is None and not other.transport.is_closing()]
+        if unused:
+            oldest = min(unused, key=lambda other: other.deadline)
+            oldest.transport.abort()
+        return bool(unused)
+
+    def data_received(self, data: bytes) -> None:
+        """Parse data of the client. Refuse a request whose head, trailers or chunk extensions are too long."""
+        self._pending_bytes += len(data)
+        self._max_head_bytes = self._pending_bytes
+        super().data_received(data)
+        if self._pending_bytes > self._limits.header_bytes:
+            self.refuse(431, self._too_long_message())
+
+    def eof_received(self) -> bool:  # type: ignore[override]
+        """Keep the connection open until all complete requests are answered, although the client sends no more data."""
+        has_open_request = self.cycle is not None and not self.cycle.response_complete and not self.cycle.more_body
+        if has_open_request:
+            self.cycle.keep_alive = False  # the latest response closes the connection
+        # With TLS, both directions can only be closed together.
+        return has_open_request and self.scheme == "http"
+
+    def on_message_begin(self) -> None:
+        """Begin a request, and refuse it if too many requests wait for the response to an earlier request."""
+        self._is_reading = True
+        self.deadline = self.loop.time() + self._limits.header_seconds
+        most = self._limits.queued_requests
+        if len(self.pipeline) >= most:
+            self._refuse_and_stop(429, f"more than {most} requests wait; read the responses first")
+        super().on_message_begin()
+
+    def on_headers_complete(self) -> None:
+        """Check the size of the complete head, and set the deadline of the body."""
+        # The exact size takes time. It is only computed if the data of the head and of the body together are long.
+        if self._max_head_bytes > self._limits.header_bytes:
+            separator_bytes = len(b": \r\n")
+            head_bytes = len(self.url) + sum(len(name) + len(value) + separator_bytes for name, value in self.headers)
+            if head_bytes > self._limits.header_bytes:
+                self._refuse_and_stop(431, self._too_long_message())
+        self._pending_bytes = 0
+        self.deadline = self.loop.time() + self._limits.body_seconds
+        super().on_headers_complete()
+
+    def on_body(self, body: bytes) -> None:
+        """Pass a part of the body to the application, which limits the size of the body."""
+        self._pending_bytes = 0
+        super().on_body(body)
+
+    def on_message_complete(self) -> None:
+        """Remove the deadline, because the request is complete."""
+        self._is_reading = False
+        self._pending_bytes = 0
+        self.deadline = math.inf
+        if self.cycle is not None and self.cycle.response_complete:  # the application has not read the whole body
+            self.deadline = self.loop.time() + self._limits.idle_seconds
+        super().on_message_complete()
+
+    def on_response_complete(self) -> None:
+        """Set the deadline of the next request, unless it has already begun."""
+        super().on_response_complete()
+        if not self._is_reading:
+            self.deadline = self.loop.time() + self._limits.idle_seconds
+
+    def pause_writing(self) -> None:
+        """Set the deadline by which the client must read its responses."""
+        super().pause_writing()
+        self.write_deadline = self.loop.time() + self._limits.body_seconds
+
+    def resume_writing(self) -> None:
+        """Remove the deadline, because the client has read its responses."""
+        super().resume_writing()
+        self.write_deadline = math.inf
+
+    def close_if_overdue(self, now: float) -> None:
+        """End the connection if a deadline has passed. If a request has begun, the client receives the reason.
+
+        Args:
+            now: Present time on the clock of the event loop, s.
+        """
+        if min(self.deadline, self.write_deadline) > now:
+            return
+        if self._is_reading:
+            self._is_reading = False
+            self.refuse(408, "waited too long for the rest of the request")
+        else:
+            self.transport.abort()
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse data that are not an HTTP request. uvicorn calls this method with a message."""
+        self.refuse(400, msg)
+
+    def refuse(self, status: int, message: str) -> None:
+        """Send a refusal as the last response of the connection, and count it.
+
+        Args:
+            status: HTTP status.
+            message: Reason of the refusal.
+        """
+        if self.transport.is_closing():
+            return
+        response = refusal(status, message)
+        exchange = Exchange("http", "none", status, None, None, 0, 0, len(response.body), self.client)
+        self._traffic.count_and_log(exchange)
+        headers = b"".join(b"%s: %s\r\n" % header for header in response.headers)
+        self.transport.write(STATUS_LINE[status] + headers + b"connection: close\r\n\r\n" + response.body)
+        self.transport.close()
+        self.deadline = self.loop.time() + self._limits.header_seconds
+
+    def _refuse_and_stop(self, status: int, message: str) -> NoReturn:
+        """Refuse a request while its data are parsed, and raise an exception that ends the parsing.
+
+        Without the exception, the parser would take the remaining data of the client for further requests.
+
+        Args:
+            status: HTTP status of the response that refuses the request.
+            message: Reason of the refusal.
+
+        Raises:
+            RequestRefused: Always.
+        """
+        self.refuse(status, message)
+        raise RequestRefused(message)
+
+    def _too_long_message(self) -> str:
+        return f"the request line and headers are longer than {self._limits.header_bytes} bytes"
 
 
 class HttpServer:

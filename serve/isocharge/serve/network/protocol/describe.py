@@ -1,11 +1,14 @@
-"""Descriptions of the server and its models as JSON objects.
+"""Descriptions of the server and its models as JSON objects, and the OpenAPI document of the HTTP server.
 
 The messages of the gRPC service have the same fields as these objects.
 """
 
+from importlib.resources import files
 from typing import Any
 
-from isocharge.common.versions import package_version
+import orjson
+
+from isocharge.common.extras import package_version
 from isocharge.serve.model.session import INPUT, OUTPUTS
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
@@ -95,3 +98,17 @@ def repository_index(store: ModelStore, *, ready: bool) -> list[dict[str, str]]:
     If `ready` is true, the result contains only the rows of loaded versions.
     """
     return [row for row in store.index() if row["state"] == "READY" or not ready]
+
+
+def openapi_document(store: ModelStore) -> dict[str, Any]:
+    """Return the OpenAPI document of the file `openapi.json`, with the names and versions of the loaded models.
+
+    A parameter without a loaded model has the value "none", because OpenAPI requires at least one.
+    """
+    document: dict[str, Any] = orjson.loads(files(__package__).joinpath("openapi.json").read_bytes())
+    document["info"]["version"] = server_metadata()["version"]
+    loaded_versions = store.loaded_versions()
+    parameters = document["components"]["parameters"]
+    parameters["model"]["schema"]["enum"] = sorted({loaded.metadata.name for loaded in loaded_versions}) or ["none"]
+    parameters["version"]["schema"]["enum"] = sorted({loaded.version for loaded in loaded_versions}) or ["none"]
+    return document

@@ -15,10 +15,10 @@ from functools import lru_cache
 from isocharge.common.errors import UnknownPath, WrongMethod
 from isocharge.serve.network.address import ServerLimits, Token
 from isocharge.serve.network.browser_check import BrowserCheck, header_values
+from isocharge.serve.network.metrics import Client, Exchange, Traffic
 from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.response import Response, decompress, error_response, json_response
 from isocharge.serve.network.protocol.routes import ROUTES, Request, Route
-from isocharge.serve.network.traffic import Client, Exchange, Traffic
 
 Headers = Iterable[tuple[bytes, bytes]]
 """Headers of a request. The names are in lower case, and the values are unchanged."""

@@ -3,15 +3,18 @@
 An inference has three steps: the server reads the request, runs the model, and writes the response. The body of a
 request or of a response is a JSON text, which may be followed by binary tensors. If binary tensors follow, an HTTP
 header contains the length of the JSON text. The gRPC service converts its messages to the same types.
+
+Some clients send `null` for every field that is not given. All optional fields therefore accept `null`.
 """
 
 import struct
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import orjson
+from msgspec import Meta, Struct
 
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import RequestError, TooLarge
@@ -19,7 +22,51 @@ from isocharge.common.structs import parse_json
 from isocharge.serve.model.contact import Contacts
 from isocharge.serve.model.session import COLUMNS, INPUT, OUTPUTS, as_float32, run
 from isocharge.serve.network.model_store import LoadedVersion
-from isocharge.serve.network.protocol.bodies import InferBody, InputTensor, Parameters
+
+Unsupported = Annotated[None, Meta(description="nothing, as this server does not support it")]
+
+
+class Parameters(Struct, frozen=True):
+    """Parameters of a request, of an input or of an output. Unknown parameters are ignored, as in Triton."""
+
+    binary_data: bool | None = None
+    binary_data_output: bool | None = None
+    binary_data_size: int | None = None
+    shared_memory_region: Unsupported = None
+    classification: Unsupported = None
+
+
+class InputTensor(Struct, frozen=True):
+    """Input tensor with the charges, pC."""
+
+    name: Literal["charge_pC"]
+    datatype: Literal["FP32", "FP64"]
+    shape: list[int]
+    data: Annotated[list[float | list[float]], Meta(description="numbers, flat or in rows")] | None = None
+    parameters: Parameters | None = None
+
+
+class OutputTensor(Struct, frozen=True):
+    """Output that the client requests."""
+
+    name: Literal["contact", "contact_std", "contact_correlation", "misfit", "flags"]
+    parameters: Parameters | None = None
+
+
+class InferBody(Struct, frozen=True):
+    """Body of a request for an inference."""
+
+    inputs: Annotated[list[InputTensor], Meta(min_length=1, max_length=1, description="a list with one tensor")]
+    id: str | None = None
+    outputs: list[OutputTensor] | None = None
+    parameters: Parameters | None = None
+
+
+class IndexBody(Struct, frozen=True):
+    """Body of a request for the index of the repository."""
+
+    ready: bool | None = None
+
 
 DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
 """NumPy type of the charges by the name of the number type. The protocol prescribes little-endian numbers."""

@@ -12,14 +12,12 @@ from prometheus_client import generate_latest
 from isocharge.common.errors import RequestError
 from isocharge.common.structs import parse_json
 from isocharge.serve.network.address import ServerLimits
-from isocharge.serve.network.metrics import CONTENT_TYPE
+from isocharge.serve.network.metrics import CONTENT_TYPE, Traffic
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol import describe
-from isocharge.serve.network.protocol.bodies import IndexBody
-from isocharge.serve.network.protocol.inference import answer_inference, read_infer, write_answer
-from isocharge.serve.network.protocol.openapi import openapi_document
+from isocharge.serve.network.protocol.describe import openapi_document
+from isocharge.serve.network.protocol.inference import IndexBody, answer_inference, read_infer, write_answer
 from isocharge.serve.network.protocol.response import Response, response_of
-from isocharge.serve.network.traffic import Traffic
 
 
 class Request(NamedTuple):
