@@ -37,7 +37,7 @@ forward_map = ForwardMap.build(sensor, Circle(1.0))
 board = VirtualSensor(forward_map.charges, wander(seed=2), noise=noise_model("reference").add)
 with tempfile.TemporaryDirectory() as folder:
     path = Path(folder) / "touch.rec"
-    with Recorder(path, "three-25um-biaxial/1", "every", {}) as recorder:
+    with Recorder(path, "three-25um-biaxial/1", {}) as recorder:
         for number, data in enumerate(islice(board.frames(), FRAMES)):
             chunk = Chunk(data, number / RATE_HZ, 0)
             lines = [record.to_json() for record in touch.feed(chunk)]

@@ -81,7 +81,7 @@ def _write(folder):
     shutil.copy(next((ROOT / "train/configs").glob("*.toml")), folder / "config.toml")
     (folder / "script.toml").write_text("presses = [[0, 0, 0, 0], [1, 1, 1, 1.5]]\n[faults]\nlose_share = 0.1\n")
     (folder / "charges.csv").write_text("A,B,C\n800.5,700.25,900\n1,2,3\n")
-    with Recorder(folder / "touch.rec", "linear/1", "every", {"tare": {"frames": 10}}) as recorder:
+    with Recorder(folder / "touch.rec", "linear/1", {"tare": {"frames": 10}}) as recorder:
         for k in range(3):
             recorder.chunk(Chunk(bytes(9), 1e9 + k, k, 0.0), ['{"timestamp": 1.0, "latency_us": 9.0}'])
             recorder.tare()

@@ -26,7 +26,7 @@ from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_search import find_model
-from isocharge.serve.record.csv_rows import csv_header
+from isocharge.serve.record.formats import csv_header
 
 HARMFUL_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 
@@ -191,7 +191,7 @@ def test_recordings(attack, tmp_path):
     def read(names):
         path.unlink(missing_ok=True)
         with checked_terminal():
-            with Recorder(path, names[0], "every", {"name": names[1]}, names[2]):
+            with Recorder(path, names[0], {"name": names[1]}, names[2]):
                 pass
             recording = Recording(path)
             print(recording.name)

@@ -34,8 +34,7 @@ def test_the_module_is_the_command():
     [
         ("isocharge s", {"simulate", "serve"}),
         ("isocharge serve pr", {"predict"}),
-        ("isocharge serve stream --po", {"--port", "--policy"}),
-        ("isocharge serve stream --policy l", {"latest"}),
+        ("isocharge serve stream --po", {"--port"}),
     ],
 )
 def test_the_shell_completes_what_is_typed(typed, proposed):

@@ -16,8 +16,8 @@ import pytest
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-from isocharge.serve.export.record_messages import pose_stamped, ros_time_ns, wrench_stamped
 from isocharge.serve.flags import MEANINGS
+from isocharge.serve.outputs.ros_messages import pose_stamped, ros_time_ns, wrench_stamped
 from isocharge.serve.record.record import TrackedContact, Tracking
 
 NODE = Path(__file__).parents[2] / "serve/deploy/ros2/isocharge_ros/isocharge_ros/node.py"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from isocharge.serve.frames.text_lines import encode_text
     from isocharge.serve.live.device import Device, device_from_table, load_device
     from isocharge.serve.live.steady_press import PressWatch
-    from isocharge.serve.live.stream import Policy, ReadingStream, TouchStream, stream
+    from isocharge.serve.live.stream import ReadingStream, TouchStream, stream
     from isocharge.serve.model.contact import Contact, Contacts
     from isocharge.serve.model.metadata import ModelMetadata
     from isocharge.serve.model.model_folder import (
@@ -57,7 +57,6 @@ __all__ = [
     "MeasuredPresses",
     "Model",
     "ModelMetadata",
-    "Policy",
     "Port",
     "PredictionRecord",
     "Predictor",

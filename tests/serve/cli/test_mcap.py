@@ -115,7 +115,7 @@ def test_plot_draws_a_recording(command, recorded, tmp_path, figures):
 )
 def test_plot_refuses_empty_and_damaged_recordings(command, tmp_path, lines, message):
     path, picture = tmp_path / "touch.rec", tmp_path / "touch.png"
-    with Recorder(path, "linear/1", "every", {}):
+    with Recorder(path, "linear/1", {}):
         pass
     path.write_text(path.read_text() + "".join(f"{line}\n" for line in lines))
     code, _, err = command("serve", "plot", path, "-o", picture)

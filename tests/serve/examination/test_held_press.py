@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame
-from isocharge.serve.examination.held_press import find_held_press
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
-from isocharge.serve.signal_chain.inflow import LeakRule
+from isocharge.serve.examination.press_detector import find_held_press
+from isocharge.serve.signal_chain.leak import LeakRule
 
 T_S = np.arange(0.0, 20.0, 0.005)
 HELD_S = T_S - 5.0

@@ -11,7 +11,7 @@ import pytest
 from isocharge.cli.serve.doctor import brief_report
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text
-from isocharge.serve.examination.channel_health import measure_channel_health
+from isocharge.serve.examination.board_health import measure_channel_health
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.live.device import ANY_BOARD

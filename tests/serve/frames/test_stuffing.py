@@ -14,8 +14,7 @@ from crcmod.predefined import mkPredefinedCrcFun
 
 from isocharge.serve import BinaryParser, Frame, encode_frame
 from isocharge.serve.frames.binary import MAX_STUFFED_LENGTH
-from isocharge.serve.frames.checksums import CHECKSUMS
-from isocharge.serve.frames.stuffing import STUFFINGS
+from isocharge.serve.frames.transmission import CHECKSUMS, STUFFINGS
 
 EXAMPLES = [
     ("slip", "C0", "DB DC"),

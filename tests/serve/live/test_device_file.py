@@ -21,11 +21,9 @@ from isocharge.serve.frames.frame_layout import SyncParser
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.signal_chain.channels import Channels
-from isocharge.serve.signal_chain.gain import Gain
+from isocharge.serve.signal_chain.gain import Gain, SaturationRule
 from isocharge.serve.signal_chain.hum import HumRule
-from isocharge.serve.signal_chain.inflow import LeakRule
-from isocharge.serve.signal_chain.leak import Leak
-from isocharge.serve.signal_chain.saturation import SaturationRule
+from isocharge.serve.signal_chain.leak import Leak, LeakRule
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.thermal import ThermalRule

@@ -59,7 +59,7 @@ def chunks_of_presses(film, chunk_bytes=37, outage_number=40):
 def record_chunks(path, chunks, predictor, table):
     """Record a stream, and yield its records as JSON. A new tare is requested before chunk 30."""
     stream = TouchStream(predictor, device_from_table(table, "test"))
-    with Recorder(path, predictor.metadata.label, "every", table) as recorder:
+    with Recorder(path, predictor.metadata.label, table) as recorder:
         live = RecordedStream(stream, recorder)
 
         def chunks_with_request():
@@ -162,7 +162,7 @@ def test_replay_in_real_time_waits_between_chunks(tmp_path, film, predictor, mon
 def test_replay_in_real_time_ignores_a_step_of_the_wall_clock(tmp_path, predictor, monkeypatch):
     """A step by 8e10 s is longer than `time.sleep` accepts."""
     path = tmp_path / "touch.rec"
-    with Recorder(path, predictor.metadata.label, "every", {}) as recorder:
+    with Recorder(path, predictor.metadata.label, {}) as recorder:
         for number, wall_s in enumerate((0.0, 0.1, 3600.2, 8e10, 0.4)):
             recorder.chunk(Chunk(b"A:1,B:2,C:3\n", wall_s, 10**8 * number), [])
     slept_s = []
@@ -186,7 +186,7 @@ def test_recording_that_begins_later_restarts_the_stream(film, predictor, tmp_pa
     def chunks_with_requests():
         for number, chunk in enumerate(chunks_of_presses(film)):
             if number == 20:
-                live.request_recording(Recorder(path, label, "every", DEVICE))
+                live.request_recording(Recorder(path, label, DEVICE))
             if number == 30:
                 live.request_marker(Marker(1e9, "now"))
             if number == 60:

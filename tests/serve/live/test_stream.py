@@ -1,6 +1,5 @@
 """Tests of the stream from chunks of bytes to records, without a port."""
 
-import math
 import time
 
 import numpy as np
@@ -10,7 +9,6 @@ from isocharge.common.errors import ChargeError, PortError
 from isocharge.serve import (
     Chunk,
     Frame,
-    Policy,
     TouchStream,
     device_from_table,
     encode_frame,
@@ -75,27 +73,6 @@ def test_record_of_a_press(film, records_after_rest):
     assert (record.model, record.frame_id) == ("linear/1", "linear-film")
     assert abs(record.timestamp - time.time()) < 5.0
     assert 0.0 < record.latency_us < 5e6
-
-
-def test_policy_latest_passes_flags_of_skipped_frames_on(predictor):
-    """Only flags that describe earlier events, such as lost frames, are passed on. The flag `invalid` is not."""
-    touch = TouchStream(predictor, BOARD, policy=Policy.latest)
-
-    def frame(seq):
-        return Frame(seq, 5000 * seq, tuple(OFFSET.tolist()))
-
-    list(touch.feed(chunk(*rest_frames())))
-    assert touch.counts.skipped == 9
-    invalid_frame = Frame(4, 20_000, (math.nan, 0.0, 0.0))
-    (record,) = touch.feed(chunk(frame(20), frame(20), frame(3), invalid_frame, frame(5)))
-    assert record.flags == ("gap", "repeat", "restart")
-    assert touch.counts.skipped == 9 + 4
-    (record,) = touch.feed(chunk(frame(6), frame(7)))
-    assert record.flags == ()
-    assert touch.counts.skipped == 9 + 4 + 1
-    (record,) = touch.feed(chunk(frame(8), frame(9), frame(11))._replace(outage_s=2.0))
-    assert record.flags == ("reconnected", "gap", "tare")
-    assert touch.counts.skipped == 9 + 4 + 1 + 2
 
 
 def test_record_out_of_contact(records_after_rest):

@@ -27,7 +27,10 @@ from rosbags.typesys.msg import get_types_from_msg
 
 from isocharge.common.errors import InputError
 from isocharge.serve import PredictionRecord
-from isocharge.serve.export.record_messages import (
+from isocharge.serve.model.contact import Contact
+from isocharge.serve.outputs.mcap_file import McapFile
+from isocharge.serve.outputs.output import OutputContext
+from isocharge.serve.outputs.ros_messages import (
     POSE,
     POSE_DEFINITION,
     STRING,
@@ -35,12 +38,9 @@ from isocharge.serve.export.record_messages import (
     WRENCH,
     WRENCH_DEFINITION,
 )
-from isocharge.serve.model.contact import Contact
-from isocharge.serve.outputs.mcap_file import McapFile
-from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.targets import Outputs
+from isocharge.serve.record.formats import record_schema
 from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking, selected_fields
-from isocharge.serve.record.schema import record_schema
 
 ELECTRODES = ("A", "B", "C")
 ROS = get_typestore(Stores.ROS2_JAZZY)

@@ -8,11 +8,11 @@ from pyarrow.parquet import write_table
 from isocharge.common.errors import InputError, RecordingError
 from isocharge.serve import Port, Recorder, Recording, open_source
 from isocharge.serve.port.source import Chunk, FileSource
-from isocharge.serve.record.csv_rows import csv_header
+from isocharge.serve.record.formats import csv_header
 
 
 def recording(path):
-    with Recorder(path, "linear/1", "every", {}) as recorder:
+    with Recorder(path, "linear/1", {}) as recorder:
         recorder.chunk(Chunk(b"A:1,B:2,C:3\n", 1.7e9, 0), [])
 
 

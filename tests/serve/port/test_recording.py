@@ -18,7 +18,7 @@ CHUNKS = [
 def recorded(tmp_path):
     """Return a recording of five chunks with 0 to 4 records. Before the third chunk, a new tare is requested."""
     path = tmp_path / "touch.rec"
-    with Recorder(path, "linear/1", "every", {"tare": {"frames": 10}}) as recorder:
+    with Recorder(path, "linear/1", {"tare": {"frames": 10}}) as recorder:
         for number, chunk in enumerate(CHUNKS):
             if number == 2:
                 recorder.tare()
@@ -39,17 +39,17 @@ def test_unfinished_line_is_ignored(recorded, cut):
 def test_recorder_does_not_overwrite_a_file(tmp_path):
     path = tmp_path / "touch.rec"
     path.write_text("mine")
-    with pytest.raises(OutputExists), Recorder(path, "m/1", "every", {}):
+    with pytest.raises(OutputExists), Recorder(path, "m/1", {}):
         pass
     assert path.read_text() == "mine"
 
 
 def test_recorder_in_a_missing_folder_is_refused(tmp_path):
-    with pytest.raises(OutputError, match="cannot be written"), Recorder(tmp_path / "no" / "x", "m/1", "every", {}):
+    with pytest.raises(OutputError, match="cannot be written"), Recorder(tmp_path / "no" / "x", "m/1", {}):
         pass
 
 
-HEADER = '"model": "m/1", "policy": "every", "device": {}'
+HEADER = '"model": "m/1", "device": {}'
 """Keys of the first line of a recording besides its version."""
 
 
@@ -64,9 +64,9 @@ HEADER = '"model": "m/1", "policy": "every", "device": {}'
         '{"isocharge_recording": 1}',
         "[" * 100_000,
         "x" * 3_000_000,
-        '{"isocharge_recording": 1, "model": 5, "policy": "every", "device": {}}',
-        '{"isocharge_recording": 1, "model": "m/1", "policy": "some", "device": {}}',
-        '{"isocharge_recording": 1, "model": "m/1", "policy": "every", "device": []}',
+        '{"isocharge_recording": 1, "model": 5, "device": {}}',
+        '{"isocharge_recording": 1, "model": "m/1", "policy": "every", "device": {}}',
+        '{"isocharge_recording": 1, "model": "m/1", "device": []}',
         f'{{"isocharge_recording": [], {HEADER}}}',
     ],
 )
@@ -130,14 +130,14 @@ def test_error_message_contains_the_number_of_a_damaged_line(recorded, line):
 
 def test_events_and_records_are_read_in_their_order(tmp_path):
     path = tmp_path / "touch.rec"
-    with Recorder(path, "m/1", "latest", {}, name="left") as recorder:
+    with Recorder(path, "m/1", {}, name="left") as recorder:
         recorder.chunk(CHUNKS[0], ['{"timestamp": 5.0, "latency_us": 7.0, "x_mm": 2.5}'])
         recorder.mark(Marker(1e9, "now"))
         recorder.model("m/2")
         recorder.tare()
         recorder.chunk(CHUNKS[3], [])
     recording = Recording(path)
-    assert (recording.policy, recording.name) == ("latest", "left")
+    assert recording.name == "left"
     assert list(recording.events()) == [
         Event(CHUNKS[0], (7.0,)),
         Marker(1e9, "now"),

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from isocharge.common.errors import InputError, PortError, PortLost
 from isocharge.serve import Chunk, Port, open_source
 from isocharge.serve.port.serial_line import QUIET_TIME_s, REPEAT_TIME_s, Request, Requester
-from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
+from isocharge.serve.virtual_sensor.sensor import PseudoPort
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import jsonschema_rs
 import pytest
 from msgspec import structs
 
-from isocharge.serve.record.fields import fields_of
+from isocharge.serve.record.formats import record_schema
 from isocharge.serve.record.record import (
     CONTACT_FIELDS,
     RECORD_FIELDS,
@@ -16,9 +16,9 @@ from isocharge.serve.record.record import (
     PredictionRecord,
     TrackedContact,
     Tracking,
+    fields_of,
     selected_fields,
 )
-from isocharge.serve.record.schema import record_schema
 
 TRACKED = TrackedContact(1.0, 2.0, 0.5, 0.01, 0.02, 0.001, 3.0, 0.0, 0.25)
 

@@ -66,13 +66,13 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
         port = stack.enter_context(Port(board.url))
 
         # A recording that the page begins has every frame, and neither a device file nor a name of the film.
-        new_recorder = partial(Recorder, policy="every", device={})
+        new_recorder = partial(Recorder, device={})
         stack.enter_context(warnings_on_page(page))
         feed = PageFeed(page, touch, stream, new_recorder)
 
         say("Ctrl-C stops")
         records = stack.enter_context(closing(stream.follow(port)))
-        for record in records:
+        for count, record in enumerate(records, start=1):
             feed.write(record)
-            if seconds is not None and touch.counts.records > seconds * board.script.rate_Hz:
+            if seconds is not None and count > seconds * board.script.rate_Hz:
                 break

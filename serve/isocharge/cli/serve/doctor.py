@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import typer
 from serial.tools import list_ports
 
-from isocharge.cli.serve.records import WaitOption
-from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption
+from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption, WaitOption
 from isocharge.cli.shared.terminal import say, show, show_json, show_result
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.files import refuse_existing, write_whole

@@ -13,7 +13,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
 from isocharge.common.files import bounded_lines
 from isocharge.serve import Predictor, load_device, read_charges, table_records, write_contacts
-from isocharge.serve.live.contact_stages import NoiseRule
+from isocharge.serve.live.device import NoiseRule
 from isocharge.serve.prediction.table import blocks, read_charge_file
 
 

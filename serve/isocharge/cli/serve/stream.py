@@ -3,25 +3,16 @@
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
-from isocharge.cli.serve.records import (
-    LATENCIES,
-    OutputOption,
-    RecordWriter,
-    WaitOption,
-    command_outputs,
-    say_missing_records,
-    summary,
-    write_records,
-)
 from isocharge.cli.shared.live_page import (
     AllowHostOption,
     LiveOption,
@@ -34,19 +25,20 @@ from isocharge.cli.shared.live_page import (
     page_tls,
     warnings_on_page,
 )
-from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption
+from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption, WaitOption
 from isocharge.cli.shared.port_hints import no_frames_advice_added, no_frames_hint
 from isocharge.cli.shared.terminal import (
     StopTimer,
     on_signal,
     say,
+    stdout_is_ready,
+    stdout_writer,
     unless_hung_up,
     until_stopped,
 )
 from isocharge.common.errors import InputError, shown
 from isocharge.common.printable_text import is_printable
 from isocharge.serve import (
-    Policy,
     PredictionRecord,
     Predictor,
     RecordedClock,
@@ -60,12 +52,113 @@ from isocharge.serve import (
     load_device,
     open_source,
 )
+from isocharge.serve.flags import TARE
 from isocharge.serve.live.device import with_settings
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
-from isocharge.serve.outputs.targets import Outputs
+from isocharge.serve.outputs.output import OutputContext
+from isocharge.serve.outputs.targets import Outputs, target_forms
 
 if TYPE_CHECKING:
     from isocharge.serve.viewer.live_page import LivePage
+
+OutputOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--output",
+        metavar="TARGET",
+        help=f"Where to write the records; repeat the option for several targets. Forms: {target_forms()}. `json` and "
+        "`csv` are standard output. Other packages can add forms. (default: json)",
+    ),
+]
+
+DEFAULT_TARGETS = ("json",)
+"""Targets of the output if the option `--output` is not given."""
+
+LATENCIES = 100_000
+"""Number of the latest records from whose latencies the summary computes percentiles."""
+
+RecordWriter = Callable[[PredictionRecord], object]
+"""Function that is called with each record."""
+
+
+def write_records(
+    records: Iterable[PredictionRecord], writers: Iterable[RecordWriter], latencies: deque[float]
+) -> None:
+    """Pass each record to all writers, print each new tare, and collect the latencies.
+
+    Args:
+        records: The records.
+        writers: Functions that write a record, which are called in their order.
+        latencies: Queue to which the latency of each record is added, us.
+    """
+    is_tare_new = True
+    for record in records:
+        for write in writers:
+            write(record)
+        if TARE in record.flags:  # the tare is being measured
+            is_tare_new = True
+        elif is_tare_new and record.tare_pC is not None:  # an invalid record has no tare
+            is_tare_new = False
+            tare_text = ", ".join(f"{electrode} {charge:.2f} pC" for electrode, charge in record.tare_pC.items())
+            say(f"tared: {tare_text}")
+        if record.latency_us is not None:
+            latencies.append(record.latency_us)
+
+
+def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_live: bool) -> Outputs:
+    """Return the outputs for the targets of `--output`. They are opened when their context is entered.
+
+    Args:
+        targets: Values of the option; None or empty for `DEFAULT_TARGETS`.
+        touch: The stream whose records are written.
+        is_live: Whether the records come from a sensor.
+
+    Raises:
+        InputError: If a target has none of the forms, two targets are equal, or two targets write to standard output.
+    """
+    context = OutputContext(
+        electrodes=touch.predictor.metadata.electrodes,
+        with_tracking=touch.has_tracking,
+        with_film=touch.has_film,
+        is_live=is_live,
+        write_stdout=stdout_writer(),
+        stdout_is_ready=stdout_is_ready,
+    )
+    return Outputs(targets or DEFAULT_TARGETS, context)
+
+
+def say_missing_records(outputs: Outputs) -> None:
+    """Print how many records are missing in each output. The outputs must have been closed.
+
+    Args:
+        outputs: The outputs. `not_written` contains the number of missing records of each incomplete output by its
+            target; None if an error ended the output.
+    """
+    for target, missing_records in outputs.not_written.items():
+        if missing_records is not None:
+            say(f"{target}: {missing_records} records not written, the oldest: the output was too slow")
+        else:
+            say(f"{target}: incomplete")
+
+
+def summary(touch: TouchStream, latencies: deque[float]) -> str:
+    """Return the summary of a stream: the numbers of frames and faults, and percentiles of the latency.
+
+    Args:
+        touch: The stream.
+        latencies: Latencies of the latest records, us.
+    """
+    totals = touch.totals()
+    frames_text = (
+        f"{totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated, {totals.restarts} restarts; "
+        f"{totals.crc_errors} CRC errors, {totals.malformed} malformed, {totals.bytes_dropped} bytes dropped; "
+        f"{totals.reconnects} reconnects"
+    )
+    if not latencies:
+        return frames_text
+    p50, p99 = np.percentile(latencies, (50, 99))
+    return f"{frames_text}; last byte to record p50 {p50:.0f} us, p99 {p99:.0f} us"
+
 
 MAX_NAME_CHARACTERS = 100
 """Largest number of characters of a film's name."""
@@ -101,12 +194,6 @@ def stream_command(
             "(default: name of the model's sensor)",
         ),
     ] = None,
-    policy: Annotated[
-        Policy,
-        typer.Option(
-            "--policy", help="If several frames come at once: a record for each of them, or for the latest alone."
-        ),
-    ] = Policy.every,
     seconds: Annotated[
         float | None, typer.Option("--seconds", min=1e-3, help="Time after which to stop, s. (default: at Ctrl-C)")
     ] = None,
@@ -160,9 +247,9 @@ def stream_command(
         board = with_settings(board, "track", on=True)
     if follow:
         board = with_settings(board, "follow", on=True)
-    touch = TouchStream(predictor, board, policy=policy, frame_id=name)
+    touch = TouchStream(predictor, board, frame_id=name)
     latencies: deque[float] = deque(maxlen=LATENCIES)
-    recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name) if record else None
+    recorder = Recorder(record, predictor.metadata.label, board.table, name) if record else None
     stream = RecordedStream(touch, recorder)
     timer = StopTimer(seconds)
     outputs: Outputs | None = None  # until the port is open
@@ -185,7 +272,7 @@ def stream_command(
         writers: list[RecordWriter] = [outputs.write]
         if page is not None:
             # The page must not begin a recording if the command itself records the stream.
-            new_recorder = None if recorder else partial(Recorder, policy=policy.value, device=board.table, name=name)
+            new_recorder = None if recorder else partial(Recorder, device=board.table, name=name)
             stack.enter_context(warnings_on_page(page))
             writers.append(PageFeed(page, touch, stream, new_recorder).write)
         if recorder:
@@ -266,9 +353,7 @@ def replay_command(
     # The function `play` yields the records. If the model was changed during the recording, `play` changes the model,
     # too, unless the user has chosen one model for the whole recording.
     clock = RecordedClock()
-    touch = TouchStream(
-        predictor, board, policy=Policy(recording.policy), now_ns=clock, frame_id=recording.name or None
-    )
+    touch = TouchStream(predictor, board, now_ns=clock, frame_id=recording.name or None)
     load = None if model else partial(_load_labelled, models=models)
     play = partial(replay, recording, touch, clock, real_time=real_time, load=load)
 

@@ -227,7 +227,7 @@ class PageFeed:
             return
         recorder = self._stream.recorder if self._stream else None
         self._page.update(
-            counters=self._touch.totals()._asdict() | {"reconnects": self._touch.counts.outages},
+            counters=self._touch.totals()._asdict(),
             rate_Hz=self._page.tape.rate_Hz(),
             model=record.model,
             film=None if record.film is None else structs.asdict(record.film),

@@ -159,3 +159,14 @@ def parse_radius_mm(text: str) -> float:
         return parse_number(text)
     except ValueError as error:
         raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error
+
+
+WaitOption = Annotated[
+    float,
+    typer.Option(
+        "--wait",
+        min=0.0,
+        max=3600.0,
+        help="Time to wait until the port can be opened, and until the first byte if this is more than 10 s, s.",
+    ),
+]

@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.printable_text import printable
-from isocharge.serve.examination.channel_health import ChannelHealth, measure_channel_health
-from isocharge.serve.examination.held_press import find_held_press
-from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
-from isocharge.serve.examination.missing import (
+from isocharge.serve.examination.board_health import (
     CLEAN_SHARE,
+    ChannelHealth,
     channel_count_sentences,
     channel_sentences,
     held_press_sentences,
+    measure_channel_health,
     transmission_sentences,
     unit_sentences,
 )
-from isocharge.serve.examination.press_detector import find_touch
+from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
+from isocharge.serve.examination.press_detector import find_held_press, find_touch
 from isocharge.serve.examination.proposal import propose, recognised_frames, unit_of
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
 from isocharge.serve.port.serial_line import Request, without_telnet

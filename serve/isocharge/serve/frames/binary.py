@@ -13,7 +13,7 @@ import struct
 from cobs import cobs
 
 from isocharge.serve.frames.frame import ChecksumError, Frame, StuffedParser
-from isocharge.serve.frames.stuffing import cobs_decode
+from isocharge.serve.frames.transmission import cobs_decode
 
 FORMAT = "binary frames of isocharge"
 """Description of the format, for the user."""

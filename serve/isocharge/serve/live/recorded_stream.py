@@ -230,7 +230,7 @@ def replay(
 
     Args:
         recording: Recording whose chunks are processed.
-        stream: New stream with the model, the device and the policy of the recorded stream. Its argument `now_ns` must
+        stream: New stream with the model and the device of the recorded stream. Its argument `now_ns` must
             be `clock`.
         clock: Clock that the replay sets to the times of the recording, so that the records have the recorded latency.
         real_time: Whether to wait before each chunk, so that the replay takes as long as the recording.

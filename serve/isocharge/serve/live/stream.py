@@ -8,57 +8,27 @@ on a model of the film, unless warming is estimated.
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from enum import StrEnum
 from typing import NamedTuple
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, NoFramesError, shown
-from isocharge.serve.flags import GAP, RECONNECTED, REPEAT, RESTART, in_order
+from isocharge.serve.flags import RECONNECTED, in_order
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, SequenceGaps
 from isocharge.serve.live.device import ANY_BOARD, Device, create_stages
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.source import Chunk
-from isocharge.serve.record.fields import Charges
-from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, PredictionRecord
+from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord
 from isocharge.serve.signal_chain.stage import Stage
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule
-
-LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
-"""Flags of a frame without a record that are added to the next record. They describe events before the next record."""
-
-
-class Policy(StrEnum):
-    """Rule that decides which frames have a record: all frames, or only the latest frame of each chunk.
-
-    Whichever rule is chosen, the signal chain processes all frames.
-    """
-
-    every = "every"
-    latest = "latest"
-
-
-@dataclass(slots=True)
-class StreamCounts:
-    """Counts of a stream that neither its parser nor its counter of missing frame numbers contains.
-
-    Attributes:
-        records: Number of records that the stream has yielded.
-        skipped: Number of frames that have no record, because the same chunk contained a newer frame (`Policy.latest`).
-        outages: Number of outages of the port after which the stream has continued.
-    """
-
-    records: int = 0
-    skipped: int = 0
-    outages: int = 0
 
 
 class StreamTotals(NamedTuple):
     """Counts of a stream since it began, including the counts before its latest restart.
 
-    The classes `FrameCounts` and `SequenceGaps` describe the meaning of each count.
+    The classes `FrameCounts` and `SequenceGaps` describe the meaning of each count except `reconnects`, which is the
+    number of outages of the port after which the stream has continued.
     """
 
     frames: int = 0
@@ -68,6 +38,7 @@ class StreamTotals(NamedTuple):
     crc_errors: int = 0
     malformed: int = 0
     bytes_dropped: int = 0
+    reconnects: int = 0
 
 
 def stream(chunks: Iterable[Chunk], predictor: Predictor, device: Device = ANY_BOARD) -> Iterator[PredictionRecord]:
@@ -100,7 +71,6 @@ class ReadingStream:
         parser: Parser that finds the frames in the bytes and counts them.
         gaps: Counter of missing frame numbers.
         clock: Clock of the device.
-        counts: Numbers of records, of skipped frames and of outages.
     """
 
     def __init__(
@@ -126,7 +96,6 @@ class ReadingStream:
         self._setup = device.setup(electrodes, reader, predictor)
         if predictor is not None and "film" not in predictor.metadata.sensor:  # a model of presses alone
             self._setup.has_any_sign = True
-        self.counts = StreamCounts()
         self._before_restart = StreamTotals()  # counts of the time before the latest `restart`
         self._begin()
 
@@ -136,6 +105,7 @@ class ReadingStream:
         self.gaps = SequenceGaps()
         self.clock = DeviceClock()
         self._charge_stages: list[Stage] = create_stages(self._setup)
+        self._reconnects = 0
         self._pending_flags: list[str] = []  # flags that the next frame gets
 
     def tare(self) -> None:
@@ -162,6 +132,7 @@ class ReadingStream:
             crc_errors=counts.crc_errors,
             malformed=counts.malformed,
             bytes_dropped=counts.bytes_dropped,
+            reconnects=self._reconnects,
         )
         return StreamTotals(*map(sum, zip(self._before_restart, since_restart, strict=True)))
 
@@ -217,7 +188,7 @@ class ReadingStream:
         The state before the outage is no longer valid, because frames are missing and the film may have been touched
         during the outage. The next frame gets the flag `reconnected`.
         """
-        self.counts.outages += 1
+        self._reconnects += 1
         self.parser.reset()
         self.gaps.reset()
         self.clock.reset()
@@ -240,7 +211,6 @@ class TouchStream(ReadingStream):
         predictor: Predictor,
         device: Device = ANY_BOARD,
         *,
-        policy: Policy = Policy.every,
         now_ns: Callable[[], int] = time.perf_counter_ns,
         frame_id: str | None = None,
     ) -> None:
@@ -249,7 +219,6 @@ class TouchStream(ReadingStream):
         Args:
             predictor: Model with which the contacts are predicted.
             device: Settings of the board.
-            policy: Rule that decides for which frames the stream yields a record.
             now_ns: Function that returns the present time, ns, on the clock of `Chunk.clock_ns`. It is used to measure
                 the latency of each record.
             frame_id: Name of the film, which each record contains. By default, the name in the metadata of the model is
@@ -262,7 +231,6 @@ class TouchStream(ReadingStream):
         """
         metadata = predictor.metadata
         super().__init__(metadata.electrodes, device, reader=f"model {metadata.label}", predictor=predictor)
-        self._policy = policy
         self._now_ns = now_ns
         self._given_name = frame_id
         self._set_model(predictor)
@@ -333,24 +301,13 @@ class TouchStream(ReadingStream):
     def feed(self, chunk: Chunk) -> Iterator[PredictionRecord]:
         """Process a chunk, and yield the records of the frames whose last byte is in the chunk.
 
-        With the policy `latest`, only the last frame of the chunk has a record.
-
         Raises:
             ChargeError: If a frame has no value for an electrode of the model.
             TareError: If the film is touched during the whole search for a tare.
             PortError: If the stream has contained no intact frame in many bytes.
         """
-        if self._policy is Policy.every:
-            for frame in self.frames(chunk):
-                yield self._record(chunk, frame)
-            return
-        frames = list(self.frames(chunk))  # the stages before the contact process the skipped frames, too
-        if frames:
-            *skipped_frames, latest_frame = frames
-            self.counts.skipped += len(skipped_frames)
-            for frame in skipped_frames:
-                latest_frame.flags += [flag for flag in frame.flags if flag in LASTING_FLAGS]
-            yield self._record(chunk, latest_frame)
+        for frame in self.frames(chunk):
+            yield self._record(chunk, frame)
 
     def _record(self, chunk: Chunk, frame: Frame) -> PredictionRecord:
         """Compute the contact of a frame, and return the prediction record of the frame.
@@ -359,7 +316,6 @@ class TouchStream(ReadingStream):
             chunk: The chunk that contains the last byte of the frame.
             frame: The frame with its touch charges.
         """
-        self.counts.records += 1
         for stage in self._contact_stages:
             stage.step(frame)
         if frame.contact is not None:

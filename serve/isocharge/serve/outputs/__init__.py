@@ -2,9 +2,8 @@
 
 Other packages can add further destinations.
 
-The module `output` defines the interface of an output. Each kind of output has its own module. The module `targets`
-registers the kinds of outputs. The kind of an output is chosen by the form of its target, such as `touch.csv` or
-`udp://127.0.0.1:9870`.
+The module `output` defines the interface of an output. The module `targets` registers the kinds of outputs. The kind of
+an output is chosen by the form of its target, such as `touch.csv` or `udp://127.0.0.1:9870`.
 
-May import: export, record.
+May import: record.
 """

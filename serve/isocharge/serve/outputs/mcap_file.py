@@ -17,7 +17,8 @@ from pathlib import Path
 
 from isocharge.common.extras import require
 from isocharge.common.files import as_output_errors
-from isocharge.serve.export.record_messages import (
+from isocharge.serve.outputs.output import FileOutput
+from isocharge.serve.outputs.ros_messages import (
     POSE,
     POSE_DEFINITION,
     STRING,
@@ -29,9 +30,8 @@ from isocharge.serve.export.record_messages import (
     string_message,
     wrench_stamped,
 )
-from isocharge.serve.outputs.output import FileOutput
+from isocharge.serve.record.formats import SCHEMA_NAME, record_schema
 from isocharge.serve.record.record import PredictionRecord
-from isocharge.serve.record.schema import SCHEMA_NAME, record_schema
 
 with require("record"):
     from mcap.writer import Writer

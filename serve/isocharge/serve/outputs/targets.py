@@ -10,8 +10,7 @@ from typing import Any, Self
 from isocharge.common.errors import InputError, shown
 from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, discard, is_file_with, output_error
 from isocharge.serve.outputs.queued_output import QueuedOutput
-from isocharge.serve.outputs.text_outputs import CSV_FILE, JSON_FILE, NO_OUTPUT, STDOUT_CSV, STDOUT_JSON
-from isocharge.serve.outputs.udp_output import UDP
+from isocharge.serve.outputs.text_outputs import CSV_FILE, JSON_FILE, NO_OUTPUT, STDOUT_CSV, STDOUT_JSON, UDP
 from isocharge.serve.record.record import PredictionRecord
 
 ROS2_SUFFIX = ".ros2.mcap"

@@ -3,7 +3,7 @@
 The bytes are stored in chunks. A chunk consists of the bytes that arrived together. Each line of the file is a JSON
 object:
 
-    {"isocharge_recording": 1, "model": "three/1", "policy": "every", "device": {...}, "name": "left"}
+    {"isocharge_recording": 1, "model": "three/1", "device": {...}, "name": "left"}
     {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
     {"timestamp": ..., ...}                       a record of that chunk
     {"tare": true}                                a request for a new tare
@@ -21,7 +21,7 @@ import logging
 from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, NamedTuple, Self, TypeVar
 
 from msgspec import Meta, Struct
 
@@ -78,20 +78,19 @@ class Recorder:
             were written before the error are complete.
     """
 
-    def __init__(self, path: Path, model: str, policy: str, device: Mapping[str, Any], name: str | None = None) -> None:
+    def __init__(self, path: Path, model: str, device: Mapping[str, Any], name: str | None = None) -> None:
         """Store the description of a recording. The file is created when the context is entered.
 
         Args:
             path: File to which the recording is written. It must not exist.
             model: Label of the model, `name/version`.
-            policy: Value of a `Policy`, which states for which frames records are written.
             device: Content of the device file.
             name: Name of the film in the records; None for the name of the sensor of the model.
         """
         self.path = path
         self.model_label = model
         self.failed = False
-        self._header = {KIND: VERSION, "model": model, "policy": policy, "device": dict(device)}
+        self._header = {KIND: VERSION, "model": model, "device": dict(device)}
         if name:
             self._header["name"] = name
         self._last_chunk: Chunk | None = None  # chunk of the latest call of `chunk`
@@ -192,7 +191,6 @@ class Recording:
 
     Attributes:
         model: Label of the model, `name/version`, at the beginning of the recording.
-        policy: Value of a `Policy`, which states for which frames records were written.
         device: Content of the device file.
         name: Name of the film in the records; empty for the name of the sensor of the model.
     """
@@ -229,7 +227,6 @@ class Recording:
                 f"{VERSION})"
             )
         self.model = header.model
-        self.policy = header.policy
         self.device = header.device
         self.name = header.name
 
@@ -305,12 +302,11 @@ class Recording:
             raise RecordingError(f"{self._path}, line {line_number}: damaged ({cut(str(error))})") from error
 
 
-class _Header(Struct):
+class _Header(Struct, forbid_unknown_fields=True):
     """The first line of a recording."""
 
     isocharge_recording: int
     model: ModelLabel
-    policy: Literal["every", "latest"]
     device: dict[str, Any]
     name: str = ""
 

@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.serve.frames.frame_field import ByteOrder
+from isocharge.serve.frames.frame_layout import ByteOrder
 from isocharge.serve.recognition.framing import INTACT_SHARE, Bytes, usual_bytes
 
 CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {

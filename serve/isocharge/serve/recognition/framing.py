@@ -18,10 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isocharge.serve.frames.checksums import CHECKSUMS
-from isocharge.serve.frames.frame_field import ByteOrder
-from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC
-from isocharge.serve.frames.stuffing import STUFFINGS, Stuffing
+from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC, ByteOrder
+from isocharge.serve.frames.transmission import CHECKSUMS, STUFFINGS, Stuffing
 
 Bytes = NDArray[np.uint8]
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import SEQ, Frame, Parser
-from isocharge.serve.frames.frame_field import PADDING, ByteOrder
-from isocharge.serve.frames.frame_layout import SYNC
+from isocharge.serve.frames.frame_layout import PADDING, SYNC, ByteOrder
 from isocharge.serve.frames.text import Layout, TextParser
 from isocharge.serve.recognition.fields import Part, Weights, identify_clock, possible_parts, split_frame, steady_step
 from isocharge.serve.recognition.framing import (

@@ -17,8 +17,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
-from isocharge.serve.signal_chain.stage import Setup, Stage
+from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage, TimeConstant
 
 MIN_SQUARED_STEP = 0.02
 """Smallest squared change of the unit phasor between two frames for an update of the hum, dimensionless."""

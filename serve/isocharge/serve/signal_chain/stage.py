@@ -9,16 +9,42 @@ export to C follow from the list.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
-from msgspec import structs
+from msgspec import Meta, structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DeviceError
+from isocharge.common.structs import Settings
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.signal_chain.rule import Rule
+
+LARGEST = 1_000_000_000
+"""Largest value of a setting, in the unit of the setting."""
+
+Setting = Annotated[float, Meta(ge=0, le=LARGEST)]
+"""Number from 0 to `LARGEST`."""
+
+Share = Annotated[float, Meta(ge=0, lt=1)]
+"""Share of a whole, from 0 to below 1, dimensionless."""
+
+Count = Annotated[int, Meta(ge=0, le=LARGEST)]
+"""Whole number from 0 to `LARGEST`."""
+
+TimeConstant = Annotated[float, Meta(ge=1e-3, le=LARGEST)]
+"""Time constant, s. It is never 0, because the signal chain divides by it."""
+
+
+class Rule(Settings, frozen=True):
+    """The settings of a stage.
+
+    Attributes:
+        on: Whether a device file switches the stage on.
+    """
+
+    on: bool = True
+
 
 R = TypeVar("R", bound=Rule)
 

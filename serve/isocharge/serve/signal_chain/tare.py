@@ -15,8 +15,7 @@ from isocharge.common.errors import DeviceError, TareError
 from isocharge.common.structs import WrongKey
 from isocharge.serve.flags import TARE
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.rule import Count, Rule, Setting, TimeConstant
-from isocharge.serve.signal_chain.stage import OffsetStage, Setup
+from isocharge.serve.signal_chain.stage import Count, OffsetStage, Rule, Setting, Setup, TimeConstant
 
 MAX_TARE_FRAMES_IN_C = 10_000
 """Largest number of frames of a tare in C, which limits the memory that the C program needs."""

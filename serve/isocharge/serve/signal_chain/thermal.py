@@ -25,8 +25,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.common.structs import Finite
 from isocharge.serve.flags import BLIND, SATURATED, THERMAL
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.rule import Rule, Setting
-from isocharge.serve.signal_chain.stage import NOT_IN_C, Setup, Stage
+from isocharge.serve.signal_chain.stage import NOT_IN_C, Rule, Setting, Setup, Stage
 
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
 """Changes of the common charge at which the misfit is evaluated, pC. A parabola is fitted to the squared misfits."""

@@ -16,8 +16,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import DRIFT, NEGATIVE
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.rule import Rule, Setting
-from isocharge.serve.signal_chain.stage import Setup, Stage
+from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage
 
 
 class TouchRule(Rule, frozen=True, kw_only=True):

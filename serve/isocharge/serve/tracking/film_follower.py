@@ -39,7 +39,7 @@ from isocharge.serve.model.contact import Contact, is_close
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.robust_estimate import ModelValues, Prior, robust_estimate
 from isocharge.serve.record.record import FollowedFilm
-from isocharge.serve.signal_chain.rule import Rule, Setting
+from isocharge.serve.signal_chain.stage import Rule, Setting
 
 MAX_AVERAGED_FRAMES = 64
 """Largest number of frames that are averaged.

@@ -12,8 +12,7 @@ from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import read_charge_map
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.record.record import NO_TRACKING, OtherContact, TrackedContact, Tracking
-from isocharge.serve.signal_chain.rule import Rule, Share
-from isocharge.serve.signal_chain.stage import Setup, Stage
+from isocharge.serve.signal_chain.stage import Rule, Setup, Share, Stage
 from isocharge.serve.tracking.contact_mixture import ContactMixture
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.mixture_components import ContactHypothesis

@@ -10,13 +10,13 @@ from rclpy.qos import qos_profile_sensor_data
 from std_msgs.msg import String
 
 from isocharge.serve import Port, Predictor, load_device, stream
-from isocharge.serve.export.record_messages import (
+from isocharge.serve.flags import INVALID, MEANINGS
+from isocharge.serve.outputs.ros_messages import (
     DEFLECTION_STD_m,
     ROTATION_VARIANCE_rad2,
     ros_time_ns,
     with_tracked_contact,
 )
-from isocharge.serve.flags import INVALID, MEANINGS
 
 DEFAULT_PARAMETERS = {"model": "three-25um-biaxial", "port": "/dev/ttyACM0", "device": "", "wait_s": 60.0}
 """Parameters of the node with their default values."""

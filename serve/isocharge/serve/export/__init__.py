@@ -1,4 +1,0 @@
-"""Conversion of prediction records to ROS 2 messages.
-
-May import: record.
-"""
