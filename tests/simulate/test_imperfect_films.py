@@ -71,7 +71,7 @@ def test_deflection_of_an_oval_film_with_uneven_tension_agrees_with_greens_funct
     np.testing.assert_allclose(deflection(solved, points), expected, rtol=tolerance)
 
 
-@pytest.mark.first_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [(0.0, 42.5), (0.0, -42.9), (44.5, 0.0)])
 def test_presses_near_the_rim_of_an_oval_film_are_solved(at):
     """The half axes are 45.9 and 44.1 mm."""
