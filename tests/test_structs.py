@@ -130,15 +130,12 @@ JSON = partial(read_json, description="a list", error_class=DeviceError, target_
     ("read", "content", "message"),
     [
         (TOML, b"a = x", "not a TOML file: .*line 1"),
-        (TOML, b"\xff", "not a TOML file: not text in UTF-8"),
+        (TOML, b"\xff", "not a TOML file: 'utf-8' codec can't decode byte 0xff in position 0"),
         (TOML, b"#" * (MAX_TOML_BYTES + 1), r"cannot be read \(larger than 262144 bytes\); expected a device file in"),
         (TOML, b"a = " + b"[" * 100_000, "not a TOML file"),
         (TOML, b"a." * 100_000 + b"a = 1", "not a TOML file: a key of more than 32 parts"),
         (TOML, b"'a b' . " * 30_000 + b"a = 1", "not a TOML file: a key of more than 32 parts"),
-        *(
-            (JSON, data, "(expected JSON, got|not a JSON file)")
-            for data in (b"{", b"[" * 100_000, b"NaN", b"\xef", b"1" * 5000)
-        ),
+        *((JSON, data, "expected JSON, got") for data in (b"{", b"[" * 100_000, b"NaN", b"\xef", b"1" * 5000)),
     ],
 )
 def test_files_that_are_none(tmp_path, read, content, message):

@@ -46,12 +46,6 @@ MAX_TOML_BYTES = 1 << 18
 MAX_JSON_BYTES = 1 << 22
 """Largest size of a JSON file, bytes."""
 
-MAX_EXAMINED_ITEMS = 1000
-"""Number of items of a list that are examined in the search for a mistake.
-
-If only a later item is wrong, the message of msgspec is used.
-"""
-
 _KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
 _DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY_PART}\.[ \t]*+){{32}}")
 """Dotted key of more than 32 parts.
@@ -99,8 +93,8 @@ def read_toml(path: Path, description: str, error_class: type[InputError], targe
     Raises:
         error_class: If the file cannot be read or its content is wrong.
     """
-    text = _read_text(path, MAX_TOML_BYTES, description, "TOML", error_class)
-    return parse_toml(text, str(path), error_class, target_type)
+    data = read_needed(path, error_class, f"expected {description} in TOML", MAX_TOML_BYTES)
+    return parse_toml(data, str(path), error_class, target_type)
 
 
 def read_json(path: Path, description: str, error_class: type[InputError], target_type: type[T]) -> T:
@@ -115,31 +109,11 @@ def read_json(path: Path, description: str, error_class: type[InputError], targe
     Raises:
         error_class: If the file cannot be read or its content is wrong.
     """
-    text = _read_text(path, MAX_JSON_BYTES, description, "JSON", error_class)
-    return parse_json(text, str(path), error_class, target_type)
+    data = read_needed(path, error_class, f"expected {description} in JSON", MAX_JSON_BYTES)
+    return parse_json(data, str(path), error_class, target_type)
 
 
-def _read_text(path: Path, max_bytes: int, description: str, language: str, error_class: type[InputError]) -> str:
-    """Read a text file in UTF-8.
-
-    Args:
-        path: The file.
-        max_bytes: Largest size of the file, bytes.
-        description: Description of the expected file for error messages, such as "a device file".
-        language: "TOML" or "JSON", for error messages.
-        error_class: Class of the error that is raised.
-
-    Raises:
-        error_class: If the file cannot be read, is too large, or is not text in UTF-8.
-    """
-    data = read_needed(path, error_class, f"expected {description} in {language}", max_bytes)
-    try:
-        return data.decode("utf-8")
-    except UnicodeDecodeError as cause:
-        raise error_class(f"{path}: not a {language} file: not text in UTF-8: {cause}") from cause
-
-
-def parse_toml(text: str, where: str, error_class: type[InputError], target_type: type[T]) -> T:
+def parse_toml(text: str | bytes, where: str, error_class: type[InputError], target_type: type[T]) -> T:
     """Parse a text in TOML, and convert its content to a type.
 
     Args:
@@ -151,10 +125,11 @@ def parse_toml(text: str, where: str, error_class: type[InputError], target_type
     Raises:
         error_class: If the text is not TOML, or its content is wrong.
     """
-    if _DEEP_KEY.search(text):  # parsing such a key needs much memory
-        raise error_class(f"{where}: not a TOML file: a key of more than 32 parts")
     try:
-        content = tomllib.loads(text)
+        decoded_text = text.decode() if isinstance(text, bytes) else text
+        if _DEEP_KEY.search(decoded_text):  # parsing such a key needs much memory
+            raise ValueError("a key of more than 32 parts")
+        content = tomllib.loads(decoded_text)
     except (ValueError, RecursionError) as cause:
         raise error_class(f"{where}: not a TOML file: {cut(str(cause))}") from cause
     return convert(content, target_type, where, error_class)
@@ -214,147 +189,103 @@ def _first_mistake(value: object, target_type: Any, cause: Exception) -> str:
     Args:
         value: Value from TOML or JSON.
         target_type: Type to which the value could not be converted.
-        cause: Exception of msgspec. Its message is returned if no mistake is found.
+        cause: Exception of msgspec. Its message is returned if `msgspec.convert` accepts the value, as 1e999 in JSON.
     """
     try:
-        return next(_mistakes(value, target_type, ""), cut(str(cause)))
+        msgspec.convert(value, target_type)
+    except msgspec.ValidationError as error:
+        return _describe_mistake(value, target_type, error)
     except RecursionError:
         return "nested too deeply"
+    return cut(str(cause))
 
 
-def _mistakes(value: object, expected_type: Any, path: str) -> Iterator[str]:
-    """Yield a description of each mistake in a value.
+def _describe_mistake(content: object, target_type: Any, error: msgspec.ValidationError) -> str:
+    """Return a description of a mistake, with the names of the keys that lead to the wrong value.
 
-    The mistakes in the keys of a table or in the items of a list are yielded before a mistake in the value as a whole.
+    The message of msgspec ends with these keys, as in "Expected `float`, got `str` - at `$.parts[1].gain[...]`". A
+    number is an index of a list, and three points are any key of a dictionary.
 
     Args:
-        value: Value from TOML or JSON.
-        expected_type: Expected type.
-        path: Names of the keys that lead to the value, such as "film.radius_mm".
+        content: Value from TOML or JSON.
+        target_type: Type to which the value could not be converted.
+        error: Exception of msgspec. If `__post_init__` of a struct has raised an exception, it is the cause of `error`.
     """
-    members = list(_union_members(expected_type))  # if the type is no union, the list contains only the type itself
-    yield from _mistakes_in_tag(value, members, path)
-    for member in members:
-        yield from _mistakes_in_parts(value, member, path)
+    message, steps = _MESSAGE.findall(str(error))[0]  # without keys if the content itself is wrong
+    value: Any = content
+    expected_type = target_type
+    path = ""
+    for name, index in _STEP.findall(steps):
+        members = list(_union_members(expected_type))
+        key: str | int = name
+        if name:
+            expected_type = _key_types(value, members)[name]
+        elif index.isdigit():
+            (item_types,) = (get_args(member) for member in members if get_origin(member) in (list, tuple))
+            is_uniform = len(item_types) == 1 or Ellipsis in item_types
+            key = int(index)
+            expected_type = item_types[0 if is_uniform else key]
+        else:
+            (expected_type,) = (get_args(member)[1] for member in members if get_origin(member) is dict)
+            key = next(key for key, item in value.items() if not _has_type(item, expected_type))
+        value = value[key]
+        path = f"{path}[{key}]" if isinstance(key, int) else _join(path, key)
 
-    # Check the value as a whole. If `__post_init__` of a struct has raised an exception, msgspec stores the exception
-    # as the cause of its own error. A `WrongKey` without a message means that the key is missing.
+    members = list(_union_members(expected_type))
+    wrong_key = _WRONG_KEY.match(message)
+    cause = error.__cause__
+    if isinstance(cause, WrongKey):
+        key_path = _join(path, cause.key)
+        return f"{key_path}: {cause}" if str(cause) else f"key {key_path!r} is missing"
+    if cause is not None:
+        return f"{_prefix(path)}{cause}"
+    if wrong_key is None:
+        is_literal = get_origin(members[0]) is Literal  # msgspec does not keep the declared order of the words
+        expected = _one_of(get_args(members[0])) if is_literal else _describe_type(inspect.type_info(expected_type))
+        return f"{_prefix(path)}expected {expected}, got {shown(value)}"
+    kind, name = wrong_key.groups()
+    if kind == "contains unknown":
+        return unknown_key(_join(path, name), name, _key_types(value, members))
+    return f"key {_join(path, name)!r} is missing"
+
+
+_MESSAGE = re.compile(r"^(.*?)(?: - at `\$([^`]*)`)?$", re.DOTALL)
+"""Message of msgspec, and the keys with which it ends."""
+
+_STEP = re.compile(r"\.([^.\[`]+)|\[(\d+|\.\.\.)\]")
+"""One of these keys, or an index of a list."""
+
+_WRONG_KEY = re.compile(r"Object (missing required|contains unknown) field `(.*)`$", re.DOTALL)
+"""Message of msgspec about a key that is missing or unknown."""
+
+
+def _has_type(value: object, expected_type: Any) -> bool:
+    """Return whether msgspec can convert a value to a type."""
     try:
         msgspec.convert(value, expected_type)
-    except msgspec.ValidationError as error:
-        cause = error.__cause__
-        if isinstance(cause, WrongKey):
-            key_path = _join(path, cause.key)
-            yield f"{key_path}: {cause}" if str(cause) else f"key {key_path!r} is missing"
-        elif cause is not None:
-            yield f"{_prefix(path)}{cause}"
-        else:
-            yield f"{_prefix(path)}expected {_expected_value(expected_type, members[0])}, got {shown(value)}"
+    except msgspec.ValidationError:
+        return False
+    return True
 
 
-def _expected_value(expected_type: Any, first_member: Any) -> str:
-    """Describe the values that a type allows, for error messages.
-
-    Args:
-        expected_type: The type.
-        first_member: The type without its annotations, or the first member of the type if the type is a union.
-    """
-    if get_origin(first_member) is Literal:
-        return _one_of(get_args(first_member))  # in the declared order, which msgspec does not keep
-    return _describe_type(inspect.type_info(expected_type))
-
-
-def _mistakes_in_tag(value: object, members: list[Any], path: str) -> Iterator[str]:
-    """Yield a description of the mistake if the tag of a table is missing or unknown.
+def _key_types(table: Mapping[str, Any], members: Iterable[Any]) -> dict[str, Any]:
+    """Return the types of the keys that a table may have.
 
     A struct is a class that declares the keys of a table. If a table may belong to one of several structs, one of its
-    keys selects the struct, and the value of this key is the tag. If only one struct is possible, the tag may be
-    missing.
-
-    Args:
-        value: Value from TOML or JSON.
-        members: Types that the value may have. If none of them is a struct with a tag, there is no mistake.
-        path: Names of the keys that lead to the value.
-    """
-    structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
-    configs = [struct.__struct_config__ for struct in structs]
-    configs_with_tag = [config for config in configs if config.tag is not None]
-    if not configs_with_tag or not isinstance(value, Mapping):
-        return
-    allowed_tags = [config.tag for config in configs_with_tag]
-    tag_key = str(configs_with_tag[0].tag_field)  # all structs of a union have the same tag key
-    is_tag_required = len(allowed_tags) > 1
-    if tag_key not in value:
-        if is_tag_required:
-            yield f"key {_join(path, tag_key)!r} is missing"
-        return
-    tag = value[tag_key]
-    if tag is not None and tag not in allowed_tags:
-        yield f"{_join(path, tag_key)}: expected {_one_of(allowed_tags)}, got {shown(tag)}"
-
-
-def _mistakes_in_parts(value: object, expected_type: Any, path: str) -> Iterator[str]:
-    """Yield a description of each mistake in the keys of a table or in the items of a list.
-
-    The function yields nothing if the value is neither a table nor a list, or if the type expects another kind of
-    value.
-
-    Args:
-        value: Value from TOML or JSON.
-        expected_type: Expected type, which must not be a union.
-        path: Names of the keys that lead to the value.
-    """
-    if isinstance(value, Mapping) and isinstance(expected_type, type) and issubclass(expected_type, Struct):
-        yield from _mistakes_in_keys(value, expected_type, path)
-    elif isinstance(value, Mapping) and get_origin(expected_type) is dict:
-        _, item_type = get_args(expected_type)
-        for key, item in value.items():
-            yield from _mistakes(item, item_type, _join(path, key))
-    elif isinstance(value, list | tuple) and get_origin(expected_type) in (list, tuple):
-        # `list[T]` and `tuple[T, ...]` have one type for all items. Other tuples have one type for each item.
-        item_types = [item_type for item_type in get_args(expected_type) if item_type is not Ellipsis]
-        if len(item_types) == 1:
-            item_types = item_types * len(value)
-        if len(item_types) == len(value):  # `_mistakes` reports a wrong length as a mistake in the value as a whole
-            for index, item in enumerate(value[:MAX_EXAMINED_ITEMS]):
-                yield from _mistakes(item, item_types[index], f"{path}[{index}]")
-
-
-def _mistakes_in_keys(table: Mapping[str, Any], struct: type[Struct], path: str) -> Iterator[str]:
-    """Yield a description of each unknown key, each missing key and each mistake in the values of a table.
-
-    A struct is a class that declares the keys of a table. If there are several structs, the value of one of the keys
-    (the tag) selects the struct. If the tag of the table selects another struct than the given struct, the function
-    yields nothing.
+    keys selects the struct, and the value of this key is the tag.
 
     Args:
         table: Table from TOML or JSON.
-        struct: Struct that declares the expected keys.
-        path: Names of the keys that lead to the table, such as "film"; empty for the whole file.
+        members: Types that the table may have. Types that are no structs are ignored.
     """
-    config = struct.__struct_config__
-    if config.tag is not None:
-        selected_tag = table.get(str(config.tag_field))
-        if selected_tag != config.tag:  # the table does not belong to this struct
-            return
-
+    structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
+    tags = [struct.__struct_config__.tag for struct in structs]
+    tag_key = structs[0].__struct_config__.tag_field  # all structs of a union have the same tag key
+    types = {} if tag_key is None else {tag_key: Literal[tuple(tags)]}
+    tag = table.get(tag_key or "")
+    struct = structs[tags.index(tag) if tag in tags else 0]
     types_of_fields = get_type_hints(struct, include_extras=True)
-    fields = msgspec.structs.fields(struct)
-    known_keys = [field.encode_name for field in fields]  # a key may have another name than its attribute
-    if config.tag_field:
-        known_keys.insert(0, config.tag_field)
-
-    if config.forbid_unknown_fields:
-        for key in table:
-            if key not in known_keys:
-                yield unknown_key(_join(path, key), key, known_keys)
-
-    for field in fields:
-        key = field.encode_name
-        if key in table:
-            yield from _mistakes(table[key], types_of_fields[field.name], _join(path, key))
-        elif field.required:
-            yield f"key {_join(path, key)!r} is missing"
+    return types | {field.encode_name: types_of_fields[field.name] for field in msgspec.structs.fields(struct)}
 
 
 def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
