@@ -32,8 +32,8 @@ from isocharge.serve.virtual_sensor.script import load_script
 from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import CalibrationProblem, FilmEstimate, read_earlier
-from isocharge.train.calibration.calibration_file import film_table, json_text
 from isocharge.train.calibration.estimator import PLANNED
+from isocharge.train.calibration.folder import film_table, json_text
 from isocharge.train.training.config import load_config
 
 ROOT = Path(__file__).parents[2]

@@ -35,10 +35,9 @@ from isocharge.simulate import ChargeMap, Circle, Domain, Sweep, load_sensor, no
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
 from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.data.presses import LOWEST_CHARGE
-from isocharge.train.training.features import WhitenedFeatures
-from isocharge.train.training.fit import contact_stage, threads_and_seed
-from isocharge.train.training.linear_targets import LinearTargets
-from isocharge.train.training.network import InverseNetwork, fold_network
+from isocharge.train.training.contact_training import LinearTargets, contact_stage
+from isocharge.train.training.fit import threads_and_seed
+from isocharge.train.training.network import InverseNetwork, WhitenedFeatures, fold_network
 
 NOISE = noise_model("reference")
 N_COPIES = 4

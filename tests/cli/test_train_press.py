@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from boards import TcpBoard, until
-from isocharge.cli.train.press_dialogue import Dialogue
-from isocharge.cli.train.press_events import PressEvents, SessionEnd
+from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, SessionEnd
 from isocharge.common.errors import PortLost
 from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_frame, read_presses
 from isocharge.serve.live.steady_press import (

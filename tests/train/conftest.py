@@ -5,8 +5,7 @@ import pytest
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Sweep, load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, TrainingData, fit
-from isocharge.train.training import fit as fit_module
-from isocharge.train.training.fit import train_network
+from isocharge.train.training.training_data import Split
 from kept import kept
 
 QUICK = FitConfig(
@@ -42,17 +41,15 @@ def dataset(dataset_folder):
 
 
 @pytest.fixture(scope="session")
-def trained(dataset):
-    """The trained network in PyTorch, with its training presses and test presses."""
-    return kept(train_network, TrainingData.of(dataset), QUICK)
+def split(dataset):
+    """The split of the dataset into presses for training and for the test, with the charge series of all presses."""
+    return kept(Split.by_position, TrainingData.of(dataset), QUICK.training)
 
 
 @pytest.fixture(scope="session")
-def fitted(dataset, trained):
-    """The same network after folding, with everything that a release needs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit_module, "train_network", lambda *_: trained)
-        return fit(dataset, QUICK)
+def fitted(dataset):
+    """A network after a short training, with everything that a release needs."""
+    return kept(fit, dataset, QUICK)
 
 
 @pytest.fixture(scope="session")

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from isocharge.common.errors import PressError
 from isocharge.simulate import Circle, NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, FilmEstimate
-from isocharge.train.calibration.calibration_file import film_table, json_text, read_film
 from isocharge.train.calibration.estimator import PLANNED
+from isocharge.train.calibration.folder import film_table, json_text, read_film
 
 PROBLEM = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
 

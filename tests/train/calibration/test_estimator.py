@@ -14,9 +14,8 @@ from isocharge.serve.model.robust_estimate import robust_estimate
 from isocharge.simulate import NoiseModel, noise_model
 from isocharge.train.calibration import estimator
 from isocharge.train.calibration.contact_error import ContactSensitivity
-from isocharge.train.calibration.discrepancy import terms
 from isocharge.train.calibration.estimator import Hypothesis, Prior, estimate, hypotheses
-from isocharge.train.calibration.film_estimate import SESSION
+from isocharge.train.calibration.film_estimate import SESSION, terms
 from isocharge.train.calibration.press_data import PressData, PressErrors
 from isocharge.train.data.presses import draw_contacts
 

@@ -13,23 +13,16 @@ from isocharge.simulate.numerics.disk_least_squares import into_domain
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, release
 from isocharge.train.data.charge_fit import fit_charge_series, fit_film_series
 from isocharge.train.data.contact_errors import rms
-from isocharge.train.data.invertible_domain import invertible_domain
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
-from isocharge.train.training.source import TrainingData
+from isocharge.train.training.training_data import TrainingData, invertible_domain
 
 DOMAIN = Domain(8.0, (0.05, 2.0))
 
 
 @pytest.fixture(scope="module")
-def field(trained):
+def field(split):
     """The charge series of a training."""
-    return trained.split.field
-
-
-@pytest.fixture(scope="module")
-def held_out_presses(trained):
-    """The presses on which the errors of the training are measured."""
-    return trained.split.test
+    return split.field
 
 
 def test_charges_agree_with_the_simulator(field, film):
@@ -122,16 +115,16 @@ def test_fold_near_the_centre_is_refused():
 
 
 def test_charge_series_of_the_whole_domain_and_a_caution_are_released_if_the_domain_is_reduced(
-    sensor, trained, tmp_path, caplog
+    sensor, split, tmp_path, caplog
 ):
     contact = draw_contacts(np.random.default_rng(0), DOMAIN, 3000)
     presses = LabelledPresses(contact, 1000.0 * charges_folded_at(5.0)(*contact.T))
     data = TrainingData(sensor=sensor, probes=("circle:1.0",), domain=DOMAIN, presses=presses, sha256="0" * 64)
     fitted = fit(data, TINY)
-    series = charge_map_from_bytes(fitted.provenance.files["charges.npz"], ("A", "B", "C"))
+    series = charge_map_from_bytes(fitted.files["charges.npz"], ("A", "B", "C"))
     assert np.allclose(series.charges(contact), presses.charge, rtol=2e-3)
     assert fitted.domain.radius < 5.2 < series.domain.radius
-    assert trained.split.folded_charges is None
+    assert split.folded_charges is None
 
     model = release(fitted, tmp_path / "models" / "folded")
     [caution] = caplog.messages
@@ -173,9 +166,9 @@ def scipy_distance(field, charge, start):
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_scipy_finds_no_nearer_contact(field, held_out_presses, fault):
+def test_scipy_finds_no_nearer_contact(field, split, fault):
     rng = np.random.default_rng(1)
-    charge = FAULTS[fault](held_out_presses.charge[:12], rng)
+    charge = FAULTS[fault](split.test.charge[:12], rng)
     contact, residual = search(field, charge, REFERENCE.sigma(charge), starts=4)
     assert np.allclose(residual, (charge - field.charges(contact)) / REFERENCE.sigma(charge), atol=1e-8)
     assert DOMAIN.contains(contact).all()

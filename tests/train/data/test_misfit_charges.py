@@ -4,7 +4,7 @@ import numpy as np
 
 from isocharge.simulate import noise_model
 from isocharge.train.data.channel_noise import ChannelNoise
-from isocharge.train.data.misfit_charges import draw_charges
+from isocharge.train.training.misfit_training import draw_charges
 
 NOISE = ChannelNoise.alike(noise_model("reference"), 3)
 

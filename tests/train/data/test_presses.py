@@ -11,7 +11,7 @@ from isocharge.common.errors import DatasetError, PressError
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle, Domain, Samples, parse_probe
 from isocharge.train.data.presses import dataset_of, domain_of, held_out, is_measured, presses_of, split_by_position
-from isocharge.train.training.source import TrainingData
+from isocharge.train.training.training_data import TrainingData
 
 
 def with_samples(dataset, **columns):

@@ -14,7 +14,7 @@ from isocharge.serve.model.session import COLUMNS
 from isocharge.simulate import load_sensor, noise_model
 from isocharge.train.data.presses import draw_contacts
 from isocharge.train.model_release.onnx_graph import write_graph
-from isocharge.train.training.features import signed_features
+from isocharge.train.training.network import signed_features
 
 FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0, 5.0, 5.0, 5.0])
 """Values of a contact, mm, N, misfit and correlations, below which differences count as absolute differences."""

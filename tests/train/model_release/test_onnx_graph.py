@@ -1,6 +1,6 @@
 """The exported graph against the network from which it was written; graphs that the reader refuses."""
 
-import copy
+from dataclasses import replace
 
 import numpy as np
 import onnx
@@ -14,27 +14,25 @@ from tests.train.random_networks import random_network
 from isocharge.common.errors import ModelError, TrainingError
 from isocharge.serve import find_model
 from isocharge.simulate import noise_model
-from isocharge.train.model_release.graph_check import check_graph
-from isocharge.train.model_release.onnx_graph import read_graph, write_graph
+from isocharge.train.model_release.onnx_graph import check_graph, read_graph, write_graph
+from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.folded_network import MISFIT_UNIT
-from isocharge.train.training.network import fold_network
+from isocharge.train.training.network import InverseNetwork, fold_network
 
 REFERENCE = noise_model("reference")
 
 EXTREME_CHARGES = {
-    "negative": lambda charge: -charge,
-    "zero": lambda charge: 0.0 * charge,
-    "tiny": lambda charge: 1e-30 * charge,
-    "huge": lambda charge: 1e30 * charge,
+    "negative": lambda presses: -presses.charge,
+    "zero": lambda presses: 0.0 * presses.charge,
+    "tiny": lambda presses: 1e-30 * presses.charge,
+    "huge": lambda presses: 1e30 * presses.charge,
 }
-"""Charges that no film gives, from the charges of presses."""
+"""Charges that no film gives, from presses."""
 
-UNUSUAL_CHARGES = {
-    "clean": lambda charge: charge,
-    "ten times": lambda charge: 10.0 * charge,
-    "a tenth": lambda charge: 0.1 * charge,
-    "dead electrode": lambda charge: charge * [0.0, 1.0, 1.0],
-    "wrong gain": lambda charge: charge * [1.0, 1.2, 1.0],
+CHARGES = {
+    "noisy": lambda presses: presses.repeated(10_000).noisy(REFERENCE, seed=0),
+    "ten times": lambda presses: 10.0 * presses.charge,
+    "dead electrode": lambda presses: presses.charge * [0.0, 1.0, 1.0],
     **EXTREME_CHARGES,
 }
 
@@ -44,20 +42,19 @@ FLOORS = ([1.0, 1.0, 0.1], [1.0, 1.0, 0.1], [1.0])
 """Values of the outputs, mm, N and standard deviations, below which differences count as absolute differences."""
 
 TOLERANCE = 1e-5
-"""Largest relative difference of contact and standard deviations that float32 causes on the charges of a film."""
+"""Largest relative difference of contact and standard deviations that float32 causes on the charges of a film.
 
-MISFIT_TOLERANCE = 1e-4
-"""Largest relative difference of the misfit."""
-
-
-@pytest.fixture(scope="module")
-def held_out(trained):
-    return trained.split.test
+The difference of the misfit may be ten times as large."""
 
 
 @pytest.fixture(scope="module")
-def exact(trained):
-    return fold_network(trained.network)
+def held_out(fitted):
+    return fitted.test
+
+
+@pytest.fixture(scope="module")
+def exact(fitted):
+    return fitted.network
 
 
 @pytest.fixture(scope="module")
@@ -74,55 +71,52 @@ def graph_outputs(session, charge):
     return session.run(OUTPUTS, {"charge_pC": charge.astype(np.float32)})
 
 
-def torch_outputs(network, charge):
-    """Evaluate a trained network with PyTorch in double precision, on the charges that the graph gets."""
-    network = copy.deepcopy(network).double()
-    charge = torch.tensor(charge.astype(np.float32)).double()
+def largest_differences(given, expected):
+    """Return the largest relative difference of each output."""
+    return [
+        float(np.max(np.abs(given_output - output) / np.maximum(np.abs(output), floor)))
+        for given_output, output, floor in zip(given, expected, FLOORS, strict=True)
+    ]
+
+
+def test_folded_network_gives_the_answers_of_pytorch(split):
+    """The network has random weights, which are evaluated with PyTorch in double precision."""
+    torch.manual_seed(0)
+    network = InverseNetwork(split.domain, split.features(REFERENCE), NetworkConfig((32, 32), (24, 24)))
+    for perceptron in (network.contact, network.misfit_vector):
+        torch.nn.init.normal_(perceptron.skip.weight, std=0.1)
+    folded = fold_network(network)
+    network = network.double()
+    charge = split.test.charge
     with torch.no_grad():
-        posterior = network.posterior(charge)
-        misfit_vector = network.misfit_vector(network.inputs(charge)).numpy()
+        posterior = network.posterior(torch.tensor(charge))
+        misfit_vector = network.misfit_vector(network.inputs(torch.tensor(charge))).numpy()
     domain = network.domain
     contact = posterior.mean.numpy() * domain.scale + domain.centre
     contact[:, 2] = np.exp(contact[:, 2])
     std = np.exp(posterior.log_std.numpy()) * domain.scale
     std[:, 2] *= contact[:, 2]
-    return contact, std, MISFIT_UNIT * np.sinh(np.linalg.norm(misfit_vector, axis=1, keepdims=True))
+    misfit = MISFIT_UNIT * np.sinh(np.linalg.norm(misfit_vector, axis=1, keepdims=True))
+    for given, expected in zip(folded.predict(charge), (contact, std, misfit), strict=True):
+        np.testing.assert_allclose(given, expected, rtol=1e-6)
 
 
-def largest_differences(given, expected):
-    """Return the largest relative difference of each output."""
-    return [
-        float(np.max(np.abs(given_output - output) / np.maximum(np.abs(output), floor)))
-        for given_output, output, floor in zip(given, expected, FLOORS, strict=False)
-    ]
-
-
-def test_the_graph_answers_as_the_network_does_on_ten_thousand_presses(trained, held_out, session):
-    rows = np.arange(10_000) % len(held_out)
-    charge = held_out[rows].noisy(REFERENCE, seed=0)
-    differences = largest_differences(graph_outputs(session, charge), torch_outputs(trained.network, charge))
-    contact, std, misfit = differences
-    assert contact < TOLERANCE
-    assert std < TOLERANCE
-    assert misfit < MISFIT_TOLERANCE
-
-
-@pytest.mark.parametrize("case", UNUSUAL_CHARGES)
-def test_the_graph_answers_as_the_network_does_on_unusual_charges(trained, held_out, session, case):
-    charge = UNUSUAL_CHARGES[case](held_out.charge)
+@pytest.mark.parametrize("case", CHARGES)
+def test_the_graph_answers_as_the_network_does(exact, held_out, session, case):
+    charge = CHARGES[case](held_out).astype(np.float32)
     outputs = graph_outputs(session, charge)
-    assert max(largest_differences(outputs, torch_outputs(trained.network, charge))) < 10.0 * TOLERANCE
+    factor = 1.0 if case == "noisy" else 10.0
+    contact, std, misfit = largest_differences(outputs, exact.predict(charge.astype(float)))
+    assert max(contact, std) < factor * TOLERANCE
+    assert misfit < 10.0 * TOLERANCE
     assert all(np.isfinite(output).all() for output in outputs)
     if case in EXTREME_CHARGES:
-        _, _, misfit = outputs
-        assert misfit.min() > 50.0
+        assert outputs[2].min() > 50.0
 
 
-def test_a_network_with_infinite_answers_is_not_released(trained, held_out):
-    network = copy.deepcopy(trained.network)
-    with torch.no_grad():
-        network.misfit_vector.skip.weight *= 100.0
-    diverging = fold_network(network)
+def test_a_network_with_infinite_answers_is_not_released(exact, held_out):
+    layers = exact.layers
+    diverging = replace(exact, layers=replace(layers, skip=100.0 * layers.skip))
     with pytest.raises(TrainingError, match=r"answers misfit = .* expected finite numbers for any charges"):
         check_graph(write_graph(diverging, {}), diverging.outputs, held_out, REFERENCE)
 
@@ -164,9 +158,7 @@ def test_the_file_is_plain_onnx_that_another_runtime_computes(held_out, graph, s
     charge = held_out.charge[:50].astype(np.float32)
     reference = ReferenceEvaluator(model).run(OUTPUTS, {"charge_pC": charge})
     contact, std, misfit = largest_differences(graph_outputs(session, charge), reference)
-    assert contact < TOLERANCE
-    assert std < TOLERANCE
-    assert misfit < MISFIT_TOLERANCE
+    assert max(contact, std, 0.1 * misfit) < TOLERANCE
 
 
 @pytest.mark.parametrize("name", ["three-25um-biaxial", "four-25um-uniaxial", "four-25um-biaxial-student"])

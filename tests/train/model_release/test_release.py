@@ -104,7 +104,7 @@ def test_command_of_a_card_trains_with_the_settings_of_its_model(name):
     metadata = Predictor(model).metadata
     n_electrode = len(metadata.electrodes)
     recorded = metadata.made_with["config"]
-    removed_keys = {"patience", "electrodes"}
+    removed_keys = {"patience", "electrodes", "activation"}
     kept_settings = {
         table: {key: value for key, value in recorded[table].items() if key not in removed_keys} for table in recorded
     }

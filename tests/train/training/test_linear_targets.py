@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from isocharge.simulate import Domain, NoiseModel
 from isocharge.simulate.forward.charge_map import FunctionMap
 from isocharge.train import LabelledPresses
-from isocharge.train.training.linear_targets import (
+from isocharge.train.training.contact_training import (
     LARGEST_LINEAR_STD,
     MAX_NOISE_FACTOR,
     LinearTargets,

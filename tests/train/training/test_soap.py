@@ -5,10 +5,10 @@ import pytest
 import torch
 from torch import nn
 
-from isocharge.train.training import soap
-from isocharge.train.training.soap import Soap
+from isocharge.train.training import descent
+from isocharge.train.training.descent import Soap
 
-BETAS = (soap.DECAY, soap.DECAY)
+BETAS = (descent.DECAY, descent.DECAY)
 
 
 def run(take_step, parameter, loss, steps):
@@ -24,7 +24,7 @@ def run_soap(parameter, loss, steps, rate):
 
 
 def run_adam(parameter, loss, steps, rate):
-    optimiser = torch.optim.Adam([parameter], lr=rate, betas=BETAS, eps=soap.EPSILON)
+    optimiser = torch.optim.Adam([parameter], lr=rate, betas=BETAS, eps=descent.EPSILON)
     run(optimiser.step, parameter, loss, steps)
 
 
@@ -82,4 +82,4 @@ def test_rows_that_get_a_gradient_only_later_do_not_cause_long_steps(shape):
         before = weight.detach().clone()
         optimiser.step(0.02)
         longest_step = max(longest_step, (weight.detach() - before).norm().item())
-    assert longest_step <= 0.02 * soap.MAX_RATIO * np.sqrt(weight.numel())
+    assert longest_step <= 0.02 * descent.MAX_RATIO * np.sqrt(weight.numel())

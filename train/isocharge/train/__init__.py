@@ -35,9 +35,8 @@ if TYPE_CHECKING:
     from isocharge.train.model_release.release import Release, release
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
     from isocharge.train.training.cross_fit import fit_presses
-    from isocharge.train.training.fit import fit
-    from isocharge.train.training.fitted import Fitted, Provenance
-    from isocharge.train.training.source import TrainingData
+    from isocharge.train.training.fit import Fitted, fit
+    from isocharge.train.training.training_data import TrainingData
 else:  # hidden from type checkers, which would otherwise accept every misspelt name
     __getattr__ = lazy_names(__name__, "train")
 
@@ -52,7 +51,6 @@ __all__ = [
     "NetworkConfig",
     "PressSession",
     "ProposedPress",
-    "Provenance",
     "Release",
     "TrainingConfig",
     "TrainingData",

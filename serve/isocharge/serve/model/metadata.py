@@ -16,7 +16,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, shown
 from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, NotNegative, Positive, Settings, Text, WrongKey, convert, parse_json
-from isocharge.serve.model.model_labels import ModelName
+from isocharge.serve.model.model_search import ModelName
 
 FORMAT_VERSION = 1
 """Version of the format of the metadata."""

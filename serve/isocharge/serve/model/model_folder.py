@@ -30,7 +30,7 @@ from isocharge.serve.model.golden import (
     read_golden,
 )
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.model_labels import NAME
+from isocharge.serve.model.model_search import NAME
 from isocharge.serve.model.session import INPUT, OUTPUTS, as_batch, check_interface, open_session, run
 
 

@@ -3,13 +3,36 @@
 A model repository is a folder that contains the folders of several models. Other files in a repository are ignored. The
 name of a model is looked up in four repositories in this order: the repository that the caller gives,
 `$ISOCHARGE_MODELS`, `./models`, and the repository that is installed with isocharge.
+
+The name of a model consists of characters that are safe in paths, URLs, web pages and the file config.pbtxt. The label
+of a model is `NAME/VERSION`. A label contains one slash and no path component `..`. A label can therefore not be the
+path of a folder outside the repositories of the user. A file from an untrusted source, such as a recording, can only
+select a model in these repositories.
 """
 
 import os
+import re
 from pathlib import Path
+from typing import Annotated
+
+from msgspec import Meta
 
 from isocharge.common.errors import ModelError, shown
-from isocharge.serve.model.model_labels import NAME, VERSION
+
+NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}"
+"""Regular expression of the name of a model."""
+
+VERSION_PATTERN = "[1-9][0-9]{0,17}"
+"""Regular expression of the version of a model: a whole number of at most 63 bits."""
+
+NAME = re.compile(NAME_PATTERN)
+VERSION = re.compile(VERSION_PATTERN)
+
+ModelName = Annotated[str, Meta(pattern=rf"\A{NAME_PATTERN}\Z", description="letters, digits, '-', '_' and '.'")]
+
+ModelLabel = Annotated[
+    str, Meta(pattern=rf"\A{NAME_PATTERN}/{VERSION_PATTERN}\Z", description="the label NAME/VERSION of a model")
+]
 
 
 def find_model(model: str | Path, models: Path | None = None) -> Path:

@@ -38,6 +38,20 @@ The distance is relative to the radius of the area.
 """
 
 
+N_CORNERS = 64
+"""Number of corners of the polygon that represents a round working area."""
+
+
+def disk_corners(radius_mm: float) -> Array:
+    """Return the corners (x, y) of a regular polygon around a disk, shape (N_CORNERS, 2), mm.
+
+    The centre of the disk is the origin. The sides of the polygon touch the disk.
+    """
+    angle = 2.0 * np.pi * np.arange(N_CORNERS) / N_CORNERS
+    corner_distance_mm = radius_mm / np.cos(np.pi / N_CORNERS)
+    return np.asarray(corner_distance_mm * np.column_stack([np.cos(angle), np.sin(angle)]))
+
+
 @dataclass(frozen=True)
 class Validity:
     """The domain in which a model is valid: the working area, the range of forces and the limit of the misfit.

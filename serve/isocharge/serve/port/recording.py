@@ -30,7 +30,7 @@ from isocharge.common.files import AtomicWriter, bounded_lines
 from isocharge.common.printable_text import is_printable
 from isocharge.common.progress import report
 from isocharge.common.structs import WrongKey, parse_json
-from isocharge.serve.model.model_labels import ModelLabel
+from isocharge.serve.model.model_search import ModelLabel
 from isocharge.serve.port.foreign_files import HEAD_BYTES, RECORDING_START, foreign_kind
 from isocharge.serve.port.source import Chunk
 

@@ -1,6 +1,7 @@
 """`isocharge train fit`: make a model from a dataset, from measured presses, or from the description of a sensor."""
 
 import shlex
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -13,15 +14,10 @@ from isocharge.cli.shared.options import (
     JsonOption,
 )
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
-from isocharge.cli.shared.terminal import say, shown_progress
-from isocharge.cli.train.train_and_release import (
-    ModelFolderOption,
-    VersionOption,
-    train_and_release,
-)
+from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
-from isocharge.serve import MeasuredPresses
+from isocharge.serve import MeasuredPresses, ModelMetadata
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import (
     Dataset,
@@ -31,8 +27,23 @@ from isocharge.simulate import (
     read_dataset,
 )
 from isocharge.simulate.sensor.probe import PROBE_HELP
-from isocharge.train import FitConfig, TrainingData, fit, fit_presses, load_config
+from isocharge.train import FitConfig, Fitted, TrainingData, fit, fit_presses, load_config, release
 from isocharge.train.data.presses import is_measured, measured_presses_of
+
+ModelFolderOption = Annotated[
+    Path,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="models/NAME",
+        help="Folder of the model. The name of the folder becomes the name of the model.",
+    ),
+]
+
+VersionOption = Annotated[
+    int,
+    typer.Option("--version", min=1, help="Version of the model, which is the name of the folder in models/NAME."),
+]
 
 DEFAULT_PROBE = "circle:1.0"
 """Notation of the probe if `--probe` is not given."""
@@ -198,3 +209,33 @@ def _read_presses_of_unknown_sensor(
     presses = read_press_file(file, None, position_std_mm, force_std)
     say(f"{file}: {len(presses)} presses of the channels {', '.join(presses.electrodes)}")
     return presses
+
+
+def train_and_release(train: Callable[[], Fitted], version_folder: Path, *, json: bool) -> None:
+    """Train a network, release it as a version folder, and print its errors.
+
+    Args:
+        train: Function that trains the network.
+        version_folder: Folder to write, as `check_target` returned it.
+        json: Whether to print the folder and the errors as one JSON object, too.
+    """
+    with shown_progress():
+        released = release(train(), version_folder.parent, version=int(version_folder.name), command=this_command())
+    if json:
+        show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})
+    say(f"{released.folder}: {_errors_sentence(released.metadata)}")
+
+
+def _errors_sentence(metadata: ModelMetadata) -> str:
+    """Return a sentence that states the errors of a model."""
+    errors = metadata.errors
+    force_words = "the force is not estimated"
+    if "force_rms_percent" in errors:
+        force_words = f"force {errors['force_rms_percent']:g} % rms"
+    press_count = errors.get("measured_presses")
+    condition = f"on {press_count:.0f} measured presses at places that were left out, " if press_count else ""
+    return (
+        f"{condition}position error {errors['position_median_mm']:g} mm median, "
+        f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "
+        f"{force_words}"
+    )

@@ -14,8 +14,7 @@ from isocharge.cli.shared.port_hints import no_frames_advice_added
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, RadiusOption, SensorOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say
-from isocharge.cli.train.press_dialogue import Dialogue
-from isocharge.cli.train.press_events import PressEvents
+from isocharge.cli.train.press_dialogue import Dialogue, PressEvents
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError, OutputError, PressError, error_prefix
 from isocharge.common.files import as_output_errors

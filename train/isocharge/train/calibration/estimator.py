@@ -24,9 +24,8 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, RobustEstimate, robust_estimate
 from isocharge.serve.model.robust_estimate import Prior as StatePrior
 from isocharge.simulate import NoiseModel, noise_model
-from isocharge.train.calibration.discrepancy import unit_covariance
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout
+from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout, unit_covariance
 from isocharge.train.calibration.press_data import (
     Linearised,
     PressData,

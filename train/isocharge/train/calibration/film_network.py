@@ -23,13 +23,12 @@ from isocharge.simulate.forward.derivative_maps import NODE_COUNT
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.simulate.solver.stress_limit import yield_force
-from isocharge.train.calibration.discrepancy import terms
 from isocharge.train.calibration.film_charges import FilmCharges, axisymmetric, circle_of
-from isocharge.train.calibration.film_estimate import FilmEstimate
+from isocharge.train.calibration.film_estimate import FilmEstimate, terms
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.charge_fit import fit_film_series, fit_series
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
-from isocharge.train.training.source import TrainingData
+from isocharge.train.training.training_data import TrainingData
 
 SERIES_CONTACTS = 4000
 """Number of contacts to which the series of the charges are fitted."""

@@ -9,9 +9,8 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.model.robust_estimate import ModelValues
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import Domain, NoiseModel
-from isocharge.train.calibration.discrepancy import terms
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.film_estimate import SESSION, Layout
+from isocharge.train.calibration.film_estimate import SESSION, Layout, terms
 
 UNKNOWN_STD = np.inf
 """Standard deviation of a value that was not measured."""

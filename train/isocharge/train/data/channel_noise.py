@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.simulate import NoiseModel
+from isocharge.simulate import NoiseModel, noise_model
 
 NEIGHBOURS = 16
 """Number of contacts to which a plane is fitted, which is four times the number of its coefficients."""
@@ -332,3 +332,12 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
 
 Noise = NoiseModel | ChannelNoise
 """Noise model with the same parameters for all channels, or with separate parameters for each channel."""
+
+
+def misfit_noise(noise: NoiseModel) -> NoiseModel:
+    """Return the noise whose standard deviation is the unit of the misfit.
+
+    The result is the noise of the training or, if the training has no noise, the noise `reference`.
+    """
+    has_noise = noise.white > 0.0
+    return noise if has_noise else noise_model("reference")

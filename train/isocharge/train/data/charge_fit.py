@@ -14,8 +14,7 @@ from scipy.linalg import cho_factor, cho_solve
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import TrainingError
-from isocharge.serve.model.charge_series import ChargeSeries, series_size
-from isocharge.serve.model.chebyshev_series import CHUNK_SIZE, chebyshev_terms, position_degrees
+from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, chebyshev_terms, position_degrees, series_size
 from isocharge.simulate import noise_model
 from isocharge.train.data.contact_errors import rms
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses

@@ -10,24 +10,154 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import ModelError
 from isocharge.common.structs import convert
 from isocharge.serve.model.golden import contact_floors
 from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
 from isocharge.serve.model.model_folder import check_target, write_model
+from isocharge.serve.model.validity import N_CORNERS, disk_corners
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
-from isocharge.train.model_release.card import model_card
-from isocharge.train.model_release.evaluate import evaluate
-from isocharge.train.model_release.graph_check import check_graph
-from isocharge.train.model_release.onnx_graph import write_graph
-from isocharge.train.model_release.unnoticed import unnoticed_presses
-from isocharge.train.training.fitted import Fitted
+from isocharge.train.model_release.evaluate import HELD_PRESSES, evaluate, unnoticed_presses
+from isocharge.train.model_release.onnx_graph import check_graph, write_graph
+from isocharge.train.training.fit import Fitted
 
-N_CORNERS = 64
-"""Number of corners of the polygon that represents a round working area."""
+LISTED_ERRORS = {
+    "position_median_mm": "position, median | {:g} mm",
+    "position_rms_mm": "position, rms | {:g} mm",
+    "position_p95_mm": "position, 95 % | {:g} mm",
+    "position_p99_mm": "position, 99 % | {:g} mm",
+    "clean_position_median_mm": "position without noise, median | {:g} mm",
+    "clean_position_p95_mm": "position without noise, 95 % | {:g} mm",
+    "force_median_percent": "force, median | {:g} %",
+    "force_rms_percent": "force, rms | {:g} %",
+    "force_p99_percent": "force, 99 % | {:g} %",
+    "coverage_68": "coverage of the 68 % intervals | {:.1%}",
+    "coverage_95": "coverage of the 95 % intervals | {:.1%}",
+    "misfit_p99": "misfit that 1 % of good presses exceed | {:g}",
+    "misfit_p999": "misfit that 0.1 % of good presses exceed | {:g}",
+    "found_gain_20_percent": "detected presses of about 1 N with one gain wrong by 20 % | {:.1%}",
+    "found_dead_electrode": "detected presses of about 1 N with one dead electrode | {:.1%}",
+}
+"""Rows of the table of errors by the name of the error in the metadata. Errors that were not measured have no row."""
+
+SIMULATED_TRUTH = (
+    "These figures compare with the simulator. On a real film, unknown gains and pretension cause larger errors."
+)
+
+MEASURED_TRUTH = (
+    "The figures are those of one sensor and its rig on the day of the measurement, and include the errors of the rig. "
+    "Another sensor, or the same sensor after months, can have far larger errors. "
+    "`isocharge serve check` measures them with a few presses."
+)
+
+LIMITS = """\
+- The answer to a press outside the working area or the range of forces, or to several presses at a time, is wrong. It
+  carries a flag only if the charges differ enough from those of every press that the model covers.
+- The standard deviations are valid for the noise named above, and not for wrong gains. The answer is a posterior mean,
+  which is close to the middle of the working area where the charges carry little information.
+"""
+
+
+def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
+    """Return the text of `card.md`.
+
+    Args:
+        metadata: Metadata of the model.
+        fitted: The network, its sensor and its presses.
+    """
+    electrodes = metadata.electrodes
+    sensor_name = metadata.sensor["name"]
+    is_measured = HELD_PRESSES in metadata.errors
+    noise = zip(electrodes, *metadata.noise.for_each_electrode(len(electrodes)), strict=True)
+    noise_text = "; ".join(f"{name} {white:g} pC and {100 * gain:.3g} %" for name, white, gain in noise)
+    error_rows = "\n".join(
+        f"| {row.format(metadata.errors[name])} |" for name, row in LISTED_ERRORS.items() if name in metadata.errors
+    )
+    unnoticed_text = f"{metadata.unnoticed.summary}.\n\n" if metadata.unnoticed is not None else ""
+    cautions_text = "".join(f"- {caution}.\n" for caution in fitted.cautions)
+    return f"""# {metadata.name}, version {metadata.version}
+
+Estimates the position and the force of one press from the charges of the sensor `{sensor_name}`.
+
+| | |
+|---|---|
+| input | `charge_pC`, float32 [n, {len(electrodes)}], touch charges of {", ".join(electrodes)} in pC |
+| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each), \
+`contact_correlation` (xy, xF, yF), `misfit` |
+| working area | {_area_text(fitted)} |
+| forces | {_forces_text(metadata)} |
+| probes | {", ".join(metadata.probes)} |
+| noise `{metadata.noise.name}` | {noise_text} |
+
+## Errors
+
+The errors are those on {len(fitted.test)} {_presses_text(metadata)}.
+
+| error | |
+|---|---|
+{error_rows}
+
+The misfit is the distance of the charges from those of the nearest single contact, in units of the noise. Three charges
+nearly always fit some contact.
+
+{unnoticed_text}## Limits
+
+- {MEASURED_TRUTH if is_measured else SIMULATED_TRUTH}
+{cautions_text}{LIMITS}
+## Make it again
+
+```bash
+{metadata.made_with["command"] or "(made by a program, see metadata)"}
+```
+"""
+
+
+def _area_text(fitted: Fitted) -> str:
+    """Return a text about the working area."""
+    if isinstance(fitted.domain, PressedArea):
+        width, height = np.ptp(np.array(fitted.domain.corners), axis=0)
+        return f"{width:.4g} mm x {height:.4g} mm, the outline of the presses; corners in the metadata"
+    return f"within {fitted.domain.radius:g} mm of the centre"
+
+
+def _forces_text(metadata: ModelMetadata) -> str:
+    """Return a text about the range of forces, and about the force at which the film yields."""
+    constant_force = metadata.made_with.get("constant_force")
+    if constant_force is not None:
+        reason = "all presses had this force" if constant_force["is_known"] else "the forces were not measured"
+        return (
+            f"not estimated: every answer is {constant_force['force_N']:g} N with a standard deviation of "
+            f"{100 * constant_force['force_std']:.3g} %, because {reason}"
+        )
+    min_force, max_force = metadata.force_range_N
+    text = f"{min_force:g} to {max_force:g} N"
+    if metadata.yield_force_N is not None:
+        text += (
+            f"; beyond {metadata.yield_force_N:g} N the film is stressed to more than {DEFAULT_STRESS_LIMIT:g} MPa: "
+            "PVDF yields (flag `stress`)"
+        )
+    return text
+
+
+def _presses_text(metadata: ModelMetadata) -> str:
+    """Return a text about the presses on which the errors were measured."""
+    measured = metadata.made_with.get("measured")
+    if measured is not None:
+        factors = " for positions and ".join(f"{factor:g}" for factor in measured["std_factors"])
+        return (
+            f"measured presses at {measured['places']} places, which are in `presses.csv`. They are estimated by "
+            f"{measured['folds']} networks, each at the places on which it was not trained. The model learned the mean "
+            f"of their answers. The standard deviations were multiplied by {factors} for forces, so that the 68 % "
+            "intervals contain 68 % of these presses"
+        )
+    return (
+        "simulated presses that were not used in the training, with that noise. The forces are log-uniform, and the "
+        "positions are uniform over the working area"
+    )
+
 
 CORNER_TOLERANCE_mm = 2e-3
 """Largest difference between the distances of two corners of a round working area from the origin, mm.
@@ -98,7 +228,7 @@ def release(
             "command": command,
             **package_versions,
             "python": platform.python_version(),
-            **fitted.provenance.made_with,
+            **fitted.made_with,
         },
         yield_force_N=fitted.yield_force_N,
     )
@@ -109,7 +239,7 @@ def release(
     floors = contact_floors(complete_metadata)
     golden_charges = check_graph(graph, fitted.network.outputs, fitted.test, fitted.misfit_noise, floors)
     card_text = card(complete_metadata, fitted)
-    version_folder = write_model(folder, graph, complete_metadata, golden_charges, card_text, fitted.provenance.files)
+    version_folder = write_model(folder, graph, complete_metadata, golden_charges, card_text, fitted.files)
     return Release(version_folder, complete_metadata)
 
 
@@ -124,21 +254,7 @@ def _working_area(domain: Domain) -> tuple[tuple[float, float], ...]:
     """Return the corners (x, y) of the working area, mm."""
     if isinstance(domain, PressedArea):
         return domain.corners
-    return _disk_polygon(domain.radius)
-
-
-def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
-    """Return the corners (x, y), mm, of a regular polygon around a disk.
-
-    The polygon has `N_CORNERS` corners, and its sides touch the disk. The centre of the disk is the origin.
-
-    Args:
-        radius: Radius of the disk, mm.
-    """
-    angle = 2.0 * np.pi * np.arange(N_CORNERS) / N_CORNERS
-    corner_radius = radius / np.cos(np.pi / N_CORNERS)  # `radius` is the distance of the sides from the centre
-    corners: Array = np.round(corner_radius * np.stack([np.cos(angle), np.sin(angle)], axis=1), 4)
-    return tuple((x, y) for x, y in corners.tolist())
+    return tuple((x, y) for x, y in disk_corners(domain.radius).round(4).tolist())
 
 
 def model_domain(metadata: ModelMetadata) -> Domain:

@@ -26,9 +26,7 @@ from isocharge.common.errors import PressError, cut
 from isocharge.serve.presses.measured_presses import MeasuredPresses, presses_text
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
 from isocharge.train.data.contact_errors import rms
-from isocharge.train.data.measured_checks import check_measured_presses
-from isocharge.train.data.measured_sensor import LEAST_RANGE, MeasuredSensor, PressedArea
-from isocharge.train.data.misfit_charges import draw_charges
+from isocharge.train.data.measured_sensor import LEAST_RANGE, MeasuredSensor, PressedArea, check_measured_presses
 from isocharge.train.data.presses import (
     FEWEST,
     FEWEST_POSITIONS,
@@ -40,12 +38,11 @@ from isocharge.train.data.presses import (
     presses_sha256,
 )
 from isocharge.train.training.config import MANY_ELECTRODE_SIZES, FitConfig, TrainingConfig
+from isocharge.train.training.contact_training import contact_stage
 from isocharge.train.training.descent import TrainingStage
-from isocharge.train.training.features import WhitenedFeatures
-from isocharge.train.training.fit import contact_stage, threads_and_seed, train_perceptron
-from isocharge.train.training.fitted import Answers, Fitted, Provenance
-from isocharge.train.training.misfit_training import misfit_stage
-from isocharge.train.training.network import InverseNetwork, Posterior, as_tensor, fold_network
+from isocharge.train.training.fit import Answers, Fitted, threads_and_seed, train_perceptron
+from isocharge.train.training.misfit_training import draw_charges, misfit_stage
+from isocharge.train.training.network import InverseNetwork, Posterior, WhitenedFeatures, as_tensor, fold_network
 
 _log = logging.getLogger(__name__)
 
@@ -151,7 +148,8 @@ def fit_presses(
         noise=noise,
         test=labelled,
         sha256=presses_sha256(usable),
-        provenance=Provenance(made_with=made_with, files={PRESSES_FILE: presses_text(usable).encode()}),
+        made_with=made_with,
+        files={PRESSES_FILE: presses_text(usable).encode()},
         cross_validated=cross_validated,
         is_force_constant=force_std is not None,
     )

@@ -1,8 +1,15 @@
-"""Training of one network by gradient descent with the optimiser SOAP."""
+"""Training of one network by gradient descent with the optimiser SOAP.
+
+SOAP applies Adam in the eigenbasis of the second moments of the gradient. Let G be the gradient of a weight matrix. The
+optimiser averages the matrices G G^T and G^T G over the steps. In the basis of the eigenvectors of these averages, the
+entries of the gradient are nearly uncorrelated. Adam scales each entry separately. In this basis, Adam therefore comes
+close to a second-order method (Vyas et al., 2024, arXiv 2409.11321, algorithm 3). The eigenvectors change slowly, and
+are updated every few steps by one orthogonal iteration.
+"""
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,7 +17,109 @@ from torch import Tensor, nn
 
 from isocharge.common.errors import TrainingError
 from isocharge.common.progress import report
-from isocharge.train.training.soap import Soap
+
+DECAY = 0.95
+"""Decay rate of the moving averages of the gradient and of its second moments."""
+
+BASIS_PERIOD = 10
+"""Number of steps between two updates of the eigenvectors."""
+
+EPSILON = 1e-10
+"""Number that is added to each root mean square of the gradient, so that no division by zero occurs."""
+
+MAX_RATIO = 2.0
+"""Largest ratio of the averaged gradient to its root mean square, in the eigenbasis.
+
+With equal decay rates, the ratio is at most 1, except where an update of the eigenvectors has moved a part of the
+averaged gradient to an entry whose mean square is nearly zero. Without the limit, the step would be arbitrarily long.
+"""
+
+
+class Soap:
+    """The optimiser SOAP. Parameters with one dimension, such as biases, are trained by Adam.
+
+    The class is not derived from `torch.optim.Optimizer`, because creating the first object of that class imports
+    PyTorch's compiler. The import takes longer than a tenth of a training.
+
+    Args:
+        parameters: Parameters to train, which are vectors or matrices.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor]) -> None:
+        """Prepare the moving averages of each parameter."""
+        self._states = [_ParameterState(parameter) for parameter in parameters]
+
+    @torch.no_grad()
+    def step(self, rate: float) -> None:
+        """Update all parameters from their gradients.
+
+        Args:
+            rate: Learning rate, which is approximately the change of each entry.
+        """
+        for state in self._states:
+            state.update(rate)
+
+
+class _ParameterState:
+    """One parameter with its moving averages and its eigenbases.
+
+    Attributes:
+        parameter: The parameter.
+        step: Number of completed steps.
+        mean: Moving average of the gradient.
+        square: Moving average of the squared entries of the gradient in the eigenbasis.
+        moments: Moving averages of G G^T and of G^T G for a matrix; empty for a vector.
+        bases: Eigenbases of the moments.
+    """
+
+    def __init__(self, parameter: Tensor) -> None:
+        """Begin with averages of zero, and with eigenbases that are identity matrices."""
+        self.parameter = parameter
+        self.step = 0
+        self.mean = torch.zeros_like(parameter)
+        self.square = torch.zeros_like(parameter)
+        sizes = parameter.shape if parameter.ndim == 2 else ()
+        self.moments = [torch.zeros(size, size) for size in sizes]
+        self.bases = [torch.eye(size) for size in sizes]
+
+    def update(self, rate: float) -> None:
+        """Change the parameter by one step of SOAP (Vyas et al., 2024, algorithm 3).
+
+        The averaged gradient is rotated into the eigenbasis. As in Adam, each entry of the rotated gradient is divided
+        by the root mean square of this entry over the past steps. The result is rotated back and gives the direction of
+        the step.
+
+        Args:
+            rate: Learning rate.
+        """
+        gradient = self.parameter.grad
+        assert gradient is not None
+        new_weight = 1.0 - DECAY
+        if self.moments:
+            for moment, square in zip(self.moments, (gradient @ gradient.T, gradient.T @ gradient), strict=True):
+                moment.lerp_(square, new_weight)
+            if self.step % BASIS_PERIOD == 0:
+                pairs = zip(self.moments, self.bases, strict=True)
+                self.bases = [torch.linalg.qr(moment @ basis).Q for moment, basis in pairs]
+        self.step += 1
+        self.mean.lerp_(gradient, new_weight)
+        self.square.lerp_(_rotate(gradient, self.bases) ** 2, new_weight)
+
+        # The moving averages begin at zero. They are therefore divided by the total weight of all gradients so far.
+        total_weight = 1.0 - DECAY**self.step
+        root_mean_square = torch.sqrt(self.square / total_weight) + EPSILON
+        ratio = _rotate(self.mean, self.bases) / (total_weight * root_mean_square)
+        ratio.clamp_(-MAX_RATIO, MAX_RATIO)
+        self.parameter.add_(_rotate(ratio, [basis.T for basis in self.bases]), alpha=-rate)
+
+
+def _rotate(matrix: Tensor, bases: Sequence[Tensor]) -> Tensor:
+    """Transform a matrix to the basis of the columns of two matrices. Without bases, return the matrix unchanged."""
+    if not bases:
+        return matrix
+    row_basis, column_basis = bases
+    return row_basis.T @ matrix @ column_basis
+
 
 RATE_INCREASE_FRACTION = 0.1
 """Fraction of the steps during which the learning rate increases, dimensionless."""

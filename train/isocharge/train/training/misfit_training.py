@@ -1,7 +1,9 @@
-"""Examples and loss for the training of the misfit perceptron.
+"""Training of the misfit perceptron: its examples and its loss.
 
 An example consists of a set of charges and the residuals of these charges with respect to the nearest contact. The
-nearest contact is found by a search.
+nearest contact is found by a search. The distances of the charges from those of presses are multiples of the standard
+deviation of the noise. The charges of any number of electrodes are moved, so that the examples contain wrong gains,
+dead electrodes, and charges that no press causes.
 """
 
 import numpy as np
@@ -10,16 +12,40 @@ from torch import Tensor
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.identifiability.nearest_contact import search
-from isocharge.train.data.channel_noise import ChannelNoise
-from isocharge.train.data.misfit_charges import draw_charges, misfit_noise
+from isocharge.train.data.channel_noise import ChannelNoise, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.training.config import TrainingConfig
 from isocharge.train.training.descent import TrainingStage
-from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.folded_network import MISFIT_UNIT
-from isocharge.train.training.losses import focused_squared_distance
-from isocharge.train.training.network import InverseNetwork, as_tensor, compress_length
-from isocharge.train.training.split import Split
+from isocharge.train.training.network import InverseNetwork, WhitenedFeatures, as_tensor, compress_length
+from isocharge.train.training.training_data import Split
+
+LOG_DISTANCES = (-1.0, 3.0)
+"""Decimal logarithms of the smallest and the largest distance from a press, in standard deviations of the noise."""
+
+
+def draw_charges(rng: np.random.Generator, charge: Array, noise: ChannelNoise, count: int) -> Array:
+    """Draw charges at all distances from the charges of presses.
+
+    All electrodes have the noise of the press. For each press, some electrodes are chosen at random, and their charges
+    are moved by normally distributed distances. The standard deviation of these distances is log-uniform within
+    `LOG_DISTANCES`. The distances are added to the levels of the charges, whose noise has the standard deviation 1.
+
+    Args:
+        rng: Random number generator.
+        charge: Charges of presses, shape (n, n_electrode), pC, from which presses are chosen at random.
+        noise: Noise of good presses.
+        count: Number of sets of charges to draw.
+
+    Returns:
+        Charges, shape (count, n_electrode), pC.
+    """
+    level = noise.level(charge[rng.integers(len(charge), size=count)])
+    is_moved = rng.random(level.shape) < rng.random((count, 1))
+    distance = 10.0 ** rng.uniform(*LOG_DISTANCES, (count, 1))
+    std = np.where(is_moved, distance, 1.0)
+    return noise.charge(level + std * rng.standard_normal(level.shape))
+
 
 MISFIT_RATE_FACTOR = 1.5
 """Learning rate of the misfit network, relative to the learning rate of the contact network. It can be larger, because
@@ -98,3 +124,20 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     steps = config.sizes(network.n_electrode).misfit_steps
     rate = MISFIT_RATE_FACTOR * config.learning_rate
     return TrainingStage("misfit", network.misfit_vector, loss, steps, rate, config.seed)
+
+
+def focused_squared_distance(vector: Tensor, target: Tensor, focus: float) -> Tensor:
+    """Compute a weighted mean of the squared distances between vectors, with small weights for long targets.
+
+    The weight is proportional to 1 / (1 + |target|^2 / focus^2). With these weights, the network becomes most accurate
+    for misfits up to the threshold of the flag `misfit`. The exact value of a misfit far above this threshold matters
+    little.
+
+    Args:
+        vector: Estimated vectors, shape (n, n_electrode).
+        target: True vectors, same shape.
+        focus: Length of a target at which its weight is half of the largest weight.
+    """
+    squared_distance = torch.sum((vector - target) ** 2, dim=-1)
+    weight = 1.0 / (1.0 + torch.sum(target**2, dim=-1) / focus**2)
+    return (weight * squared_distance).sum() / weight.sum()

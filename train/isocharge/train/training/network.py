@@ -1,6 +1,6 @@
 """Trainable network in PyTorch that estimates contacts, standard deviations and misfits from charges.
 
-The inputs are whitened logarithms of the charges (`isocharge.train.training.features`). A larger force increases all
+The inputs are whitened logarithms of the charges (`isocharge.train.training.network`). A larger force increases all
 charges by nearly the same factor. Therefore, the common factor of the charges depends mostly on the force, and the
 ratios of the charges depend mostly on the position. A first perceptron estimates the means of x, y and ln F and the
 logarithms of their standard deviations.
@@ -13,7 +13,7 @@ length is not smooth. Therefore, the perceptron learns the vector instead of the
 several thousand, so it is compressed by the function asinh.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -23,12 +23,127 @@ from torch import Tensor, nn
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
-from isocharge.train.training.activations import ACTIVATIONS, TANH, Activation
+from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 from isocharge.train.training.config import NetworkConfig
-from isocharge.train.training.features import WhitenedFeatures
-from isocharge.train.training.folded_network import LOG_FORCE, LOG_STD, MEAN, MISFIT_UNIT, FoldedNetwork
-from isocharge.train.training.folding import TURN, fold, linear_answer_map
-from isocharge.train.training.perceptron import LARGEST_INT8, Layer, Perceptron
+from isocharge.train.training.folded_network import (
+    LARGEST_INT8,
+    LOG_FORCE,
+    LOG_STD,
+    MEAN,
+    MISFIT_UNIT,
+    TURN,
+    ChargeFeatures,
+    FoldedNetwork,
+    Layer,
+    Perceptron,
+    fold,
+    linear_answer_map,
+)
+
+
+@dataclass(frozen=True)
+class WhitenedFeatures:
+    """Input features (charge features - mean) @ matrix, which have zero mean and unit covariance.
+
+    Attributes:
+        charge_features: Charge features, which are logarithms or inverse hyperbolic sines of the charges.
+        mean: Mean of the charge features over the presses, shape (n_electrode,).
+        matrix: Whitening matrix, shape (n_electrode, n_electrode).
+    """
+
+    charge_features: ChargeFeatures
+    mean: Array
+    matrix: Array
+
+    @classmethod
+    def fit_logarithms(cls, charge: Array) -> "WhitenedFeatures":
+        """Fit whitened logarithms to positive charges.
+
+        Args:
+            charge: Charges of presses without noise, shape (n, n_electrode), pC.
+        """
+        clipped_charge = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
+        mean_logarithm = np.log(clipped_charge).mean(axis=0)
+        return cls._fit(logarithmic_features(mean_logarithm), charge)
+
+    @classmethod
+    def fit_signed(cls, charge: Array, typical: Array) -> "WhitenedFeatures":
+        """Fit whitened inverse hyperbolic sines to charges of both signs.
+
+        Args:
+            charge: Charges of presses, shape (n, n_electrode), pC.
+            typical: Charge above which the noise is proportional to the charge, shape (n_electrode,), pC.
+        """
+        return cls._fit(signed_features(charge, typical), charge)
+
+    @classmethod
+    def _fit(cls, charge_features: ChargeFeatures, charge: Array) -> "WhitenedFeatures":
+        """Fit the mean and the whitening matrix to the charge features of presses.
+
+        Args:
+            charge_features: Charge features before the whitening.
+            charge: Charges of the presses, shape (n, n_electrode), pC.
+        """
+        mean, matrix = whitening(charge_features.evaluate(charge))
+        return cls(charge_features, mean, matrix)
+
+
+def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
+    """Return features for positive charges: the logarithms of charge / typical charge.
+
+    The typical charge of an electrode is the power of two nearest to the geometric mean of its charges. A division by a
+    power of two is exact in float32. The logarithms of the quotients are near 0, where float32 has the smallest errors.
+
+    Args:
+        mean_logarithm: Mean of the logarithms of the charges in pC, shape (n_electrode,).
+    """
+    return ChargeFeatures(
+        typical_pC=2.0 ** np.round(mean_logarithm / np.log(2.0)),
+        low_pC=np.array(LOWEST_CHARGE),
+        high_pC=np.array(HIGHEST_CHARGE),
+    )
+
+
+def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
+    """Return features for charges of both signs: asinh(charge / typical charge) minus its mean over the given charges.
+
+    Before the conversion, each charge is limited to three times the range of the given charges: the inverse hyperbolic
+    sines may exceed their range by its width on both sides.
+
+    Args:
+        charge: Charges of presses, shape (n, n_electrode), pC.
+        typical: Typical charge of each electrode, shape (n_electrode,), pC.
+    """
+    asinh_charge = np.arcsinh(charge / typical)
+    lowest = asinh_charge.min(axis=0)
+    highest = asinh_charge.max(axis=0)
+    margin = highest - lowest
+    return ChargeFeatures(
+        typical_pC=typical,
+        low_pC=np.sinh(lowest - margin) * typical,
+        high_pC=np.sinh(highest + margin) * typical,
+        mean=asinh_charge.mean(axis=0),
+    )
+
+
+def whitening(values: Array) -> tuple[Array, Array]:
+    """Compute the whitening transform of values by a principal component analysis.
+
+    The covariance of the transformed values (values - mean) @ matrix is the identity matrix.
+
+    Args:
+        values: Values, shape (n, k), where n is at least k.
+
+    Returns:
+        Mean, shape (k,), and matrix, shape (k, k).
+    """
+    # The rows of `axes` are the principal axes. The standard deviation of the values along an axis is its singular
+    # value divided by the square root of the number of values.
+    mean = values.mean(axis=0)
+    _, singular_values, axes = np.linalg.svd(values - mean, full_matrices=False)
+    inverse_std = np.sqrt(len(values)) / np.maximum(singular_values, np.finfo(float).eps)
+    return mean, axes.T * inverse_std
+
 
 FIRST_LAYER_SLOPES = (0.5, 3.5)
 """Smallest and largest norm of the initial weights of a unit in a sharpened first layer.
@@ -55,7 +170,7 @@ class Posterior(NamedTuple):
 
 
 class TrainablePerceptron(nn.Module):
-    """A perceptron with a skip layer (`isocharge.train.training.perceptron`).
+    """A perceptron with a skip layer (`isocharge.train.training.folded_network`).
 
     The logarithm of the force is nearly a linear function of the logarithms of the charges. The network must estimate
     the logarithm of the force with an error of about a thousandth of its range. The skip layer learns the linear part
@@ -65,20 +180,17 @@ class TrainablePerceptron(nn.Module):
         n_input: Number of inputs.
         hidden: Widths of the hidden layers.
         n_output: Number of outputs.
-        activation: Activation of the hidden layers.
     """
 
-    def __init__(self, n_input: int, hidden: tuple[int, ...], n_output: int, activation: Activation = TANH) -> None:
+    def __init__(self, n_input: int, hidden: tuple[int, ...], n_output: int) -> None:
         """Create the layers with random weights. The weights of the skip layer are zero.
 
         Args:
             n_input: Number of inputs.
             hidden: Widths of the hidden layers.
             n_output: Number of outputs.
-            activation: Activation of the hidden layers.
         """
         super().__init__()
-        self.activation = activation
         widths = (n_input, *hidden, n_output)
         self.layers = nn.ModuleList([nn.Linear(n_in, n_out) for n_in, n_out in pairwise(widths)])
         self.skip = nn.Linear(n_input, n_output, bias=False)
@@ -90,7 +202,7 @@ class TrainablePerceptron(nn.Module):
         Near the rim of the working area, the posterior mean of the contact is a strongly nonlinear function of the
         charges. Units that are nearly linear for all inputs learn such a function slowly. Therefore, each unit gets a
         random direction in the space of the inputs, a random slope along this direction, and a random centre. The
-        centre is the point of this space at which the argument of the activation is zero.
+        centre is the point of this space at which the argument of the hyperbolic tangent is zero.
         """
         first, *_ = self.linear_layers()
         n_unit = first.out_features
@@ -111,18 +223,17 @@ class TrainablePerceptron(nn.Module):
         Returns:
             Outputs, shape (n, n_output).
         """
-        activation = getattr(nn.functional, self.activation.torch_name)
         *hidden, last = self.linear_layers()
         value = inputs
         for layer in hidden:
-            value = activation(layer(value))
+            value = torch.tanh(layer(value))
         outputs: Tensor = last(value) + self.skip(inputs)
         return outputs
 
     def to_numpy(self) -> Perceptron:
         """Return a copy of the perceptron as NumPy arrays in double precision."""
         *hidden, last = (Layer(_to_numpy(layer.weight.T), _to_numpy(layer.bias)) for layer in self.linear_layers())
-        return Perceptron(tuple(hidden), last, _to_numpy(self.skip.weight.T), self.activation)
+        return Perceptron(tuple(hidden), last, _to_numpy(self.skip.weight.T))
 
     def linear_layers(self) -> list[nn.Linear]:
         """Return the hidden layers and the output layer, from first to last."""
@@ -156,7 +267,7 @@ class InverseNetwork(nn.Module):
     Args:
         domain: Contacts for which the network is trained.
         features: Whitened input features.
-        config: Widths and activation of the hidden layers.
+        config: Widths of the hidden layers.
         force_std: Relative standard deviation of the force if all presses have the same force. The network then always
             answers the force in the middle of the domain with this standard deviation. None to learn the force.
     """
@@ -171,18 +282,17 @@ class InverseNetwork(nn.Module):
         Args:
             domain: Contacts for which the network is trained.
             features: Whitened input features.
-            config: Widths and activation of the hidden layers.
+            config: Widths of the hidden layers.
             force_std: Relative standard deviation of a constant force; None to learn the force.
         """
         super().__init__()
         self.domain = domain
         self.features = features
         n_electrode = self.n_electrode
-        activation = ACTIVATIONS[config.activation]
         widths, misfit_widths = config.widths(n_electrode)
-        self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop, activation)
+        self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop)
         self.contact.sharpen_first_layer()
-        self.misfit_vector = TrainablePerceptron(n_electrode, misfit_widths, n_electrode, activation)
+        self.misfit_vector = TrainablePerceptron(n_electrode, misfit_widths, n_electrode)
         self.output_factor = nn.Buffer(torch.ones(TURN.stop))
         self.output_offset = nn.Buffer(torch.zeros(TURN.stop))
         if force_std is not None:

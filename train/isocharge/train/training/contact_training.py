@@ -1,0 +1,302 @@
+"""Training of the contact perceptron: its losses, the noise of the charges, and its targets.
+
+Targets that follow the noise of the charges
+--------------------------------------------
+
+A press at the contact c has the charges Q(c) + n, where n is the noise. A network that minimises the squared errors
+learns the posterior mean of the contact. If the noise is small, the posterior mean is the generalised least squares
+estimate (Aitken 1936), which is linear in the noise:
+
+    m = c + A n,   A = (J' W J + P)^-1 J' W.
+
+Here J contains the derivatives of the charges with respect to the contact, W is the inverse of the covariance of the
+noise, and P is the inverse of the covariance of the contacts in the domain (the prior).
+
+The posterior mean m is a better target for the network than the contact c, for two reasons. First, m is nearly a
+function of the charges, while the relation between c and the charges contains random noise. Second, A hardly depends on
+the size of the noise. Therefore, the noise can be enlarged in the training, so that the network learns more clearly how
+m changes with the charges. Both reasons matter for sensors with many electrodes. A change of the contact changes their
+charges along only three directions. The network has to learn that noise along all other directions has no influence on
+m.
+
+The posterior mean is linear in the noise only if the standard deviation of the contact is small. For every other press,
+the target is the contact, and the noise is not enlarged.
+"""
+
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from isocharge.simulate import ChargeMap
+from isocharge.train.data.channel_noise import Noise
+from isocharge.train.data.presses import LabelledPresses
+from isocharge.train.training.config import TrainingConfig
+from isocharge.train.training.descent import TrainingStage
+from isocharge.train.training.network import InverseNetwork, Posterior, as_tensor
+
+LINEAR_TARGET_FRACTION = 0.7
+"""Fraction of the steps in which the network of a sensor with more than `FEW_ELECTRODES` electrodes learns from linear
+targets. With three and four electrodes, these targets do not reduce the errors."""
+
+MAX_NORMAL_ERROR = 2.0
+"""Error in standard deviations above which the loss of the covariance grows with the logarithm of the error instead of
+its square."""
+
+MIN_SINE = 0.003
+"""Smallest sine of an angle of the correlations in the loss. Smaller sines count as this value."""
+
+
+def fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor:
+    """Draw normally distributed noise for charges.
+
+    Args:
+        charge: Charges without noise, any shape, pC.
+        noise: White noise and noise of the gains.
+        random: Random number generator.
+
+    Returns:
+        The noise, same shape as the charges, pC.
+    """
+    white = torch.as_tensor(noise.white, dtype=torch.float32)
+    gain = torch.as_tensor(noise.gain, dtype=torch.float32)
+    sigma = torch.hypot(white, gain * charge)
+    return sigma * torch.randn(charge.shape, generator=random)
+
+
+def contact_loss(posterior: Posterior, target: Tensor, error: Tensor) -> Tensor:
+    """Compute the loss of the contact perceptron: that of the mean plus that of the covariance.
+
+    The two losses have separate gradients. The first loss does not change the outputs for the covariance, and the
+    second loss does not change the mean.
+
+    Args:
+        posterior: Estimated unit coordinates with their standard deviations and correlations.
+        target: Unit coordinates that the mean should have, shape (n, 3): the true contact or a better estimate of the
+            posterior mean.
+        error: Errors of the mean that the covariance should describe, shape (n, 3).
+    """
+    return (mean_loss(posterior, target) + covariance_loss(posterior, error)).mean()
+
+
+def mean_loss(posterior: Posterior, target: Tensor) -> Tensor:
+    """Compute half of the weighted squared errors of the mean of each press, shape (n,).
+
+    The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Therefore, a network
+    learns the mean slowly where it overestimates the standard deviation (Seitzer et al., 2022, arXiv 2203.09168). In
+    this loss, the squared errors of a Gaussian likelihood are multiplied by the estimated standard deviation. These
+    factors are scaled so that their mean over the presses is 1.
+
+    Args:
+        posterior: Estimated unit coordinates with their standard deviations.
+        target: Unit coordinates that the mean should have, shape (n, 3).
+    """
+    std = torch.exp(posterior.log_std.detach())
+    squares = (posterior.mean - target) ** 2 / (std * std.mean(dim=0))
+    return 0.5 * squares.sum(dim=1)
+
+
+def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
+    """Compute the loss of the standard deviations plus that of the correlations of each press, shape (n,).
+
+    Both are negative logarithms of likelihoods, without constants. The standard deviations are fitted to the errors,
+    and the correlations to the errors divided by the standard deviations. The likelihoods are Gaussian for errors up to
+    `MAX_NORMAL_ERROR` standard deviations, and have longer tails beyond (Huber 1964, proposal 2). Where the map from
+    contacts to charges nearly folds, the errors have longer tails than a normal distribution. A Gaussian likelihood
+    would enlarge the intervals of all contacts because of these errors.
+
+    Args:
+        posterior: Standard deviations and angles of the correlations (`isocharge.train.training.folded_network`).
+        error: Errors of the unit coordinates, shape (n, 3), which are constants in this loss.
+    """
+    deviation = error.detach() * torch.exp(-posterior.log_std)
+    std_loss = posterior.log_std.sum(dim=1) + _half_long_tailed_square(deviation)
+
+    # The Cholesky factor of the correlations has the rows (1, 0, 0), (cos a, sin a, 0) and (cos b, sin b cos c,
+    # sin b sin c). It is inverted row by row, which gives errors with unit covariance.
+    sin_a, sin_b, sin_c = torch.cos(posterior.turn).clamp(min=MIN_SINE).unbind(dim=1)
+    cos_a, cos_b, cos_c = torch.sin(-posterior.turn).unbind(dim=1)
+    x_deviation, y_deviation, force_deviation = deviation.detach().unbind(dim=1)
+    white_y = (y_deviation - cos_a * x_deviation) / sin_a
+    white_force = (force_deviation - cos_b * x_deviation - sin_b * cos_c * white_y) / (sin_b * sin_c)
+    log_determinant = torch.log(sin_a * sin_b * sin_c)
+    return std_loss + log_determinant + _half_long_tailed_square(torch.stack([white_y, white_force], dim=1))
+
+
+def _half_long_tailed_square(deviation: Tensor) -> Tensor:
+    """Return half of the sum of the squares of each row, shape (n,), with logarithms instead of large squares.
+
+    At `MAX_NORMAL_ERROR`, the logarithmic function has the same value and the same slope as the square. The result is
+    divided by the mean square of a normal variable with this limit. If the errors are normally distributed, the minimum
+    of the loss is therefore at their standard deviation.
+
+    Args:
+        deviation: Errors in standard deviations, shape (n, k).
+    """
+    squares = deviation**2
+    largest_square = MAX_NORMAL_ERROR**2
+    tail = largest_square * (1.0 + torch.log(squares.clamp(min=largest_square) / largest_square))
+    long_tailed_square = torch.where(squares < largest_square, squares, tail)
+    return 0.5 * long_tailed_square.sum(dim=1) / mean_square_of_limited_normal(MAX_NORMAL_ERROR)
+
+
+def mean_square_of_limited_normal(limit: float) -> float:
+    """Return the mean square of a standard normal variable whose absolute value is limited to `limit`.
+
+    The mean square is the integral of the square within the limits, plus the squared limit times the probability beyond
+    the limits.
+    """
+    normal = NormalDist()
+    probability_within = normal.cdf(limit) - normal.cdf(-limit)
+    square_within = probability_within - 2.0 * limit * normal.pdf(limit)  # integration by parts
+    return square_within + limit**2 * (1.0 - probability_within)
+
+
+LARGEST_LINEAR_STD = 0.012
+"""Standard deviation of the contact up to which the estimate counts as linear in the noise, in unit coordinates.
+
+The noise is not enlarged beyond this standard deviation, either.
+"""
+
+MAX_NOISE_FACTOR = 5.0
+"""Largest factor by which the noise of a press is enlarged, dimensionless."""
+
+
+class TargetBatch(NamedTuple):
+    """Charges with noise, and the targets that the network learns from these charges.
+
+    Attributes:
+        charge: Charges with noise, shape (n, n_electrode), pC.
+        target: Unit coordinates that the mean of the network should have, shape (n, 3).
+        noise_factor: Factor by which the noise was enlarged, shape (n, 1).
+    """
+
+    charge: Tensor
+    target: Tensor
+    noise_factor: Tensor
+
+
+@dataclass(frozen=True)
+class LinearTargets:
+    """Presses without noise, and matrices that determine how the targets change with the noise that is added later.
+
+    Attributes:
+        charge: Charges without noise, shape (n, n_electrode), pC.
+        contact: Contacts in unit coordinates, shape (n, 3).
+        noise_response: Matrices A, shape (n, 3, n_electrode), 1/pC. The noise n changes the estimated contact by A n.
+            The matrix is zero if the estimated contact of a press is not linear in the noise.
+        noise_factor: Factor by which the noise of each press is enlarged, shape (n, 1).
+        noise: Noise of the charges.
+    """
+
+    charge: Tensor
+    contact: Tensor
+    noise_response: Tensor
+    noise_factor: Tensor
+    noise: Noise
+
+    @classmethod
+    def compute(cls, presses: LabelledPresses, charge_map: ChargeMap, noise: Noise) -> "LinearTargets":
+        """Compute for each press the matrix A. If the noise n is added to the charges, the estimate changes by A n.
+
+        With the derivatives J of the charges, the inverse W of the noise covariance, and the prior precision P, the
+        matrix is A = (J' W J + P)^-1 J' W, where J' is the transpose of J. If the estimate of a press is not linear in
+        the noise, its matrix is zero.
+
+        Args:
+            presses: Presses without noise.
+            charge_map: Map from contacts to charges, which gives the derivatives J and the unit coordinates.
+            noise: Noise of the charges.
+        """
+        domain = charge_map.domain
+        unit_derivatives = charge_map.derivatives(presses.contact) * domain.scale  # J, shape (n, n_electrode, 3)
+        noise_std = noise.sigma(presses.charge)
+        whitened_jacobian = unit_derivatives / noise_std[:, :, None]  # W^(1/2) J
+        transposed = whitened_jacobian.swapaxes(1, 2)  # J' W^(1/2), shape (n, 3, n_electrode)
+        prior_precision = 3.0 * np.eye(3)  # P, of unit coordinates that are uniformly distributed between -1 and 1
+        precision = transposed @ whitened_jacobian + prior_precision  # J' W J + P, shape (n, 3, 3)
+        noise_response = np.linalg.solve(precision, transposed / noise_std[:, None, :])
+
+        # If the contact is too uncertain, the estimate is not linear, and the noise is not enlarged (factor 1). If the
+        # contact is very certain, the noise is enlarged up to the limit of linearity. The inverse of the precision is
+        # the covariance of the contact, and its diagonal contains the variances.
+        contact_variance = np.linalg.inv(precision).diagonal(axis1=1, axis2=2)
+        largest_std = np.sqrt(contact_variance.max(axis=1))
+        is_linear = largest_std <= LARGEST_LINEAR_STD
+        noise_response[~is_linear] = 0.0
+        noise_factor = np.clip(LARGEST_LINEAR_STD / largest_std, 1.0, MAX_NOISE_FACTOR)
+        return cls(
+            charge=as_tensor(presses.charge),
+            contact=as_tensor(domain.to_unit(presses.contact)),
+            noise_response=as_tensor(np.asarray(noise_response, dtype=float)),
+            noise_factor=as_tensor(np.asarray(noise_factor[:, None], dtype=float)),
+            noise=noise,
+        )
+
+    def draw(self, rows: Tensor, random: torch.Generator) -> TargetBatch:
+        """Add new noise to the charges of some presses, and compute the targets for these charges.
+
+        Args:
+            rows: Indices of the presses, shape (n,).
+            random: Random number generator of the noise.
+        """
+        charge = self.charge[rows]
+        noise_factor = self.noise_factor[rows]
+        noise = noise_factor * fresh_noise(charge, self.noise, random)
+        contact_change = (self.noise_response[rows] @ noise[:, :, None])[:, :, 0]  # A n, shape (n, 3)
+        return TargetBatch(charge + noise, self.contact[rows] + contact_change, noise_factor)
+
+
+def contact_stage(
+    network: InverseNetwork,
+    train: LabelledPresses,
+    noise: Noise,
+    config: TrainingConfig,
+    *,
+    linear_targets: LinearTargets | None = None,
+) -> TrainingStage:
+    """Define the training of the contact perceptron on charges with fresh noise.
+
+    If there are linear targets, the
+    mean of the network learns from them during the first `LINEAR_TARGET_FRACTION` of the steps. Later, or without
+    linear targets, it learns from the true contacts. The
+    covariance always learns from the errors.
+
+    Args:
+        network: The network, whose contact perceptron is trained.
+        train: Presses for training.
+        noise: Noise that is added to the charges in every step.
+        config: Number of steps, batch size, learning rate and seed.
+        linear_targets: Targets of the presses of `train` for the first steps; None to use only the contacts.
+    """
+    domain = network.domain
+    charge = as_tensor(train.charge)
+    unit_contact = as_tensor(domain.to_unit(train.contact))
+    batch = min(config.batch, len(charge))
+
+    def loss(progress: float, random: torch.Generator) -> Tensor:
+        """Return the loss of a random batch with new noise.
+
+        Args:
+            progress: Fraction of completed steps.
+            random: Random number generator of the batch and of its noise.
+        """
+        rows = torch.randint(len(charge), (batch,), generator=random)
+        contact = unit_contact[rows]
+        if linear_targets is not None and progress < LINEAR_TARGET_FRACTION:
+            noisy_batch, target, noise_factor = linear_targets.draw(rows, random)
+            posterior = network.posterior(noisy_batch)
+            # The errors are proportional to the noise. The division by the factor gives the errors that charges with
+            # their usual noise would cause.
+            return contact_loss(posterior, target, (contact - posterior.mean) / noise_factor)
+
+        noisy_batch = charge[rows] + fresh_noise(charge[rows], noise, random)
+        posterior = network.posterior(noisy_batch)
+        return contact_loss(posterior, contact, contact - posterior.mean)
+
+    sizes = config.sizes(network.n_electrode)
+    rate = config.learning_rate * sizes.rate_factor
+    return TrainingStage("contact", network.contact, loss, sizes.steps, rate, config.seed)

@@ -1,0 +1,234 @@
+"""Presses for the training and the test of a network.
+
+A network is trained in the largest disk in which the map from contacts to charges certainly does not fold.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from isocharge.common.errors import DatasetError
+from isocharge.serve.model.charge_series import ChargeSeries
+from isocharge.simulate import ChargeMap, Dataset, Domain, NoiseModel, Sensor
+from isocharge.simulate.forward.charge_map import within
+from isocharge.simulate.identifiability.working_area import working_area
+from isocharge.train.data.channel_noise import ChannelNoise, misfit_noise
+from isocharge.train.data.charge_fit import fit_charge_series
+from isocharge.train.data.presses import (
+    LabelledPresses,
+    domain_of,
+    outside_presses_of,
+    presses_of,
+    split_by_position,
+    yield_force_of,
+)
+from isocharge.train.training.config import TrainingConfig
+from isocharge.train.training.network import WhitenedFeatures
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingData:
+    """Presses for the training of one network, and presses for the measurement of its errors.
+
+    Attributes:
+        sensor: Sensor to which the presses belong.
+        probes: Notations of the probes.
+        domain: Contacts for which a network is requested. The network gets a smaller domain if the map from contacts to
+            charges folds.
+        presses: Presses for training. Noise is added to the charges during the training.
+        sha256: Checksum of the presses.
+        outside: Presses between the domain and the clamp; None if there are none.
+        yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
+            or above the range of forces.
+        field: Charges as a function of the contact; None to fit them to `presses`.
+    """
+
+    sensor: Sensor
+    probes: tuple[str, ...]
+    domain: Domain
+    presses: LabelledPresses
+    sha256: str
+    outside: LabelledPresses | None = None
+    yield_force_N: float | None = None
+    field: ChargeSeries | None = None
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> "TrainingData":
+        """Convert a simulated dataset to training data.
+
+        Raises:
+            DatasetError: If the dataset has too few presses or electrodes, or is measured.
+        """
+        presses = presses_of(dataset)
+        if presses.measured:
+            raise DatasetError(
+                "expected simulated presses, got a measured dataset, whose manifest has no settings of a simulator; "
+                "train with `isocharge train fit DATASET`, or with `fit_presses` in Python"
+            )
+        return cls(
+            sensor=dataset.sensor,
+            probes=tuple(sorted({str(probe) for probe in dataset.samples.probe})),
+            domain=domain_of(dataset),
+            presses=presses,
+            sha256=dataset.sha256,
+            outside=outside_presses_of(dataset),
+            yield_force_N=yield_force_of(dataset),
+        )
+
+
+MAX_ERROR_OF_CERTAIN_FOLD = 3e-4
+"""Largest relative error of the fitted charges at which a fold counts as certain. A poor fit has spurious folds."""
+
+SEARCHED_RADIUS_RATIO = 0.98
+"""Ratio of the radius within which folds are searched for to the radius of the domain.
+
+At the edge of the domain, the presses do not determine the derivatives of the charges accurately."""
+
+SMALLEST_SHARE = 0.2
+"""Smallest ratio of the radius without folds to the radius of the dataset at which a network can be trained."""
+
+
+def invertible_domain(
+    field: ChargeSeries, presses: LabelledPresses, noise: NoiseModel
+) -> tuple[Domain, tuple[str, ...]]:
+    """Return the disk on which a network is trained, and sentences for the user about ambiguous contacts.
+
+    At a fold, the map from contacts to charges turns back, so that contacts on both sides of the fold have the same
+    charges. If an accurate fit shows a fold, the disk is reduced to the radius of the fold, and a sentence states this.
+    Otherwise, the disk is the domain of the field.
+
+    Args:
+        field: Charge field that was fitted to the presses.
+        presses: Presses to which the field was fitted. A sentence states how many of them lie in the disk.
+        noise: Noise of good presses. Charges that differ by less than the noise count as equal.
+
+    Returns:
+        The domain, which is the disk with the range of forces, and the sentences.
+
+    Raises:
+        DatasetError: If the radius of the disk is less than `SMALLEST_SHARE` of the radius of the field.
+    """
+    requested_domain = field.domain
+    if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
+        return requested_domain, ()
+    fold_radius = _fold_radius(field, noise)
+    if not fold_radius < requested_domain.radius:
+        return requested_domain, ()
+
+    if fold_radius < SMALLEST_SHARE * requested_domain.radius:
+        raise DatasetError(
+            f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of "
+            f"{requested_domain.radius:g} mm asked for: beyond, two contacts give the same charges; add an "
+            "electrode, or take a biaxial film"
+        )
+    return requested_domain.within(fold_radius), (_fold_caution(field, presses, fold_radius),)
+
+
+def _fold_caution(field: ChargeSeries, presses: LabelledPresses, fold_radius: float) -> str:
+    """Return a sentence that states the radius of a certain fold, to which the domain is reduced.
+
+    The sentence also names the command that tracks contacts beyond the fold.
+
+    Args:
+        field: Charge field, whose domain is not reduced yet.
+        presses: The presses, some of which lie beyond the fold.
+        fold_radius: Distance of the fold from the centre, mm.
+    """
+    requested_radius = field.domain.radius
+    remaining_count = len(presses.within(fold_radius))
+    caution = (
+        f"the map from contacts to charges folds beyond {fold_radius:g} mm: two contacts give the same charges there; "
+        f"the model is trained for {fold_radius:g} mm, not {requested_radius:g} mm, on {remaining_count} of "
+        f"{len(presses)} presses"
+    )
+    return f"{caution}; 'serve stream --track' follows contacts to {requested_radius:g} mm"
+
+
+def _fold_radius(field: ChargeSeries, noise: NoiseModel) -> float:
+    """Return the rounded radius of the largest disk without folds, mm, or infinity if the domain has no fold.
+
+    Args:
+        field: Charge field in whose domain folds are searched for.
+        noise: Noise of good presses.
+    """
+    area = working_area(within(field, SEARCHED_RADIUS_RATIO * field.domain.radius), noise, search_pairs=False)
+    if not np.isfinite(area.fold_radius):
+        return np.inf
+    return float(f"{area.unambiguous_radius:.6g}")
+
+
+SIGNED_FEATURE_SCALE = 0.1
+"""Charge above which features of charges of both signs are logarithmic, dimensionless.
+
+It is relative to the charge above which the noise is proportional to the charge. On a taut uniaxial film, the value 0.1
+gave smaller position errors than the value 1.
+"""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Presses that are split by position into presses for training and for the test.
+
+    In the domain of the presses, the map from contacts to charges can be inverted.
+
+    Attributes:
+        domain: Contacts for which the network is trained.
+        train: Presses for training.
+        test: Presses for measuring errors.
+        field: Map from contacts to charges, which is fitted to all presses.
+        cautions: Sentences about folds of the map and about contacts with the same charges.
+        folded_charges: Approximation of the charges by a series, which includes the region where the map folds; None if
+            the map does not fold.
+    """
+
+    domain: Domain
+    train: LabelledPresses
+    test: LabelledPresses
+    field: ChargeMap
+    cautions: tuple[str, ...]
+    folded_charges: ChargeSeries | None
+
+    @classmethod
+    def by_position(cls, data: TrainingData, training: TrainingConfig) -> "Split":
+        """Split presses into two parts for training and for the test, and fit a charge field to them.
+
+        A charge field is a smooth map from contacts to charges. The map folds where different contacts have the same
+        charges. The field is fitted to all presses and determines the largest disk in which the map certainly does not
+        fold. Only the presses within this disk are distributed among the two parts.
+
+        Args:
+            data: Presses of the sensor.
+            training: Fractions of the presses, noise and seed.
+        """
+        # Fit the field, and determine the domain without folds.
+        presses = data.presses
+        electrode_names = data.sensor.electrode_names
+        field_train, field_validation = split_by_position(presses, training.hold_out, training.seed)
+        whole_field = data.field or fit_charge_series(data.domain, electrode_names, field_train, field_validation)
+        domain, cautions = invertible_domain(whole_field, presses, misfit_noise(training.noise_model))
+        is_folded = domain != data.domain  # `invertible_domain` reduces the domain only if the map folds
+        used_presses = presses.within(domain.radius) if is_folded else presses
+
+        train, test = split_by_position(used_presses, training.hold_out, training.seed)
+        field = within(whole_field, domain.radius) if is_folded else whole_field
+        folded_charges = replace(whole_field, is_folded=True) if is_folded else None
+        return cls(domain, train, test, field, cautions, folded_charges)
+
+    def features(self, noise: NoiseModel) -> WhitenedFeatures:
+        """Fit the input features to the training presses.
+
+        The features are logarithms of the charges if all charges are positive. Otherwise, they are inverse hyperbolic
+        sines of charge / typical charge, which are linear for small charges and logarithmic for large charges.
+
+        Args:
+            noise: Noise of the charges, which determines the typical charges.
+        """
+        charge = self.train.charge
+        has_both_signs = self.train.signed or self.test.signed
+        if not has_both_signs:
+            return WhitenedFeatures.fit_logarithms(charge)
+        channel_noise = ChannelNoise.alike(noise, charge.shape[1])
+        # The typical charge of a channel is the charge above which the noise would be proportional to the charge if the
+        # white noise were multiplied by `SIGNED_FEATURE_SCALE`.
+        smaller_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
+        return WhitenedFeatures.fit_signed(charge, smaller_noise.transition_charge(charge))
