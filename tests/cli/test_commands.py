@@ -234,6 +234,8 @@ BAD = [
         (("train", "fit", *words.split(), "-o", "OUT"), 2, message)
         for words, message in [
             (f"{__file__} --radius 5", "--radius: belongs to --sensor"),
+            (f"--sensor {SENSOR} --force-std 0.1", "--force-std: belongs to a file of measured presses"),
+            (". --probe circle:1.0", "--probe: is contained in the dataset folder; leave the option out"),
             (f"{__file__} --sensor {SENSOR}", "calibrate its film; use `isocharge train calibrate"),
             (f"none.csv --sensor {SENSOR}", "none.csv: expected a dataset folder or a file of measured presses"),
         ]

@@ -1,7 +1,7 @@
 """`isocharge train fit`: make a model from a dataset, from measured presses, or from the description of a sensor."""
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -9,10 +9,7 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.forward_maps import simulated_presses, sweep_radius, warn_of_stress
-from isocharge.cli.shared.options import (
-    ConfigOption,
-    JsonOption,
-)
+from isocharge.cli.shared.options import ConfigOption, JsonOption
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
@@ -48,11 +45,9 @@ VersionOption = Annotated[
 DEFAULT_PROBE = "circle:1.0"
 """Notation of the probe if `--probe` is not given."""
 
-DEFAULT_RADIUS_TEXT = f"{DEFAULT_RADIUS}"
-"""Value of `--radius` if the option is not given: the radius of the working area, mm, as text."""
-
 
 def fit_command(
+    context: typer.Context,
     output: ModelFolderOption,
     dataset: Annotated[
         Path | None,
@@ -60,8 +55,7 @@ def fit_command(
             metavar="DATASET|PRESSES.csv|SENSOR",
             help="A dataset folder of `isocharge simulate sweep` or of measured presses, or a CSV file of measured "
             "presses with the columns x_mm, y_mm, force_N and the names of the channels (pC). The file needs 500 or "
-            "more presses. A SENSOR is the same as --sensor SENSOR alone. (default: "
-            "--sensor)",
+            "more presses. A SENSOR is the same as --sensor SENSOR alone. (default: --sensor)",
         ),
     ] = None,
     sensor: Annotated[
@@ -87,7 +81,7 @@ def fit_command(
             help="With --sensor: largest distance of a press from the film's centre, mm; or auto: the working area, "
             "where the charges determine the position to 1 mm.",
         ),
-    ] = DEFAULT_RADIUS_TEXT,
+    ] = f"{DEFAULT_RADIUS}",
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
     config: ConfigOption = None,
@@ -127,13 +121,19 @@ def fit_command(
         )
     if dataset is not None and sensor is not None:
         raise InputError("expected either a DATASET folder or --sensor SENSOR, got both; leave one of them out")
+    if sensor is None:
+        _refuse_options(context, ("radius",), "belongs to --sensor; the presses determine the working area")
+    else:
+        _refuse_options(context, ("position_std_mm", "force_std"), "belongs to a file of measured presses")
+    if dataset is not None and press_file is None:
+        _refuse_options(context, ("probe", "position_std_mm", "force_std"), "is contained in the dataset folder")
     fit_config = load_config(config) if config else FitConfig()
     loaded_dataset = read_dataset(dataset) if dataset is not None and press_file is None else None
     presses: MeasuredPresses | None = None
     sensor_name = output.resolve().name  # the sensor of a file of presses has no other name than that of the model
     pressing_probes = set(probe or ["unknown"])
     if press_file is not None:
-        presses = _read_presses_of_unknown_sensor(press_file, radius, position_std_mm, force_std)
+        presses = _read_presses_of_unknown_sensor(press_file, position_std_mm, force_std)
     elif loaded_dataset is not None and is_measured(loaded_dataset):
         presses = measured_presses_of(loaded_dataset)
         sensor_name = loaded_dataset.sensor.name
@@ -152,6 +152,23 @@ def fit_command(
         data = _prepare_data(loaded_dataset, sensor, notations, radius)
     version_folder = check_target(output, version, data.sensor.electrode_names)
     train_and_release(partial(fit, data, fit_config), version_folder, json=json)
+
+
+def _refuse_options(context: typer.Context, names: Sequence[str], reason: str) -> None:
+    """Raise an error if one of the options is given, because it would have no effect.
+
+    Args:
+        context: The command with its arguments.
+        names: Names of the function's arguments to which the options belong.
+        reason: End of a sentence that begins with the option.
+
+    Raises:
+        InputError: If an option is given.
+    """
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in names and source is not None and source.name == "COMMANDLINE":
+            raise InputError(f"{parameter.opts[0]}: {reason}; leave the option out")
 
 
 def _is_sensor(argument: Path) -> bool:
@@ -186,26 +203,17 @@ def _prepare_data(dataset: Dataset | None, sensor: str | None, notations: list[s
     return TrainingData.of(simulated_presses(described_sensor, probes, radius_mm, DEFAULT_FORCE_RANGE))
 
 
-def _read_presses_of_unknown_sensor(
-    file: Path, radius: str, position_std_mm: float, force_std: float
-) -> MeasuredPresses:
+def _read_presses_of_unknown_sensor(file: Path, position_std_mm: float, force_std: float) -> MeasuredPresses:
     """Read the measured presses of a sensor without a description, and print which columns are its channels.
 
     Args:
         file: CSV file of the presses.
-        radius: Value of `--radius`, which must be the default.
         position_std_mm: Standard deviation of the positions if the file contains none, mm.
         force_std: Relative standard deviation of the forces if the file contains none.
 
     Raises:
-        InputError: If `--radius` is given.
         PressError: If the file cannot be read.
     """
-    if radius != DEFAULT_RADIUS_TEXT:
-        raise InputError(
-            f"--radius: belongs to --sensor, got {radius} without --sensor; leave it out, because the working area is "
-            "then the area of the presses"
-        )
     presses = read_press_file(file, None, position_std_mm, force_std)
     say(f"{file}: {len(presses)} presses of the channels {', '.join(presses.electrodes)}")
     return presses
