@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from isocharge.train.training.activations import TANH
 from isocharge.train.training.folded_network import ANGLES, LARGEST_INT8, FoldedNetwork, Layer, Perceptron, fold
 from isocharge.train.training.network import logarithmic_features
 
@@ -12,7 +13,7 @@ TYPICAL_pC = 512.0
 """Charge by which each charge is divided, pC."""
 
 
-def random_perceptron(rng, widths):
+def random_perceptron(rng, widths, activation=TANH):
     """Return a perceptron with random weights; `widths` are those of the inputs, the hidden layers and the outputs."""
     layers = []
     for n_input, n_output in itertools.pairwise(widths):
@@ -20,10 +21,10 @@ def random_perceptron(rng, widths):
         layers.append(Layer(weight, 0.3 * rng.standard_normal(n_output)))
     *hidden, last = layers
     skip = 0.1 * rng.standard_normal((widths[0], widths[-1]))
-    return Perceptron(tuple(hidden), last, skip)
+    return Perceptron(tuple(hidden), last, skip, activation)
 
 
-def random_network(n_electrode, hidden, misfit_hidden, *, is_int8=False):
+def random_network(n_electrode, hidden, misfit_hidden, *, is_int8=False, activation=TANH):
     """Return a network with random weights.
 
     Args:
@@ -31,12 +32,13 @@ def random_network(n_electrode, hidden, misfit_hidden, *, is_int8=False):
         hidden: Widths of the hidden layers of the contact perceptron.
         misfit_hidden: Widths of the hidden layers of the misfit perceptron.
         is_int8: Whether the weights between hidden layers are rounded to 8 bits.
+        activation: Activation of the hidden layers.
     """
     rng = np.random.default_rng(0)
     n_contact = ANGLES.stop
     perceptrons = [
-        random_perceptron(rng, (n_electrode, *hidden, n_contact)),
-        random_perceptron(rng, (n_electrode, *misfit_hidden, n_electrode)),
+        random_perceptron(rng, (n_electrode, *hidden, n_contact), activation),
+        random_perceptron(rng, (n_electrode, *misfit_hidden, n_electrode), activation),
     ]
     n_answer = n_contact + n_electrode
     units = Layer(np.diag([8.0, 8.0, *np.ones(n_answer - 2)]), np.zeros(n_answer))

@@ -45,6 +45,7 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import COLUMNS
 from isocharge.serve.model.validity import Validity
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
+from isocharge.train.training.activations import Activation
 from isocharge.train.training.folded_network import (
     ANGLES,
     COSINES_TO_CORRELATIONS,
@@ -81,14 +82,14 @@ class LayerSource:
         weight: Weights W, shape (inputs, outputs), float32.
         bias: Bias c, shape (outputs,), which is written as the array `name_bias`. None if c is not constant.
         blocks: Blocks of W. All weights outside the blocks are zero.
-        is_hidden: Whether f is the hyperbolic tangent. Otherwise, f is the identity.
+        activation: The function f; None for the identity.
     """
 
     name: str
     weight: Singles
     bias: Singles | None = None
     blocks: tuple[Block, ...] = (WHOLE_MATRIX,)
-    is_hidden: bool = False
+    activation: Activation | None = None
 
     def text(self) -> str:
         """Return the C text of the constant arrays, and of the function that computes y = f(x @ weight + c).
@@ -111,8 +112,8 @@ class LayerSource:
         # C expression for output j. At first, y[j] contains the sum of the products for this output. If the weights are
         # integers, the sum is multiplied by the scale of its column.
         result = "y[j] + c[j]" if scale is None else f"y[j] * {self.name}_scale[j] + c[j]"
-        if self.is_hidden:
-            result = f"tanh_of({result})"
+        if self.activation is not None:
+            result = f"{self.activation.c_function}({result})"
 
         # The function: set the sums to zero, add the products of each block, and compute the outputs.
         products = [_product_lines(name, block, values[block]) for name, block in named_blocks]
@@ -307,6 +308,7 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),
+        activation=network.layers.activation.c_source,
         features=_features_source(network.features),
         layers="\n".join(layer.text() for layer in (*hidden, skip, last)),
         rows=", ".join(f"{buffer}[{widest}]" for buffer in hidden_buffers),
@@ -348,11 +350,13 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
 
     # The hidden layers
     first_weight = convert_input_weights(first_layer.weight)
-    hidden = [LayerSource("layer_0", first_weight, _to_single_precision(first_layer.bias), is_hidden=True)]
+    hidden = [
+        LayerSource("layer_0", first_weight, _to_single_precision(first_layer.bias), activation=perceptron.activation)
+    ]
     for layer, weight, blocks in zip(other_layers, other_weights, other_blocks, strict=True):
         name = f"layer_{len(hidden)}"
         bias = _to_single_precision(layer.bias)
-        hidden.append(LayerSource(name, weight, bias, blocks, is_hidden=True))
+        hidden.append(LayerSource(name, weight, bias, blocks, activation=perceptron.activation))
 
     # The skip layer and the output layer. The bias of the output layer is added with the skip layer.
     skip = LayerSource("skip", convert_input_weights(perceptron.skip), _to_single_precision(perceptron.last.bias))

@@ -21,6 +21,7 @@ from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS, open_sess
 from isocharge.serve.presses.number_table import LARGEST
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
+from isocharge.train.training.activations import ACTIVATIONS
 from isocharge.train.training.folded_network import (
     COSINES_TO_CORRELATIONS,
     LARGEST_LOGARITHM,
@@ -155,7 +156,7 @@ def _add_perceptron(builder: GraphBuilder, inputs: str, perceptron: Perceptron) 
     Args:
         builder: Builder of the graph.
         inputs: Name of the tensor with the inputs.
-        perceptron: Weights and biases of the layers.
+        perceptron: Weights and biases of the layers, and the activation.
 
     Returns:
         Name of the tensor with the outputs.
@@ -163,7 +164,7 @@ def _add_perceptron(builder: GraphBuilder, inputs: str, perceptron: Perceptron) 
     hidden_outputs = inputs
     for layer in perceptron.hidden:
         linear = builder.add("Gemm", hidden_outputs, builder.constant(layer.weight), builder.constant(layer.bias))
-        hidden_outputs = builder.add("Tanh", linear)
+        hidden_outputs = builder.add(perceptron.activation.onnx_operator, linear)
     output_layer = perceptron.last
     skip_and_bias = builder.add("Gemm", inputs, builder.constant(perceptron.skip), builder.constant(output_layer.bias))
     return builder.add("Gemm", hidden_outputs, builder.constant(output_layer.weight), skip_and_bias)
@@ -209,12 +210,14 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
         graph: The graph.
 
     Raises:
-        LookupError: If the graph has no operators.
+        LookupError: If the graph has no activation.
         ValueError: If the shapes of the constants do not fit a network, or a constant is not finite.
         StopIteration: If the graph has too few constants.
     """
     operators = [node.op_type for node in graph.node]
-    n_hidden = operators.count("Tanh")
+    activations = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
+    activation = activations[operators[operators.index("Gemm") + 1]]
+    n_hidden = operators.count(activation.onnx_operator)  # each hidden layer has one activation
     is_signed = operators[0] == "Max"  # the first node of a graph for charges of both signs
 
     names = [name for node in graph.node for name in node.input]
@@ -231,7 +234,7 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     # ONNX would also repeat a single number for all columns, C does not.
     if any(layer.bias.shape != layer.weight.shape[1:] for layer in (*hidden, last, Layer(skip, bias))):
         raise ValueError("expected a bias for each column of the weights")
-    return FoldedNetwork(features, Perceptron(tuple(hidden), last, skip))
+    return FoldedNetwork(features, Perceptron(tuple(hidden), last, skip, activation))
 
 
 OutputFunction = Callable[[Array], tuple[Array, ...]]

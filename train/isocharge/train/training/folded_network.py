@@ -13,9 +13,9 @@ write networks of this form.
 Perceptron
 ----------
 
-For inputs x, the hidden layer l computes h_l = tanh(h_(l-1) W_l + b_l), where h_0 = x. The output layer computes
-y = h_L V + c + x S from the result h_L of the last hidden layer. The skip layer S maps the inputs linearly to the
-outputs. The hidden layers therefore only need to learn the nonlinear part of the function.
+For inputs x, the hidden layer l computes h_l = f(h_(l-1) W_l + b_l), where h_0 = x and f is the activation function.
+The output layer computes y = h_L V + c + x S from the result h_L of the last hidden layer. The skip layer S maps the
+inputs linearly to the outputs. The hidden layers therefore only need to learn the nonlinear part of the function.
 
 The training makes two perceptrons, for the contact and for the misfit. In a prediction for a single press, the overhead
 of each node of the graph takes more time than the arithmetic. Both perceptrons are therefore folded into one, whose
@@ -46,6 +46,7 @@ from scipy.linalg import block_diag
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
+from isocharge.train.training.activations import Activation
 
 
 @dataclass(frozen=True)
@@ -110,20 +111,22 @@ class Perceptron:
     """A multilayer perceptron with a skip layer.
 
     Attributes:
-        hidden: Hidden layers, from the first to the last layer. The hyperbolic tangent follows each hidden layer.
+        hidden: Hidden layers, from the first to the last layer. The activation function follows each hidden layer.
         last: Output layer.
         skip: Weights of the skip layer from the inputs directly to the outputs, shape (n_input, n_output).
+        activation: Activation function of the hidden layers.
     """
 
     hidden: tuple[Layer, ...]
     last: Layer
     skip: Array
+    activation: Activation
 
     def evaluate(self, inputs: Array) -> Array:
         """Compute the outputs, shape (n, n_output), of inputs of shape (n, n_input)."""
         value = inputs
         for layer in self.hidden:
-            value = np.tanh(value @ layer.weight + layer.bias)
+            value = self.activation.numpy_function(value @ layer.weight + layer.bias)
         return np.asarray(value @ self.last.weight + self.last.bias + inputs @ self.skip)
 
 
@@ -294,6 +297,7 @@ def fold(perceptrons: Sequence[Perceptron], mean: Array, matrix: Array, answer_m
         hidden=(Layer(first_weight, first_bias), *later),
         last=Layer(last.weight @ answer_map.weight, last_bias),
         skip=skip,
+        activation=perceptrons[0].activation,
     )
 
 

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
+from isocharge.train.training.activations import ACTIVATIONS, TANH, Activation
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.folded_network import (
     LARGEST_INT8,
@@ -180,17 +181,20 @@ class TrainablePerceptron(nn.Module):
         n_input: Number of inputs.
         hidden: Widths of the hidden layers.
         n_output: Number of outputs.
+        activation: Activation of the hidden layers.
     """
 
-    def __init__(self, n_input: int, hidden: tuple[int, ...], n_output: int) -> None:
+    def __init__(self, n_input: int, hidden: tuple[int, ...], n_output: int, activation: Activation = TANH) -> None:
         """Create the layers with random weights. The weights of the skip layer are zero.
 
         Args:
             n_input: Number of inputs.
             hidden: Widths of the hidden layers.
             n_output: Number of outputs.
+            activation: Activation of the hidden layers.
         """
         super().__init__()
+        self.activation = activation
         widths = (n_input, *hidden, n_output)
         self.layers = nn.ModuleList([nn.Linear(n_in, n_out) for n_in, n_out in pairwise(widths)])
         self.skip = nn.Linear(n_input, n_output, bias=False)
@@ -202,7 +206,7 @@ class TrainablePerceptron(nn.Module):
         Near the rim of the working area, the posterior mean of the contact is a strongly nonlinear function of the
         charges. Units that are nearly linear for all inputs learn such a function slowly. Therefore, each unit gets a
         random direction in the space of the inputs, a random slope along this direction, and a random centre. The
-        centre is the point of this space at which the argument of the hyperbolic tangent is zero.
+        centre is the point of this space at which the argument of the activation is zero.
         """
         first, *_ = self.linear_layers()
         n_unit = first.out_features
@@ -223,17 +227,18 @@ class TrainablePerceptron(nn.Module):
         Returns:
             Outputs, shape (n, n_output).
         """
+        activation = getattr(nn.functional, self.activation.torch_name)
         *hidden, last = self.linear_layers()
         value = inputs
         for layer in hidden:
-            value = torch.tanh(layer(value))
+            value = activation(layer(value))
         outputs: Tensor = last(value) + self.skip(inputs)
         return outputs
 
     def to_numpy(self) -> Perceptron:
         """Return a copy of the perceptron as NumPy arrays in double precision."""
         *hidden, last = (Layer(_to_numpy(layer.weight.T), _to_numpy(layer.bias)) for layer in self.linear_layers())
-        return Perceptron(tuple(hidden), last, _to_numpy(self.skip.weight.T))
+        return Perceptron(tuple(hidden), last, _to_numpy(self.skip.weight.T), self.activation)
 
     def linear_layers(self) -> list[nn.Linear]:
         """Return the hidden layers and the output layer, from first to last."""
@@ -290,9 +295,10 @@ class InverseNetwork(nn.Module):
         self.features = features
         n_electrode = self.n_electrode
         widths, misfit_widths = config.widths(n_electrode)
-        self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop)
+        activation = ACTIVATIONS[config.activation]
+        self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop, activation)
         self.contact.sharpen_first_layer()
-        self.misfit_vector = TrainablePerceptron(n_electrode, misfit_widths, n_electrode)
+        self.misfit_vector = TrainablePerceptron(n_electrode, misfit_widths, n_electrode, activation)
         self.output_factor = nn.Buffer(torch.ones(TURN.stop))
         self.output_offset = nn.Buffer(torch.zeros(TURN.stop))
         if force_std is not None:
