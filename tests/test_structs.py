@@ -143,3 +143,10 @@ def test_files_that_are_none(tmp_path, read, content, message):
     for path, expected in ((tmp_path / "board", message), (tmp_path, "cannot be read")):
         with pytest.raises(DeviceError, match=rf"^{path}: {expected}"):
             read(path)
+
+
+@pytest.mark.parametrize("path", ["$.zzz", "$[0]", "$[...]", "$.name.b"])
+def test_key_that_imitates_the_path_of_a_message_is_named(path):
+    key = f"a` - at `{path}"
+    with pytest.raises(DeviceError, match=re.escape(key)):
+        convert({"name": "x", key: 1}, Part, "board.toml", DeviceError)

@@ -194,7 +194,14 @@ def _first_mistake(value: object, target_type: Any, cause: Exception) -> str:
     try:
         msgspec.convert(value, target_type)
     except msgspec.ValidationError as error:
-        return _describe_mistake(value, target_type, error)
+        try:
+            return _describe_mistake(value, target_type, error)
+        except (
+            LookupError,
+            ValueError,
+            StopIteration,
+        ):  # a key of the file imitates the keys in the message of msgspec
+            return cut(str(error))
     except RecursionError:
         return "nested too deeply"
     return cut(str(cause))
