@@ -120,10 +120,10 @@ release: $(VENV)/installed
 	$(BIN)/isocharge train fit three-25um-biaxial --config train/configs/student.toml -o models/three-25um-biaxial-student
 	$(BIN)/isocharge train fit --sensor four-25um-biaxial --radius auto --config train/configs/student.toml -o models/four-25um-biaxial-student
 
-# Speed against error of the released models, on fresh presses: report/report.md. Nothing else should run meanwhile.
+# Speed against error of the released models: report/report.md. Nothing else should run meanwhile.
 report: $(VENV)/installed
-	$(BIN)/isocharge simulate sweep three-25um-biaxial --samples 3000 -o build/three-25um-biaxial
-	$(BIN)/isocharge simulate sweep four-25um-biaxial --radius auto --samples 3000 -o build/four-25um-biaxial
+	$(BIN)/isocharge simulate sweep three-25um-biaxial --samples 20000 -o build/three-25um-biaxial
+	$(BIN)/isocharge simulate sweep four-25um-biaxial --radius auto --samples 20000 -o build/four-25um-biaxial
 	$(BIN)/isocharge train report build/three-25um-biaxial build/four-25um-biaxial -o report
 
 # The figures and numbers of Mirbagheri et al. (2007), ours beside them: paper/paper.md; five minutes on two cores.

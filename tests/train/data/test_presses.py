@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from isocharge.common.errors import DatasetError, PressError
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle, Domain, Samples, parse_probe
-from isocharge.train.data.presses import dataset_of, domain_of, held_out, is_measured, presses_of, split_by_position
+from isocharge.train.data.presses import (
+    LabelledPresses,
+    dataset_of,
+    domain_of,
+    is_measured,
+    position_ranks,
+    presses_of,
+    split_by_position,
+)
 from isocharge.train.training.training_data import TrainingData
 
 
@@ -22,23 +30,6 @@ def with_samples(dataset, **columns):
 def positions_of(contact):
     """Return the set of the positions (x, y) of contacts, mm."""
     return {tuple(position) for position in contact[:, :2]}
-
-
-@pytest.fixture(scope="module")
-def repeated_positions(dataset):
-    """The presses of the dataset, moved to 400 positions with many forces at each."""
-    position = np.random.default_rng(0).integers(0, 400, len(dataset.samples))
-    samples = dataset.samples
-    return presses_of(with_samples(dataset, x_mm=samples.x_mm[position], y_mm=samples.y_mm[position]))
-
-
-def test_split_puts_each_position_into_one_part(repeated_positions):
-    train, test = split_by_position(repeated_positions, 0.2, seed=3)
-    train_positions = positions_of(train.contact)
-    test_positions = positions_of(test.contact)
-    assert not train_positions & test_positions
-    assert len(train) + len(test) == len(repeated_positions)
-    assert len(test_positions) == pytest.approx(0.2 * len(train_positions | test_positions), abs=1)
 
 
 def test_domain_is_that_of_the_manifest_or_of_the_samples(dataset):
@@ -110,25 +101,21 @@ def measured_presses(contact: np.ndarray, charge: np.ndarray) -> MeasuredPresses
 
 @given(count=st.integers(50, 300), seed=st.integers(0, 999), forces=st.integers(1, 5))
 @settings(max_examples=40, deadline=None)
-def test_held_out_presses_are_whole_positions_and_do_not_depend_on_the_order(count, seed, forces):
+def test_split_keeps_positions_together_and_does_not_depend_on_the_order_or_on_other_presses(count, seed, forces):
     contact = np.repeat(random_contacts(count, seed), forces, axis=0)
-    is_held_out = held_out(contact)
-    expected_count = max(10, 0.2 * len(contact))
-    assert expected_count <= is_held_out.sum() <= expected_count + forces
-    assert not positions_of(contact[is_held_out]) & positions_of(contact[~is_held_out])
+    presses = LabelledPresses(contact, np.ones((len(contact), 3)))
+    first, second = split_by_position(presses, 0.2)
+    assert len(first) + len(second) == len(presses)
+    assert 0.2 * count <= len(positions_of(second.contact)) <= 0.2 * count + 1
+    assert not positions_of(first.contact) & positions_of(second.contact)
     order = np.random.default_rng(seed).permutation(len(contact))
-    assert np.array_equal(held_out(contact[order]), is_held_out[order])
+    _, reordered = split_by_position(presses[order], 0.2)
+    assert positions_of(reordered.contact) == positions_of(second.contact)
 
-
-def test_held_out_presses_of_a_part_are_also_held_out_of_all_presses():
-    """The part has fewer held-out presses, or more of them than there are held-out presses of all in this part."""
-    contact = random_contacts(400, 1)
-    part = contact[np.hypot(contact[:, 0], contact[:, 1]) < 5.0]
-    held_out_of_all = {tuple(row) for row in contact[held_out(contact)]}
-    held_out_of_part = {tuple(row) for row in part[held_out(part)]}
-    in_part = {tuple(row) for row in part}
-    n_expected = min(len(held_out_of_part), len(held_out_of_all & in_part))
-    assert len(held_out_of_part & held_out_of_all) >= n_expected
+    # The order of the positions of a part is that of the same positions among all presses.
+    part = contact[: len(contact) // 2]
+    of_part, of_all = (np.argsort(ranks, kind="stable") for ranks in (position_ranks(part), position_ranks(contact)))
+    assert np.array_equal(of_part, of_all[of_all < len(part)])
 
 
 def test_simulated_and_measured_datasets_are_distinguished(dataset, sensor):

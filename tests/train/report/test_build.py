@@ -26,14 +26,12 @@ METHODS = {  # further methods may be registered
 
 
 @pytest.fixture(scope="module")
-def report(dataset, film, spline, tmp_path_factory):
-    """The folder, the record and the page of a report, for which the film is not solved again."""
+def report(dataset, tmp_path_factory):
+    """The folder, the record and the page of a report."""
     folder = tmp_path_factory.mktemp("report") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(benchmark, "ROUNDS", 2)
         patch.setattr(benchmark, "MIN_CALLS", 1)
-        patch.setattr(evaluation, "solve_maps", lambda *_, **__: (film,))
-        patch.setattr(evaluation.ChargeSpline, "of", lambda _: spline)
         record = write_report(folder, [(dataset, find_model(NAME))], SMALL)
     return folder, record, (folder / "report.md").read_text("utf-8")
 
@@ -105,10 +103,19 @@ def test_dataset_of_another_sensor_is_refused(dataset, tmp_path):
 
 def test_dataset_with_other_forces_than_the_model_is_refused(dataset, tmp_path):
     samples = replace(dataset.samples, force_N=100.0 * dataset.samples.force_N)
-    stronger = replace(dataset, samples=samples, manifest={"solver": dataset.manifest["solver"]})
-    with pytest.raises(DatasetError, match=r"forces of the model, 0.05 to 2 N, got 5"):
-        write_report(tmp_path / "out", [(stronger, find_model(NAME))], SMALL)
+    with pytest.raises(DatasetError, match=r"of its forces, 0.05 to 2 N, got none among 6000 presses"):
+        write_report(tmp_path / "out", [(replace(dataset, samples=samples), find_model(NAME))], SMALL)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_limit_of_an_inaccurate_series_is_left_out_with_the_reason(dataset, tmp_path):
+    few = replace(dataset, samples=dataset.samples[np.arange(3_000)])
+    record = write_report(tmp_path / "out", [(few, find_model(NAME))], SMALL)
+    (section,) = record["datasets"]
+    assert section["limits"] == {}
+    (reason,) = section["left_out"]
+    assert re.match(r"Cramér-Rao limit: .* 24\d\d presses has an error of 0\.\d+ % of a charge", reason)
+    assert f"Left out: {reason}." in (tmp_path / "out" / "report.md").read_text("utf-8")
 
 
 def test_dataset_with_one_position_in_the_working_area_is_refused(dataset, tmp_path):
@@ -116,7 +123,7 @@ def test_dataset_with_one_position_in_the_working_area_is_refused(dataset, tmp_p
     samples = dataset.samples
     is_moved_out = np.arange(len(samples)) % 2
     moved = replace(samples, x_mm=is_moved_out * (20.0 + samples.x_mm), y_mm=is_moved_out * samples.y_mm)
-    one_position = replace(dataset, samples=moved, manifest={"solver": dataset.manifest["solver"]})
+    one_position = replace(dataset, samples=moved)
     with pytest.raises(DatasetError, match="50 positions, got 3000 at 1"):
         write_report(tmp_path / "out", [(one_position, find_model(NAME))], SMALL)
     assert list(tmp_path.iterdir()) == []

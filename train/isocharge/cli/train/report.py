@@ -53,12 +53,12 @@ def report_command(
 ) -> None:
     """Compare a model with other methods: error (mm, % of force) against time (us).
 
-    All methods predict the same presses with noise. If DATASET was measured, the methods are tested on a fifth of its
-    presses, to which no method was fitted. In this case, no noise is added to the charges, and all results that need a
-    simulation are left out. The option --probe states the probe with which the presses of PRESSES.csv were made.
+    All methods predict the same presses, to which no method was fitted: a tenth of the presses of DATASET with noise,
+    or a fifth without noise if DATASET was measured. The option --probe states the probe with which the presses of
+    PRESSES.csv were made.
 
-    The report takes about a minute for each dataset. Durations are measured, so do not run other programs at the same
-    time. The option --json prints report.json.
+    The report takes less than a minute for each dataset. Durations are measured, so do not run other programs at the
+    same time. The option --json prints report.json.
 
     Example: isocharge train report presses -o report
     """

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import DatasetError, PressError, cut, shown
 from isocharge.common.files import sha256_of
 from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
@@ -185,26 +185,38 @@ def yield_force_of(dataset: Dataset) -> float | None:
     return yield_force(dataset.sensor.film, probes, domain_of(dataset).force_range)
 
 
-def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tuple[LabelledPresses, LabelledPresses]:
-    """Split presses at random into two parts. All presses at one position belong to the same part.
+def split_by_position(presses: LabelledPresses, share: float) -> tuple[LabelledPresses, LabelledPresses]:
+    """Split presses into two parts. All presses at one position belong to the same part.
 
     Args:
         presses: The presses.
         share: Share of the positions in the second part, 0 to 1.
-        seed: Seed of the choice.
 
     Returns:
         The first and the second part.
     """
-    # Positions are rounded to 1e-6 mm, so that numerical errors do not separate the presses at one position.
-    rounded_positions = np.round(presses.contact[:, :2], 6)
-    unique_positions, position_of_press = np.unique(rounded_positions, axis=0, return_inverse=True)
-    shuffled_positions = np.random.default_rng(seed).permutation(len(unique_positions))
-    second_count = max(1, round(share * len(unique_positions)))
-    second_positions = shuffled_positions[:second_count]
-    # Some versions of NumPy return `position_of_press` with two axes.
-    is_in_second = np.isin(position_of_press.ravel(), second_positions)
+    is_in_second = position_ranks(presses.contact) < share
     return presses[~is_in_second], presses[is_in_second]
+
+
+def position_ranks(contact: Array) -> Array:
+    """Order the positions of presses, and return the rank of the position of each press.
+
+    The order is that of the checksums of the coordinates. It is random but the same in every run, and the order of two
+    positions does not depend on the other positions.
+
+    Args:
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Ranks divided by the number of positions, from 0 to 1 (excluded), shape (n,).
+    """
+    rounded_position = np.round(contact[:, :2], 3) + 0.0  # the addition converts -0.0 into 0.0
+    positions, position_of_press = np.unique(rounded_position, axis=0, return_inverse=True)
+    order = np.argsort([sha256_of(position.tobytes()) for position in positions])
+    rank = np.empty(len(positions))
+    rank[order] = np.arange(len(positions)) / len(positions)
+    return rank[position_of_press.ravel()]  # some versions of NumPy return two axes
 
 
 def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
@@ -267,47 +279,6 @@ It is also the number of networks of a cross-validation.
 
 FEWEST_MEASURED = 50
 """Smallest number of measured presses for a training, a report or held-out errors."""
-
-
-def held_out(contact: Array) -> Booleans:
-    """Determine which measured presses are held out for the measurement of errors.
-
-    One of `HELD_PARTS` parts is held out. Presses at one position are held out together.
-
-    Args:
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-
-    Returns:
-        Whether each press is held out, shape (n,).
-    """
-    return np.asarray(folds_by_place(contact, HELD_PARTS) == 0)
-
-
-def folds_by_place(contact: Array, count: int) -> Integers:
-    """Divide measured presses into parts, and return the number of the part of each press, from 0 to `count` - 1.
-
-    Presses at one position are in the same part. The positions are assigned to the parts in the order of the checksums
-    of their coordinates. This order is random but the same in every run. The presses at one position count as at most
-    one part of all counted presses, so that no part remains empty beside a position with very many presses.
-
-    Args:
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        count: Number of parts.
-
-    Returns:
-        Number of the part of each press, shape (n,).
-    """
-    rounded_position = np.round(contact[:, :2], 3) + 0.0  # the addition converts -0.0 into 0.0
-    positions, position_of_press, presses_at_position = np.unique(
-        rounded_position, axis=0, return_inverse=True, return_counts=True
-    )
-    counts = presses_at_position
-    while counts.max() > max(1, counts.sum() // count):
-        counts = np.minimum(counts, max(1, counts.sum() // count))
-    order = np.argsort([sha256_of(position.tobytes()) for position in positions])
-    presses_before = np.empty_like(counts)
-    presses_before[order] = np.cumsum(counts[order]) - counts[order]  # the sum without the position itself
-    return np.asarray((presses_before * count // counts.sum())[position_of_press.ravel()], dtype=np.intp)
 
 
 def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Dataset:

@@ -17,7 +17,7 @@ from isocharge.common.structs import convert
 from isocharge.serve.model.golden import contact_floors
 from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
 from isocharge.serve.model.model_folder import check_target, write_model
-from isocharge.serve.model.validity import N_CORNERS, disk_corners
+from isocharge.serve.model.validity import disk_corners
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
 from isocharge.train.model_release.evaluate import HELD_PRESSES, evaluate, unnoticed_presses
@@ -159,12 +159,6 @@ def _presses_text(metadata: ModelMetadata) -> str:
     )
 
 
-CORNER_TOLERANCE_mm = 2e-3
-"""Largest difference between the distances of two corners of a round working area from the origin, mm.
-
-The corners in the metadata are rounded to 0.0001 mm.
-"""
-
 CardWriter = Callable[[ModelMetadata, Fitted], str]
 """Function from the metadata and the trained network to the text of the card."""
 
@@ -255,24 +249,3 @@ def _working_area(domain: Domain) -> tuple[tuple[float, float], ...]:
     if isinstance(domain, PressedArea):
         return domain.corners
     return tuple((x, y) for x, y in disk_corners(domain.radius).round(4).tolist())
-
-
-def model_domain(metadata: ModelMetadata) -> Domain:
-    """Determine the domain of the contacts for which a model was trained, using its metadata.
-
-    In a model of simulated presses, the working area is a polygon around a disk, whose centre is the origin. For such a
-    polygon, the domain is the largest disk in the polygon, with a radius rounded to 0.001 mm. For every other working
-    area, the domain is a `PressedArea` with the same corners.
-
-    Args:
-        metadata: Metadata of the model.
-    """
-    corners = np.array(metadata.working_area_mm)
-
-    # The corners of a regular polygon around the origin have equal distances, and so have the centres of its edges.
-    edge_centres = 0.5 * (corners + np.roll(corners, -1, axis=0))
-    radius = round(float(np.hypot(*edge_centres.T).min()), 3)
-    is_disk = len(corners) == N_CORNERS and np.ptp(np.hypot(*corners.T)) < CORNER_TOLERANCE_mm
-    if is_disk:
-        return Domain(radius, metadata.force_range_N)
-    return PressedArea.of_corners(corners, metadata.force_range_N)

@@ -11,7 +11,7 @@ Example:
 from isocharge.common.extras import require
 
 with require("train"):
-    from isocharge.train.report.build import write_report
     from isocharge.train.report.evaluation import QUICK, Settings
+    from isocharge.train.report.page import write_report
 
 __all__ = ["QUICK", "Settings", "write_report"]

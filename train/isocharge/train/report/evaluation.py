@@ -9,41 +9,34 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import DatasetError, ModelError
+from isocharge.common.errors import DatasetError, ModelError, TrainingError
 from isocharge.common.progress import track
 from isocharge.serve.benchmark import Contender, take_turns
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
-from isocharge.simulate import (
-    ChargeSpline,
-    Dataset,
-    Domain,
-    Probe,
-    Samples,
-    SolveSettings,
-    Sweep,
-    limits_at,
-    noise_model,
-    parse_probe,
-)
-from isocharge.simulate.dataset.sweep import solve_maps
-from isocharge.simulate.mechanics.theory import ACCURACY
+from isocharge.serve.model.validity import inside_polygon
+from isocharge.simulate import Dataset, limits_at, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
+from isocharge.train.data.charge_fit import fit_charge_series
 from isocharge.train.data.contact_errors import ContactErrorStatistics, rms
-from isocharge.train.data.presses import LabelledPresses, check_enough, domain_of, held_out, is_measured, presses_of
+from isocharge.train.data.presses import (
+    HELD_PARTS,
+    LabelledPresses,
+    check_enough,
+    domain_of,
+    is_measured,
+    presses_of,
+    split_by_position,
+)
 from isocharge.train.model_release.evaluate import rounded
-from isocharge.train.model_release.release import model_domain
-from isocharge.train.report.methods import FittingTask, Method, fit_methods, model_method
+from isocharge.train.report.methods import METHOD_BUILDERS, FittingTask, Method, model_method
+from isocharge.train.training.config import TrainingConfig
 
 NOISE = noise_model("reference")
 """Noise of simulated test presses, which also weights the charges of measured presses."""
 
-TEST_SEED = 7919
-"""Seed of the test presses and of their noise, relative to the seed of the settings, so that they differ from those of
-a dataset."""
-
 MIN_TRAINING_PRESSES = 30
-"""Smallest number of measured presses that must remain for fitting after the test presses are held out."""
+"""Smallest number of presses that must remain for fitting after the test presses are held out."""
 
 SINGLE_PRESSES = 64
 """Number of different presses that are predicted in turn when predictions are timed."""
@@ -54,21 +47,19 @@ class Settings:
     """Settings of a report. The names of the attributes are keys of `report.json`.
 
     Attributes:
-        presses: Number of simulated test presses.
+        presses: Smallest number of simulated test presses. Fewer presses are repeated with other noise.
         seconds: Duration for which the predictions of a method are timed, s.
-        accuracy: Relative accuracy of the charges in the solves of the film.
         seed: Seed of all random numbers.
         quick: Whether the report is a trial run, whose results are not meaningful.
     """
 
     presses: int = 4096
     seconds: float = 0.1
-    accuracy: float = ACCURACY
     seed: int = 0
     quick: bool = False
 
 
-QUICK = Settings(presses=512, seconds=0.01, accuracy=1e-2, quick=True)
+QUICK = Settings(presses=512, seconds=0.01, quick=True)
 """Settings for a trial run, which takes less than a minute."""
 
 
@@ -107,9 +98,9 @@ class Section:
         fitted_presses: Number of presses to which the methods were fitted.
         test_presses: Number of test presses.
         limits: Cramér-Rao limits of the errors on the test presses, by the names of the errors. They are empty for
-            measured presses, because they need a simulation of exactly this film.
+            measured presses, whose noise is unknown, and without a charge map.
         methods: Records of the methods. The evaluated model is the first one.
-        left_out: Reasons why other methods could not be fitted to measured presses.
+        left_out: Reasons why other methods or the limit could not be computed.
     """
 
     sensor: str
@@ -131,28 +122,25 @@ class DatasetEvaluation:
     """Prepared evaluation of a model and of all other methods on one dataset.
 
     Attributes:
-        dataset: The dataset.
+        dataset: The presses of the dataset that the model covers.
         model_folder: Version folder of the evaluated model.
-        domain: Contacts that both the model and the dataset cover.
         presses: The presses to which the methods are fitted.
-        held_out_presses: The test presses of a measured dataset; None if the test presses are simulated.
-        probes: The probes of the dataset.
-        is_rotated: Whether presses of a probe have several orientations.
+        held_out_presses: The presses at other positions, on which the methods are tested.
         settings: Settings of the report.
     """
 
     dataset: Dataset
     model_folder: Path
-    domain: Domain
     presses: LabelledPresses
-    held_out_presses: LabelledPresses | None
-    probes: tuple[Probe, ...]
-    is_rotated: bool
+    held_out_presses: LabelledPresses
     settings: Settings
 
     @classmethod
     def prepare(cls, dataset: Dataset, model_folder: Path, settings: Settings) -> "DatasetEvaluation":
-        """Select the presses that the model covers, and hold out a part of measured presses for the test.
+        """Select the presses that the model covers, and hold out a part of them for the test.
+
+        Of simulated presses, a tenth of the positions is held out, which a training on the same dataset also holds out.
+        Of measured presses, which are fewer, a fifth is held out.
 
         Args:
             dataset: The dataset.
@@ -169,98 +157,72 @@ class DatasetEvaluation:
         """
         model = Predictor(model_folder).metadata
         _check_same_sensor(model, dataset)
-
-        trained_domain = model_domain(model)
-        domain = _common_domain(trained_domain, domain_of(dataset))
-        contact = LabelledPresses.of(dataset).contact
-        is_covered = trained_domain.contains(contact) & domain.contains(contact)
-        covered = replace(dataset, samples=dataset.samples[is_covered])
-        held_out_presses = None
+        samples = dataset.samples
+        min_force, max_force = model.force_range_N
+        is_covered = inside_polygon(samples.x_mm, samples.y_mm, np.array(model.working_area_mm))
+        is_covered &= (samples.force_N >= min_force) & (samples.force_N <= max_force)
+        if not is_covered.any():
+            raise DatasetError(
+                f"expected presses in the working area of the model {model.label} and of its forces, {min_force:g} to "
+                f"{max_force:g} N, got none among {len(samples)} presses; choose another model with --model"
+            )
+        # The ranges in the manifest are those of all presses. Those of the covered presses follow from the samples.
+        manifest = {name: entry for name, entry in dataset.manifest.items() if name != "ranges"}
+        covered = replace(dataset, samples=samples[is_covered], manifest=manifest)
         if is_measured(dataset):
-            check_enough(len(covered.samples), len(dataset.samples), dataset.sensor.name)
-            all_presses = LabelledPresses.of(covered)
-            is_held_out = held_out(all_presses.contact)
-            held_out_presses = all_presses[is_held_out]
-            remaining = replace(covered, samples=covered.samples[~is_held_out])
-            presses = presses_of(remaining, MIN_TRAINING_PRESSES)
+            check_enough(len(covered.samples), len(samples), dataset.sensor.name)
+            presses, held_out = split_by_position(presses_of(covered, MIN_TRAINING_PRESSES), 1.0 / HELD_PARTS)
         else:
-            presses = presses_of(covered)
-        probes, is_rotated = _read_probes(covered.samples)
-        return cls(
-            dataset=covered,
-            model_folder=model_folder,
-            domain=domain,
-            presses=presses,
-            held_out_presses=held_out_presses,
-            probes=probes,
-            is_rotated=is_rotated,
-            settings=settings,
-        )
+            presses, held_out = split_by_position(presses_of(covered), TrainingConfig().hold_out)
+        return cls(covered, model_folder, presses, held_out, settings)
 
     def measure(self) -> Section:
         """Fit all methods, and measure their errors and their speed."""
-        task = FittingTask(self.presses, self.domain, NOISE, seed=self.settings.seed)
-        limits: dict[str, float] = {}
-        if self.held_out_presses is None:
-            task, test_presses, limits = self._simulate(task)
-        else:
-            test_presses = self.held_out_presses
+        domain = domain_of(self.dataset)
+        seed = self.settings.seed
+        test = self.held_out_presses
+        if not test.measured:
+            test = test.repeated(self.settings.presses)
+            test = replace(test, charge=test.noisy(NOISE, seed))
 
-        fitted_methods, failure_reasons = fit_methods(task)
-        methods = [model_method(self.model_folder), *fitted_methods]
+        methods = [model_method(self.model_folder)]
+        limits: dict[str, float] = {}
+        failure_reasons = []
+        try:
+            train, validation = split_by_position(self.presses, TrainingConfig().hold_out)
+            charge_map = fit_charge_series(domain, self.dataset.sensor.electrode_names, train, validation)
+            task = FittingTask(self.presses, charge_map, NOISE)
+            methods += [build_method(task) for build_method in METHOD_BUILDERS]
+            # The limit follows from the derivatives of the series.
+            is_accurate = charge_map.charge_std < NOISE.gain
+            if not is_accurate:
+                failure_reasons.append(
+                    f"Cramér-Rao limit: a series that is fitted to {len(train)} presses has an error of "
+                    f"{100.0 * charge_map.charge_std:.2g} % of a charge, more than the noise; simulate more presses"
+                )
+            elif not test.measured:
+                cramer_rao = limits_at(charge_map, test.contact, NOISE)
+                limits = {
+                    "position_rms_mm": rounded(rms(cramer_rao.position)),
+                    "position_median_mm": rounded(np.median(cramer_rao.position)),
+                    "force_rms_percent": rounded(100.0 * rms(cramer_rao.force)),
+                }
+        except TrainingError as error:
+            failure_reasons.append(str(error))
         return Section(
             sensor=self.dataset.sensor.name,
-            measured=self.held_out_presses is not None,
-            probes=[probe.notation for probe in self.probes],
-            radius_mm=self.domain.radius,
-            force_N=self.domain.force_range,
-            noise=NOISE.name if self.held_out_presses is None else None,
+            measured=test.measured,
+            probes=[str(notation) for notation in np.unique(self.dataset.samples.probe)],
+            radius_mm=domain.radius,
+            force_N=domain.force_range,
+            noise=None if test.measured else NOISE.name,
             dataset_sha256=self.dataset.sha256,
             fitted_presses=len(self.presses),
-            test_presses=len(test_presses),
+            test_presses=len(test),
             limits=limits,
-            methods=measure_methods(methods, test_presses, self.settings.seconds),
+            methods=measure_methods(methods, test, self.settings.seconds),
             left_out=failure_reasons,
         )
-
-    def _simulate(self, task: FittingTask) -> tuple[FittingTask, LabelledPresses, dict[str, float]]:
-        """Simulate the charge map of the methods and the test presses, and compute the limits of the errors.
-
-        The test presses have the distribution of the dataset but another seed. The charge map and the limits are those
-        of the first probe.
-
-        Args:
-            task: Conditions of the fits without a charge map.
-
-        Returns:
-            The conditions with the charge map; the test presses with noise; and the Cramér-Rao limits of the errors, by
-            the names of the errors.
-        """
-        settings = self.settings
-        seed = settings.seed + TEST_SEED
-        sweep = Sweep(
-            radius=self.domain.radius,
-            force_range=self.domain.force_range,
-            samples=settings.presses - settings.presses % len(self.probes),  # the same number for each probe
-            seed=seed,
-            orientation="random" if self.is_rotated else "fixed",
-        )
-        forward_maps = solve_maps(self.dataset.sensor, self.probes, sweep, SolveSettings(accuracy=settings.accuracy))
-        presses = sweep.over(self.probes)
-        charge = np.empty((len(presses), self.presses.charge.shape[1]))
-        for probe_index, forward_map in enumerate(forward_maps):
-            rows = np.flatnonzero(presses.probe == probe_index)
-            charge[rows] = forward_map.charges(presses.contact[rows], presses.rotation[rows])
-        noisy_charge = NOISE.add(charge, np.random.default_rng(seed))
-
-        charge_map = ChargeSpline.of(forward_maps[0])
-        cramer_rao = limits_at(charge_map, presses.contact, NOISE)
-        limits = {
-            "position_rms_mm": rounded(rms(cramer_rao.position)),
-            "position_median_mm": rounded(np.median(cramer_rao.position)),
-            "force_rms_percent": rounded(100.0 * rms(cramer_rao.force)),
-        }
-        return replace(task, charge_map=charge_map), LabelledPresses(presses.contact, noisy_charge), limits
 
 
 def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
@@ -289,47 +251,6 @@ def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
             f"{', '.join(names)}, got a model with another {', '.join(differences)}; choose a model of this sensor "
             "with --model, or train one"
         )
-
-
-def _common_domain(first: Domain, second: Domain) -> Domain:
-    """Return the contacts that two domains have in common: the smaller disk, and the common range of forces.
-
-    Raises:
-        DatasetError: If the ranges of forces have no common force.
-    """
-    min_force, max_force = np.clip(second.force_range, *first.force_range).tolist()
-    if min_force >= max_force and second.force_range[0] < second.force_range[1]:
-        raise DatasetError(
-            f"expected presses with the forces of the model, {first.force_range[0]:g} to {first.force_range[1]:g} N, "
-            f"got {second.force_range[0]:g} to {second.force_range[1]:g} N"
-        )
-    return Domain(min(first.radius, second.radius), (min_force, max_force))
-
-
-def _read_probes(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
-    """Return the probes of a dataset, and whether the presses of any probe have several orientations.
-
-    If all presses of a probe have the same angle, the probe is returned with this rotation.
-
-    Args:
-        samples: The presses of the dataset, each with the notation of its probe and its orientation.
-
-    Raises:
-        DatasetError: If the notation of a probe is not valid.
-    """
-    probes = []
-    is_rotated = False
-    for notation in np.unique(samples.probe):
-        try:
-            probe = parse_probe(str(notation))
-        except ValueError as error:
-            raise DatasetError(f"the probe {str(notation)!r} of the dataset: {error}") from error
-        angles_deg = np.unique(samples.orientation_deg[samples.probe == notation])
-        if len(angles_deg) == 1:
-            probe = probe.rotated(float(np.deg2rad(angles_deg[0])))
-        is_rotated |= len(angles_deg) > 1
-        probes.append(probe)
-    return tuple(probes), is_rotated
 
 
 def measure_methods(methods: Sequence[Method], presses: LabelledPresses, seconds: float) -> list[MethodRecord]:

@@ -11,16 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.model.predictor import Predictor
-from isocharge.simulate import ChargeMap, Domain, NoiseModel, Triangulation
+from isocharge.simulate import ChargeMap, NoiseModel, Triangulation
 from isocharge.simulate.identifiability.nearest_contact import search
-from isocharge.train.data.charge_fit import fit_charge_series
-from isocharge.train.data.presses import LabelledPresses, split_by_position
-
-VALIDATION_FRACTION = 0.1
-"""Fraction of the positions whose presses are used to choose the degree of a charge series."""
+from isocharge.train.data.presses import LabelledPresses
 
 N_CANDIDATES = 512
 """Number of contacts among which least squares chooses the starting points of its descents."""
@@ -32,18 +27,14 @@ class FittingTask:
 
     Attributes:
         presses: Presses of the dataset. Simulated presses have no noise.
-        domain: Contacts that can occur. Their positions are uniformly distributed over a disk, and their forces are
-            log-uniform.
+        charge_map: Map from contacts to charges that is fitted to the presses. Its domain contains the contacts that
+            can occur.
         noise: Noise of the charges when the method is used.
-        charge_map: Simulated map from contacts to charges; None if the presses were measured.
-        seed: Seed of random choices.
     """
 
     presses: LabelledPresses
-    domain: Domain
+    charge_map: ChargeMap
     noise: NoiseModel
-    charge_map: ChargeMap | None = None
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -75,14 +66,8 @@ class Method:
         return self.single_call(charge)
 
 
-def triangulation(task: FittingTask) -> Method | None:
-    """Return the triangulation of the paper, which intersects the contours of the charges.
-
-    Args:
-        task: Conditions. Without a charge map, there are no contours, and None is returned.
-    """
-    if task.charge_map is None:
-        return None
+def triangulation(task: FittingTask) -> Method:
+    """Return the triangulation of the paper, which intersects the contours of the charges."""
     contours = Triangulation(task.charge_map)
     return Method("triangulation", "NumPy", lambda charge: contours.locate(charge).contact)
 
@@ -91,57 +76,18 @@ def least_squares(task: FittingTask) -> Method:
     """Return the search for the contact with the smallest squared residuals of the charges.
 
     The residuals are divided by the standard deviation of the noise. The contact is restricted to the domain.
-
-    Args:
-        task: Presses and conditions. Without a charge map, a series is fitted to the presses.
-
-    Raises:
-        TrainingError: If there are too few presses.
     """
-    charge_map = task.charge_map
-    if charge_map is None:
-        train, validation = split_by_position(task.presses, VALIDATION_FRACTION, task.seed)
-        names = tuple(map(str, range(train.charge.shape[1])))
-        charge_map = fit_charge_series(task.domain, names, train, validation)
 
     def estimate(charge: Array) -> Array:
         """Estimate contacts (x, y, F), shape (n, 3), mm and N."""
-        contact, _ = search(charge_map, charge, task.noise.sigma(charge), candidates=N_CANDIDATES)
+        contact, _ = search(task.charge_map, charge, task.noise.sigma(charge), candidates=N_CANDIDATES)
         return contact
 
     return Method("least squares, Gauss-Newton", "NumPy", estimate)
 
 
-METHOD_BUILDERS: tuple[Callable[[FittingTask], Method | None], ...] = (triangulation, least_squares)
-"""Functions that fit the methods of all reports. A function returns None if its method needs a missing charge map."""
-
-
-def fit_methods(task: FittingTask) -> tuple[list[Method], list[str]]:
-    """Fit all methods of `METHOD_BUILDERS`.
-
-    Args:
-        task: Presses and conditions of the fits.
-
-    Returns:
-        The fitted methods; and the reasons why other methods could not be fitted to measured presses.
-
-    Raises:
-        DatasetError: If a method cannot be fitted to simulated presses.
-        TrainingError: If there are too few simulated presses for a method.
-    """
-    methods = []
-    failure_reasons = []
-    for build_method in METHOD_BUILDERS:
-        try:
-            method = build_method(task)
-        except (DatasetError, TrainingError) as error:
-            if not task.presses.measured:
-                raise
-            failure_reasons.append(f"{build_method.__name__}: {error}")
-            continue
-        if method is not None:
-            methods.append(method)
-    return methods, failure_reasons
+METHOD_BUILDERS: tuple[Callable[[FittingTask], Method], ...] = (triangulation, least_squares)
+"""Functions that fit the methods of all reports. A function raises TrainingError if there are too few presses."""
 
 
 def model_method(folder: Path) -> Method:

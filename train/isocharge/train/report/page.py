@@ -1,13 +1,27 @@
-"""Page of a report in Markdown, and its picture of the error against the time of one prediction."""
+"""Folder of a report: its page in Markdown, its JSON record, and its picture of the errors and durations."""
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from isocharge.simulate.plots.figure import FELT, INK, new_figure
-from isocharge.train.report.evaluation import MethodRecord, Section, Settings
+from isocharge.common.files import new_folder, refuse_existing, write_whole
+from isocharge.common.progress import track
+from isocharge.serve.benchmark import machine
+from isocharge.simulate import Dataset
+from isocharge.simulate.plots.figure import FELT, INK, new_figure, save_picture
+from isocharge.train.report.evaluation import DatasetEvaluation, MethodRecord, Section, Settings
+from isocharge.train.training.fit import threads_and_seed
+
+RECORDED_PACKAGES = ("isocharge", "numpy", "scipy", "onnxruntime")
+"""Packages whose versions are recorded with the results."""
+
+FORMAT_VERSION = 3
+"""Version of the format of `report.json`."""
 
 PICTURE = "speed.png"
 """Name of the file of the picture."""
@@ -73,15 +87,15 @@ def _conditions(section: Section) -> str:
     )
     if section.measured:
         return (
-            f"{area} The presses were measured. Least squares uses a series that is fitted to {section.fitted_presses} "
-            f"presses, and all errors are measured on {section.test_presses} other presses. No noise is added. The "
-            "errors contain the uncertainty of the positions and forces that the test rig reports. The Cramér-Rao "
-            "limit and triangulation are left out, because they need a simulation of exactly this film."
+            f"{area} The presses were measured. Triangulation and least squares use a series that is fitted to "
+            f"{section.fitted_presses} presses, and all errors are measured on {section.test_presses} other presses. "
+            "No noise is added. The errors contain the uncertainty of the positions and forces that the test rig "
+            "reports. The Cramér-Rao limit is left out, because the noise is unknown."
         )
     return (
-        f"{area} The positions of the {section.test_presses} simulated test presses are uniform over the disk, and "
-        f"their forces are log-uniform. The noise is `{section.noise}`. Triangulation and least squares use the "
-        "simulated charge map of the first probe."
+        f"{area} The {section.test_presses} test presses are at positions of the dataset that are held out, with the "
+        f"noise `{section.noise}`. Triangulation and least squares use a series that is fitted to the other "
+        f"{section.fitted_presses} presses."
     )
 
 
@@ -158,3 +172,51 @@ def _draw_panel(axes: Axes, section: Section) -> None:
     axes.xaxis.set_major_formatter("{x:,g}")
     axes.grid(alpha=0.25)
     axes.legend(fontsize=8)
+
+
+def write_report(
+    folder: Path,
+    subjects: Sequence[tuple[Dataset, Path]],
+    settings: Settings | None = None,
+    *,
+    command: str = "",
+) -> dict[str, Any]:
+    """Measure every method on every dataset, and write `report.md`, `report.json` and the picture.
+
+    All methods are tested on presses at positions that are held out.
+
+    Args:
+        folder: Folder to write; it must not exist.
+        subjects: Datasets, each with the version folder of the model that is evaluated on it.
+        settings: Settings of the report; None for the settings of a full report.
+        command: Command that repeats the report, for the page; empty if there is none.
+
+    Returns:
+        The content of `report.json`.
+
+    Raises:
+        OutputExists: If the folder exists.
+        DatasetError: If the methods cannot be fitted to a dataset.
+        ModelError: If a model is for another sensor than its dataset.
+        PressError: If there are too few measured presses.
+    """
+    refuse_existing(folder)
+    settings = settings or Settings()
+    evaluations = [DatasetEvaluation.prepare(dataset, model_folder, settings) for dataset, model_folder in subjects]
+    with threads_and_seed(1, settings.seed):  # all methods are timed with one thread
+        sections = [evaluation.measure() for evaluation in track(evaluations, "datasets")]
+
+    this_machine = machine(RECORDED_PACKAGES)
+    record = {
+        "format_version": FORMAT_VERSION,
+        "command": command,
+        "machine": this_machine,
+        "settings": asdict(settings),
+        "datasets": [asdict(section) for section in sections],
+    }
+    page = report_page(sections, settings, this_machine, command)
+    with new_folder(folder) as draft:
+        save_picture(draw_speed(sections), draft / PICTURE)
+        write_whole(draft / "report.md", page.encode())
+        write_whole(draft / "report.json", (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
+    return record

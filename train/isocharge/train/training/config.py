@@ -116,7 +116,7 @@ class TrainingConfig(Settings, frozen=True):
         learning_rate: Largest learning rate of the optimiser SOAP.
         hold_out: Fraction of the positions that are used for testing.
         noise: Noise that is drawn again in every step, as a `NoiseModel` or as a name that `noise_model` accepts.
-        seed: Seed of the initial weights, the batches, the noise and the split of the presses.
+        seed: Seed of the initial weights, the batches and the noise.
         threads: Number of CPU threads. For networks of these sizes, one thread is nearly as fast as two threads, and
             programs on the second core do not delay it.
     """

@@ -34,7 +34,7 @@ from isocharge.train.data.presses import (
     LabelledPresses,
     check_known_columns,
     complete,
-    folds_by_place,
+    position_ranks,
     presses_sha256,
 )
 from isocharge.train.training.config import MANY_ELECTRODE_SIZES, FitConfig, TrainingConfig
@@ -112,7 +112,7 @@ def fit_presses(
             InverseNetwork(domain, features, settings.network, force_std) for _ in range(1 + HELD_PARTS)
         )
         # For the cross-validation, train a network for each fold on the presses of all other folds.
-        fold_of_press = folds_by_place(labelled.contact, HELD_PARTS)
+        fold_of_press = (HELD_PARTS * position_ranks(labelled.contact)).astype(int)
         for fold_index, network_of_fold in enumerate(fold_networks):
             fold_config = structs.replace(training, seed=training.seed + fold_index)
             train_presses = labelled[fold_of_press != fold_index]

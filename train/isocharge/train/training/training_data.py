@@ -203,13 +203,13 @@ class Split:
         # Fit the field, and determine the domain without folds.
         presses = data.presses
         electrode_names = data.sensor.electrode_names
-        field_train, field_validation = split_by_position(presses, training.hold_out, training.seed)
+        field_train, field_validation = split_by_position(presses, training.hold_out)
         whole_field = data.field or fit_charge_series(data.domain, electrode_names, field_train, field_validation)
         domain, cautions = invertible_domain(whole_field, presses, misfit_noise(training.noise_model))
         is_folded = domain != data.domain  # `invertible_domain` reduces the domain only if the map folds
         used_presses = presses.within(domain.radius) if is_folded else presses
 
-        train, test = split_by_position(used_presses, training.hold_out, training.seed)
+        train, test = split_by_position(used_presses, training.hold_out)
         field = within(whole_field, domain.radius) if is_folded else whole_field
         folded_charges = replace(whole_field, is_folded=True) if is_folded else None
         return cls(domain, train, test, field, cautions, folded_charges)
