@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from isocharge.serve.model.predictor import Predictor
     from isocharge.serve.model.validity import Validity
     from isocharge.serve.network.http.application import asgi_app
-    from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
+    from isocharge.serve.port.recording import Recorder, Recording
     from isocharge.serve.port.source import Chunk, Port, open_source
     from isocharge.serve.prediction.press_check import PressCheck, check_presses
     from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
@@ -63,7 +63,6 @@ __all__ = [
     "PressCheck",
     "PressWatch",
     "ReadingStream",
-    "RecordedClock",
     "Recorder",
     "Recording",
     "Script",

@@ -22,7 +22,6 @@ def context(**changes):
     [
         ("json", "json"),
         ("csv", "csv"),
-        ("none", "none"),
         ("a/touch.jsonl", "FILE.jsonl"),
         ("touch.csv", "FILE.csv"),
         ("touch.mcap", "FILE.mcap"),
@@ -39,7 +38,7 @@ def test_form_of_a_target_chooses_the_output(target, form):
     "target", ["touch.txt", "", "tcp://127.0.0.1:9", "JSON", "touch", "mqtt://h/x.csv", "s3://h/x.ros2.mcap"]
 )
 def test_target_of_no_form_is_refused_with_the_known_forms(target):
-    with pytest.raises(InputError, match=r"expected one of the forms json, csv, none, FILE\.jsonl"):
+    with pytest.raises(InputError, match=r"expected one of the forms json, csv, FILE\.jsonl"):
         Outputs([target], context())
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from isocharge.common.errors import OutputError, OutputExists, RecordingError
 from isocharge.serve import Chunk, Recorder, Recording
-from isocharge.serve.port.recording import Event, Marker, NewModel
+from isocharge.serve.port.recording import Event, Marker
 
 CHUNKS = [
     Chunk(bytes([number, 255 - number]), 1e9 + 0.1 * number, 1000 * number, outage_s=1.5 if number == 3 else 0.0)
@@ -33,7 +33,7 @@ def test_unfinished_line_is_ignored(recorded, cut):
     recorded.write_bytes(recorded.read_bytes()[:-cut])
     *events, last_event = Recording(recorded).events()
     assert events == complete_events[:-1]
-    assert last_event == (CHUNKS[-1], complete_events[-1].latencies_us[:-1])
+    assert last_event == Event(chunk=CHUNKS[-1], latencies_us=complete_events[-1].latencies_us[:-1])
 
 
 def test_recorder_does_not_overwrite_a_file(tmp_path):
@@ -113,11 +113,11 @@ def test_recording_of_another_version_is_refused(tmp_path):
         '{"timestamp": 1.0, "latency_us": "soon"}',
         '{"timestamp": 1, "latency_us": 1e300}',
         '{"chunk": [1.0, 2]}',
-        '{"chunk": [1.0, 2, 0.0, "no base64!"]}',
-        '{"chunk": [1e300, 5, 0.0, "YWJj"]}',
-        '{"chunk": [1e9, 11111111111111111111111, 0.0, "YWJj"]}',
-        '{"chunk": [1e9, 5, -1.0, "YWJj"]}',
-        '{"chunk": [1e9, 5, 0.0, "' + "A" * 3_000_000 + '"]}',
+        '{"chunk": ["no base64!", 1.0, 2, 0.0]}',
+        '{"chunk": ["YWJj", 1e300, 5, 0.0]}',
+        '{"chunk": ["YWJj", 1e9, 11111111111111111111111, 0.0]}',
+        '{"chunk": ["YWJj", 1e9, 5, -1.0]}',
+        '{"chunk": ["' + "A" * 3_000_000 + '", 1e9, 5, 0.0]}',
     ],
 )
 def test_error_message_contains_the_number_of_a_damaged_line(recorded, line):
@@ -139,10 +139,10 @@ def test_events_and_records_are_read_in_their_order(tmp_path):
     recording = Recording(path)
     assert recording.name == "left"
     assert list(recording.events()) == [
-        Event(CHUNKS[0], (7.0,)),
-        Marker(1e9, "now"),
-        NewModel("m/2"),
-        Event(None),
-        Event(CHUNKS[3]),
+        Event(chunk=CHUNKS[0], latencies_us=[7.0]),
+        Event(marker=Marker(1e9, "now")),
+        Event(use="m/2"),
+        Event(tare=True),
+        Event(chunk=CHUNKS[3]),
     ]
     assert list(recording.records(dict)) == [{"timestamp": 5.0, "latency_us": 7.0, "x_mm": 2.5}]

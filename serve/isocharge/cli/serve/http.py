@@ -28,7 +28,7 @@ from isocharge.serve.network.http import Application, HttpServer
 from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import ModelStore, open_model_store
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.outputs.queued_output import WriterQueue
+from isocharge.serve.outputs.writer_queue import WriterQueue
 
 
 def http_command(

@@ -41,7 +41,6 @@ from isocharge.common.printable_text import is_printable
 from isocharge.serve import (
     PredictionRecord,
     Predictor,
-    RecordedClock,
     Recorder,
     Recording,
     TouchStream,
@@ -352,10 +351,9 @@ def replay_command(
 
     # The function `play` yields the records. If the model was changed during the recording, `play` changes the model,
     # too, unless the user has chosen one model for the whole recording.
-    clock = RecordedClock()
-    touch = TouchStream(predictor, board, now_ns=clock, frame_id=recording.name or None)
+    touch = TouchStream(predictor, board, frame_id=recording.name or None)
     load = None if model else partial(_load_labelled, models=models)
-    play = partial(replay, recording, touch, clock, real_time=real_time, load=load)
+    play = partial(replay, recording, touch, real_time=real_time, load=load)
 
     latencies: deque[float] = deque(maxlen=LATENCIES)
     outputs = command_outputs(output, touch, is_live=False)

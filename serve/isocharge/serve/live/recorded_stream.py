@@ -11,12 +11,13 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from itertools import islice
+
+from msgspec import structs
 
 from isocharge.common.errors import IsochargeError
 from isocharge.serve.live.stream import TouchStream
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.port.recording import Event, Marker, NewModel, RecordedClock, Recorder, Recording
+from isocharge.serve.port.recording import Marker, Recorder, Recording
 from isocharge.serve.port.source import Chunk
 from isocharge.serve.record.record import PredictionRecord
 
@@ -217,7 +218,6 @@ class RecordedStream:
 def replay(
     recording: Recording,
     stream: TouchStream,
-    clock: RecordedClock,
     *,
     real_time: bool = False,
     load: Callable[[str], Predictor] | None = None,
@@ -230,9 +230,7 @@ def replay(
 
     Args:
         recording: Recording whose chunks are processed.
-        stream: New stream with the model and the device of the recorded stream. Its argument `now_ns` must
-            be `clock`.
-        clock: Clock that the replay sets to the times of the recording, so that the records have the recorded latency.
+        stream: New stream with the model and the device of the recorded stream.
         real_time: Whether to wait before each chunk, so that the replay takes as long as the recording.
         load: Function that loads the model with a given label. It is called when the recorded stream has changed its
             model. If `load` is None, all records are computed with the first model.
@@ -246,27 +244,23 @@ def replay(
     previous_chunk: Chunk | None = None
     due_s = 0.0  # monotonic time at which the replay of the next chunk begins
     for event in recording.events():
-        match event:
-            case Marker():
-                on_marker(event)
-            case NewModel(label=label):
-                if load is not None:
-                    stream.use(load(label))
-            case Event(chunk=None):  # a new tare was requested
-                clock.set(event)
-                stream.tare()
-            case Event(chunk=Chunk() as chunk, latencies_us=latencies_us):
-                clock.set(event)
-                if previous_chunk is None:
-                    due_s = time.monotonic()
-                else:
-                    due_s += chunk.elapsed_since(previous_chunk)
-                previous_chunk = chunk
-                if real_time:
-                    wait_s = max(0.0, due_s - time.monotonic())
-                    time.sleep(min(wait_s, threading.TIMEOUT_MAX))
-                records = stream.feed(chunk)
-                yield from islice(records, len(latencies_us))  # there is one latency for each recorded record
-                # If the recording program ended within the chunk, its last records were not recorded. The stream
-                # processes the whole chunk all the same.
-                deque(records, maxlen=0)
+        chunk = event.chunk
+        if event.marker is not None:
+            on_marker(event.marker)
+        elif event.use is not None:
+            if load is not None:
+                stream.use(load(event.use))
+        elif chunk is None:
+            stream.tare()
+        else:
+            due_s = due_s + chunk.elapsed_since(previous_chunk) if previous_chunk else time.monotonic()
+            previous_chunk = chunk
+            if real_time:
+                wait_s = max(0.0, due_s - time.monotonic())
+                time.sleep(min(wait_s, threading.TIMEOUT_MAX))
+            records = stream.feed(chunk)
+            for latency_us, record in zip(event.latencies_us, records, strict=False):
+                yield structs.replace(record, latency_us=latency_us)
+            # If the recording program ended within the chunk, its last records were not recorded. The stream processes
+            # the whole chunk all the same.
+            deque(records, maxlen=0)

@@ -7,7 +7,7 @@ on a model of the film, unless warming is estimated.
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from isocharge.common.arrays import Array
@@ -211,7 +211,6 @@ class TouchStream(ReadingStream):
         predictor: Predictor,
         device: Device = ANY_BOARD,
         *,
-        now_ns: Callable[[], int] = time.perf_counter_ns,
         frame_id: str | None = None,
     ) -> None:
         """Create the stages that compute the charges and the contact.
@@ -219,8 +218,6 @@ class TouchStream(ReadingStream):
         Args:
             predictor: Model with which the contacts are predicted.
             device: Settings of the board.
-            now_ns: Function that returns the present time, ns, on the clock of `Chunk.clock_ns`. It is used to measure
-                the latency of each record.
             frame_id: Name of the film, which each record contains. By default, the name in the metadata of the model is
                 used.
 
@@ -231,7 +228,6 @@ class TouchStream(ReadingStream):
         """
         metadata = predictor.metadata
         super().__init__(metadata.electrodes, device, reader=f"model {metadata.label}", predictor=predictor)
-        self._now_ns = now_ns
         self._given_name = frame_id
         self._set_model(predictor)
 
@@ -334,7 +330,7 @@ class TouchStream(ReadingStream):
             charge_raw_pC=charge_raw_pC,
             tare_pC=tare_pC,
             flags=flags if len(flags) < 2 else in_order(flags),
-            latency_us=(self._now_ns() - chunk.clock_ns) / 1e3,  # includes the time that the stages have taken
+            latency_us=(time.perf_counter_ns() - chunk.clock_ns) / 1e3,  # includes the time that the stages have taken
             model=self._label,
             frame_id=self.frame_id,
             tracking=frame.tracking,

@@ -135,7 +135,6 @@ class OutputKind:
         may_block: Whether `write` may wait. In a live stream, such an output has its own thread and queue.
         is_standard_output: Whether the output writes to standard output. Only one output of a command may write to
             standard output. The stream ends when standard output is closed.
-        writes_nothing: Whether the output drops all records, so that it cannot miss any.
     """
 
     form: str
@@ -143,4 +142,3 @@ class OutputKind:
     open: Callable[[str, OutputContext], Output]
     may_block: bool = True
     is_standard_output: bool = False
-    writes_nothing: bool = False

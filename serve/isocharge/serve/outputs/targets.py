@@ -1,7 +1,7 @@
 """Available kinds of outputs, and the class that writes records to all outputs of a command."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -9,8 +9,8 @@ from typing import Any, Self
 
 from isocharge.common.errors import InputError, shown
 from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, discard, is_file_with, output_error
-from isocharge.serve.outputs.queued_output import QueuedOutput
-from isocharge.serve.outputs.text_outputs import CSV_FILE, JSON_FILE, NO_OUTPUT, STDOUT_CSV, STDOUT_JSON, UDP
+from isocharge.serve.outputs.text_outputs import CSV_FILE, JSON_FILE, STDOUT_CSV, STDOUT_JSON, UDP
+from isocharge.serve.outputs.writer_queue import WriterQueue
 from isocharge.serve.record.record import PredictionRecord
 
 ROS2_SUFFIX = ".ros2.mcap"
@@ -30,7 +30,6 @@ MCAP_FILE = OutputKind(form="FILE.mcap", accepts=is_file_with(".mcap"), open=_op
 OUTPUT_KINDS: tuple[OutputKind, ...] = (
     STDOUT_JSON,
     STDOUT_CSV,
-    NO_OUTPUT,
     JSON_FILE,
     CSV_FILE,
     ROS2_MCAP_FILE,
@@ -38,6 +37,9 @@ OUTPUT_KINDS: tuple[OutputKind, ...] = (
     UDP,
 )
 """Kinds of outputs of this package. If several kinds accept a target, the first of them is used."""
+
+NO_OUTPUT = "none"
+"""Target that receives no records."""
 
 ENTRY_POINTS = "isocharge.outputs"
 """Group of the entry points through which other packages add kinds of outputs."""
@@ -47,7 +49,7 @@ log = logging.getLogger(__name__)
 
 def target_forms() -> str:
     """Return the forms of all targets that this package accepts, as one text, separated by commas."""
-    return ", ".join(kind.form for kind in OUTPUT_KINDS)
+    return ", ".join([*(kind.form for kind in OUTPUT_KINDS), NO_OUTPUT])
 
 
 def output_kind(target: str) -> OutputKind:
@@ -102,21 +104,19 @@ class Outputs:
             InputError: If no kind of output accepts a target, two targets are equal, or two targets write to standard
                 output.
         """
-        kinds = {target: output_kind(target) for target in targets}
-        stdout_targets = [target for target in targets if kinds[target].is_standard_output]
-        other_targets = [target for target in targets if not kinds[target].is_standard_output]
+        if len(set(targets)) < len(targets):
+            raise InputError(f"outputs {shown(list(targets))}: expected targets that differ; remove one of them")
+        kinds = {target: output_kind(target) for target in targets if target != NO_OUTPUT}
+        stdout_targets = [target for target, kind in kinds.items() if kind.is_standard_output]
         if len(stdout_targets) > 1:
             raise InputError(
                 f"outputs {shown(stdout_targets)}: expected at most one on standard output; remove one of them"
             )
-        has_equal_targets = len(set(targets)) < len(targets)
-        if has_equal_targets:
-            raise InputError(f"outputs {shown(list(targets))}: expected targets that differ; remove one of them")
         # Standard output is written last: if the program that reads it has ended, the write raises an error, but all
         # other outputs have received the record before.
-        self._kinds = {target: kinds[target] for target in other_targets + stdout_targets}
+        self._kinds = dict(sorted(kinds.items(), key=lambda item: item[1].is_standard_output))
         self._context = context
-        self._outputs: dict[str, Output] = {}
+        self._writers: dict[str, Callable[[PredictionRecord], object]] = {}
         self._stack = ExitStack()  # closes or discards all outputs, the latest first
         self._is_discarded = False
         self.not_written: dict[str, int | None] = {}
@@ -136,25 +136,15 @@ class Outputs:
                 if isinstance(error, Exception):
                     raise output_error(error, target)  # noqa: B904  # the cause is set
                 raise
-            # A live stream must not wait for a slow consumer, so its records are written by another thread.
+            queue: WriterQueue[PredictionRecord] | None = None
+            # A live stream must not wait for a slow consumer, so its records are written by another thread. Only
+            # standard output can report that its reader is slow.
             if self._context.is_live and kind.may_block:
-                output = self._queued(output, target, kind)
-            self._outputs[target] = output
-            self._stack.callback(self._close_or_discard, target, output)
+                is_ready = self._context.stdout_is_ready if kind.is_standard_output else lambda: True
+                queue = WriterQueue(output.write, is_ready)
+            self._writers[target] = output.write if queue is None else queue.put
+            self._stack.callback(self._close_or_discard, target, output, queue)
         return self
-
-    def _queued(self, output: Output, target: str, kind: OutputKind) -> QueuedOutput:
-        """Return an output that passes its records to an open output in a separate thread.
-
-        Args:
-            output: The open output.
-            target: Target of the open output, for messages.
-            kind: Kind of the open output. It decides two things: only standard output can report that its reader is
-                slow, and only an error of standard output ends the stream.
-        """
-        if kind.is_standard_output:
-            return QueuedOutput(output, target, is_ready=self._context.stdout_is_ready, ends_stream=True)
-        return QueuedOutput(output, target)
 
     def __exit__(self, error: type[BaseException] | None, *_: Any) -> None:
         """Close the outputs.
@@ -179,12 +169,27 @@ class Outputs:
         Raises:
             Exception: In a replay, the error of any output. In a live stream, only an error of standard output.
         """
-        target = ""
-        try:
-            for target, output in self._outputs.items():  # noqa: B007  # the error states the target
-                output.write(record)
-        except Exception as error:
-            raise output_error(error, target)  # noqa: B904  # the cause is set
+        for target, write in self._writers.items():
+            try:
+                write(record)
+            except Exception as error:
+                self._handle_error(target, error)
+
+    def _handle_error(self, target: str, error: Exception) -> None:
+        """Raise the error of an output, or continue a live stream without this output, unless it is standard output.
+
+        The first error of an output is written to the log, and its later errors are ignored.
+
+        Raises:
+            Exception: The error, with its cause and the target.
+        """
+        reason = output_error(error, target)
+        if not self._context.is_live or self._kinds[target].is_standard_output:
+            raise reason
+        if target in self._writers:
+            log.error("%s: stopped (%s); the records after that are missing", target, reason)
+        self._writers = {other: write for other, write in self._writers.items() if other != target}
+        self.not_written[target] = None  # the number is unknown
 
     def close(self) -> None:
         """Close all open outputs, and store in `not_written` how many records each output has not received.
@@ -194,8 +199,8 @@ class Outputs:
         """
         self._stack.close()
 
-    def _close_or_discard(self, target: str, output: Output) -> None:
-        """Close an output, or discard it if a replay was stopped, because it has not received all records.
+    def _close_or_discard(self, target: str, output: Output, queue: WriterQueue[PredictionRecord] | None) -> None:
+        """Close an output, or discard it if a replay was stopped or the output has failed, because it is incomplete.
 
         An error while an output is discarded is written to the log, because the error that has ended the command is
         more important.
@@ -203,24 +208,31 @@ class Outputs:
         Raises:
             Exception: The error of the output, if it cannot be closed.
         """
-        if self._is_discarded:
-            try:
-                discard(output)
-            except Exception as error:
-                log.error("%s", output_error(error, target))
-            if not self._kinds[target].writes_nothing:
-                self.not_written[target] = None  # the number of missing records is unknown
-            return
         try:
-            output.close()
+            if queue is not None:
+                self._close_queue(target, queue)
+                if queue.is_stuck:  # the thread is still in `write` of the output, which therefore cannot be closed
+                    return
+            if self._is_discarded or target not in self._writers:
+                discard(output)
+            else:
+                output.close()
         except KeyboardInterrupt:  # in a replay, the file is then removed
             self.not_written[target] = None
             raise
         except Exception as error:
-            raise output_error(error, target)  # noqa: B904  # the cause is set
-        finally:
-            # Only a queue can lose records without raising an error.
-            if isinstance(output, QueuedOutput) and output.has_failed:
-                self.not_written[target] = None  # the number is unknown, because the output has stopped
-            elif isinstance(output, QueuedOutput) and output.lost > 0:
-                self.not_written[target] = output.lost
+            if self._is_discarded:
+                log.error("%s", output_error(error, target))
+            else:
+                self._handle_error(target, error)
+        if self._is_discarded:
+            self.not_written[target] = None  # the number of missing records is unknown
+
+    def _close_queue(self, target: str, queue: WriterQueue[PredictionRecord]) -> None:
+        """Write the records that wait in the queue of an output, and count those that its consumer does not accept."""
+        try:
+            queue.close()
+        except Exception as error:
+            self._handle_error(target, error)
+        if queue.lost > 0:
+            self.not_written.setdefault(target, queue.lost)

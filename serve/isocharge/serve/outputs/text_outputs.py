@@ -94,16 +94,6 @@ class TextFile(FileOutput):
             self._file.write(text.encode())
 
 
-class NoOutput:
-    """Output that ignores all records."""
-
-    def write(self, record: PredictionRecord) -> None:
-        """Ignore a record."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
 def _open_stdout(lines: Callable[[OutputContext], LineFormat], _: str, context: OutputContext) -> Output:
     return StandardOutput(context.write_stdout, lines(context))
 
@@ -112,17 +102,12 @@ def _open_file(lines: Callable[[OutputContext], LineFormat], target: str, contex
     return TextFile(Path(target), lines(context), is_live=context.is_live)
 
 
-def _open_nothing(_: str, __: OutputContext) -> Output:
-    return NoOutput()
-
-
 STDOUT_JSON = OutputKind(
     form="json", accepts="json".__eq__, open=partial(_open_stdout, json_lines), is_standard_output=True
 )
 STDOUT_CSV = OutputKind(
     form="csv", accepts="csv".__eq__, open=partial(_open_stdout, csv_lines), is_standard_output=True
 )
-NO_OUTPUT = OutputKind(form="none", accepts="none".__eq__, open=_open_nothing, may_block=False, writes_nothing=True)
 JSON_FILE = OutputKind(form="FILE.jsonl", accepts=is_file_with(".jsonl"), open=partial(_open_file, json_lines))
 CSV_FILE = OutputKind(form="FILE.csv", accepts=is_file_with(".csv"), open=partial(_open_file, csv_lines))
 

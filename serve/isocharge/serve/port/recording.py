@@ -4,7 +4,7 @@ The bytes are stored in chunks. A chunk consists of the bytes that arrived toget
 object:
 
     {"isocharge_recording": 1, "model": "three/1", "device": {...}, "name": "left"}
-    {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
+    {"chunk": ["base64 of the bytes", timestamp, clock_ns, outage_s]}
     {"timestamp": ..., ...}                       a record of that chunk
     {"tare": true}                                a request for a new tare
     {"use": "three/2"}                            the model of all records after this line
@@ -15,15 +15,14 @@ same model, the records of the replay are bitwise equal to the recorded records.
 full disk or a power failure may leave an incomplete last line, which the reader of the file ignores.
 """
 
-import base64
 import json
 import logging
-from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self, TypeVar
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
+from msgspec.json import encode
 
 from isocharge.common.errors import RecordingError, cut
 from isocharge.common.files import AtomicWriter, bounded_lines
@@ -32,7 +31,7 @@ from isocharge.common.progress import report
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.model.model_search import ModelLabel
 from isocharge.serve.port.foreign_files import HEAD_BYTES, RECORDING_START, foreign_kind
-from isocharge.serve.port.source import Chunk
+from isocharge.serve.port.source import Chunk, Moment
 
 VERSION = 1
 """Version of the format of the file."""
@@ -47,8 +46,6 @@ PROGRESS_LINES = 1000
 """Number of lines between two reports of the progress of reading."""
 
 Latency = Annotated[float, Meta(ge=-1e12, le=1e12, description="a latency of some days at most, us")]
-Moment = Annotated[float, Meta(ge=-1e11, le=1e11, description="a time before the year 5138, unix seconds")]
-Nanoseconds = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 
 log = logging.getLogger(__name__)
 
@@ -64,8 +61,8 @@ class Marker(NamedTuple):
         text: Note of the user. It may be empty.
     """
 
-    timestamp: float
-    text: str
+    timestamp: Moment
+    text: Annotated[str, Meta(max_length=1000)]
 
 
 class Recorder:
@@ -128,8 +125,7 @@ class Recorder:
         is_same_chunk = chunk is self._last_chunk
         if is_same_chunk and self._file.tell() > self._size_before_last_chunk:
             return
-        base64_data = base64.b64encode(chunk.data).decode()
-        chunk_line = json.dumps({"chunk": [chunk.timestamp, chunk.clock_ns, chunk.outage_s, base64_data]})
+        chunk_line = encode({"chunk": chunk}).decode()
         self._last_chunk = chunk
         self._size_before_last_chunk = self._file.tell()
         self._write("\n".join([chunk_line, *records]))
@@ -164,26 +160,43 @@ class Recorder:
             log.error("%s: recording stopped (%s); what was written until now is whole", self.path, error.strerror)
 
 
-class Event(NamedTuple):
-    """A recorded chunk, or a recorded request for a new tare.
+class Event(Struct):
+    """A line of a recording after the first line.
+
+    A record contains `timestamp`, `latency_us` and other keys, which are ignored. A chunk, a request for a new tare, a
+    change of the model and a marker each contain one of the other keys.
 
     Attributes:
-        chunk: The chunk; None if the event is a request for a new tare.
+        timestamp: Time of a record, unix seconds.
+        latency_us: Latency of a record, us.
+        tare: Whether a new tare was requested.
+        use: Label of a new model, `name/version`. The model computed all records after this line.
+        marker: A moment that the user has marked.
+        chunk: A chunk.
         latencies_us: Latency of each record that was computed from the chunk, us.
     """
 
-    chunk: Chunk | None
-    latencies_us: tuple[float, ...] = ()
+    timestamp: float | None = None
+    latency_us: Latency | None = None
+    tare: bool | None = None
+    use: ModelLabel | None = None
+    marker: Marker | None = None
+    chunk: Chunk | None = None
+    latencies_us: list[Latency] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        """Check that the line contains a complete record or an event.
 
-class NewModel(NamedTuple):
-    """A recorded change of the model that computes the records.
-
-    Attributes:
-        label: Label of the new model, `name/version`. The model computed all records after this line.
-    """
-
-    label: str
+        Raises:
+            WrongKey: If a record lacks its time or its latency, or if the line has no known key.
+        """
+        has_time = self.timestamp is not None
+        has_latency = self.latency_us is not None
+        if has_time != has_latency:  # a record has both keys, and an event has neither
+            raise WrongKey("latency_us")
+        known_keys = (self.timestamp, self.tare, self.use, self.marker, self.chunk)
+        if all(key is None for key in known_keys):
+            raise WrongKey("chunk")
 
 
 class Recording:
@@ -230,31 +243,25 @@ class Recording:
         self.device = header.device
         self.name = header.name
 
-    def events(self) -> Iterator[Event | Marker | NewModel]:
+    def events(self) -> Iterator[Event]:
         """Yield all events of the recording in their order.
 
-        The records are not yielded. The event of a chunk contains only the latencies of the records that were computed
-        from the chunk.
+        The records are not yielded. The event of a chunk contains the latencies of the records that were computed from
+        the chunk, which follow the chunk in the file.
 
         Raises:
             RecordingError: If a line other than the last line is damaged.
         """
-        # In the file, the records of a chunk follow the chunk. A chunk is therefore yielded when the next line that is
-        # not a record has been read, or at the end of the file.
-        chunk: Chunk | None = None  # chunk whose records are being read
-        latencies_us: list[float] = []
-        for entry in self._parsed_lines(_Entry):
-            if entry.latency_us is not None:  # only records have a latency
-                latencies_us.append(entry.latency_us)
-                continue
-            if chunk is not None:
-                yield Event(chunk, tuple(latencies_us))
-            latencies_us = []
-            chunk = entry.recorded_chunk
-            if chunk is None:  # the line is another event, such as a marker
-                yield entry.other_event
-        if chunk is not None:
-            yield Event(chunk, tuple(latencies_us))
+        event: Event | None = None
+        for line in self._parsed_lines(Event):
+            if line.latency_us is None:
+                if event is not None:
+                    yield event
+                event = line
+            elif event is not None:
+                event.latencies_us.append(line.latency_us)
+        if event is not None:
+            yield event
 
     def records(self, record_type: type[Line]) -> Iterator[Line]:
         """Yield the prediction records of the recording in their order.
@@ -313,77 +320,3 @@ class _Header(Struct, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if not is_printable(self.name):
             raise WrongKey("name", "printable characters", self.name)
-
-
-class _Entry(Struct):
-    """A line of a recording after the first line, which is a record or an event.
-
-    A record contains `timestamp`, `latency_us` and other keys, which are ignored. An event contains one of the other
-    keys of this class.
-    """
-
-    timestamp: float | None = None
-    latency_us: Latency | None = None
-    tare: bool | None = None
-    use: ModelLabel | None = None
-    marker: tuple[Moment, Annotated[str, Meta(max_length=1000)]] | None = None
-    chunk: tuple[Moment, Nanoseconds, Annotated[float, Meta(ge=0.0)], bytes] | None = None
-
-    def __post_init__(self) -> None:
-        """Check that the line contains a complete record or an event.
-
-        Raises:
-            WrongKey: If a record lacks its time or its latency, or if the line has no known key.
-        """
-        has_time = self.timestamp is not None
-        has_latency = self.latency_us is not None
-        if has_time != has_latency:  # a record has both keys, and an event has neither
-            raise WrongKey("latency_us")
-        known_keys = (self.timestamp, self.tare, self.use, self.marker, self.chunk)
-        if all(key is None for key in known_keys):
-            raise WrongKey("chunk")
-
-    @property
-    def recorded_chunk(self) -> Chunk | None:
-        """The chunk that this line contains, or None if the line contains no chunk."""
-        if self.chunk is None:
-            return None
-        timestamp, clock_ns, outage_s, data = self.chunk
-        return Chunk(data, timestamp, clock_ns, outage_s)
-
-    @property
-    def other_event(self) -> Event | Marker | NewModel:
-        """The event that this line contains. The line must be neither a record nor a chunk."""
-        if self.marker is not None:
-            return Marker(*self.marker)
-        if self.use is not None:
-            return NewModel(self.use)
-        return Event(None)  # a request for a new tare
-
-
-class RecordedClock:
-    """Clock of a replay, which returns the times at which the records were created during the recording."""
-
-    def __init__(self) -> None:
-        """Start with the time 0."""
-        self._arrival_ns = 0
-        self._remaining_latencies_us: deque[float] = deque()
-
-    def set(self, event: Event) -> None:
-        """Set the clock to the arrival of a chunk, before the records of the chunk are computed again.
-
-        Args:
-            event: The chunk and the latencies of its records. An event without a chunk (a request for a new tare) sets
-                the clock to 0.
-        """
-        self._arrival_ns = event.chunk.clock_ns if event.chunk is not None else 0
-        self._remaining_latencies_us = deque(event.latencies_us)
-
-    def __call__(self) -> int:
-        """Return the time at which the next record of the chunk was created, in ns on the clock of `Chunk.clock_ns`.
-
-        Each call consumes the latency of one record. After the last record, the time of arrival of the chunk is
-        returned.
-        """
-        latency_us = self._remaining_latencies_us.popleft() if self._remaining_latencies_us else 0.0
-        return self._arrival_ns + round(latency_us * 1e3)

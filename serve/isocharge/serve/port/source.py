@@ -27,7 +27,9 @@ import time
 from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self
+from typing import Annotated, NamedTuple, Protocol, Self
+
+from msgspec import Meta
 
 from isocharge.common.errors import InputError, PortError, PortLost
 from isocharge.serve.port.foreign_files import HEAD_BYTES, refuse_foreign_file
@@ -55,6 +57,9 @@ Many boards restart when their port is opened, and send nothing for up to 6 s.
 log = logging.getLogger(__name__)
 
 
+Moment = Annotated[float, Meta(ge=-1e11, le=1e11, description="a time before the year 5138, unix seconds")]
+
+
 class Chunk(NamedTuple):
     """Bytes that arrived together, with the time of arrival.
 
@@ -67,9 +72,9 @@ class Chunk(NamedTuple):
     """
 
     data: bytes
-    timestamp: float
-    clock_ns: int
-    outage_s: float = 0.0
+    timestamp: Moment
+    clock_ns: Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
+    outage_s: Annotated[float, Meta(ge=0.0)] = 0.0
 
     def elapsed_since(self, previous: "Chunk") -> float:
         """Return the time since an earlier chunk of the same source, s. It does not depend on the wall clock.
