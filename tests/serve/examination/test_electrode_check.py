@@ -12,7 +12,7 @@ import pytest
 from isocharge.cli.serve import doctor
 from isocharge.cli.shared.virtual_sensor import film_charges
 from isocharge.common.errors import PressCheckError
-from isocharge.serve import Predictor, Script, VirtualSensor, device_from_table, load_device
+from isocharge.serve import Chunk, Predictor, Script, VirtualSensor, device_from_table, load_device
 from isocharge.serve.examination import electrode_check
 from isocharge.serve.examination.electrode_check import (
     ElectrodeCheck,
@@ -42,10 +42,11 @@ class SimulatedPort:
         self._frames = sensor.frames()
         self.now_s = 0.0
 
-    def read(self, _timeout_s):
-        """Return the frames that arrive next. The simulated time passes until they have arrived."""
-        self.now_s += FRAMES_AT_ONCE / RATE_HZ
-        return SimpleNamespace(data=b"".join(islice(self._frames, FRAMES_AT_ONCE)))
+    def __iter__(self):
+        """Yield the frames that arrive next. The simulated time passes until they have arrived."""
+        while True:
+            self.now_s += FRAMES_AT_ONCE / RATE_HZ
+            yield Chunk(b"".join(islice(self._frames, FRAMES_AT_ONCE)), 1e9 + self.now_s, round(1e9 * self.now_s))
 
 
 def press_script(directions, rest_s=REST_S, first_rest_s=REST_S, end_s=END_S):
@@ -68,22 +69,24 @@ def noise(charge_pC, rng):
     return charge_pC + rng.normal(0.0, 1.0, charge_pC.shape)
 
 
-def sensor_with_wiring(charges, directions, wiring, gain=1.0, **options):
-    """Return a virtual sensor. Its channel i is connected to electrode `wiring[i]`."""
+def sensor_with_wiring(charges, directions, wiring, gain=1.0, unit_pC=1.0, **options):
+    """Return a virtual sensor, whose channel i is connected to electrode `wiring[i]`, and which sends units of pC."""
     wired = lambda contact: np.asarray(gain) * charges(contact)[:, list(wiring)]  # noqa: E731
-    return VirtualSensor(wired, press_script(directions, **options), noise=noise, offset_pC=[20.0] * len(wiring))
+    measure = lambda charge_pC, rng: noise(charge_pC, rng) / unit_pC  # noqa: E731
+    offset = [20.0 / unit_pC] * len(wiring)
+    return VirtualSensor(wired, press_script(directions, **options), noise=measure, offset_pC=offset)
 
 
 @pytest.fixture
 def check(monkeypatch):
     """Return a function that checks the electrodes of a virtual sensor in simulated time."""
 
-    def check_in_simulated_time(sensor, electrodes, timeout_s=20.0):
+    def check_in_simulated_time(sensor, electrodes, unit="pC", timeout_s=20.0):
         port = SimulatedPort(sensor)
         monkeypatch.setattr(electrode_check, "time", SimpleNamespace(monotonic=lambda: port.now_s))
         channels = {electrode: str(number + 1) for number, electrode in enumerate(electrodes)}
         requests = []
-        result = check_electrodes(port, device_from_table({}, "test"), channels, requests.append, timeout_s)
+        result = check_electrodes(port, device_from_table({}, "test"), channels, requests.append, unit, timeout_s)
         assert requests[0].startswith("wait")
         presses = [sentence for sentence in requests if sentence.startswith("press near")]
         assert list(dict.fromkeys(sentence.split()[3].rstrip(",") for sentence in presses)) == list(electrodes)
@@ -109,14 +112,15 @@ def test_channels_of_three_electrodes(film, check, wiring, sentence):
     assert (result.found == dict(result.expected)) == (wiring == (0, 1, 2))
 
 
-def test_swapped_channels_of_the_simulated_film(check):
+@pytest.mark.parametrize(("unit", "unit_pC"), [("pC", 1.0), ("V", 1000.0), ("counts", 0.05)])
+def test_swapped_channels_of_the_simulated_film(check, unit, unit_pC):
     """The charges are those of the simulator. The gains differ by a factor of two, and one gain is negative."""
     sensor = load_sensor("three-25um-biaxial")
     forward_map = kept(ForwardMap.build, sensor, Circle(1.0))
     places = np.array([electrode.centre for electrode in sensor.electrodes])
     directions = places / np.linalg.norm(places, axis=1, keepdims=True)
-    board = sensor_with_wiring(film_charges(forward_map), 0.99 * directions, (0, 2, 1), gain=(1.0, -2.0, 0.7))
-    result = check(board, "ABC")
+    board = sensor_with_wiring(film_charges(forward_map), 0.99 * directions, (0, 2, 1), (1.0, -2.0, 0.7), unit_pC)
+    result = check(board, "ABC", unit)
     assert result.found == {"A": "1", "B": "3", "C": "2"}
     assert result.inverted == ("2",)
     assert "check the signs of the gain" in "\n".join(result.sentences)
@@ -181,7 +185,7 @@ def test_doctor_writes_the_order_of_the_channels_found_by_presses(film, models, 
     wiring = (1, 0, 2)
     sensor = sensor_with_wiring(film.charges, film.directions, wiring, first_rest_s=60.0)
 
-    def check_and_press(port, device, channels, ask):
+    def check_and_press(port, device, channels, ask, unit):
         def ask_and_press(sentence):
             ask(sentence)
             if sentence.startswith("press near electrode"):
@@ -189,7 +193,7 @@ def test_doctor_writes_the_order_of_the_channels_found_by_presses(film, models, 
                 presses = press_script(film.directions[[electrode]], end_s=2.0)
                 sensor.use(lambda contact: film.charges(contact)[:, list(wiring)], presses)
 
-        return check_electrodes(port, device, channels, ask_and_press)
+        return check_electrodes(port, device, channels, ask_and_press, unit)
 
     monkeypatch.setattr(doctor, "check_electrodes", check_and_press)
     with sensor:

@@ -172,7 +172,7 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
         channel_of_electrode = {name: name for name in channel_names}
 
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
-        return check_electrodes(port, device, channel_of_electrode, say)
+        return check_electrodes(port, device, channel_of_electrode, say, examination.unit)
 
 
 def port_lines() -> Iterator[str]:

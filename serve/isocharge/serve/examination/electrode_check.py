@@ -11,14 +11,22 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressCheckError
 from isocharge.common.printable_text import printable
-from isocharge.serve.examination.press_detector import BLOCK_S, CHANGE_BLOCKS, Press, channel_noise, find_press
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.device import Device
+from isocharge.serve.live.stream import ReadingStream
 from isocharge.serve.port.source import Port
-from isocharge.serve.signal_chain.channels import channel_index
+from isocharge.serve.signal_chain.gain import GainRule
+from isocharge.serve.signal_chain.stage import Rule
+from isocharge.serve.signal_chain.tare import TareRule
+from isocharge.serve.signal_chain.touch import TouchRule
+
+MIN_PRESS_S = 0.1
+"""Shortest duration of a press, s. Damaged frames are shorter."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,7 @@ def check_electrodes(
     device: Device,
     channels: Mapping[str, str],
     ask: Callable[[str], None],
+    unit: str = "pC",
     timeout_s: float = 60.0,
 ) -> ElectrodeCheck:
     """For each electrode, ask the user for a press near it, and find the channel that changes most under this press.
@@ -66,6 +75,7 @@ def check_electrodes(
         device: Format of the frames.
         channels: Assumed channel of each electrode, by the name of the electrode.
         ask: Function that is called with a sentence that asks the user to wait or to press.
+        unit: Unit of the charges: "pC", "counts" or another unit.
         timeout_s: Time to wait for each press, s.
 
     Returns:
@@ -73,12 +83,14 @@ def check_electrodes(
 
     Raises:
         PressCheckError: If a press does not come in time, or the presses do not distinguish the channels.
+        ChargeError: If the frames lack a channel.
         PortLost: If the connection to the board is lost.
     """
     electrodes = list(channels)
     channel_names = list(channels.values())
-    presses = _PressReader(port, device, channel_names, ask, timeout_s)
-    changes = np.array([presses.press_near(electrode) for electrode in electrodes])
+    ask("wait, and do not touch the film, until the rest level is known")
+    frames = _charge_frames(port, device, channels, unit)
+    changes = np.array([_charges_of_press(frames, electrode, ask, timeout_s) for electrode in electrodes])
     columns = assign_channels(changes, electrodes)
 
     # A channel is inverted if its value falls under the press near its own electrode.
@@ -159,97 +171,66 @@ def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str
     return {**table, **moved_sections, "channels": dict(check.found)}
 
 
-class _PressReader:
-    """Reader of presses, each of which the user is asked for."""
+def _charge_frames(port: Port, device: Device, channels: Mapping[str, str], unit: str) -> Iterator[Frame]:
+    """Yield the frames of a board with their touch charges in the order of the electrodes.
 
-    def __init__(
-        self, port: Port, device: Device, channels: list[str], ask: Callable[[str], None], timeout_s: float
-    ) -> None:
-        """Store the arguments.
+    If the gain is unknown, the charges have the unit of the board. The tare therefore accepts any noise and any offset,
+    and the charges of a touch may have any sign.
 
-        Args:
-            port: The open port.
-            device: Format of the frames.
-            channels: Names of the channels.
-            ask: Function that is called with a sentence that asks the user to wait or to press.
-            timeout_s: Longest time to wait for the rest or for a press, s.
-        """
-        self._port = port
-        self._parser = device.parser()
-        self._channels = channels
-        self._ask = ask
-        self._timeout_s = timeout_s
-        self._blocks: list[Array] = []  # values of the blocks since the end of the previous press
-        self._previous_change = np.zeros(len(channels))  # change of the channels under the previous press
+    Args:
+        port: The open port.
+        device: Settings of the board, of which the frames, the kind of the front end and the gain are used.
+        channels: Channel of each electrode, by the name of the electrode.
+        unit: Unit of the charges. A touch changes counts and charges in pC by more than the default threshold.
+    """
+    rules: dict[type[Rule], Rule] = {
+        TareRule: TareRule(noise_limit_pC=math.inf, offset_limit_pC=math.inf, patience=0),
+        TouchRule: TouchRule() if unit in ("pC", "counts") else TouchRule(floor_pC=0.0),
+    }
+    gain = device.rule(GainRule)
+    if gain is not None:
+        rules[GainRule] = gain
+    raw_device = structs.replace(device, channels=dict(channels), rules=rules)
+    stream = ReadingStream(tuple(channels), raw_device, has_any_sign=True)
+    for chunk in port:
+        yield from stream.frames(chunk)
 
-    def press_near(self, electrode: str) -> Array:
-        """Ask for a press, wait until it has begun and ended, and return the change of the channels at its peak.
 
-        Args:
-            electrode: Electrode near which the press is expected.
+def _charges_of_press(frames: Iterator[Frame], electrode: str, ask: Callable[[str], None], timeout_s: float) -> Array:
+    """Ask for a press, wait until it has begun and ended, and return its mean touch charges.
 
-        Returns:
-            Change of each channel in the block with the largest total change, shape (channels,), in the unit of the
-            board.
+    Args:
+        frames: The frames of the board.
+        electrode: Electrode near which the press is expected.
+        ask: Function that is called with the request.
+        timeout_s: Longest time to wait for the press, s.
 
-        Raises:
-            PressCheckError: If the rest, or the begin or the end of the press, does not come in time.
-        """
-        if not self._blocks:
-            self._ask("wait, and do not touch the film, until the rest level is known")
-            deadline_s = time.monotonic() + self._timeout_s
-            while len(self._blocks) <= CHANGE_BLOCKS or self._find_press() is not None:
-                self._blocks = [*self._blocks[-CHANGE_BLOCKS:], self._next_block(deadline_s, electrode)]
-        self._ask(f"press near electrode {electrode}, as close to it as you can, and let go")
-        deadline_s = time.monotonic() + self._timeout_s
-        while True:
-            self._blocks.append(self._next_block(deadline_s, electrode))
-            press = self._find_press()
-            if press is not None and press.end is not None:
-                self._blocks = self._blocks[press.end :]
-                self._previous_change = press.change
-                return press.change
+    Returns:
+        Mean touch charges of the press, shape (n_electrode,), in the unit of the board.
 
-    def _find_press(self) -> Press | None:
-        """Return the first press in the blocks; None if no press has begun.
-
-        The first blocks are dropped while the charges still fall after the previous press.
-        """
-        direction = np.sign(self._previous_change)
-        while len(self._blocks) > 1:
-            first_level, second_level = (np.median(block, axis=0) for block in self._blocks[:2])
-            if direction @ (second_level - first_level) >= 0.0:
-                break
-            del self._blocks[0]
-        levels = np.array([np.median(block, axis=0) for block in self._blocks])
-        return find_press(levels, channel_noise(np.vstack(self._blocks)))
-
-    def _next_block(self, deadline_s: float, electrode: str) -> Array:
-        """Collect the frames of one block of time, and return their values, shape (frames, channels).
-
-        A block lasts for `BLOCK_S`, or longer if no frame has arrived during this time. Frames without a finite number
-        for every channel are ignored.
-
-        Args:
-            deadline_s: Time on the monotonic clock until which the function waits for frames, s.
-            electrode: Electrode near which the press is expected, for the error message.
-
-        Raises:
-            PressCheckError: If no frames come before the deadline.
-        """
-        rows: list[list[float]] = []  # the values of the channels in each frame
-        end_s = time.monotonic() + BLOCK_S
-        while time.monotonic() < end_s or not rows:
-            remaining_s = deadline_s - time.monotonic()
-            if remaining_s <= 0.0:
-                raise PressCheckError(
-                    f"electrode {electrode}: no press began and ended within {self._timeout_s:g} s; take the finger "
-                    "away after each press, and try again"
-                )
-            chunk = self._port.read(min(BLOCK_S, remaining_s))
-            for frame in [] if chunk is None else self._parser.feed(chunk.data):
-                positions = [channel_index(channel, frame) for channel in self._channels]  # None for a missing channel
-                values = [math.nan if position is None else frame.values[position] for position in positions]
-                if all(map(math.isfinite, values)):
-                    rows.append(values)
-        return np.array(rows)
+    Raises:
+        PressCheckError: If the begin or the end of the press does not come in time.
+    """
+    deadline_s = time.monotonic() + timeout_s
+    begin_s = 0.0
+    charges: list[Array] = []
+    is_asked = False
+    for frame in frames:
+        if time.monotonic() > deadline_s:
+            break
+        if frame.charge_pC is None:  # the tare is being measured, or the frame is invalid
+            continue
+        if not is_asked:
+            ask(f"press near electrode {electrode}, as close to it as you can, and let go")
+            is_asked = True
+        if frame.is_contact:
+            begin_s = begin_s if charges else frame.clock_s
+            charges.append(frame.charge_pC)
+        elif charges and frame.clock_s - begin_s >= MIN_PRESS_S:
+            return np.asarray(np.mean(charges, axis=0))
+        else:
+            charges = []
+    raise PressCheckError(
+        f"electrode {electrode}: no press began and ended within {timeout_s:g} s; take the finger away after each "
+        "press, and try again"
+    )

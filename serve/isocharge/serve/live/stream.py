@@ -80,6 +80,7 @@ class ReadingStream:
         *,
         reader: str = "the sensor",
         predictor: Predictor | None = None,
+        has_any_sign: bool = False,
     ) -> None:
         """Create the parser, the counters, the clock and the stages.
 
@@ -88,14 +89,15 @@ class ReadingStream:
             device: Settings of the board.
             reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
             predictor: Model with which warming is estimated; None if warming is not estimated.
+            has_any_sign: Whether the charges of a touch may have any sign, for example because the gain is unknown.
 
         Raises:
             DeviceError: If the device file contains settings for other electrodes.
         """
         self._device = device
         self._setup = device.setup(electrodes, reader, predictor)
-        if predictor is not None and "film" not in predictor.metadata.sensor:  # a model of presses alone
-            self._setup.has_any_sign = True
+        has_film = predictor is None or "film" in predictor.metadata.sensor  # false for a model of presses alone
+        self._setup.has_any_sign = self._setup.has_currents or has_any_sign or not has_film
         self._before_restart = StreamTotals()  # counts of the time before the latest `restart`
         self._begin()
 
