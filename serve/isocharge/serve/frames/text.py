@@ -1,7 +1,7 @@
 """Parser for boards that send frames as lines of text.
 
 A board sends each frame either as a single line or as a cycle of several lines, each of which contains a part of the
-frame. `isocharge.serve.frames.text_lines` takes the numbers out of each line. Lines with the same text between their
+frame. `isocharge.serve.frames.text_lines` reads the numbers of each line. Lines with the same text between their
 numbers are frames. The parser recognises this layout as soon as the same kind of line, or the same cycle of lines, has
 occurred three times in succession. Lines that resemble a message, such as `Channel 3 is ready`, must occur ten times,
 because a board that starts often sends several similar messages. After the recognition, lines with another layout

@@ -77,7 +77,7 @@ class Requester:
         self._requested_s = -float("inf")  # time of the latest request
         self._received_s = -float("inf")  # time of the latest received byte
         self._expects_echo = False  # whether the next bytes may be an echo of the request
-        self._received_start = b""  # first bytes after the request, which may be the beginning of its echo
+        self._kept_bytes = b""  # first bytes after the request, which may be the beginning of its echo
 
     def wait_s(self) -> float:
         """Return the time until the next request is due, s, or 0 if a request is due now.
@@ -97,14 +97,14 @@ class Requester:
         """Return the bytes of the next request, which the caller must send now."""
         self._requested_s = self._now_s()
         self._expects_echo = True
-        self._received_start = b""
+        self._kept_bytes = b""
         return self._request.data
 
     def remove_echo(self, received: bytes) -> bytes:
         """Return the received bytes without the echo of the request.
 
-        The echo consists of the same bytes as the request, and may arrive in several parts. If the first bytes may be
-        the beginning of the echo, they are returned together with the bytes that show that they are none.
+        The echo consists of the same bytes as the request, and may arrive in several parts. Bytes that may be the
+        beginning of an echo are kept back. If later bytes differ from the request, the kept bytes are returned, too.
 
         Args:
             received: Bytes that arrived after the latest request; may be empty.
@@ -113,12 +113,12 @@ class Requester:
             self._received_s = self._now_s()
         if not self._expects_echo:
             return received
-        self._received_start += received
+        self._kept_bytes += received
         request = self._request.data
-        if request != self._received_start and request.startswith(self._received_start):
+        if request != self._kept_bytes and request.startswith(self._kept_bytes):
             return b""
         self._expects_echo = False
-        return self._received_start.removeprefix(request)
+        return self._kept_bytes.removeprefix(request)
 
 
 MAX_READ_BYTES = 65536

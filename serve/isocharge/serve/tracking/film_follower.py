@@ -331,7 +331,7 @@ class FilmFollower:
     def _apply_estimate(self) -> None:
         """Correct contacts for the mean of the state, if the pretension may not have changed at all.
 
-        Before the touches, the pretension has not changed with a probability of 1/2. The touches change the odds by the
+        Before the touches, the probability that the pretension is unchanged is 1/2. The touches change the odds by the
         ratio of the probability densities of t = 0 after and before them (Savage-Dickey ratio, Dickey 1971).
         """
         change_MPa = self._state[0]

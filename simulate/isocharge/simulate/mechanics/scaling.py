@@ -152,7 +152,7 @@ class DimensionlessGroups:
 
     @property
     def without_probe(self) -> "DimensionlessGroups":
-        """Dimensionless groups of the film without the forces of the probe, in the units of the press."""
+        """Groups of the same film when no probe presses it. The units remain those of the press."""
         return replace(self, load=0.0, side_load=(0.0, 0.0))
 
     @property

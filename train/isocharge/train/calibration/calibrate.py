@@ -151,9 +151,10 @@ def _fit_even_film(
 def _fit_uneven_film(
     problem: CalibrationProblem, data: PressData, estimation: Estimation, executor: Executor | None
 ) -> Estimation:
-    """Solve the film that was found with its imperfections and its real probe, and estimate the properties again.
+    """Solve the estimated film with its imperfections and its real probe, and estimate the properties again.
 
-    The film is solved at most twice. A film that is nearly even under a circular probe is not solved again.
+    This step is repeated once if the estimate changes the film much. A nearly even film under a circular probe needs no
+    step.
     """
     for _ in range(2):
         charges, values = estimation.charges, estimation.film.film_values

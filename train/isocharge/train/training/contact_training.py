@@ -127,11 +127,11 @@ def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
 
 
 def _half_long_tailed_square(deviation: Tensor) -> Tensor:
-    """Return half of the sum of the squares of each row, shape (n,), with logarithms instead of large squares.
+    """Compute half of the sum of the squares of each row, shape (n,). Large squares are replaced by smaller values.
 
-    At `MAX_NORMAL_ERROR`, the logarithmic function has the same value and the same slope as the square. The result is
-    divided by the mean square of a normal variable with this limit. If the errors are normally distributed, the minimum
-    of the loss is therefore at their standard deviation.
+    These values increase logarithmically. At `MAX_NORMAL_ERROR`, the logarithmic function has the same value and the
+    same slope as the square. The result is divided by the mean square of a normal variable with this limit. If the
+    errors are normally distributed, the minimum of the loss is therefore at their standard deviation.
 
     Args:
         deviation: Errors in standard deviations, shape (n, k).
@@ -186,7 +186,8 @@ class LinearTargets:
     Attributes:
         charge: Charges without noise, shape (n, n_electrode), pC.
         contact: Contacts in unit coordinates, shape (n, 3).
-        noise_response: Matrices A, shape (n, 3, n_electrode), 1/pC. The noise n changes the estimated contact by A n.
+        noise_response: Matrices, shape (n, 3, n_electrode), 1/pC. The matrix of a press times the vector of its noise
+            is the change of its estimated contact.
             The matrix is zero if the estimated contact of a press is not linear in the noise.
         noise_factor: Factor by which the noise of each press is enlarged, shape (n, 1).
         noise: Noise of the charges.
@@ -246,7 +247,7 @@ class LinearTargets:
         charge = self.charge[rows]
         noise_factor = self.noise_factor[rows]
         noise = noise_factor * fresh_noise(charge, self.noise, random)
-        contact_change = (self.noise_response[rows] @ noise[:, :, None])[:, :, 0]  # A n, shape (n, 3)
+        contact_change = (self.noise_response[rows] @ noise[:, :, None])[:, :, 0]  # matrix times vector, shape (n, 3)
         return TargetBatch(charge + noise, self.contact[rows] + contact_change, noise_factor)
 
 
