@@ -182,7 +182,6 @@ def test_the_errors_in_the_metadata_are_those_of_the_served_model(fitted, releas
     force_percent = 100.0 * np.abs(contact[:, 2] / fitted.test.contact[:, 2] - 1.0)
     assert errors["position_rms_mm"] == pytest.approx(np.sqrt(np.mean(position_error**2)), rel=1e-3)
     assert errors["force_p99_percent"] == pytest.approx(np.percentile(force_percent, 99), rel=1e-3)
-    assert evaluate(fitted, fitted.test.within(4.0))["position_rms_mm"] < errors["position_rms_mm"]
 
 
 def test_the_stated_errors_are_those_on_other_presses_and_small_enough(truth, predictor):

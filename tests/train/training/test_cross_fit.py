@@ -15,6 +15,7 @@ from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingC
 from isocharge.train.data.channel_noise import LocalPlanes
 from isocharge.train.data.measured_sensor import PressedArea, outline
 from isocharge.train.data.presses import position_ranks
+from isocharge.train.model_release.evaluate import contact_errors
 from isocharge.train.model_release.release import release
 from isocharge.train.training.cross_fit import std_factors, usable_presses
 from kept import ROOT, kept
@@ -106,6 +107,12 @@ def fresh():
     return LabelledPresses(contact, charges_on_l(contact, 3), measured=True)
 
 
+def errors_on(fitted, presses):
+    """Return the errors of a network on measured presses, by name."""
+    contact, std, _ = fitted.predict(presses.charge)
+    return contact_errors(contact, std, presses.contact)
+
+
 def test_the_noise_of_the_channels_is_estimated(fitted_pad):
     np.testing.assert_allclose(fitted_pad.noise.sigma(np.zeros((1, 4)))[0], NOISE_pC, rtol=0.1)
     assert (fitted_pad.noise.gain < 0.03).all()
@@ -117,14 +124,14 @@ def test_errors_are_those_of_weighted_least_squares(fitted_pad, fresh):
     The network may have slightly smaller errors, because it learns the edges of the area.
     """
     x_variance, y_variance, force_variance = np.diag(np.linalg.inv(SLOPES.T @ np.diag(NOISE_pC**-2.0) @ SLOPES))
-    errors = evaluate(fitted_pad, fresh)
+    errors = errors_on(fitted_pad, fresh)
     assert errors["position_rms_mm"] == pytest.approx(np.sqrt(x_variance + y_variance), rel=0.12)
     assert errors["force_rms_percent"] == pytest.approx(100.0 * np.sqrt(force_variance), rel=0.12)
 
 
 def test_errors_and_intervals_hold_for_presses_at_other_places(fitted_pad, fresh):
     stated_errors = evaluate(fitted_pad)
-    fresh_errors = evaluate(fitted_pad, fresh)
+    fresh_errors = errors_on(fitted_pad, fresh)
     assert stated_errors["position_rms_mm"] == pytest.approx(fresh_errors["position_rms_mm"], rel=0.08)
     assert fresh_errors["coverage_68"] == pytest.approx(0.683, abs=0.04)
     assert fresh_errors["coverage_95"] == pytest.approx(0.95, abs=0.02)
@@ -388,7 +395,7 @@ def test_a_real_pad_is_learned_better_than_by_boosted_trees():
     is_held_out = position_ranks(presses.contact) < 0.2
     fitted = fit_presses(presses[~is_held_out], "pad")
     held_out_presses = presses[is_held_out]
-    errors = evaluate(fitted, LabelledPresses(held_out_presses.contact, held_out_presses.charge_pC, measured=True))
+    errors = errors_on(fitted, LabelledPresses(held_out_presses.contact, held_out_presses.charge_pC, measured=True))
     assert errors["position_rms_mm"] < 6.93
     assert errors["force_rms_percent"] < 27.0
     assert 0.63 < errors["coverage_68"] < 0.75

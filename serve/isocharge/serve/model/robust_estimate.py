@@ -127,7 +127,8 @@ def robust_estimate(
         measured: Measured coordinates of the contacts; None if all contacts are unknown.
         contact_bounds: Smallest and largest coordinates of contacts, each of shape (3,). The contacts are clipped.
         state_bounds: Smallest and largest values of the state, each of shape (p,). The state is clipped.
-        freedom: Degrees of freedom nu of the distribution of the residuals; infinity for a Gaussian distribution.
+        freedom: Degrees of freedom nu of the distribution of the residuals. A large number stands for a Gaussian
+            distribution.
         max_steps: Largest number of steps.
         tolerance: The search ends when a step reduces the minimised function by less than this value. A step of one
             standard deviation of the state reduces it by about 0.5.
@@ -230,11 +231,8 @@ class _Problem:
         residual = (self._whitening @ (self._charge_pC - values.charge_pC)[:, :, None])[:, :, 0]
         contact_residual = (self._measured - contacts) * self._contact_weight
         chi2 = (residual**2).sum(axis=1) + (contact_residual**2).sum(axis=1)
-        weights = np.ones(len(chi2))
-        press_cost = 0.5 * chi2
-        if np.isfinite(self._freedom):
-            weights = (self._freedom + self._degrees) / (self._freedom + chi2)
-            press_cost = 0.5 * (self._freedom + self._degrees) * np.log1p(chi2 / self._freedom)
+        weights = (self._freedom + self._degrees) / (self._freedom + chi2)
+        press_cost = 0.5 * (self._freedom + self._degrees) * np.log1p(chi2 / self._freedom)
         deviation = state - self._prior.mean
         return _Point(
             state=state,

@@ -133,9 +133,6 @@ class PressEvents:
         self._queue.put((self._arm_count, SessionEnd()))
 
 
-SAME_CONTACT_TOLERANCE = 1e-9
-"""Largest difference between a press of the session and the same press in the list of a machine, mm and N."""
-
 PHASE_TEXTS = {
     Phase.taring: "measuring the tare: leave the film alone",
     Phase.lift: "lift the probe",
@@ -380,7 +377,7 @@ def _count_rows_made(session: PressSession, contacts: Array) -> int:
     if len(session) == 0:
         return 0
     last_contact = session.presses.contact[-1]
-    is_equal = np.isclose(contacts, last_contact, rtol=0.0, atol=SAME_CONTACT_TOLERANCE, equal_nan=True)
+    is_equal = np.isclose(contacts, last_contact, equal_nan=True)
     equal_rows = np.flatnonzero(is_equal.all(axis=1))  # x, y and F are equal
     if equal_rows.size == 0:
         return 0

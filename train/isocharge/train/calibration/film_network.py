@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.model.charge_series import ChargeSeries, series_size
+from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, series_size
 from isocharge.serve.presses.measured_presses import CONTACT
 from isocharge.simulate import Domain, ForwardMap, NoiseModel
 from isocharge.simulate.forward.derivative_maps import NODE_COUNT
@@ -50,8 +50,6 @@ The negative changes are smaller for a film that they would make slack."""
 PRESSES = 60_000
 """Number of presses from which the network learns."""
 
-CHUNK = 4096
-"""Number of presses that are drawn at the same time, which limits the memory."""
 
 OUTSIDE_PRESSES = 16_384
 """Number of presses outside the working area from which the network learns that they are outside."""
@@ -214,7 +212,7 @@ def training_data(
 def _drawn_charges(series: ChargeSeries, rng: np.random.Generator, contact: Array) -> Array:
     """Draw the charges of contacts, each on another film of the posterior distribution, shape (n, n_electrode), pC."""
     drawn = []
-    for chunk in np.array_split(contact, len(contact) // CHUNK + 1):
+    for chunk in np.array_split(contact, len(contact) // CHUNK_SIZE + 1):
         state = rng.standard_normal((len(chunk), 1 + series.direction_count))
         state[:, 0] = 0.0  # the pretension does not change
         drawn.append(series.changes(chunk, state).charge_pC)

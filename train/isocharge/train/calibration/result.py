@@ -136,8 +136,6 @@ class CalibrationResult:
         """Convert the errors and the properties into a dictionary for JSON."""
         chi2 = self.estimation.press_chi2
         return {
-            "sensor": self.problem.sensor.name,
-            "probe": self.problem.probe.notation,
             "presses": len(self.presses),
             "left_out_lines": list(self.bad_lines),
             "reduced_chi2": self.estimation.chi2 / max(self.estimation.redundancy, 1.0),

@@ -7,6 +7,7 @@ noise of a channel is modelled as white^2 + (gain * Q)^2, with the charge Q and 
 """
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy.optimize import minimize
@@ -334,10 +335,13 @@ Noise = NoiseModel | ChannelNoise
 """Noise model with the same parameters for all channels, or with separate parameters for each channel."""
 
 
-def misfit_noise(noise: NoiseModel) -> NoiseModel:
+AnyNoise = TypeVar("AnyNoise", bound=Noise)
+
+
+def misfit_noise(noise: AnyNoise) -> AnyNoise | NoiseModel:
     """Return the noise whose standard deviation is the unit of the misfit.
 
     The result is the noise of the training or, if the training has no noise, the noise `reference`.
     """
-    has_noise = noise.white > 0.0
+    has_noise = np.any(np.asarray(noise.white) > 0.0)
     return noise if has_noise else noise_model("reference")

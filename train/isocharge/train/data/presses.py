@@ -14,7 +14,7 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import DatasetError, PressError, cut, shown
 from isocharge.common.files import sha256_of
 from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor, parse_probe
+from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
 from isocharge.train.data.channel_noise import Noise
 
 LOWEST_CHARGE = 1.0
@@ -166,23 +166,6 @@ def outside_presses_of(dataset: Dataset) -> LabelledPresses | None:
     if dataset.outside is None:
         return None
     return LabelledPresses.of_samples(dataset.outside, measured=is_measured(dataset))
-
-
-def yield_force_of(dataset: Dataset) -> float | None:
-    """Return the smallest force of a dataset at which the film yields under any of its probes, N.
-
-    The manifest of a sweep states the force. For other datasets, the stress of the film is computed.
-
-    Returns:
-        The force; None if the film does not yield within the range of forces.
-    """
-    if YIELD_FORCE in dataset.manifest:
-        force: float | None = dataset.manifest[YIELD_FORCE]
-        return force
-    from isocharge.simulate.solver.stress_limit import yield_force  # the solver is not needed for datasets of a sweep
-
-    probes = [parse_probe(str(notation)) for notation in np.unique(dataset.samples.probe)]
-    return yield_force(dataset.sensor.film, probes, domain_of(dataset).force_range)
 
 
 def split_by_position(presses: LabelledPresses, share: float) -> tuple[LabelledPresses, LabelledPresses]:

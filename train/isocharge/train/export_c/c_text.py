@@ -9,9 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-LINE_WIDTH = 109
-"""Largest number of characters in a line of numbers, without the indentation."""
-
 
 def source_text(name: str, **values: object) -> str:
     """Read a file in `sources/`, and replace each `$name` by its value."""
@@ -54,7 +51,7 @@ def c_array(name: str, values: NDArray[Any]) -> str:
     literals = ", ".join(as_text(value) for value in values.ravel())
     # While the lines are broken, a comma follows the last number, too. The last number then counts with the same length
     # as the other numbers. The last comma is removed afterwards. Lines are not broken after a minus sign.
-    lines = wrap(f"{literals},", LINE_WIDTH, break_on_hyphens=False)
+    lines = wrap(f"{literals},", break_on_hyphens=False)
     numbers = "\n    ".join(lines).rstrip(",")
     return f"static const {number_type} {name}[{values.size}] = {{\n    {numbers}\n}};\n"
 

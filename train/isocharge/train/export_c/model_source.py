@@ -63,8 +63,6 @@ N_ROWS = 4
 
 The program then reads and writes each output only once for all of these rows."""
 
-INT8_TOLERANCE = 2.0**-21
-"""Largest relative difference between a weight and a multiple of the scale that rounding in float32 can cause."""
 
 Block = tuple[slice, slice]
 """Rows and columns of a part of a matrix."""
@@ -186,7 +184,7 @@ def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
     scale = np.abs(values).max(axis=0) / np.float32(LARGEST_INT8)
     nonzero_scale = np.where(scale > 0.0, scale, 1.0)  # a column of zeros has the scale 0
     multiples = np.round(values / nonzero_scale)
-    are_multiples = np.allclose(multiples * scale, values, rtol=INT8_TOLERANCE, atol=0.0)
+    are_multiples = np.allclose(multiples * scale, values, atol=0.0)
     if are_multiples:
         return multiples.astype(np.int8), scale
     return values, None

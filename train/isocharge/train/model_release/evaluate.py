@@ -11,8 +11,7 @@ from isocharge.serve.flags import STRESS
 from isocharge.serve.model.contact import Contacts
 from isocharge.serve.model.metadata import ModelMetadata, UnnoticedPresses
 from isocharge.serve.model.validity import Validity
-from isocharge.simulate import Dataset, NoiseModel
-from isocharge.train.data.channel_noise import misfit_noise
+from isocharge.train.data.channel_noise import Noise, misfit_noise
 from isocharge.train.data.contact_errors import ContactErrorStatistics, position_error
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.fit import Fitted
@@ -37,53 +36,37 @@ ONLY_SIMULATED = ("position_p99_mm", "force_p99_percent")
 """Names of the errors that need more presses than a rig usually makes."""
 
 
-def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *, seed: int = 1) -> dict[str, float]:
-    """Measure the errors of a trained network.
+def evaluate(fitted: Fitted) -> dict[str, float]:
+    """Measure the errors of a trained network on presses that were not used in its training.
+
+    The errors of a network of measured presses are those of the cross-validation. They contain the errors of the
+    measured places and forces.
 
     Args:
         fitted: The network, with its noise and its presses for the test.
-        presses: Presses on which the errors are measured; None for the test presses of `fitted`. Noise is added to the
-            charges of simulated presses. Measured presses already contain noise. Their errors also include the errors
-            of the measured places and forces.
-        seed: Seed of the noise.
 
     Returns:
         Errors by name. The position errors are in mm, and the force errors are in percent of the force. The coverages
         of the 68 and 95 % intervals are fractions of the coordinates, 0 to 1. If the network always answers the same
         force, there are no errors of the force, and the coverages are those of x and y. Further entries are the misfits
-        that 1 % and 0.1 % of the good presses exceed. For simulated presses, the result
-        also contains the errors without noise, and the fractions of faults that cause an alarm. For measured presses,
-        the result also contains the number of presses.
+        that 1 % and 0.1 % of the good presses exceed. For simulated presses, the result also contains the errors
+        without noise, and the fractions of faults that cause an alarm. For measured presses, the result also contains
+        the number of presses.
     """
-    if presses is None:
-        test_presses = fitted.test
-    elif isinstance(presses, Dataset):
-        test_presses = LabelledPresses.of(presses)
-    else:
-        test_presses = presses
-    if not test_presses.measured and isinstance(fitted.noise, NoiseModel):
-        return simulated_errors(fitted.predict, test_presses, fitted.noise, seed)
+    if fitted.cross_validated is None:
+        return simulated_errors(fitted.predict, fitted.test, fitted.noise)
 
-    # If the network was trained on its own test presses, use the estimates of the cross-validation instead.
-    if presses is None and fitted.cross_validated is not None:
-        contact, std, _ = fitted.cross_validated
-    else:
-        contact, std, _ = fitted.predict(test_presses.charge)
-    all_errors = contact_errors(contact, std, test_presses.contact)
+    contact, std, misfit = fitted.cross_validated
+    truth = fitted.test.contact
     # Too few presses are measured for the 99th percentiles.
-    errors = {name: error for name, error in all_errors.items() if name not in ONLY_SIMULATED}
+    errors = {name: error for name, error in contact_errors(contact, std, truth).items() if name not in ONLY_SIMULATED}
     if fitted.is_force_constant:
-        n_plane = 2  # x and y
-        errors |= _coverages(contact[:, :n_plane], std[:, :n_plane], test_presses.contact[:, :n_plane])
         errors = {name: error for name, error in errors.items() if not name.startswith("force_")}
-    errors[HELD_PRESSES] = float(len(test_presses))
-    if fitted.cross_validated is not None:
-        return errors | _misfit_percentiles(fitted.cross_validated.misfit)
-    assert isinstance(fitted.noise, NoiseModel)  # noise of channels belongs to a network of measured presses
-    return errors | misfit_errors(fitted.predict, fitted.test, fitted.noise, seed)
+        errors |= _coverages(contact[:, :2], std[:, :2], truth[:, :2])
+    return {**errors, HELD_PRESSES: float(len(truth)), **_misfit_percentiles(misfit)}
 
 
-def simulated_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int = 1) -> dict[str, float]:
+def simulated_errors(predict: Predict, presses: LabelledPresses, noise: Noise, seed: int = 1) -> dict[str, float]:
     """Measure the errors of a network on simulated presses, with and without noise.
 
     Args:
@@ -98,11 +81,19 @@ def simulated_errors(predict: Predict, presses: LabelledPresses, noise: NoiseMod
     contact, std, _ = predict(presses.noisy(noise, seed))
     clean_contact, _, _ = predict(presses.charge)
     clean_error = position_error(clean_contact, presses.contact)
+
+    unit_noise = misfit_noise(noise)
+    _, _, misfits = predict(presses.repeated(N_GOOD_PRESSES).noisy(unit_noise, seed))
+    min_force, max_force = FORCES_NEAR_1_N
+    force = presses.contact[:, 2]
+    presses_near_1_N = presses[(force >= min_force) & (force <= max_force)]
+    threshold = float(np.percentile(misfits, 99.0))
     return {
         **contact_errors(contact, std, presses.contact),
         "clean_position_median_mm": rounded(np.median(clean_error)),
         "clean_position_p95_mm": rounded(np.percentile(clean_error, 95)),
-        **misfit_errors(predict, presses, noise, seed),
+        **_misfit_percentiles(misfits),
+        **_measure_detection(predict, presses_near_1_N, unit_noise, threshold, seed + 1),
     }
 
 
@@ -132,45 +123,12 @@ def _coverages(estimate: Array, std: Array, truth: Array) -> dict[str, float]:
     }
 
 
-def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int) -> dict[str, float]:
-    """Compute the thresholds of the misfit, and the fraction of faults that cause an alarm.
-
-    Args:
-        predict: Function that computes the answers of the network.
-        presses: Presses without noise.
-        noise: Noise of the training, from which the noise that is added here is derived by `misfit_noise`.
-        seed: Seed of the noise.
-
-    Returns:
-        Errors by name, as `evaluate` returns them.
-    """
-    added_noise = misfit_noise(noise)
-    _, _, misfits = predict(presses.repeated(N_GOOD_PRESSES).noisy(added_noise, seed))
-    threshold = alarm_threshold(misfits)
-    min_force, max_force = FORCES_NEAR_1_N
-    force = presses.contact[:, 2]
-    presses_near_1_N = presses[(force >= min_force) & (force <= max_force)]
-    detected_fractions = _measure_detection(predict, presses_near_1_N, added_noise, threshold, seed + 1)
-    return {**_misfit_percentiles(misfits), **detected_fractions}
-
-
 def _misfit_percentiles(good_misfits: Array) -> dict[str, float]:
     """Return the misfits that 1 % and 0.1 % of good presses exceed."""
     return {
-        "misfit_p99": rounded(alarm_threshold(good_misfits)),
+        "misfit_p99": rounded(np.percentile(good_misfits, 99.0)),
         "misfit_p999": rounded(np.percentile(good_misfits, 99.9)),
     }
-
-
-def alarm_threshold(good_misfits: Array) -> float:
-    """Compute the misfit above which there is an alarm.
-
-    One percent of the good presses has a larger misfit.
-
-    Args:
-        good_misfits: Misfits of good presses, array of any shape.
-    """
-    return float(np.percentile(good_misfits, 99.0))
 
 
 def rounded(value: float | np.floating) -> float:
@@ -179,7 +137,7 @@ def rounded(value: float | np.floating) -> float:
 
 
 def _measure_detection(
-    predict: Predict, presses: LabelledPresses, noise: NoiseModel, threshold: float, seed: int
+    predict: Predict, presses: LabelledPresses, noise: Noise, threshold: float, seed: int
 ) -> Mapping[str, float]:
     """Simulate one faulty electrode at a time, and compute the fraction of presses whose misfits exceed a threshold.
 
@@ -232,7 +190,7 @@ def unnoticed_presses(fitted: Fitted, metadata: ModelMetadata) -> UnnoticedPress
     if outside is None:
         return None
     presses = outside.test
-    contact, std, misfit = fitted.predict(presses.noisy(fitted.misfit_noise, seed=11))
+    contact, std, misfit = fitted.predict(presses.noisy(misfit_noise(fitted.noise), seed=11))
     is_value_wrong = np.abs(contact - presses.contact) > WRONG_STDS * std  # for x, y and F, shape (n, 3)
     is_wrong = is_value_wrong.any(axis=1)
     is_unnoticed = is_wrong & ~is_flagged(metadata, contact, std, misfit)

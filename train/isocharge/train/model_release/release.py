@@ -19,6 +19,7 @@ from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
 from isocharge.serve.model.model_folder import check_target, write_model
 from isocharge.serve.model.validity import disk_corners
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
+from isocharge.train.data.channel_noise import misfit_noise
 from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
 from isocharge.train.model_release.evaluate import HELD_PRESSES, evaluate, unnoticed_presses
 from isocharge.train.model_release.onnx_graph import check_graph, write_graph
@@ -231,7 +232,7 @@ def release(
 
     graph = write_graph(fitted.network, complete_metadata.to_props())
     floors = contact_floors(complete_metadata)
-    golden_charges = check_graph(graph, fitted.network.outputs, fitted.test, fitted.misfit_noise, floors)
+    golden_charges = check_graph(graph, fitted.network.outputs, fitted.test, misfit_noise(fitted.noise), floors)
     card_text = card(complete_metadata, fitted)
     version_folder = write_model(folder, graph, complete_metadata, golden_charges, card_text, fitted.files)
     return Release(version_folder, complete_metadata)

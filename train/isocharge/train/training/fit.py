@@ -20,7 +20,7 @@ from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.progress import second_thread
 from isocharge.serve.model.charge_file import FILE as CHARGES_FILE
 from isocharge.serve.model.charge_file import charge_map_bytes
-from isocharge.simulate import Dataset, Domain, NoiseModel, Sensor
+from isocharge.simulate import Dataset, Domain, Sensor
 from isocharge.train.data.channel_noise import Noise, misfit_noise
 from isocharge.train.data.measured_sensor import MeasuredSensor
 from isocharge.train.data.outside_presses import OutsidePresses
@@ -86,14 +86,6 @@ class Fitted:
     outside: OutsidePresses | None = None
     yield_force_N: float | None = None
     is_force_constant: bool = False
-
-    @property
-    def misfit_noise(self) -> Noise:
-        """Noise whose standard deviation is the unit of the misfit.
-
-        For simulated presses, this noise is derived from the noise of the training by `misfit_noise`.
-        """
-        return misfit_noise(self.noise) if isinstance(self.noise, NoiseModel) else self.noise
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Estimate contacts.

@@ -15,12 +15,12 @@ from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.train.data.channel_noise import ChannelNoise, misfit_noise
 from isocharge.train.data.charge_fit import fit_charge_series
 from isocharge.train.data.presses import (
+    YIELD_FORCE,
     LabelledPresses,
     domain_of,
     outside_presses_of,
     presses_of,
     split_by_position,
-    yield_force_of,
 )
 from isocharge.train.training.config import TrainingConfig
 from isocharge.train.training.network import WhitenedFeatures
@@ -72,7 +72,7 @@ class TrainingData:
             presses=presses,
             sha256=dataset.sha256,
             outside=outside_presses_of(dataset),
-            yield_force_N=yield_force_of(dataset),
+            yield_force_N=dataset.manifest.get(YIELD_FORCE),
         )
 
 
