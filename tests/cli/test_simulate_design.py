@@ -6,10 +6,11 @@ from dataclasses import replace
 import pytest
 
 from isocharge.simulate import load_sensor
+from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.layout import case as case_module
-from isocharge.simulate.layout import charge_table
 from isocharge.simulate.layout import design as design_module
 from isocharge.simulate.layout import search as search_module
+from isocharge.simulate.layout import stress_fields
 
 DESIGN = ("simulate", "design", "three-25um-biaxial", "--electrodes")
 FILES = ["design.json", "design.png", "layout.dxf", "layout.svg", "sensor.toml"]
@@ -21,7 +22,7 @@ def _rough(monkeypatch):
     monkeypatch.setattr(case_module, "FINE_GRID_STEPS", 12)
     monkeypatch.setattr(case_module, "MAX_SEARCH_PRESSES", 50)
     monkeypatch.setattr(search_module, "STARTS", 2)
-    monkeypatch.setattr(charge_table, "N_DISTANCES", 2)
+    monkeypatch.setattr(stress_fields, "NODE_COUNT", NodeCount(distances=2, forces=1))
     monkeypatch.setattr(design_module, "describe_ambiguities", lambda *_: design_module.UNAMBIGUOUS)
 
 

@@ -1,11 +1,11 @@
-"""Small table of charges, for presses within 4 mm, that the tests of layouts share."""
+"""Stress fields for presses within 4 mm, which the tests of layouts share."""
 
 from dataclasses import replace
 
 import pytest
 
 from isocharge.simulate import Circle, load_sensor
-from isocharge.simulate.layout.charge_table import ChargeTable
+from isocharge.simulate.layout.stress_fields import solve_fields
 from kept import kept
 
 RADIUS = 4.0
@@ -17,8 +17,8 @@ def sensor():
 
 
 @pytest.fixture(scope="session")
-def tables(sensor):
-    """Tables of two sensors that have the same film, by the name of the sensor."""
-    table = kept(ChargeTable.solve, sensor, Circle(1.0), 1.0, RADIUS)
+def fields(sensor):
+    """Stress fields of two sensors that have the same film, by the name of the sensor."""
     uniaxial = load_sensor("four-25um-uniaxial")
-    return {sensor.name: table, uniaxial.name: replace(table, piezo=(uniaxial.piezo.d31, uniaxial.piezo.d32))}
+    solved = kept(solve_fields, sensor, Circle(1.0), 1.0, RADIUS)
+    return {sensor.name: solved, uniaxial.name: replace(solved, sensor=uniaxial)}

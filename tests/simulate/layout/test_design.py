@@ -13,7 +13,6 @@ from isocharge.simulate.layout import case as case_module
 from isocharge.simulate.layout import design as design_module
 from isocharge.simulate.layout import search as search_module
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase
-from isocharge.simulate.layout.charge_table import ChargeTable
 from isocharge.simulate.layout.design import NOT_SEARCHED, UNAMBIGUOUS, describe_ambiguities, design
 from isocharge.simulate.layout.search import Search, random_layouts
 from kept import kept
@@ -24,8 +23,8 @@ def case_of(sensor, **changes):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _rough(tables, sensor):
-    """Fewer presses, positions and layouts, and a table and forward maps that have already been solved."""
+def _rough(fields, sensor):
+    """Fewer presses, positions and layouts, and stress fields and forward maps that have already been solved."""
     build = ForwardMap.build
     with pytest.MonkeyPatch.context() as patch:
         for module, name, value in (
@@ -35,7 +34,7 @@ def _rough(tables, sensor):
             (search_module, "ROUNDS", 2),
         ):
             patch.setattr(module, name, value)
-        patch.setattr(ChargeTable, "solve", staticmethod(lambda sensor, *_: tables[sensor.name]))
+        patch.setattr(design_module, "solve_fields", lambda sensor, *_: fields[sensor.name])
         patch.setattr(ForwardMap, "build", lambda new, *domain, **_: replace(kept(build, sensor, *domain), sensor=new))
         yield
 
@@ -72,17 +71,17 @@ def test_errors_agree_with_the_limits_of_the_forward_map(found):
     )
 
 
-def test_no_neighbouring_layout_is_better_by_more_than_one_percent(found, centres, tables):
+def test_no_neighbouring_layout_is_better_by_more_than_one_percent(found, centres, fields):
     """Small random moves of the electrodes do not reduce the largest error noticeably."""
-    search, rng = Search(found.case, tables["four-25um-biaxial"]), np.random.default_rng(0)
+    search, rng = Search(found.case, fields["four-25um-biaxial"]), np.random.default_rng(0)
     assert all(
         search.minimised_error(centres + rng.uniform(-0.4, 0.4, (3, 2))) > 0.99 * found.minimised_error
         for _ in range(20)
     )
 
 
-def test_goal_rms_reduces_the_root_mean_square(centres, sensor, tables):
-    search = Search(case_of(sensor, goal="rms"), tables["four-25um-biaxial"])
+def test_goal_rms_reduces_the_root_mean_square(centres, sensor, fields):
+    search = Search(case_of(sensor, goal="rms"), fields["four-25um-biaxial"])
     start = random_layouts(search.case)[0]
     found = search.refine(search.optimum(start))
     assert found.error == pytest.approx(search.minimised_error(found.positions))

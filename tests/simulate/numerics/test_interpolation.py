@@ -1,4 +1,4 @@
-"""Lagrange and cubic interpolation, compared with exact polynomials and with SciPy."""
+"""Lagrange interpolation, compared with exact polynomials and with SciPy."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,6 @@ from scipy.interpolate import BarycentricInterpolator
 from isocharge.simulate.numerics.interpolation import (
     basis,
     chebyshev_nodes,
-    cubic_weights,
     lagrange_values,
     lobatto_nodes,
 )
@@ -34,14 +33,3 @@ def test_interpolation_on_chebyshev_nodes_agrees_with_scipy(count):
     values = np.random.default_rng(count).standard_normal(count)
     ours = lagrange_values(nodes, at) @ values
     np.testing.assert_allclose(ours, BarycentricInterpolator(nodes, values)(at), rtol=1e-9, atol=1e-9)
-
-
-# Local cubics
-
-
-def test_cubic_weights_reproduce_cubic_polynomials():
-    polynomial = np.polynomial.Polynomial([1.0, -2.0, 0.3, 0.05])
-    at = np.array([-0.5, 0.0, 0.2, 1.7, 3.0, 5.9, 7.0, 7.4])
-    number, weights = cubic_weights(at, 8)
-    assert (number.min(), number.max()) == (0, 7)
-    assert (weights * polynomial(number)).sum(axis=1) == pytest.approx(polynomial(at))

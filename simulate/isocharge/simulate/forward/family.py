@@ -28,7 +28,7 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings, check_press, layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
-from isocharge.simulate.solver.press_chain import Chain, Reading, probe_frame_stress, solve_chains
+from isocharge.simulate.solver.press_chain import Chain, Reading, solve_chains
 
 ROTATIONS = 7
 """Smallest number of orientations of a probe that is not axisymmetric.
@@ -229,7 +229,7 @@ class Family:
         probe: Probe,
         settings: SolveSettings,
         executor: Executor | None,
-        read: Reading | None = None,
+        read: Reading,
     ) -> Array:
         """Compute the stress under the presses of the family, for the rotations within one period of the probe.
 
@@ -238,8 +238,7 @@ class Family:
             probe: Probe that presses the film.
             settings: Theory, mesh and width of the thin rings at the rim, which are the same for all presses.
             executor: Executor that runs the solves; None for this process.
-            read: Function that computes the returned values from each solved press; None for the scaled stress in the
-                frame of the probe.
+            read: Function that computes the returned values from each solved press.
 
         Returns:
             Values that `read` computes, shape (n_distance, n_force, n_direction, n_solved_rotation, n_value),
@@ -255,7 +254,7 @@ class Family:
                 forces=self.force,
                 surface=sensor.surface,
                 settings=settings,
-                read=read or probe_frame_stress,
+                read=read,
             )
             for distance in self.distance
             for direction in self.direction

@@ -33,7 +33,7 @@ from isocharge.simulate.forward.family import (
     relative_error,
     spread_check_presses,
 )
-from isocharge.simulate.forward.press_chunk import PressChunk
+from isocharge.simulate.forward.press_chunk import PressChunk, PressMeshes
 from isocharge.simulate.forward.readout import COARSE, FINE, ReadoutPoints, are_near, contact_charge
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.theory import Theory
@@ -44,6 +44,7 @@ from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings
+from isocharge.simulate.solver.press_chain import Reading, probe_frame_stress
 
 CHUNK_SIZE = 256
 """Number of presses that are evaluated at once, which limits the size of the working arrays to about 100 MB."""
@@ -159,6 +160,7 @@ class ForwardMap:
         count: NodeCount,
         settings: SolveSettings = SolveSettings(),
         *,
+        read: Reading = probe_frame_stress,
         executor: Executor | None = None,
     ) -> "ForwardMap":
         """Build a forward map from a few solves, and do not compare it with direct solves. Its error is not known.
@@ -169,6 +171,8 @@ class ForwardMap:
             domain: Presses for which the map will be used.
             count: Numbers of distances, forces, orientations and directions at which presses are solved.
             settings: Accuracy, theory and mesh; see `build`.
+            read: Function that computes the stress fields of the table from each solved press, shape (n_element,
+                n_local, ..., 3), in the frame of the probe.
             executor: Executor that runs the solves; None for this process.
 
         Raises:
@@ -178,7 +182,7 @@ class ForwardMap:
         check_family(sensor.film, probe, domain)
         mesh = family_mesh(sensor.film, probe, domain, settings)
         family = Family.spread(domain, sensor.film, probe, count)
-        return cls._solve(sensor, probe, family, settings.theory, mesh, executor)
+        return cls._solve(sensor, probe, family, settings.theory, mesh, executor, read)
 
     @classmethod
     def _solve(
@@ -189,6 +193,7 @@ class ForwardMap:
         theory: Theory,
         mesh: tuple[Resolution, float],
         executor: Executor | None,
+        read: Reading = probe_frame_stress,
     ) -> "ForwardMap":
         """Solve a family of presses. The error of the map is infinite, because it is not known.
 
@@ -199,11 +204,12 @@ class ForwardMap:
             theory: Terms of the film theory.
             mesh: Fineness of the mesh, and total width of the thin rings at the rim, in film radii.
             executor: Executor that runs the solves; None for this process.
+            read: Function that computes the stress fields from each solved press.
         """
         resolution, layer = mesh
         settings = SolveSettings(theory=theory, resolution=resolution, layer=layer)
         template = template_for(probe, resolution, whole=not sensor.film.is_axisymmetric)
-        table = family.unfold(family.solve(sensor, probe, settings, executor), template)
+        table = family.unfold(family.solve(sensor, probe, settings, executor, read), template)
         return cls(sensor, probe, family, theory, resolution, layer, table, np.inf)
 
     @property
@@ -460,25 +466,31 @@ class ForwardMap:
             position: Positions x + iy, shape (n,), mm.
             force: Forces, shape (n,), N.
             orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
-
-        Returns:
-            The interpolated fields, with the position of the mesh under each press.
         """
-        distance = np.abs(position)
         direction = np.angle(position)  # from the centre of the film to the press, rad
         rotation = orientation - direction  # of the probe relative to the direction of the press
         weights = self.family.weights(position, force, rotation)
         nodal_fields = weights.astype(self.table.dtype) @ self.table  # in the precision of the table
-        film = self.sensor.film
-        mesh = template_for(self.probe, self.resolution, whole=not film.is_axisymmetric)
-        circular_distance = distance_on_circular_film(film, distance, direction)
-        placement = Placement.of(mesh, self.probe, circular_distance, film.radius, self.layer, rotation)
 
         # The stress refers to the direction of the press or, if the probe is not axisymmetric, to the probe.
         frame_angle = direction
         if not self.probe.is_axisymmetric:
             frame_angle = direction + rotation + self.probe.angle
-        return PressChunk(mesh, placement, nodal_fields, direction, frame_angle, film_oval(film, direction))
+        return PressChunk(self.meshes_under(position, rotation), nodal_fields, frame_angle)
+
+    def meshes_under(self, position: Complexes, rotation: Array) -> PressMeshes:
+        """Return the meshes under several presses.
+
+        Args:
+            position: Positions x + iy, shape (n,), mm.
+            rotation: Rotation of the probe relative to the direction of each press, shape (n,), rad.
+        """
+        film = self.sensor.film
+        direction = np.angle(position)
+        template = template_for(self.probe, self.resolution, whole=not film.is_axisymmetric)
+        circular_distance = distance_on_circular_film(film, np.abs(position), direction)
+        placement = Placement.of(template, self.probe, circular_distance, film.radius, self.layer, rotation)
+        return PressMeshes(template, placement, direction, film_oval(film, direction))
 
     @cached_property
     def _fine_rule(self) -> ReadoutPoints:

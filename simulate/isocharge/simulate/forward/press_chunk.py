@@ -15,26 +15,60 @@ from isocharge.simulate.numerics.interpolation import tensor_values
 
 
 @dataclass(frozen=True)
-class PressChunk:
-    """Stress fields under several presses, interpolated at the nodes of the mesh.
+class PressMeshes:
+    """Meshes under several presses.
 
     Attributes:
-        mesh: Template of the mesh.
+        template: Template of the meshes.
         placement: Position of the template under each press, after the press has been rotated onto the x axis.
-        field: Scaled stresses of all fields at the nodes of every element, shape (n, n_element * n_local * n_field *
-            3), dimensionless. The values of all fields at one node are adjacent.
         direction: Direction from the centre of the film to each press, shape (n,), rad.
-        frame_angle: Angle of axis 1 of the stress fields from the x axis, shape (n,), rad.
         oval: Shape of an oval clamp, rotated with each press, shape (n,); see `mesh.placed_mesh.PlacedMesh`. Zero for a
             circular clamp.
     """
 
-    mesh: Template
+    template: Template
     placement: Placement
-    field: Array
     direction: Array
-    frame_angle: Array
     oval: Complexes
+
+    def locate(self, press_index: Integers, points: Complexes) -> tuple[Integers, Array, Booleans]:
+        """Find the elements that contain integration points, and evaluate the basis functions at the points.
+
+        If only half of the film is meshed, points in the other half are reflected into the meshed half.
+
+        Args:
+            press_index: Index of the press of each pair, shape (n_pair,).
+            points: Integration points x + iy, shape (n_pair, n_point), in film radii.
+
+        Returns:
+            Index of the element, shape (n_pair, n_point). Values of the basis functions, shape (n_pair, n_point,
+            n_local). Whether each point was reflected, shape (n_pair, n_point).
+        """
+        # Rotate the film so that the press lies on the positive x axis.
+        mesh = self.template
+        rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]
+        if self.oval.any():
+            rotated_points = from_oval(rotated_points, self.oval[press_index, None])
+        position, is_mirrored = mesh.into_meshed_half(rotated_points)
+        element, xi, eta = locate_points(self.placement[press_index], mesh, position)
+        basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel())
+        return element, basis_values.reshape(*points.shape, mesh.xi.size), is_mirrored
+
+
+@dataclass(frozen=True)
+class PressChunk:
+    """Stress fields under several presses, interpolated at the nodes of the mesh.
+
+    Attributes:
+        meshes: Meshes under the presses.
+        field: Scaled stresses of all fields at the nodes of every element, shape (n, n_element * n_local * n_field *
+            3), dimensionless. The values of all fields at one node are adjacent.
+        frame_angle: Angle of axis 1 of the stress fields from the x axis, shape (n,), rad.
+    """
+
+    meshes: PressMeshes
+    field: Array
+    frame_angle: Array
 
     def charges_by_rules(
         self, rules: tuple[tuple[ReadoutPoints, Booleans], ...], film_radius: float, is_odd: Booleans
@@ -93,8 +127,6 @@ class PressChunk:
     def _interpolated_stress(self, press_index: Integers, points: Complexes, n_field: int) -> tuple[Array, Booleans]:
         """Interpolate the stress of all fields from the nodes of the mesh to the integration points.
 
-        If only half of the film is meshed, points in the other half are reflected into the meshed half.
-
         Args:
             press_index: Index of the press of each pair, shape (n_pair,).
             points: Integration points x + iy, shape (n_pair, n_point), in film radii.
@@ -104,22 +136,9 @@ class PressChunk:
             Scaled stress (s11, s22, s12) in the frame of the mesh, shape (n_pair, n_point, n_field, 3), dimensionless.
             Whether each point was reflected, shape (n_pair, n_point).
         """
-        # Rotate the film so that the press lies on the positive x axis, and find the element of the mesh that contains
-        # each point.
-        mesh = self.mesh
-        rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]
-        if self.oval.any():
-            rotated_points = from_oval(rotated_points, self.oval[press_index, None])
-        position, is_mirrored = mesh.into_meshed_half(rotated_points)
-        element, first_local, second_local = locate_points(self.placement[press_index], mesh, position)
-
-        # Interpolate the values of all fields from the nodes of this element to the point. The basis functions depend
-        # on the two local coordinates of the point in its element.
+        element, basis_values, is_mirrored = self.meshes.locate(press_index, points)
         n_value = 3 * n_field  # number of values at a node
-        basis_values = tensor_values(mesh.resolution.order, first_local.ravel(), second_local.ravel())
-        basis_values = basis_values.astype(self.field.dtype)
-        field_by_element = self.field.reshape(len(self.field), mesh.n_element, -1, n_value)
+        field_by_element = self.field.reshape(len(self.field), self.meshes.template.n_element, -1, n_value)
         nodal_stress = field_by_element[press_index[:, None], element]  # shape (n_pair, n_point, n_local, n_value)
-        flat_stress = nodal_stress.reshape(*basis_values.shape, n_value)  # shape (n_pair * n_point, n_local, n_value)
-        stress = np.matmul(basis_values[:, None, :], flat_stress)
-        return stress.reshape(*position.shape, n_field, 3), is_mirrored
+        stress = basis_values[..., None, :].astype(self.field.dtype) @ nodal_stress
+        return stress.reshape(*points.shape, n_field, 3), is_mirrored

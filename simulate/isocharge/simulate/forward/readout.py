@@ -71,11 +71,11 @@ class ReadoutPoints:
             sensor: Sensor with the electrodes, the readout, the gains and the piezoelectric coefficients.
             per_side: Number of Gauss points per side of an electrode.
         """
-        layout_points = _layout_points(sensor.electrodes, sensor.readout, per_side)
+        nominal = layout_points(sensor.electrodes, sensor.readout, per_side)
         # The factor 2 accounts for s12 and s21, which contribute equally.
         charge_per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
-        weights = sensor.gains[:, None, None] * layout_points.weights * charge_per_stress
-        return cls(sensor.calibration.place(layout_points.points), weights, layout_points.count)
+        weights = sensor.gains[:, None, None] * nominal.weights * charge_per_stress
+        return cls(sensor.calibration.place(nominal.points), weights, nominal.count)
 
     def charge(self, stress: Array) -> Array:
         """Compute charges from the stress at the points.
@@ -91,7 +91,7 @@ class ReadoutPoints:
 
 
 @lru_cache(maxsize=32)
-def _layout_points(electrodes: tuple[Electrode, ...], readout: Readout, per_side: int) -> ReadoutPoints:
+def layout_points(electrodes: tuple[Electrode, ...], readout: Readout, per_side: int) -> ReadoutPoints:
     """Return the integration points at the nominal positions of the electrodes, with areas as weights.
 
     The result is cached, because many films have the same layout.
@@ -106,9 +106,11 @@ def _layout_points(electrodes: tuple[Electrode, ...], readout: Readout, per_side
         others is filled up with points of zero area.
     """
     rules = [electrode_rule(electrode, readout, per_side) for electrode in electrodes]
-    counts = np.array([len(shares) for _, shares in rules])
-    points = np.zeros((len(electrodes), counts.max(), 2))
-    areas = np.zeros((len(electrodes), counts.max(), 3))  # an area for each component of the stress (s11, s22, s12)
+    counts = np.array([len(shares) for _, shares in rules], dtype=np.intp)
+    points = np.zeros((len(electrodes), counts.max(initial=0), 2))
+    areas = np.zeros(
+        (len(electrodes), counts.max(initial=0), 3)
+    )  # an area for each component of the stress (s11, s22, s12)
     for index, electrode in enumerate(electrodes):
         electrode_points, shares = rules[index]
         n_point = counts[index]

@@ -266,7 +266,8 @@ class DesignCase:
         added to the noise.
 
         Args:
-            rows: Rows of a charge table, which contain charges and their derivatives, shape (n_press, n_electrode, 6).
+            rows: Charges and their derivatives, with the columns `stress_fields.COLUMNS`, shape (n_press, n_electrode,
+                6).
             nuisances: Standard deviations of the parameters that are not known exactly.
 
         Returns:

@@ -16,8 +16,8 @@ from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase
-from isocharge.simulate.layout.charge_table import ChargeTable
 from isocharge.simulate.layout.search import MAX_FINALISTS, MIN_DIFFERENCE, Layout, Search, random_layouts
+from isocharge.simulate.layout.stress_fields import rows_of, solve_fields
 from isocharge.simulate.sensor.sensor import Sensor
 
 DECIMALS = 3
@@ -130,8 +130,8 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     """
     # Improve random layouts, and refine the best ones that are not rotations of each other.
     starts = random_layouts(case)
-    table = ChargeTable.solve(case.sensor, case.probe, case.force, case.radius, executor)
-    search = Search(case, table)
+    fields = solve_fields(case.sensor, case.probe, case.force, case.radius, executor)
+    search = Search(case, fields)
     optima = list(track(in_order(executor, search.optimum, starts), "improving", len(starts)))
     finalists: list[Layout] = []
     for layout in sorted(optima, key=lambda layout: layout.error):
@@ -156,8 +156,8 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
 
     # If all layouts are ambiguous, choose the first layout, which has the smallest error.
     chosen = summaries.index(UNAMBIGUOUS) if UNAMBIGUOUS in summaries else 0
-    errors_before = error_map(case, table, case.sensor) if len(case.sensor.electrodes) >= 3 else None
-    errors_after = error_map(case, table, sensors[chosen])
+    errors_before = error_map(case, fields, case.sensor) if len(case.sensor.electrodes) >= 3 else None
+    errors_after = error_map(case, fields, sensors[chosen])
     error = refined_layouts[chosen].error
     return Design(case, sensors[chosen], error, summaries[chosen], chosen, errors_before, errors_after)
 
@@ -203,18 +203,18 @@ def describe_ambiguities(case: DesignCase, charges: ChargeMap) -> str:
     return "; ".join(findings) or UNAMBIGUOUS
 
 
-def error_map(case: DesignCase, table: ChargeTable, sensor: Sensor) -> ErrorMap:
+def error_map(case: DesignCase, fields: ForwardMap, sensor: Sensor) -> ErrorMap:
     """Compute the position errors of a sensor whose electrodes lie at their nominal positions.
 
     Args:
         case: Design case with the presses, the noise and the nuisances.
-        table: Charge table of the case.
+        fields: Stress fields of the case.
         sensor: Sensor whose layout is evaluated.
 
     Returns:
         Position errors for the noise alone, and for the noise together with the nuisances.
     """
-    charge_rows = table.rows(case.fine_grid, sensor.electrodes)
+    charge_rows = rows_of(fields, case.fine_grid, sensor.electrodes)
     error_by_noise = case.position_errors(charge_rows, NO_NUISANCES)
     error_with_nuisances = case.position_errors(charge_rows, case.nuisances)
     return ErrorMap(case.fine_grid, error_by_noise, error_with_nuisances)

@@ -17,8 +17,9 @@ import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
+from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.layout.case import DesignCase
-from isocharge.simulate.layout.charge_table import ChargeTable, PressedFilm
+from isocharge.simulate.layout.stress_fields import PressedFilm, rows_of
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.sensor import Electrode
 
@@ -104,11 +105,11 @@ class Search:
 
     Attributes:
         case: Requirements of the layout.
-        table: Charge table for the probe and the force of the case.
+        fields: Stress fields for the probe and the force of the case.
     """
 
     case: DesignCase
-    table: ChargeTable
+    fields: ForwardMap
 
     def errors(self, positions: Array) -> Array:
         """Compute the position error of each press of the fine grid, shape (n_press,), mm.
@@ -117,7 +118,7 @@ class Search:
             positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
         """
         electrodes = self.case.layout(positions).electrodes
-        return self.case.position_errors(self.table.rows(self.case.fine_grid, electrodes), self.case.nuisances)
+        return self.case.position_errors(rows_of(self.fields, self.case.fine_grid, electrodes), self.case.nuisances)
 
     def minimised_error(self, positions: Array) -> float:
         """Compute the largest error or the root mean square of the errors on the fine grid, mm.
@@ -171,7 +172,7 @@ class Search:
         Returns:
             Layout with its power mean.
         """
-        pressed = PressedFilm.interpolate(self.table, presses)
+        pressed = PressedFilm.interpolate(self.fields, presses)
         kept_rows = pressed.rows(self.case.kept_electrodes)
         side = self.case.square_side
 

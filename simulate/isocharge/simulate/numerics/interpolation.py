@@ -1,4 +1,4 @@
-"""Polynomial interpolation on Gauss-Lobatto nodes, Chebyshev nodes and uniform grids, and Gauss quadrature rules."""
+"""Polynomial interpolation on Gauss-Lobatto nodes and Chebyshev nodes, and Gauss quadrature rules."""
 
 from functools import lru_cache
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.polynomial.legendre import legder, leggauss, legvander
 from scipy.special import eval_legendre, roots_jacobi
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array
 
 
 @lru_cache(maxsize=32)
@@ -183,45 +183,7 @@ def _tensor_product(xi_values: Array, eta_values: Array) -> Array:
     return products.reshape(len(xi_values), eta_values.shape[1] * xi_values.shape[1])
 
 
-def cubic_weights(points: Array, count: int, periodic: bool = False) -> tuple[Integers, Array]:
-    """Compute the weights of cubic interpolation between four neighbouring nodes of a uniform grid.
-
-    The weight of a node is the value of its cubic Lagrange polynomial, which is 1 at this node and 0 at the other three
-    nodes.
-
-    Args:
-        points: Points of evaluation in units of the grid spacing, any shape. The nodes have the coordinates 0, 1, ...,
-            count - 1. If the grid is not periodic, values at points beyond its ends are extrapolated.
-        count: Number of nodes, at least four.
-        periodic: Whether the grid is periodic. In a periodic grid, node `count` is the same as node 0.
-
-    Returns:
-        Indices of the four nodes of each point, and the weights of these nodes, each of shape (..., 4).
-    """
-    # A point lies between the second and the third of its four nodes, except near the ends of a grid that is not
-    # periodic.
-    first_node = np.floor(points).astype(np.intp) - 1
-    if not periodic:
-        first_node = np.clip(first_node, 0, count - 4)
-
-    # The weight of a node is the product of the signed distances of the point from the other three nodes, divided by
-    # the value of this product at the node itself.
-    distance_0 = (points - first_node)[..., None]  # from the first of the four nodes, shape (..., 1)
-    distance_1 = distance_0 - 1.0
-    distance_2 = distance_0 - 2.0
-    distance_3 = distance_0 - 3.0
-    weight_0 = -distance_1 * distance_2 * distance_3 / 6.0
-    weight_1 = distance_0 * distance_2 * distance_3 / 2.0
-    weight_2 = -distance_0 * distance_1 * distance_3 / 2.0
-    weight_3 = distance_0 * distance_1 * distance_2 / 6.0
-    weights = np.concatenate([weight_0, weight_1, weight_2, weight_3], axis=-1)
-
-    nodes = first_node[..., None] + np.arange(4)
-    if periodic:
-        nodes = nodes % count
-    return nodes, weights
-
-
+@lru_cache(maxsize=32)
 def gauss_line(count: int) -> tuple[Array, Array]:
     """Return the points and weights of the Gauss-Legendre rule on the interval [0, 1].
 
@@ -232,7 +194,7 @@ def gauss_line(count: int) -> tuple[Array, Array]:
         Points and weights, each of shape (count,). The weights add up to one.
     """
     points, weights = leggauss(count)  # on the interval [-1, 1]
-    return 0.5 * (points + 1.0), 0.5 * weights
+    return _read_only(0.5 * (points + 1.0)), _read_only(0.5 * weights)
 
 
 @lru_cache(maxsize=32)

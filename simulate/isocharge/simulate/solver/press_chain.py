@@ -59,7 +59,7 @@ class Chain:
     forces: Array
     surface: Surface
     settings: SolveSettings
-    read: Reading = probe_frame_stress
+    read: Reading
 
 
 def solve_chains(chains: Sequence[Chain], executor: Executor | None) -> Array:

@@ -16,16 +16,16 @@ different displacement components are fixed on the line of symmetry.
 The derivative dR/dm and the change of the stress are computed by central differences.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.stress import stress_rotation
-from isocharge.simulate.mesh.placed_mesh import from_oval
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.solver.assembly import assembly
@@ -142,53 +142,6 @@ FILM_IS_ODD = np.array([field.odd for field in FILM_FIELDS])
 """Whether each of `FILM_FIELDS` is odd about the direction of the press, shape (n_field,)."""
 
 
-def _side_load_imperfection(direction: tuple[float, float]) -> AddImperfection:
-    """Create a function that adds a side load to a press.
-
-    The unit of the side load is E h a A^2, with Young's modulus E, the thickness h, the film radius a and the amplitude
-    A.
-
-    Args:
-        direction: Unit vector (x, y) of the side load.
-    """
-
-    def add_side_load(solved: Equilibrium, value: float) -> Equilibrium:
-        """Return the equilibrium with `value` units of additional side load."""
-        load_x, load_y = solved.groups.side_load
-        direction_x, direction_y = direction
-        side_load = (load_x + value * direction_x, load_y + value * direction_y)
-        return replace(solved, groups=replace(solved.groups, side_load=side_load))
-
-    return add_side_load
-
-
-SIDE_FORCE_FIELDS = (
-    StressField(_side_load_imperfection((1.0, 0.0)), odd=False),
-    StressField(_side_load_imperfection((0.0, 1.0)), odd=True),
-)
-"""Stress fields of a side force along the direction of the press (even), and across this direction (odd)."""
-
-SIDE_FORCE_IS_ODD = np.array([field.odd for field in SIDE_FORCE_FIELDS])
-"""Whether each of `SIDE_FORCE_FIELDS` is odd, shape (2,)."""
-
-
-def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute how the side forces in `SIDE_FORCE_FIELDS` change the scaled stress at the nodes.
-
-    The changes are computed for a scaled side load of one. The function `scaling.side_force_unit` returns the
-    corresponding side force in N.
-
-    Args:
-        solved: Press with a circular probe.
-        surface: Surface of the film at which the stress is computed; see `touch_stress`.
-
-    Returns:
-        Changes, shape (n_element, n_local, 2, 3), in the order of the table of a `ForwardMap` with several fields. The
-        last two axes are the field and the stress component (S11, S22, S12).
-    """
-    return np.moveaxis(_changes_by_fields(solved, SIDE_FORCE_FIELDS, surface), 0, 2)
-
-
 def film_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
     """Compute how changes of the film, as in `FILM_FIELDS`, change the scaled stress at the nodes.
 
@@ -203,23 +156,8 @@ def film_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
         Changes per unit, shape (n_element, n_local, n_field, 3), in the order of the table of a `ForwardMap` with
         several fields. The last two axes are the field and the stress component (S11, S22, S12).
     """
-    return np.moveaxis(_changes_by_fields(solved, FILM_FIELDS, surface), 0, 2)
-
-
-def _changes_by_fields(solved: Equilibrium, fields: Sequence[StressField], surface: Surface) -> Array:
-    """Compute how several imperfections change the scaled stress at the nodes.
-
-    Even and odd fields have different fixed displacements on the line of symmetry. Therefore the tangent is factorised
-    once for all even fields, and once for all odd fields.
-
-    Args:
-        solved: The solved press.
-        fields: Stress fields of the imperfections.
-        surface: Surface of the film at which the stress is computed.
-
-    Returns:
-        Changes per unit of the imperfection, shape (n_field, n_element, n_local, 3).
-    """
+    # Even and odd fields have different fixed displacements on the line of symmetry. Therefore the tangent is
+    # factorised once for all even fields, and once for all odd fields.
     with single_threaded_blas():
         elastic = ElasticFilm(solved.mesh.geometry, solved.groups)
         even_assembly = assembly(solved.mesh.template, elastic.unknowns_per_node, odd=False)
@@ -227,10 +165,10 @@ def _changes_by_fields(solved: Equilibrium, fields: Sequence[StressField], surfa
         even_factor = factor_tangent(elastic, even_assembly, solved.field)
         odd_factor = factor_tangent(elastic, odd_assembly, solved.field)
         changes = []
-        for field in fields:
+        for field in FILM_FIELDS:
             factor = odd_factor if field.odd else even_factor
             changes.append(_change_by_imperfection(solved, field.add, factor, surface))
-        return np.stack(changes)
+        return np.stack(changes, axis=2)
 
 
 def _change_by_imperfection(
@@ -267,10 +205,23 @@ def _change_by_imperfection(
     # The nodes of an oval film move with the rim. Subtract the change of the stress that the movement of the nodes
     # causes, so that the result holds for fixed points of the film.
     if positive_press.mesh.oval != negative_press.mesh.oval:
-        # Derivative of the positions x + iy of the nodes, shape (n_element, n_local)
         node_shift = (positive_press.mesh.points - negative_press.mesh.points) / (2.0 * STEP)
-        stress_gradient = solved.mesh.node_derivatives(nodal_stress(solved, surface))
-        x_contribution = node_shift.real[..., None] * stress_gradient[..., 0, :]
-        y_contribution = node_shift.imag[..., None] * stress_gradient[..., 1, :]
-        change -= x_contribution + y_contribution
+        change -= change_by_node_shift(solved.mesh, nodal_stress(solved, surface), node_shift)
     return np.asarray(change)
+
+
+def change_by_node_shift(mesh: PlacedMesh, stress: Array, node_shift: Complexes) -> Array:
+    """Compute to first order how the stress at the nodes changes if the nodes move in a constant stress field.
+
+    Args:
+        mesh: Mesh before the movement.
+        stress: Stress at the nodes of every element, shape (n_element, n_local, 3).
+        node_shift: Movement x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
+
+    Returns:
+        Change of the stress at the nodes, same shape and unit as `stress`.
+    """
+    stress_gradient = mesh.node_derivatives(stress)
+    x_contribution = node_shift.real[..., None] * stress_gradient[..., 0, :]
+    y_contribution = node_shift.imag[..., None] * stress_gradient[..., 1, :]
+    return np.asarray(x_contribution + y_contribution)

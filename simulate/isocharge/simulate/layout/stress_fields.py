@@ -1,0 +1,237 @@
+"""Charges of electrodes at any position on the film, and their derivatives with respect to the parameters of a press.
+
+A forward map interpolates the stress and its derivatives with respect to the position and the force of the press, the
+probe radius and the pretension. All presses have the same probe and the same force. The equilibrium of the film under a
+press does not depend on the electrodes, so the same stress fields are used for all layouts.
+"""
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Complexes
+from isocharge.common.contact_domain import Domain
+from isocharge.simulate.forward.family import NodeCount
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.forward.press_chunk import PressMeshes
+from isocharge.simulate.forward.readout import layout_points
+from isocharge.simulate.mechanics.stress import rotate_stress
+from isocharge.simulate.sensor.film import Surface
+from isocharge.simulate.sensor.probe import Circle
+from isocharge.simulate.sensor.sensor import Electrode, Sensor
+from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
+from isocharge.simulate.solver.load_case import SolveSettings
+from isocharge.simulate.solver.press import press
+from isocharge.simulate.solver.sensitivity import change_by_node_shift
+
+COLUMNS = ("charge", "x", "y", "ln force", "probe radius", "pretension")
+"""Columns of a row, which contains the results for one press and one electrode.
+
+The columns are the charge (pC) and its derivatives with respect to x and y (pC/mm), ln F (pC), the probe radius (pC/mm)
+and the pretension (pC/MPa).
+"""
+
+STEPS = {"x": 0.02, "y": 0.02, "ln force": 0.05, "probe radius": 0.02, "pretension": 0.1}
+"""Steps of the finite differences of the stress.
+
+The steps of the position and of the probe radius are in units of the probe radius, and that of the pretension is in
+MPa.
+"""
+
+NODE_COUNT = NodeCount(distances=8, forces=1)
+"""Numbers of distances and directions of the solved presses."""
+
+GAUSS_RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
+"""Integration rules of electrodes in ascending order of the distance between the electrode and the press.
+
+Each rule consists of the largest distance at which it is used, and of the number of Gauss points per side of the
+electrode. The unit of the distances is the sum of the radius of the circle around the electrode and the probe radius.
+The kink of the stress crosses only electrodes to which the first rule applies.
+"""
+
+PRESS_CHUNK = 256
+"""Number of presses that are evaluated at once, which limits the required memory to about 100 MB."""
+
+
+def solve_fields(
+    sensor: Sensor, probe: Circle, force: float, radius: float, executor: Executor | None = None
+) -> ForwardMap:
+    """Solve presses at a few distances from the centre, and compute one stress field for each of the `COLUMNS`.
+
+    Args:
+        sensor: Sensor with the film, its piezoelectric coefficients and the surface at which the stress is read.
+        probe: Circular probe that presses the film.
+        force: Force of the presses, N.
+        radius: Largest distance of a press from the centre, mm.
+        executor: Executor that runs the solves; None for this process.
+
+    Returns:
+        Forward map whose table contains the stress fields in MPa instead of the scaled stress.
+
+    Raises:
+        SolveError: If a press has no equilibrium.
+    """
+    domain = Domain(radius, (force, force))
+    fields = ForwardMap.build_unchecked(
+        sensor, probe, domain, NODE_COUNT, read=_stress_and_derivatives, executor=executor
+    )
+    return replace(fields, table=fields.table.astype(np.float32))
+
+
+def rows_of(fields: ForwardMap, presses: Array, electrodes: Sequence[Electrode]) -> Array:
+    """Compute the charges of electrodes under presses, and the derivatives of these charges.
+
+    A row contains the charge of one electrode under one press, followed by the derivatives of this charge. The charge
+    per area is averaged over the area of an electrode, even if the sensor has the edge readout.
+
+    Args:
+        fields: Stress fields that `solve_fields` returns.
+        presses: Positions (x, y) of the presses, shape (n, 2), mm.
+        electrodes: Electrodes of any shape at their nominal positions.
+
+    Returns:
+        One row with the columns `COLUMNS` for each press and electrode, shape (n, n_electrode, 6).
+    """
+    chunks = np.array_split(presses, math.ceil(len(presses) / PRESS_CHUNK))
+    return np.concatenate([PressedFilm.interpolate(fields, chunk).rows(electrodes) for chunk in chunks])
+
+
+@dataclass(frozen=True)
+class PressedFilm:
+    """Charge per area that several presses cause, at the nodes of the mesh under each press.
+
+    Attributes:
+        presses: Positions x + iy of the presses, shape (n,), mm.
+        probe_radius: Radius of the probe, mm.
+        film_radius: Radius of the film, mm.
+        meshes: Meshes under the presses.
+        density: Charge per area (pC/mm^2) and its derivatives, with the columns `COLUMNS`, in the meshed half of the
+            film and in its mirror image, shape (2, n, n_element, n_local, 6). The derivatives with respect to the
+            position are along and across the direction of the press.
+    """
+
+    presses: Complexes
+    probe_radius: float
+    film_radius: float
+    meshes: PressMeshes
+    density: np.ndarray
+
+    @classmethod
+    def interpolate(cls, fields: ForwardMap, presses: Array) -> "PressedFilm":
+        """Compute the charges per area that several presses cause.
+
+        Args:
+            fields: Stress fields that `solve_fields` returns, in a domain that contains the presses.
+            presses: Positions (x, y) of the presses, shape (n, 2), mm.
+        """
+        position = presses @ np.array([1.0, 1j])  # x + iy
+        direction = np.angle(position)
+        press_weights = fields.family.weights(position, np.full(len(presses), fields.family.force[0]), np.zeros(1))
+        meshes = fields.meshes_under(position, np.zeros(1))
+
+        # One matrix product interpolates the stress and converts it into charge per area, for all nodes.
+        piezo = fields.sensor.piezo
+        charge_per_stress = np.array([piezo.d31, piezo.d32, 2.0 * piezo.d12])
+        coefficients = rotate_stress(np.eye(3), direction[:, None]) @ charge_per_stress  # shape (n, 3)
+        n_solved = len(fields.table)
+        table = np.moveaxis(fields.table.reshape(n_solved, -1, 3), 2, 1).reshape(3 * n_solved, -1)
+        # In the mirror image, the shear stress has the opposite sign.
+        both_coefficients = np.stack([coefficients, coefficients * [1.0, 1.0, -1.0]])
+        weights = press_weights[:, :, None] * both_coefficients[:, :, None]  # shape (2, n, n_solved, 3)
+        flat_weights = weights.reshape(2 * len(presses), -1).astype(np.float32)
+        density = flat_weights @ table
+        density = density.reshape(2, len(presses), meshes.template.n_element, -1, len(COLUMNS))
+        # The derivative with respect to the movement across the direction of the press is odd.
+        density[1, ..., COLUMNS.index("y")] *= -1.0
+        return cls(position, fields.probe.reach, fields.sensor.film.radius, meshes, density)
+
+    def rows(self, electrodes: Sequence[Electrode]) -> Array:
+        """Compute the charges of electrodes and their derivatives for all presses; see `rows_of`."""
+        rows = np.zeros((len(self.presses), len(electrodes), len(COLUMNS)))
+        corners = [np.concatenate(electrode.parts) @ np.array([1.0, 1j]) for electrode in electrodes]
+        centre = np.array([points.mean() for points in corners])
+        reach = np.array([np.abs(points - points.mean()).max() for points in corners]) + self.probe_radius
+
+        # Each press and electrode use the first rule whose largest distance is not below their distance.
+        limits = [largest_distance for largest_distance, _ in GAUSS_RULES]
+        rule_of_pair = np.searchsorted(limits, np.abs(self.presses[:, None] - centre) / reach)
+        for number, (_, per_side) in enumerate(GAUSS_RULES):
+            rule = layout_points(tuple(electrodes), "area", per_side)
+            for n_point in np.unique(rule.count):
+                press_index, electrode = np.nonzero((rule_of_pair == number) & (rule.count == n_point))
+                if not press_index.size:
+                    continue
+                points = rule.points[electrode, :n_point] @ np.array([1.0, 1j]) / self.film_radius
+                weights = rule.weights[electrode, :n_point, 0]  # the weights of s11, s22 and s12 are equal
+                element, basis_values, is_mirrored = self.meshes.locate(press_index, points)
+                density = self.density[is_mirrored.astype(np.intp), press_index[:, None], element]
+                node_weights = weights[..., None] * basis_values
+                flat_weights = node_weights.reshape(len(press_index), 1, -1).astype(np.float32)
+                rows[press_index, electrode] = (flat_weights @ density.reshape(len(press_index), -1, len(COLUMNS)))[
+                    :, 0
+                ]
+
+        # Rotate the derivatives along and across the direction of each press into derivatives with respect to x and y.
+        x_column = COLUMNS.index("x")
+        y_column = COLUMNS.index("y")
+        derivative = (rows[..., x_column] + 1j * rows[..., y_column]) * np.exp(1j * self.meshes.direction)[:, None]
+        rows[..., x_column] = derivative.real
+        rows[..., y_column] = derivative.imag
+        return rows
+
+
+def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
+    """Compute the stress under a press and its derivatives at the nodes of the mesh, in the frame of the press.
+
+    The derivatives refer to fixed points of the film. They are computed by finite differences between solved presses.
+
+    Args:
+        solved: Equilibrium of the film under a press on the positive x axis.
+        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
+
+    Returns:
+        Stress (s11, s22, s12) and its derivatives in the order of `COLUMNS`, shape (n_element, n_local, 6, 3), MPa.
+    """
+    mesh = solved.mesh
+    film = solved.film
+    radius = solved.probe.reach
+    settings = SolveSettings(theory=solved.theory, resolution=mesh.resolution, layer=mesh.layer)
+    distance, _ = solved.at
+
+    def stress_of(equilibrium: Equilibrium) -> tuple[Array, Complexes]:
+        """Return the stress at the nodes in the frame of the given press, MPa, and the nodes, in film radii."""
+        x, y = equilibrium.at
+        angle = math.atan2(y, x)
+        stress_unit = film.young * equilibrium.groups.squared_amplitude
+        stress = stress_unit * rotate_stress(nodal_stress(equilibrium, surface), angle)
+        return stress, equilibrium.mesh.points * np.exp(1j * angle)
+
+    def changed(column: str, change: float) -> tuple[Array, Complexes]:
+        """Return the stress and the nodes if the quantity of one column changes."""
+        changes = dict.fromkeys(STEPS, 0.0) | {column: change}
+        changed_press = press(
+            replace(film, pretension=film.pretension + changes["pretension"]),
+            Circle(radius + changes["probe radius"]),
+            (distance + changes["x"], changes["y"]),
+            solved.force * math.exp(changes["ln force"]),
+            settings,
+            start=solved,
+        )
+        return stress_of(changed_press)
+
+    stress, _ = stress_of(solved)
+    columns = [stress]
+    for column, relative_step in STEPS.items():
+        step = relative_step if column in ("ln force", "pretension") else relative_step * radius
+        last_stress, last_points = changed(column, step)
+        if column == "pretension":  # the pretension may be zero and must not become negative
+            columns.append((last_stress - stress) / step)
+            continue
+        first_stress, first_points = changed(column, -step)
+        # The nodes move with the press. Subtract the change of the stress that their movement causes.
+        change = last_stress - first_stress - change_by_node_shift(mesh, stress, last_points - first_points)
+        columns.append(change / (2.0 * step))
+    return np.stack(columns, axis=2)
