@@ -63,7 +63,6 @@ def wrong_arguments(film):
     }
 
 
-@pytest.mark.parametrize("another_version", [False, True], ids=["new folder", "folder with version 7"])
 @pytest.mark.parametrize(
     ("mistake", "error", "message"),
     [
@@ -76,9 +75,8 @@ def wrong_arguments(film):
         ("no golden", ModelError, "expected a list of lists, 1 or more"),
     ],
 )
-def test_refused_model_leaves_no_files(film, tmp_path, mistake, error, message, another_version):
-    if another_version:
-        film.write(tmp_path, version=7)
+def test_refused_model_leaves_no_files(film, tmp_path, mistake, error, message):
+    film.write(tmp_path, version=7)
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(error, match=message):
         write(film, tmp_path / "linear", **wrong_arguments(film)[mistake])

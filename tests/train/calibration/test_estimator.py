@@ -188,15 +188,3 @@ def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synt
     assert abs(found.film.value("pretension") - changed[0]) < 3.0 * std
     assert std < 0.6 * np.sqrt(prior.earlier.covariance[0, 0])
     assert np.median(np.hypot(*(found.contact - contact)[:, :2].T)) < 0.3
-
-
-def test_without_presses_to_tell_the_estimate_is_the_prior(problem, synthetic):
-    """A single touch at an unknown place changes nothing but the contact."""
-    _, _, presses = rig(problem, synthetic, 1, seed=7)
-    presses.contact[:] = np.nan
-    presses.charge_pC[0, 3] = np.nan  # three charges only determine the contact
-    found = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
-    film = problem.prior.layout.film
-    std = np.sqrt(np.diag(found.film.covariance))[film]
-    assert (std > 0.9 * problem.prior.layout.prior.std * 0.8).all()
-    assert np.isnan(found.press_chi2).all()

@@ -1,6 +1,7 @@
 """Charges of a solved film and of similar films against direct solves, and calibrations of solved films."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from tests.benchmarks.measured_films import measured_presses, with_rig_errors
 
 from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, load_sensor, local_workers, parse_probe, press, touch_charge
+from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import CalibrationProblem, FitConfig, TrainingConfig, calibrate, write_calibration
 from isocharge.train.calibration.calibrate import solve_even
@@ -74,14 +76,10 @@ def test_derivatives_are_those_of_direct_solves(solved, name):
 
 
 def test_contact_slopes_are_differences_of_the_charges(solved):
-    step = 1e-4
-    slopes = solved.contact_slopes(solved.prior.mean, CONTACT)
-    for axis in range(3):
-        above, below = CONTACT.copy(), CONTACT.copy()
-        for contact, sign in ((above, 1.0), (below, -1.0)):
-            contact[:, axis] += sign * step * (CONTACT[:, axis] if axis == 2 else 1.0)
-        difference = (solved.charges(solved.prior.mean, above) - solved.charges(solved.prior.mean, below)) / (2 * step)
-        np.testing.assert_allclose(slopes[:, :, axis], difference, rtol=1e-3, atol=1e-3 * np.abs(slopes).max())
+    values = solved.prior.mean
+    slopes = solved.contact_slopes(values, CONTACT)
+    expected = differences(partial(solved.charges, values), CONTACT, steps=(1e-4, 1e-4, 1e-4))
+    np.testing.assert_allclose(slopes, expected, rtol=1e-3, atol=1e-3 * np.abs(slopes).max())
 
 
 def calibrated(problem, sensor, probe, path, count=15, seed=3):

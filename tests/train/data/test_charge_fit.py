@@ -7,7 +7,6 @@ from scipy.optimize import minimize
 from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.serve.model.charge_file import charge_map_from_bytes
 from isocharge.simulate import Domain, noise_model
-from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.simulate.numerics.disk_least_squares import into_domain
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, release
@@ -30,13 +29,6 @@ def test_charges_agree_with_the_simulator(field, film):
     relative_error = np.abs(field.charges(contact) / film.charges(contact) - 1.0)
     assert np.median(relative_error) < 2e-4
     assert np.sqrt(np.mean(relative_error**2)) < 2.0 * field.charge_std
-
-
-def test_derivatives_are_finite_differences_of_the_charges(field):
-    inner = Domain(7.0, (0.06, 1.9))  # differences need charges on both sides of a contact
-    contact = draw_contacts(np.random.default_rng(3), inner, 200)
-    expected = differences(field.charges, contact, steps=(1e-3, 1e-3, 1e-4))
-    assert np.allclose(field.derivatives(contact), expected, rtol=1e-4, atol=1e-2)
 
 
 def test_too_few_presses_are_refused():

@@ -11,8 +11,6 @@ from tests.train.random_networks import random_network
 
 from isocharge.serve import find_model, load_model, write_model
 from isocharge.serve.model.session import COLUMNS
-from isocharge.simulate import load_sensor, noise_model
-from isocharge.train.data.presses import draw_contacts
 from isocharge.train.model_release.onnx_graph import write_graph
 from isocharge.train.training.network import signed_features
 
@@ -38,16 +36,6 @@ def double_precision_answers(network, charge_pC):
 def check_agreement(given, expected, tolerance=1e-5):
     scale = np.maximum(np.abs(expected), FLOORS[: expected.shape[1]])
     assert np.all(np.abs(given - expected) <= tolerance * scale)
-
-
-@pytest.mark.first_cases(1)
-@pytest.mark.parametrize("model", ["four-25um-biaxial", "three-25um-biaxial"])
-def test_ten_thousand_noisy_presses_agree_with_onnxruntime(model, build, film):
-    rng = np.random.default_rng(0)
-    model_film = replace(film, sensor=load_sensor(model))
-    charge = model_film.charges(draw_contacts(rng, film.domain.within(7.9), 10_000))
-    charge_pC = noise_model("reference").add(charge, rng).astype(np.float32)
-    check_agreement(build(model).predict(charge_pC), onnxruntime_answers(model, charge_pC))
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -17,7 +17,7 @@ from isocharge.train.data.measured_sensor import PressedArea, outline
 from isocharge.train.data.presses import position_ranks
 from isocharge.train.model_release.evaluate import contact_errors
 from isocharge.train.model_release.release import release
-from isocharge.train.training.cross_fit import std_factors, usable_presses
+from isocharge.train.training.cross_fit import usable_presses
 from kept import ROOT, kept
 
 QUICK = FitConfig(
@@ -188,22 +188,12 @@ def test_pressed_area_contains_its_own_presses_and_no_others(released_pad):
     assert not area.contains(outside).any()
     with pytest.raises(SceneError, match=r"press 0 at \(-20, 0\) mm .* in the pressed area, x from -\d.* to 4\d"):
         area.check(outside, "pad")
-
-
-def test_flags_of_contacts_depend_on_the_pressed_area_and_not_on_the_distance_from_the_origin(released_pad, fresh):
-    predictor = Predictor(released_pad)
-    contacts = predictor.predict_batch(fresh.charge[:200])
-    flags = predictor.validity.batch_flags(contacts)
-    assert flags == [predictor.flags(predictor.predict(row)) for row in fresh.charge[:200]]
-    assert sum(not words for words in flags) > 150
-    assert "positions from (-" in repr(predictor)
+    # A contact is beyond the area at three times its radius from its centre, which is not the origin.
+    flags = Predictor(released_pad).flags
     contact = Contact(10.0, 0.0, 1.0, 0.1, 0.1, 0.1, 0.1)
-    radius = np.hypot(20.0, 20.0)
-    assert predictor.flags(contact) == ()
-    assert predictor.flags(contact._replace(x_mm=-20.0)) == ("outside",)
-    assert predictor.flags(contact._replace(x_mm=20.0 + 2.8 * radius)) == ("outside",)
-    assert predictor.flags(contact._replace(x_mm=20.0 + 3.5 * radius)) == ("outside", "beyond")
-    assert predictor.flags(contact._replace(x_mm=20.0 - 3.5 * radius)) == ("outside", "beyond")
+    assert flags(contact) == ()
+    assert flags(contact._replace(x_mm=20.0 + 2.8 * area.radius)) == ("outside",)
+    assert flags(contact._replace(x_mm=20.0 - 3.5 * area.radius)) == ("outside", "beyond")
 
 
 def test_outline_of_a_square_grid_is_larger_by_half_the_grid_step():
@@ -222,13 +212,6 @@ def test_charges_between_places_that_were_pressed_many_times_fit_the_presses():
     residual = planes.residuals(charges_on_l(other_contact, 9) / NOISE_pC)
     # Four charges of three unknowns leave one noise with standard deviation 1, spread over four residuals.
     assert 0.1 < np.median(np.abs(residual)) < 0.4
-
-
-def test_factors_of_standard_deviations_are_the_ratio_of_errors_to_standard_deviations():
-    rng = np.random.default_rng(0)
-    truth = rng.standard_normal((20_000, 3))
-    error = np.array([2.0, 2.0, 0.5]) * rng.standard_normal(truth.shape)
-    assert std_factors(truth + error, np.ones_like(truth), truth) == pytest.approx((2.0, 0.5), rel=0.03)
 
 
 def test_too_few_presses_are_refused():

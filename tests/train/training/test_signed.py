@@ -10,9 +10,7 @@ from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, release
-from isocharge.train.data.charge_fit import fit_charge_series
 from isocharge.train.data.contact_errors import ContactErrorStatistics
-from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from kept import kept
 
 RADIUS_mm = 1.5
@@ -74,15 +72,3 @@ def test_served_model_has_a_large_misfit_for_a_charge_that_is_too_negative(fitte
     too_negative = charge[charge[:, 1] < 0.0] - [0.0, 15.0, 0.0, 0.0]
     _, _, large_misfit = fitted.predict(too_negative)
     assert np.mean(large_misfit > model.metadata.errors["misfit_p99"]) > 0.9
-
-
-def test_series_of_charges_of_both_signs_agrees_with_the_simulated_charges(film):
-    contact = draw_contacts(np.random.default_rng(0), film.domain, 5_000)
-    presses = LabelledPresses(contact, film.charges(contact))
-    train, validation = np.split(np.arange(5_000), [4_000])
-    field = fit_charge_series(film.domain, film.electrodes, presses[train], presses[validation])
-    assert np.abs(field.charges(contact) - presses.charge).max() < 0.05  # pC: a twentieth of the noise
-    is_inner = np.hypot(contact[:, 0], contact[:, 1]) < 0.95 * RADIUS_mm
-    inner = contact[is_inner][:200]
-    expected = film.derivatives(inner)
-    assert np.abs(field.derivatives(inner) - expected).max() < 5e-3 * np.abs(expected).max()

@@ -61,12 +61,6 @@ def test_an_ill_conditioned_problem_is_solved_far_better_than_by_adam():
     assert losses[0] < 0.1 * losses[1]
 
 
-def test_a_gradient_of_zero_changes_nothing():
-    weight = nn.Parameter(torch.ones(4, 3))
-    run_soap(weight, lambda parameter: 0.0 * parameter.sum(), 12, rate=0.1)
-    torch.testing.assert_close(weight, torch.ones(4, 3))
-
-
 @pytest.mark.parametrize("shape", [(4, 6), (9, 32)])
 def test_rows_that_get_a_gradient_only_later_do_not_cause_long_steps(shape):
     """Until then, their mean square in the eigenbasis is zero."""
