@@ -20,6 +20,7 @@ from isocharge.simulate import (
     load_sensor,
 )
 from isocharge.simulate.dataset.sweep import write_sweep
+from isocharge.simulate.forward.derivative_maps import SideForceMap
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.placed_mesh import Geometry, place
 from isocharge.simulate.mesh.template import Template
@@ -141,6 +142,12 @@ def taut_map() -> ForwardMap:
     return kept(
         ForwardMap.build, replace(sensor, film=replace(sensor.film, pretension=0.8)), Circle(1.0), 8.0, (0.2, 1.0)
     )
+
+
+@pytest.fixture(scope="session")
+def side_force_map(taut_map: ForwardMap) -> SideForceMap:
+    """Derivatives of the charges of `taut_map` with respect to side forces."""
+    return kept(SideForceMap.build, taut_map)
 
 
 @pytest.fixture(scope="session")

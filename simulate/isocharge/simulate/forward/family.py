@@ -281,6 +281,8 @@ class Family:
             dimensionless. The rows have the order of the columns of `weights`.
         """
         n_value = solved.shape[-1]
+        if self.symmetry_order == 1:
+            return solved.reshape(-1, n_value)
         solved_period = solved.reshape(*solved.shape[:-1], mesh.n_element, -1, 3)
         stress_of_periods = []
         for period_index in range(self.symmetry_order):

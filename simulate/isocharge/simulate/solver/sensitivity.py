@@ -16,7 +16,7 @@ different displacement components are fixed on the line of symmetry.
 The derivative dR/dm and the change of the stress are computed by central differences.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -142,14 +142,46 @@ FILM_IS_ODD = np.array([field.odd for field in FILM_FIELDS])
 """Whether each of `FILM_FIELDS` is odd about the direction of the press, shape (n_field,)."""
 
 
-def film_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute how changes of the film, as in `FILM_FIELDS`, change the scaled stress at the nodes.
+def _side_load_imperfection(direction: tuple[float, float]) -> AddImperfection:
+    """Create a function that adds a side load to a press.
+
+    The unit of the side load is E h a A^2, with Young's modulus E, the thickness h, the film radius a and the amplitude
+    A.
+
+    Args:
+        direction: Unit vector (x, y) of the side load.
+    """
+
+    def add_side_load(solved: Equilibrium, value: float) -> Equilibrium:
+        """Return the equilibrium with `value` units of additional side load."""
+        load_x, load_y = solved.groups.side_load
+        direction_x, direction_y = direction
+        side_load = (load_x + value * direction_x, load_y + value * direction_y)
+        return replace(solved, groups=replace(solved.groups, side_load=side_load))
+
+    return add_side_load
+
+
+SIDE_FORCE_FIELDS = (
+    StressField(_side_load_imperfection((1.0, 0.0)), odd=False),
+    StressField(_side_load_imperfection((0.0, 1.0)), odd=True),
+)
+"""Stress fields of a side force along the direction of the press (even), and across this direction (odd)."""
+
+SIDE_FORCE_IS_ODD = np.array([field.odd for field in SIDE_FORCE_FIELDS])
+"""Whether each of `SIDE_FORCE_FIELDS` is odd, shape (2,)."""
+
+
+def stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: Surface = "middle") -> Array:
+    """Compute how the scaled stress at the nodes changes, for example by `FILM_FIELDS` or `SIDE_FORCE_FIELDS`.
 
     The changes refer to fixed points of the film, after the press has been rotated onto the x axis. The unit of a
     tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is the amplitude of the press.
+    The function `scaling.side_force_unit` returns the unit of a side force.
 
     Args:
         solved: Press with a circular probe.
+        fields: Stress fields to be computed.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
@@ -160,14 +192,11 @@ def film_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
     # factorised once for all even fields, and once for all odd fields.
     with single_threaded_blas():
         elastic = ElasticFilm(solved.mesh.geometry, solved.groups)
-        even_assembly = assembly(solved.mesh.template, elastic.unknowns_per_node, odd=False)
-        odd_assembly = assembly(solved.mesh.template, elastic.unknowns_per_node, odd=True)
-        even_factor = factor_tangent(elastic, even_assembly, solved.field)
-        odd_factor = factor_tangent(elastic, odd_assembly, solved.field)
-        changes = []
-        for field in FILM_FIELDS:
-            factor = odd_factor if field.odd else even_factor
-            changes.append(_change_by_imperfection(solved, field.add, factor, surface))
+        factors = [
+            factor_tangent(elastic, assembly(solved.mesh.template, elastic.unknowns_per_node, odd), solved.field)
+            for odd in (False, True)
+        ]
+        changes = [_change_by_imperfection(solved, field.add, factors[field.odd], surface) for field in fields]
         return np.stack(changes, axis=2)
 
 
