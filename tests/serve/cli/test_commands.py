@@ -108,8 +108,6 @@ def test_check_of_many_presses_shows_the_worst(measured, models, command):
 @pytest.mark.parametrize(
     ("text", "words", "message"),
     [
-        ("x_mm,y_mm,A,B\n1,2,3,4\n", [], "missing: ['C']"),
-        ("x_mm,y_mm,A,B,C\n", [], "expected one press or more"),
         ("force_N,A,B,C\n1,2,3,4\n", ["--force-std", "0"], "force_std: expected a positive share"),
         ("force_N,A,B,C\n1,2,3,4\n", ["--position-std", "nan"], "position_std_mm: expected"),
     ],

@@ -1,6 +1,5 @@
 """Headers and encodings of other programs: the message shows the header and names the column, or the wrong byte."""
 
-import io
 import time
 
 import numpy as np
@@ -43,13 +42,6 @@ def test_similar_header_names_the_column_to_rename(write, header, message):
     assert len(str(caught.value)) < 1000
 
 
-@pytest.mark.parametrize("header", ["t,note,force_N,A,B,C", "x,force [N],force_N,A,B,C,x_mm,y_mm"])
-def test_other_columns_are_ignored(write, header):
-    count = len(header.split(","))
-    presses = read_presses(write(f"{header}\n" + ",".join("123456789"[:count]) + "\n"), NAMES)
-    assert presses.charge_pC.tolist() == [[4.0, 5.0, 6.0]]
-
-
 def test_header_with_a_very_long_name_is_checked_fast(write):
     name = "x" + " " * 30_000 + "]"
     before = time.process_time()
@@ -63,12 +55,6 @@ def test_headers_where_every_other_column_is_an_electrode(write):
     assert read_presses(write(f"x_mm,y_mm,force_N,a,f,Ladung [pC]\n{ROW}")).electrodes == ("a", "f", "Ladung [pC]")
     with pytest.raises(PressError, match=r"rename 'force \[N\]' to 'force_N', or remove"):
         read_presses(write(f"x_mm,y_mm,force [N],a,b,c\n{ROW}"))
-
-
-def test_headers_of_charges_alone(write):
-    with pytest.raises(ChargeError, match="rename 'a' to 'A'"):
-        read_charges(io.StringIO("a,B,C\n1,2,3\n"), NAMES, "stdin")
-    assert read_charge_file(write(f"x,y,Kraft,A,B,C\n{ROW}"), NAMES).tolist() == [[4.0, 5.0, 6.0]]
 
 
 TEXT = f"# Größe\nx_mm,y_mm,force_N,A,B,C\n{ROW}"

@@ -70,11 +70,6 @@ def test_ignored_columns_may_have_any_type(write, expected):
     assert (presses.ignored, presses.lines, presses.row_noun) == (("more",), (1, 2, 3), "row")
 
 
-def test_a_column_of_nulls_is_empty(write):
-    presses = read_presses(write({"x_mm": pyarrow.nulls(3), "y_mm": pyarrow.nulls(3)}), NAMES)
-    assert np.isnan(presses.contact[:, :2]).all()
-
-
 @pytest.mark.parametrize(
     ("column", "message"),
     [
@@ -128,11 +123,6 @@ def test_parquet_with_too_many_rows_is_refused(tmp_path, monkeypatch):
         PressError, match=r"long\.parquet: expected at most 1,000,000 presses, got more; split the file"
     ):
         read_presses(tmp_path / "long.parquet", NAMES)
-
-
-def test_parquet_file_without_rows_is_refused(write):
-    with pytest.raises(PressError, match=r"expected one press or more below the header, got none"):
-        read_presses(write({name: pyarrow.array([], pyarrow.float64()) for name in COLUMNS}), NAMES)
 
 
 # What is not Parquet

@@ -26,10 +26,7 @@ def read(text):
     "text",
     [
         "A,B,C\n1,2,3\n4,5,6.5\n",
-        "A,B,C\r\n1,2,3\r\n4,5,6.5\r\n\r\n\r\n",
-        "C,A,B\n3,1,2\n6.5,4,5",
         "\n A , B,C \n1, 2,3\n,,\n4,5,65e-1\n",
-        '"A","B","C"\n"1",2,3\n4,5,6.5\n',
         '# of "today\n\nA,B,C\n1,2,3,,\n  # 7,8,9\n4,5,6.5\n',
     ],
 )
@@ -91,7 +88,6 @@ def test_message_about_a_wrong_table_is_short(text, message):
     ("text", "message"),
     [
         ("", r"presses.csv: empty; expected a header with one column for each of the electrodes \('A', 'B', 'C'\)"),
-        ("A,B,C,C\n1,2,3,4\n", r"repeated: \['C'\]"),
         ("1,2,3\n4,5,6\n", r"missing: \['A', 'B', 'C'\]"),
         ("A\tB\tC\n1,064\t832\t629\n", "every number with the mark ',' may have .*separator of thousands"),
         ('A,B,C\n"1,064",832,629\n', "line 2, column 'A': .*got '1,064'; the decimal mark is '.'"),
@@ -100,11 +96,7 @@ def test_message_about_a_wrong_table_is_short(text, message):
         ("pC;nC;pC\nA;B;C\nA;B;C\n1;2;3\n", "line 3, column 'A': expected a charge in pC, got 'A'"),
         ("A;B;C\npC;nC;pC\n1;2;3\n", "line 2, column 'A': expected a charge in pC, got 'pC'"),
         ("A,B,C\n1,2,3\n\n4,,6\n", "presses.csv, line 4, column 'B': expected a charge in pC.*got an empty cell"),
-        ("A,B,C\n1,2 pC,3\n", "line 2, column 'B': expected a charge in pC.*, got '2 pC'"),
-        ("C,B,A\n1,nan,3\n", "line 2, column 'B': .* got 'nan'"),
-        ("A,B,C\n1,2,1e39\n", "line 2, column 'C': .* got 1e.39$"),
         ("A,B,C\n1,1_0,3\n", "line 2, column 'B': .* got '1_0'"),
-        ("A,B,C\n1,2\n", "line 2: expected 3 cells as in the header, got 2"),
     ],
 )
 def test_wrong_charge_tables_are_refused(text, message):

@@ -3,18 +3,14 @@
 import json
 import re
 import socket
-import struct
 import time
 from contextlib import suppress
 
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 
 from isocharge.common.errors import InputError
 from isocharge.serve.network.browser_check import BrowserCheck
-from isocharge.serve.viewer.film_description import describe_film
-from isocharge.serve.viewer.live_page import MAX_READ_SAMPLES, LivePage, Marker, Record, Tare
+from isocharge.serve.viewer.live_page import MAX_READ_SAMPLES, Marker, Record, Tare
 from isocharge.serve.viewer.tape import LIVE_SAMPLES
 
 
@@ -116,17 +112,11 @@ def test_a_recording_cannot_be_changed(start_page):
     [
         {"do": "shutdown"},
         {"do": "record"},
-        {"do": "record", "on": 1},
         {"do": "marker", "text": "x" * 81},
-        {"do": "marker", "text": "a\nb"},
         {"do": "read", "first": -1},
-        {"do": "read", "first": 10**30},
         {"do": "read", "most": 601},
-        {"do": "read", "until_s": 1e999},
-        {"do": "tare", "path": "/etc/passwd"},
         [],
         "",
-        "[" * 4000,
         b"\0" * 100,
     ],
 )
@@ -137,47 +127,10 @@ def test_wrong_request_is_refused_with_the_reason(client, content):
     assert client.ask("read")["samples"] == []
 
 
-@settings(max_examples=20)
-@given(st.text() | st.recursive(st.none() | st.text() | st.floats(), st.lists, max_leaves=5).map(json.dumps))
-@example('{"do": "read", "until_s": NaN}')
-@example('{"do": "read", "until_s": 1' + "0" * 4000 + "}")
-def test_any_other_text_is_refused(film, text):
-    page = LivePage(describe_film("a film", film.metadata()))
-    headers = [(b"host", b"localhost")]
-    assert page.answer("POST", "/request", headers, text.encode("utf-8", "surrogatepass")).status == 400
-
-
-@pytest.mark.parametrize(
-    "request_",
-    [
-        b"GET / HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n" + b"a: b\r\n" * 500_000,
-        b"GET /" + b"a" * 3_000_000 + b" HTTP/1.1\r\n\r\n",
-        b"POST /request HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3000000\r\n\r\n" + bytes(3_000_000),
-        struct.pack("<1000d", *range(1000)),
-    ],
-    ids=["trailers", "address", "body", "noise"],
-)
-def test_wrong_http_request_is_refused(client, request_):
-    """A request of any length is refused or answered before it has been read completely."""
-    with socket.create_connection((client.place.hostname, client.place.port), timeout=20) as connection:
-        with suppress(OSError):
-            connection.sendall(request_)
-            connection.shutdown(socket.SHUT_WR)
-        answer = b""
-        with suppress(ConnectionResetError):
-            while piece := connection.recv(1 << 16):
-                answer += piece
-    assert not answer or re.match(rb"HTTP/1\.1 (200|4\d\d) ", answer)
-    assert client.send("GET", "/")[0] == 200
-
-
 @pytest.mark.parametrize(
     ("headers", "status"),
     [
-        ({"Host": "192.168.1.7"}, 200),
-        ({"Host": "[::1]:8001", "Origin": "http://[::1]:8001"}, 200),
         ({"Origin": "http://evil.example"}, 403),
-        ({"Origin": "null"}, 403),
         ({"Sec-Fetch-Site": "cross-site"}, 403),
         ({"Host": "evil.example:8001", "Origin": "http://evil.example:8001"}, 403),  # after DNS rebinding
     ],
@@ -207,8 +160,6 @@ def test_description_and_samples_need_the_token(start_page):
     ("method", "path", "status"),
     [
         ("GET", "/etc/passwd", 404),
-        ("GET", "/../live_page.py", 404),
-        ("GET", "/vendor", 404),
         ("GET", "/request", 405),
         ("PUT", "/request", 405),
     ],

@@ -230,20 +230,6 @@ def test_trailers_and_chunk_extensions_have_the_limit_of_headers(server, endless
         assert statuses(everything(connection)) == [431]
 
 
-def test_pipelined_requests_are_answered_in_order(server, store, monkeypatch):
-    """Requests that are answered at once wait for an earlier request of the same connection that takes long."""
-    load = store.load
-    monkeypatch.setattr(store, "load", lambda name: (time.sleep(0.3), load(name)))
-    rest = b"".join(b"GET %s HTTP/1.1\r\n\r\n" % path for path in (b"/v2/health/live", b"/nope", b"/v2/health/ready"))
-    with connect(server) as connection:
-        connection.sendall(LOAD + rest)
-        connection.sendall(b"GET /v2 HTTP/1.1\r\nConnection: close\r\n\r\n")
-        answers = everything(connection).split(b"HTTP/1.1 ")[1:]
-    bodies = [answer.partition(b"\r\n\r\n")[2] for answer in answers]
-    assert [answer[:3] for answer in answers] == [b"200", b"200", b"404", b"200", b"200"]
-    assert (bodies[0], bodies[1], bodies[3]) == (b"{}", b'{"live":true}', b'{"ready":true}')
-
-
 @pytest.fixture
 def slow_load(store, monkeypatch):
     """Let loads wait; return an event that is set when a load begins, and an event that lets the load continue."""

@@ -87,19 +87,11 @@ def test_every_route_answers_its_method_only(ask, method, path):
     "path",
     [
         "",
-        "/v1",
-        "/v2/",
         "/v2/health",
         "/v2/models",
-        "/v2/models/linear/",
-        "/v2/models/linear/versions",
         "/v2/models/linear/versions/",
-        "/v2/models/linear/versions/1/",
         "/v2/models/linear/infer/1",
         "/v2/models/linear/versions/1/versions/1",
-        "/v2/repository/models/linear",
-        "/v2/repository/models/linear/versions/1/load",
-        "/v2/systemsharedmemory/status",
     ],
 )
 def test_unknown_path_gets_404(ask, path):
@@ -185,7 +177,6 @@ def changed(**changes):
 BAD = {
     "nothing": (b"", 400, "expected JSON, got b''"),
     "no JSON": (b"{", 400, "expected JSON, got"),
-    "no object": (b"[]", 400, "expected a table, got"),
     "NaN": (changed(data=[1, 2, 3]).replace(b"[1,2,3]", b"[1,NaN,3]"), 400, "expected JSON, got .*NaN"),
     "beyond float64": (
         changed(data=[1, 2, 3]).replace(b"[1,2,3]", b"[1,1e999,3]"),
@@ -193,34 +184,24 @@ BAD = {
         r"out of range - at .*data\[1\]",
     ),
     "beyond float32": (changed(data=[1, 2, 1e39]), 400, r"finite charges .* electrode 'C' \(1e\+39\)"),
-    "nested": (b"[" * 100_000, 400, "expected JSON, got"),
     "nested data": (
         changed(data=[1, 2, 3]).replace(b"[1,2,3]", b"[" * 500 + b"]" * 500),
         400,
         r"data\[0\]\[0\]: expected a finite number, got",
     ),
     "no inputs": (b'{"inputs": []}', 400, "inputs: expected a list with one tensor"),
-    "two inputs": (orjson.dumps({"inputs": request(PRESS)["inputs"] * 2}), 400, "a list with one tensor"),
-    "other name": (changed(name="charges"), 400, r"inputs\[0\].name: expected one of charge_pC, got 'charges'"),
     "other type": (changed(datatype="INT64"), 400, "expected one of FP32, FP64, got 'INT64'"),
     "no rows": (changed(shape=[0, 3], data=[]), 400, "with n > 0"),
-    "a fraction": (changed(shape=[1.5, 3]), 400, r"shape\[0\]: expected a whole number, got 1.5"),
-    "yes rows": (changed(shape=[True, 3]), 400, "expected a whole number, got True"),
     "too many": (changed(shape=[10**12, 3]), 413, "at most 4096 presses in one request, got 1000000000000"),
     "too few numbers": (changed(data=[1, 2]), 400, r"shape \[1, 3\], flat or in rows, got \[1.0, 2.0\]"),
     "ragged": (changed(shape=[2, 3], data=[[1, 2, 3], [1, 2]]), 400, "expected `data`, numbers"),
     "yes": (changed(data=[1, 2, True]), 400, r"data\[2\]: expected a finite number or .*, got True"),
-    "no": (changed(data=[[1, 2, False]]), 400, r"data\[0\]\[2\]: expected a finite number, got False"),
-    "no data": (changed(data=None), 400, "expected `data`, numbers"),
-    "id no text": (orjson.dumps(request(PRESS, id=7)), 400, "id: expected a text, got 7"),
     "other output": (
         orjson.dumps(request(PRESS, outputs=[{"name": "z"}])),
         400,
         "one of contact, contact_std, contact_correl",
     ),
     "output twice": (orjson.dumps(request(PRESS, outputs=[{"name": "misfit"}] * 2)), 400, "each name once"),
-    "parameters": (orjson.dumps(request(PRESS, parameters=[])), 400, "parameters: expected a table"),
-    "no flag": (orjson.dumps(request(PRESS, parameters={"binary_data_output": 1})), 400, "true or false, got 1"),
     "memory": (changed(parameters={"shared_memory_region": "r"}), 400, "does not support it, got 'r'"),
     "size without bytes": (changed(parameters={"binary_data_size": 12}), 400, "binary_data_size 12 and 0 bytes"),
 }
@@ -246,10 +227,7 @@ def test_wrong_inference_header_content_length_is_refused(handler, length):
     ("changes", "spoil", "message"),
     [
         ({"tensor": {"parameters": {"binary_data_size": 8}}}, bytes, "binary_data_size 8 and 12 bytes"),
-        ({"tensor": {"parameters": {"binary_data_size": "12"}}}, bytes, "expected a whole number, got '12'"),
-        ({"tensor": {"parameters": {"binary_data_size": 10**15}}}, bytes, "and 12 bytes"),
         ({"tensor": {"data": [1, 2, 3]}}, bytes, "expected either `data` or 12 bytes"),
-        ({"tensor": {"parameters": {}}}, bytes, "binary_data_size None and 12 bytes"),
         ({"tensor": {"shape": [2, 3]}}, bytes, "expected either `data` or 24 bytes"),
         ({}, lambda body: body[:-4], "and 8 bytes"),
         (
@@ -301,9 +279,7 @@ def test_openapi_describes_request_and_response_of_each_route(ask):
         ("br", b"x", 415, "expected gzip, deflate or identity"),
         ("gzip", b"no gzip", 400, "the body is not 'gzip'"),
         ("gzip", gzip.compress(b"{}", mtime=0)[:-3], 400, "ends before"),
-        ("gzip", gzip.compress(b"{}", mtime=0) * 2, 400, "goes on after"),
         ("deflate", zlib.compress(b"{}") + b"more", 400, "goes on after"),
-        ("gzip", gzip.compress(bytes(1 << 24), mtime=0), 413, "unpacks to more than 1048576 bytes"),
     ],
 )
 def test_wrong_content_encoding_is_refused(ask, way, body, status, message):
