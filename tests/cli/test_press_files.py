@@ -4,8 +4,8 @@ import pyarrow
 import pytest
 from pyarrow.parquet import write_table
 
+from isocharge.common.defaults import MAX_BATCH
 from isocharge.serve import Predictor
-from isocharge.serve.prediction.table import BLOCK_ROWS
 
 COMMANDS = {
     "predict": ("serve", "predict", "four-25um-biaxial"),
@@ -74,11 +74,11 @@ def test_a_long_table_is_predicted_in_pieces(command, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Predictor, "predict_batch", recorded)
     header = "A,B,C,D\n"
-    (tmp_path / "p.csv").write_text(header + "500,500,500,500\n" * (BLOCK_ROWS + 1))
+    (tmp_path / "p.csv").write_text(header + "500,500,500,500\n" * (MAX_BATCH + 1))
     (tmp_path / "empty.csv").write_text(header)
     _, out, _ = command(*COMMANDS["predict"], tmp_path / "p.csv")
     _, out_of_empty, _ = command(*COMMANDS["predict"], tmp_path / "empty.csv")
-    assert sizes == [BLOCK_ROWS, 1, 0]
+    assert sizes == [MAX_BATCH, 1, 0]
     names, *rows = out.splitlines()
     assert out_of_empty.splitlines() == [names]
-    assert (len(rows), len(set(rows))) == (BLOCK_ROWS + 1, 1)
+    assert (len(rows), len(set(rows))) == (MAX_BATCH + 1, 1)

@@ -18,7 +18,7 @@ from typing import BinaryIO, TextIO
 from isocharge.common.errors import IsochargeError, OutputError, OutputExists
 
 MAX_FILE_BYTES = 64 << 20
-"""Largest size of a file that is read by `read_whole`, bytes."""
+"""Largest size of a file that is read by `read_whole`, and of the unpacked arrays of an npz file, bytes."""
 
 MAX_LINE_CHARACTERS = 1 << 20
 """Largest number of characters of a line in a text that is read line by line."""

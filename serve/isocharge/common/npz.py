@@ -10,8 +10,7 @@ import zipfile
 
 import numpy as np
 
-MAX_UNPACKED_BYTES = 64 << 20
-"""Largest total size of the arrays of a file, bytes."""
+from isocharge.common.files import MAX_FILE_BYTES
 
 COMPRESSION_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods that are accepted. NumPy writes no others."""
@@ -36,8 +35,8 @@ def npz_arrays(data: bytes) -> dict[str, np.ndarray]:
                     raise ValueError(f"an array has the compression method {entry.compress_type}")
             # An entry that is longer than declared is read only up to its declared length, and fails its checksum.
             unpacked_bytes = sum(entry.file_size for entry in archive.infolist())
-        if unpacked_bytes > MAX_UNPACKED_BYTES:
-            raise ValueError(f"the arrays unpack to more than {MAX_UNPACKED_BYTES} bytes")
+        if unpacked_bytes > MAX_FILE_BYTES:
+            raise ValueError(f"the arrays unpack to more than {MAX_FILE_BYTES} bytes")
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return {name: np.asarray(content) for name, content in arrays.items()}
     except Exception as error:  # zipfile, zlib and NumPy raise many types of exceptions for damaged files

@@ -24,9 +24,6 @@ from isocharge.serve.model.predictor import Predictor
 Clock = Callable[[], int]
 """Function that returns the time, ns."""
 
-MIN_CALLS = 3
-"""Smallest number of calls in a turn, even if these calls take longer than the turn."""
-
 ROUNDS = 10
 """Number of turns of every contender. The first turn is a warm-up, whose durations are not used."""
 
@@ -116,12 +113,12 @@ def _measure_turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> lis
 
     Args:
         call: Function whose duration is measured.
-        turn_ns: Length of the turn, ns. The turn takes longer if it would contain fewer than `MIN_CALLS` calls.
+        turn_ns: Length of the turn, ns. The turn takes longer if its only call takes longer.
         clock: Function that returns the time, ns.
     """
     durations_ns: list[int] = []
     turn_end_ns = clock() + turn_ns
-    while len(durations_ns) < MIN_CALLS or clock() < turn_end_ns:
+    while not durations_ns or clock() < turn_end_ns:
         call_start_ns = clock()
         call()
         durations_ns.append(clock() - call_start_ns)

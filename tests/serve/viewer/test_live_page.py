@@ -10,8 +10,8 @@ import pytest
 
 from isocharge.common.errors import InputError
 from isocharge.serve.network.browser_check import BrowserCheck
-from isocharge.serve.viewer.live_page import MAX_READ_SAMPLES, Marker, Record, Tare
-from isocharge.serve.viewer.tape import LIVE_SAMPLES
+from isocharge.serve.viewer.live_page import Marker, Record, Tare
+from isocharge.serve.viewer.tape import LIVE_SAMPLES, MAX_DRAWN_SAMPLES
 
 
 def put(client, record, count, **changes):
@@ -30,7 +30,7 @@ def record_count(client, answer):
 def test_new_browser_receives_the_last_ten_seconds_and_then_each_record_once(client, record):
     put(client, record, 3000)
     answer = client.ask("read")
-    assert len(answer["samples"]) == MAX_READ_SAMPLES
+    assert len(answer["samples"]) == MAX_DRAWN_SAMPLES
     assert record_count(client, answer) == pytest.approx(2000, abs=2)
     assert client.ask("read", first=answer["first"])["samples"] == []
     put(client, record, 100)

@@ -12,7 +12,7 @@ from isocharge.serve import flags
 from isocharge.serve.record.record import OtherContact, TrackedContact, Tracking
 from isocharge.serve.viewer.tape import (
     FLAG_BITS,
-    OVERVIEW_PIECES,
+    MAX_DRAWN_SAMPLES,
     RecordedTape,
     Tape,
     coalesce,
@@ -130,6 +130,6 @@ def test_recorded_tape_stores_all_samples_and_the_largest_force_of_each_piece(re
     assert recorded.span() == (1e9, 1e9 + 59.999)
     assert recorded.first_number_after(1e9 + 15.0005) == 15_001
     overview = recorded.overview()
-    assert len(overview) == OVERVIEW_PIECES
-    assert overview.index(1.5) / OVERVIEW_PIECES == pytest.approx(0.5, abs=0.01)
+    assert len(overview) == MAX_DRAWN_SAMPLES
+    assert overview.index(1.5) / MAX_DRAWN_SAMPLES == pytest.approx(0.5, abs=0.01)
     assert sum(force > 0 for force in overview) == 1

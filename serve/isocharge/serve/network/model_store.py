@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import TypeVar
 
 from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.model.metadata import ModelMetadata
@@ -27,6 +27,12 @@ from isocharge.serve.network.metrics import ModelMetrics, Statistics
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
+
+VersionKey = tuple[str, int]
+"""Name of a model and number of a version."""
+
 
 @dataclass(frozen=True)
 class LoadedVersion:
@@ -34,37 +40,26 @@ class LoadedVersion:
 
     Attributes:
         model: The model, which contains its session of onnxruntime.
-        metadata: Metadata of the model.
-        version: Number of the version as a text.
         statistics: Counters of the requests to this version.
     """
 
     model: Model
-    metadata: ModelMetadata
-    version: str
     statistics: Statistics
+
+    @property
+    def metadata(self) -> ModelMetadata:
+        """Metadata of the model."""
+        return self.model.metadata
+
+    @cached_property
+    def version(self) -> str:
+        """Number of the version as a text."""
+        return str(self.metadata.version)
 
     @cached_property
     def validity(self) -> Validity:
         """Limits within which the contacts that the model estimates are valid."""
         return Validity.of(self.metadata)
-
-
-class _Versions(NamedTuple):
-    """Versions of one model. The object is never changed, so that other threads can use it without a lock.
-
-    Attributes:
-        loaded: Loaded versions by number, in ascending order of their numbers.
-        refused: Reasons why versions were refused or unloaded, by number.
-    """
-
-    loaded: Mapping[int, LoadedVersion] = MappingProxyType({})
-    refused: Mapping[int, str] = MappingProxyType({})
-
-    def find(self, version: str) -> LoadedVersion | None:
-        """Return the loaded version with a number, or the highest loaded version if the number is empty."""
-        numbers = [number for number in self.loaded if version in ("", str(number))]
-        return self.loaded[numbers[-1]] if numbers else None
 
 
 class ModelStore:
@@ -89,72 +84,57 @@ class ModelStore:
         self._folders = folders
         self._change_lock = threading.Lock()
         self.metrics = ModelMetrics()
-        self._statistics: dict[tuple[str, int], Statistics] = {}
-        self._models: dict[str, _Versions] = {}  # is replaced as a whole, so that no thread reads half of a change
+        self._statistics: dict[VersionKey, Statistics] = {}
+        # The following dictionaries are replaced as a whole, so that no thread reads half of a change.
+        self._loaded: dict[VersionKey, LoadedVersion] = {}  # in ascending order of names and numbers
+        self._refused: dict[VersionKey, str] = {}  # reasons why versions were refused or unloaded
         for name, folder in folders().items():
             self._load_versions(name, folder)
         if not self.loaded_versions():
             raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'no model was found'}")
 
-    def find(self, name: str, version: str = "") -> LoadedVersion | None:
-        """Return a loaded version of a model, or None if the version is not loaded.
+    def get(self, name: str, version: str = "") -> LoadedVersion:
+        """Return a loaded version of a model.
 
         Args:
             name: Name of the model.
             version: Number of the version as a text. An empty text means the highest loaded version.
-        """
-        return self._models.get(name, _Versions()).find(version)
-
-    def get(self, name: str, version: str = "") -> LoadedVersion:
-        """Return a loaded version of a model, as `find` does.
 
         Raises:
             ModelNotFound: If the version is not loaded. The message lists the loaded versions, and states why the
                 version was refused or unloaded.
         """
-        loaded = self.find(name, version)
-        if loaded is not None:
-            return loaded
+        versions = self.versions_of(name, version)
+        if versions:
+            return versions[-1]
         label = f"{name}/{version}" if version else name
-        available = ", ".join(sorted(loaded.metadata.label for loaded in self.loaded_versions())) or "no model"
-        refused = self._models.get(name, _Versions()).refused
-        reasons = [reason for number, reason in refused.items() if version in ("", str(number))]
+        available = ", ".join(loaded.metadata.label for loaded in self.loaded_versions()) or "no model"
+        reasons = [reason for key, reason in self._refused.items() if key[0] == name and version in ("", str(key[1]))]
         raise ModelNotFound(
             "; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *dict.fromkeys(reasons)])
         )
 
     def label(self, name: str, version: str = "") -> str | None:
-        """Return the label `name/version` of the version that `find` returns, or None if the version is not loaded."""
-        loaded = self.find(name, version)
-        return None if loaded is None else loaded.metadata.label
+        """Return the label `name/version` of the version that `get` returns, or None if the version is not loaded."""
+        versions = self.versions_of(name, version)
+        return versions[-1].metadata.label if versions else None
 
     def loaded_versions(self) -> list[LoadedVersion]:
         """Return all loaded versions of all models, sorted by name and version."""
-        return [loaded for _, versions in sorted(self._models.items()) for loaded in versions.loaded.values()]
+        return list(self._loaded.values())
 
-    def versions_of(self, name: str) -> list[LoadedVersion]:
+    def versions_of(self, name: str, version: str = "") -> list[LoadedVersion]:
         """Return the loaded versions of one model, in ascending order of their numbers.
 
-        Raises:
-            ModelNotFound: If no version of the model is loaded.
+        Args:
+            name: Name of the model.
+            version: Number of the only version that is returned, as a text. An empty text selects all versions.
         """
-        self.get(name)  # raises ModelNotFound
-        return list(self._models[name].loaded.values())
+        return [loaded for key, loaded in _of_model(name, self._loaded).items() if version in ("", str(key[1]))]
 
     def refusals(self) -> list[str]:
         """Return the reasons why versions were refused or unloaded, sorted by name and version."""
-        return [row["reason"] for row in self.index() if row["reason"]]
-
-    def check_ready(self) -> None:
-        """Check that at least one version of a model is loaded.
-
-        The error message contains no names of files, because it is also sent to clients without a token.
-
-        Raises:
-            ModelError: If no version is loaded.
-        """
-        if not self.loaded_versions():
-            raise ModelError("not ready: no model is loaded; the repository's index has the reasons")
+        return [reason for _, reason in sorted(self._refused.items())]
 
     def index(self) -> list[dict[str, str]]:
         """Return one row for every version that is loaded, was refused or was unloaded, and for every other model.
@@ -162,17 +142,17 @@ class ModelStore:
         A row contains the name of the model, and the number and the state of the version. If the version was refused or
         unloaded, the row also contains the reason. The number is empty if no version of a model was found.
         """
-        rows = []
-        models = self._models
-        for name in sorted(models.keys() | self._folders().keys()):
-            loaded, refused = models.get(name, _Versions())
-            for version in sorted(loaded.keys() | refused.keys()):  # new files of a loaded version may be refused
-                state = "READY" if version in loaded else "UNAVAILABLE"
-                reason = refused.get(version, "")
-                rows.append({"name": name, "version": str(version), "state": state, "reason": reason})
-            if not (loaded or refused):
-                rows.append({"name": name, "version": "", "state": "UNAVAILABLE", "reason": ""})
-        return rows
+        keys = self._loaded.keys() | self._refused.keys()  # new files of a loaded version may be refused
+        keys |= {(name, 0) for name in self._folders().keys() - {name for name, _ in keys}}
+        return [
+            {
+                "name": name,
+                "version": str(version or ""),
+                "state": "READY" if (name, version) in self._loaded else "UNAVAILABLE",
+                "reason": self._refused.get((name, version), ""),
+            }
+            for name, version in sorted(keys)
+        ]
 
     def load(self, name: str) -> None:
         """Read the files of a model again, and replace its loaded versions.
@@ -209,10 +189,10 @@ class ModelStore:
             ModelNotFound: If no version of the model is loaded.
         """
         with self._change_lock:
-            unloaded = {loaded.metadata.version: "unloaded" for loaded in self.versions_of(name)}
-            self._replace(name, _Versions(refused=unloaded))
+            self.get(name)  # raises ModelNotFound
+            self._replace(name, {}, dict.fromkeys(_of_model(name, self._loaded), "unloaded"))
 
-    def _load_versions(self, name: str, folder: Path) -> Mapping[int, str]:
+    def _load_versions(self, name: str, folder: Path) -> Mapping[VersionKey, str]:
         """Load every version in the folder of a model, and replace the versions that were loaded before.
 
         If a version is refused, or if no version is found, every earlier version that was not replaced remains loaded.
@@ -222,30 +202,36 @@ class ModelStore:
             folder: Folder of the model.
 
         Returns:
-            Reasons why versions were refused, by number.
+            Reasons why versions were refused.
         """
-        loaded: dict[int, LoadedVersion] = {}
-        refused: dict[int, str] = {}
+        loaded: dict[VersionKey, LoadedVersion] = {}
+        refused: dict[VersionKey, str] = {}
         for version, version_folder in version_folders(folder).items():
+            key = (name, version)
             # The counters continue when files are loaded again, because a Prometheus counter must never decrease.
-            if (name, version) not in self._statistics:
-                self._statistics[name, version] = Statistics(self.metrics, name, version)
-            statistics = self._statistics[name, version]
+            if key not in self._statistics:
+                self._statistics[key] = Statistics(self.metrics, name, version)
             try:
-                loaded[version] = _load_version(name, version, version_folder, statistics)
+                loaded[key] = _load_version(name, version, version_folder, self._statistics[key])
             except Exception as error:  # any error in one folder must not affect the other models
-                refused[version] = _refusal_reason(version_folder, error)
+                refused[key] = _refusal_reason(version_folder, error)
         if refused or not loaded:  # keep the versions that were loaded before, unless new files replace them
-            loaded = {**self._models.get(name, _Versions()).loaded, **loaded}
-        self._replace(name, _Versions(dict(sorted(loaded.items())), refused))
+            loaded = _of_model(name, self._loaded) | loaded
+        self._replace(name, loaded, refused)
         return refused
 
-    def _replace(self, name: str, versions: _Versions) -> None:
-        """Replace the versions of a model."""
-        self._models = self._models | {name: versions}
-        for (known_name, version), statistics in self._statistics.items():
-            if known_name == name:
-                statistics.ready.set(version in versions.loaded)
+    def _replace(self, name: str, loaded: dict[VersionKey, LoadedVersion], refused: dict[VersionKey, str]) -> None:
+        """Replace the versions of a model, and the reasons why versions were refused or unloaded."""
+        others = {key: version for key, version in self._loaded.items() if key[0] != name}
+        self._loaded = dict(sorted((others | loaded).items()))
+        self._refused = {key: reason for key, reason in self._refused.items() if key[0] != name} | refused
+        for key, statistics in _of_model(name, self._statistics).items():
+            statistics.ready.set(key in loaded)
+
+
+def _of_model(name: str, values: Mapping[VersionKey, T]) -> dict[VersionKey, T]:
+    """Return only the values of one model."""
+    return {key: value for key, value in values.items() if key[0] == name}
 
 
 def open_model_store(models: Path | None = None) -> ModelStore:
@@ -314,4 +300,4 @@ def _load_version(name: str, version: int, folder: Path, statistics: Statistics)
             "move it into folders of that name and version"
         )
     statistics.description.info({"sensor": model.metadata.frame_id, "sha256": model.golden.sha256})
-    return LoadedVersion(model, model.metadata, str(version), statistics)
+    return LoadedVersion(model, statistics)

@@ -33,8 +33,6 @@ from isocharge.serve.prediction.press_errors import (
     FORCE,
     NOT_TRAINED,
     PressErrors,
-    X,
-    Y,
     misfit_limit,
     press_errors,
 )
@@ -51,9 +49,6 @@ MISFIT_FRACTION = 0.01
 
 MIN_COMMON_SIGNIFICANCE = 3.0
 """Significance above which a common shift or a common scale factor is reported, in standard deviations."""
-
-MIN_FIT_PRESSES = 500
-"""Smallest number of presses from which `isocharge train fit` trains a model."""
 
 
 @dataclass(frozen=True)
@@ -344,7 +339,7 @@ def _remedies(position: ErrorSummary | None, force: ErrorSummary | None) -> Iter
 
     yield (
         "if the film has changed since its calibration, or was never calibrated: isocharge train calibrate; what no "
-        f"film explains, `isocharge train fit PRESSES.csv` learns from {MIN_FIT_PRESSES} presses on"
+        "film explains, `isocharge train fit PRESSES.csv` learns from 500 presses on"
     )
 
 
@@ -382,13 +377,14 @@ def _common_notes(agreement: Agreement) -> Iterator[str]:
         agreement: Tests of the errors, which contain the common errors of x, y and the force.
     """
     mean, std, significance = agreement.common
+    x_shift_mm, y_shift_mm, force_scale_change = mean
     if np.nanmax(np.abs(significance[:FORCE]), initial=0.0) > MIN_COMMON_SIGNIFICANCE:
         yield (
-            f"positions are off by ({mean[X]:.2g}, {mean[Y]:.2g}) +- {std[:FORCE].max():.2g} mm on the average: "
+            f"positions are off by ({x_shift_mm:.2g}, {y_shift_mm:.2g}) +- {std[:FORCE].max():.2g} mm on the average: "
             "electrodes or rig are shifted"
         )
     if abs(significance[FORCE]) > MIN_COMMON_SIGNIFICANCE:
         yield (
-            f"forces are {1.0 + mean[FORCE]:.4g} +- {std[FORCE]:.2g} times the measured ones on the average, as after "
-            "a change of pretension, d31 or gains"
+            f"forces are {1.0 + force_scale_change:.4g} +- {std[FORCE]:.2g} times the measured ones on the average, as "
+            "after a change of pretension, d31 or gains"
         )

@@ -23,10 +23,8 @@ CONTACT_UNKNOWN = "neither place nor force is known"
 NOT_TRAINED = "not trained for"
 """Reasons why a press is excluded from the comparison, as parts of a sentence."""
 
-X = 0
-Y = 1
 FORCE = 2
-"""Columns of the errors and standard deviations of `PressErrors`."""
+"""Column of the force in the errors and standard deviations of `PressErrors`. The columns before it are x and y."""
 
 VALUE_COLUMNS = slice(0, 3)
 """Columns of x, y and the force in an array of contacts with one column for each attribute of `Contact`."""
@@ -84,7 +82,7 @@ class PressErrors:
     @property
     def position_error_mm(self) -> Array:
         """Distances between predicted and measured positions, shape (n,), mm; NaN if a position is unknown."""
-        return np.hypot(self.error[:, X], self.error[:, Y])
+        return np.asarray(np.linalg.norm(self.error[:, :FORCE], axis=1))
 
     def row(self, press_index: int) -> dict[str, Any]:
         """Return the contact, the errors and the flags of one press as a dictionary whose keys contain the units.
@@ -94,7 +92,7 @@ class PressErrors:
         Args:
             press_index: Index of the press; the first press has the index 0.
         """
-        error = self.error[press_index]  # x and y in mm, and the force relative to the measured force
+        x_error_mm, y_error_mm, force_error = self.error[press_index]  # the force is relative to the measured force
         noise_std = self.noise_std[press_index]
         rig_std = self.rig_std[press_index]
         contact_names = Contacts._fields[:N_WITHOUT_CORRELATION]
@@ -102,12 +100,12 @@ class PressErrors:
         return {
             "line": self.lines[press_index],
             **dict(zip(contact_names, contact_values, strict=True)),
-            "x_error_mm": error[X],
-            "y_error_mm": error[Y],
+            "x_error_mm": x_error_mm,
+            "y_error_mm": y_error_mm,
             "position_error_mm": self.position_error_mm[press_index],
-            "force_error_percent": 100.0 * error[FORCE],
+            "force_error_percent": 100.0 * force_error,
             "noise_std_percent": 100.0 * noise_std[FORCE],
-            "position_std_mm": rig_std[X],
+            "position_std_mm": rig_std[0],
             "force_std_percent": 100.0 * rig_std[FORCE],
             "flags": list(self.flags[press_index]),
             "left_out": self.exclusion_reasons[press_index] or None,  # None if the press is compared

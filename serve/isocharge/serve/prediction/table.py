@@ -14,6 +14,7 @@ from typing import TextIO
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ChargeError
 from isocharge.serve.model.contact import Contact, Contacts
 from isocharge.serve.model.predictor import Predictor
@@ -23,9 +24,6 @@ from isocharge.serve.presses.csv_table import CsvTable
 from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, TableSource, ignored_columns_message
 from isocharge.serve.presses.table_file import open_table
 from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
-
-BLOCK_ROWS = 4096
-"""Number of rows that are converted at the same time, which limits the memory."""
 
 MAX_CHARGE_ROWS = 10_000_000
 """Largest number of rows of a file of charges."""
@@ -149,7 +147,7 @@ def write_contacts(
 
 
 def blocks(rows: Array) -> Iterator[Array]:
-    """Yield successive blocks of `BLOCK_ROWS` rows of an array. The last block may have fewer rows.
+    """Yield successive blocks of `MAX_BATCH` rows of an array. The last block may have fewer rows.
 
     An array without rows is one empty block. The caller processes only one block at a time, because the model and
     Python numbers need a hundred times as much memory as the array.
@@ -157,8 +155,8 @@ def blocks(rows: Array) -> Iterator[Array]:
     Args:
         rows: Array of shape (n, ...).
     """
-    for start in range(0, max(len(rows), 1), BLOCK_ROWS):
-        yield rows[start : start + BLOCK_ROWS]
+    for start in range(0, max(len(rows), 1), MAX_BATCH):
+        yield rows[start : start + MAX_BATCH]
 
 
 def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:

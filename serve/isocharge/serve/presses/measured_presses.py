@@ -59,9 +59,6 @@ PRESS_RULES = {
 MAX_ELECTRODES = MAX_COLUMNS - len(PRESS_RULES)
 """Largest number of electrodes in a file of presses."""
 
-MAX_NAME_CHARACTERS = 1_000
-"""Largest number of characters of the name of an electrode in a file of presses."""
-
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPresses:
@@ -375,12 +372,11 @@ def _check_electrodes(electrodes: Collection[str]) -> None:
     """
     are_different = len(set(electrodes)) == len(electrodes)
     are_names = all(
-        name not in PRESS_RULES and name.isprintable() and name == name.strip() and 0 < len(name) <= MAX_NAME_CHARACTERS
-        for name in electrodes
+        name not in PRESS_RULES and name.isprintable() and name == name.strip() and name for name in electrodes
     )
     if not (0 < len(electrodes) <= MAX_ELECTRODES and are_different and are_names):
         raise PressError(
-            f"electrodes: expected 1 to {MAX_ELECTRODES} different names of at most {MAX_NAME_CHARACTERS:,} printable "
-            f"characters, without blanks at their ends, none of {', '.join(PRESS_RULES)}, got {shown(electrodes)}; "
+            f"electrodes: expected 1 to {MAX_ELECTRODES} different names of printable characters, without blanks "
+            f"at their ends, none of {', '.join(PRESS_RULES)}, got {shown(electrodes)}; "
             "rename the electrodes"
         )

@@ -14,8 +14,8 @@ Components are added in three cases.
 - Before each update, a component with an unknown velocity is added, because the contact may have started or stopped.
 - If the most probable component extends across a fold, one component is added on each side of the fold.
 
-The charges are averaged over intervals of `STEP_s` before an update. Shorter intervals would hardly improve the
-accuracy.
+The charges are averaged over intervals of `NOISE_INTERVAL_s` before an update. Shorter intervals would hardly improve
+the accuracy.
 """
 
 import math
@@ -40,11 +40,9 @@ from isocharge.serve.tracking.motion_filter import (
     RATES,
     MAX_GAP_s,
     MEAN_MODE_TIME_s,
+    NOISE_INTERVAL_s,
     mixture_moments,
 )
-
-STEP_s = 0.0045
-"""Shortest time over which charges are averaged, s. Five frames at 1 kHz are averaged."""
 
 GAIN_STD = 0.01
 """Standard deviation of an electrode gain about its calibrated value, dimensionless."""
@@ -137,7 +135,7 @@ class ContactMixture:
         if t_s < latest_frame_s:
             self.reset()
         self._frames.append((charge_pC, t_s))
-        if t_s - self._step_begin_s < STEP_s:
+        if t_s - self._step_begin_s < NOISE_INTERVAL_s:
             return self._hypotheses
 
         # The frame noise of the n frames is independent, so its variance is divided by n. The slow noise is the same.

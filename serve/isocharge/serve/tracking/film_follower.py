@@ -40,6 +40,7 @@ from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.robust_estimate import ModelValues, Prior, robust_estimate
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.stage import Rule, Setting
+from isocharge.serve.tracking.contact_mixture import GAIN_STD
 
 MAX_AVERAGED_FRAMES = 64
 """Largest number of frames that are averaged.
@@ -110,9 +111,6 @@ class TouchPeak:
         """Average of the touch charges, shape (n_electrode,), pC."""
         return np.asarray(np.mean(self._averaged_charges_pC, axis=0))
 
-
-GAIN_STD = 0.01
-"""Standard deviation of the change of a gain before the first touch, relative to the gain."""
 
 RELATIVE_OFFSET_STD = 0.1
 """Standard deviations of the common offset, and of the offset of a touch about it, relative to the largest offset."""

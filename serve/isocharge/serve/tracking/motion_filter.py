@@ -94,12 +94,6 @@ NOISE_FRAMES = 100
 At first, the noise that the model states has the weight of one frame.
 """
 
-MIN_FORCE_N = 1e-6
-"""Smallest force whose logarithm is computed, N."""
-
-MIN_UNCORRELATED_SHARE = 1e-6
-"""Share of uncorrelated variance that keeps the covariance of a contact invertible."""
-
 
 def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float) -> Array:
     """Return the covariance that a white acceleration adds to moving states (Bar-Shalom et al. 2001, 6.2.2).
@@ -322,12 +316,13 @@ def _measured_values(contact: Contact) -> tuple[Array, Array]:
 
     Correlations of NaN count as 0.
     """
-    force_N = max(MIN_FORCE_N, contact.force_N)
+    single = np.finfo(np.float32)  # the number type of the model
+    force_N = max(float(single.tiny), contact.force_N)
     std = np.array([contact.x_std_mm, contact.y_std_mm, contact.force_std_N / force_N])
     xy, xF, yF = contact.xy_correlation, contact.xF_correlation, contact.yF_correlation
     correlation = np.array([[1.0, xy, xF], [xy, 1.0, yF], [xF, yF, 1.0]])
     if math.isnan(xy):
         correlation = np.eye(3)
     # Rounding must not make the covariance of fully correlated errors singular.
-    correlation += MIN_UNCORRELATED_SHARE * np.eye(3)
+    correlation += single.eps * np.eye(3)
     return np.array([contact.x_mm, contact.y_mm, math.log(force_N)]), correlation * np.outer(std, std)

@@ -23,10 +23,7 @@ CERTAIN_PROBABILITY = 0.97
 
 
 HOLD_TIME_s = 0.2
-"""Time at rest after which a hold begins, s."""
-
-MAX_TAP_TIME_s = 0.25
-"""Longest duration of a tap, s."""
+"""Time at rest after which a hold begins, and longest duration of a tap, s."""
 
 SLIDE_DISTANCE_mm = 0.3
 """Distance from the position at which the contact last rested, above which a moving contact slides, mm."""
@@ -104,7 +101,7 @@ class TouchEvents:
             t_s: Time of the first frame without a contact, s.
         """
         self._correct_for_clock(t_s)
-        is_short = t_s - self._press_s <= MAX_TAP_TIME_s
+        is_short = t_s - self._press_s <= HOLD_TIME_s
         if self._latest_event == "press" and is_short:
             return "tap"
         return "release"

@@ -38,7 +38,15 @@ from isocharge.serve.network.protocol.response import (
     response_of,
 )
 from isocharge.serve.record.record import PredictionRecord
-from isocharge.serve.viewer.tape import FLAG_BITS, RecordedTape, Tape, coalesce, sample_type, sample_values
+from isocharge.serve.viewer.tape import (
+    FLAG_BITS,
+    MAX_DRAWN_SAMPLES,
+    RecordedTape,
+    Tape,
+    coalesce,
+    sample_type,
+    sample_values,
+)
 
 SESSION_PATH = "/session.json"
 """Path of the description of the stream and its film."""
@@ -51,9 +59,6 @@ PAGE_LIMITS = ServerLimits(body_bytes=1 << 12, connections=64)
 
 HISTORY_S = 10.0
 """Time span of the earlier samples that a new browser receives, s. The traces of the page have this length."""
-
-MAX_READ_SAMPLES = 600
-"""Largest number of samples in the response to one request."""
 
 MAX_MARKERS = 200
 """Number of the latest markers that the page shows."""
@@ -80,7 +85,7 @@ class Read(PageRequest):
     first: Annotated[int, Meta(ge=0, le=1 << 53)] | None = None
     until_s: Finite | None = None
     version: int = -1
-    most: Annotated[int, Meta(ge=1, le=MAX_READ_SAMPLES)] = MAX_READ_SAMPLES
+    most: Annotated[int, Meta(ge=1, le=MAX_DRAWN_SAMPLES)] = MAX_DRAWN_SAMPLES
 
 
 class Tare(PageRequest):

@@ -103,8 +103,8 @@ They cover 16 s at 1 kHz. A browser that falls further behind misses samples.
 RATE_SAMPLES = 400
 """Number of the latest samples from whose times the frame rate of the board is computed."""
 
-OVERVIEW_PIECES = 600
-"""Number of pieces of equal duration into which the overview divides a recording."""
+MAX_DRAWN_SAMPLES = 600
+"""Largest number of samples that the page draws in a line: of a response to one request, or of an overview."""
 
 
 class Tape:
@@ -210,11 +210,11 @@ class RecordedTape(Tape):
         self._ring = np.memmap(self._file, self._ring.dtype, "r+", shape=(capacity,))
 
     def overview(self) -> list[float]:
-        """Return the largest force in each of `OVERVIEW_PIECES` pieces of the recording, N."""
+        """Return the largest force in each of `MAX_DRAWN_SAMPLES` pieces of the recording, N."""
         samples = self._ring[: self.total]
         start_s, end_s = self.span()
         elapsed = (samples["timestamp"] - start_s) / max(end_s - start_s, np.finfo(float).tiny)  # from 0 to 1
-        piece_of_sample = np.minimum(elapsed * OVERVIEW_PIECES, OVERVIEW_PIECES - 1).astype(int)
-        max_force_N = np.zeros(OVERVIEW_PIECES)
+        piece_of_sample = np.minimum(elapsed * MAX_DRAWN_SAMPLES, MAX_DRAWN_SAMPLES - 1).astype(int)
+        max_force_N = np.zeros(MAX_DRAWN_SAMPLES)
         np.maximum.at(max_force_N, piece_of_sample, np.nan_to_num(samples["force_N"], nan=0.0))
         return max_force_N.round(3).tolist()

@@ -78,12 +78,9 @@ def statistics_of(store: ModelStore, name: str = "", version: str = "") -> dict[
     Raises:
         ModelNotFound: If the selected model or version is not loaded.
     """
-    if version:
-        selected = [store.get(name, version)]
-    elif name:
-        selected = store.versions_of(name)
-    else:
-        selected = store.loaded_versions()
+    if name:
+        store.get(name, version)  # raises ModelNotFound
+    selected = store.versions_of(name, version) if name else store.loaded_versions()
     return {
         "model_stats": [
             {"name": loaded.metadata.name, "version": loaded.version, **loaded.statistics.to_json()}

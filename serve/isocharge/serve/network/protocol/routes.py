@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from prometheus_client import generate_latest
 
-from isocharge.common.errors import RequestError
+from isocharge.common.errors import ModelError, RequestError
 from isocharge.common.structs import parse_json
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.metrics import CONTENT_TYPE, Traffic
@@ -76,7 +76,9 @@ def _show_metrics(request: Request) -> Response:
 
 
 def _is_ready(request: Request) -> dict[str, bool]:
-    request.store.check_ready()
+    """Check that a model is loaded. The error names no files, because it is also sent to clients without a token."""
+    if not request.store.loaded_versions():
+        raise ModelError("not ready: no model is loaded; the repository's index has the reasons")
     return {"ready": True}
 
 
