@@ -184,9 +184,9 @@ def test_replay_has_the_name_and_the_pace_of_the_recording(board, models, tmp_pa
     assert time.monotonic() - began > 0.2  # 50 chunks of 10 ms
 
 
-@pytest.mark.parametrize("name", ["", "a\nb", "x" * 101])
-def test_option_name_refuses_empty_long_and_unprintable_names(models, run, name):
-    with pytest.raises(InputError, match="--name: expected 1 to 100 printable characters"):
+@pytest.mark.parametrize("name", ["", "a\nb"])
+def test_option_name_refuses_empty_and_unprintable_names(models, run, name):
+    with pytest.raises(InputError, match="--name: expected printable characters"):
         run("stream", "linear", "--port", "p", "--models", models, "--name", name)
 
 

@@ -159,10 +159,6 @@ def summary(touch: TouchStream, latencies: deque[float]) -> str:
     return f"{frames_text}; last byte to record p50 {p50:.0f} us, p99 {p99:.0f} us"
 
 
-MAX_NAME_CHARACTERS = 100
-"""Largest number of characters of a film's name."""
-
-
 def stream_command(
     model: ModelArgument,
     port: Annotated[
@@ -234,8 +230,8 @@ def stream_command(
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
-    if name is not None and not (0 < len(name) <= MAX_NAME_CHARACTERS and is_printable(name)):
-        raise InputError(f"--name: expected 1 to {MAX_NAME_CHARACTERS} printable characters, got {shown(name)}")
+    if name is not None and not (name and is_printable(name)):
+        raise InputError(f"--name: expected printable characters, got {shown(name)}")
     address = None if live is None else page_address(live, token)  # None for no page
     tls = page_tls(live, tls_cert, tls_key)
 

@@ -13,7 +13,7 @@ from isocharge.common.printable_text import printable
 from isocharge.serve.examination.listening import Capture
 from isocharge.serve.examination.press_detector import HeldPress
 from isocharge.serve.live.device import Device
-from isocharge.serve.port.serial_line import TELNET_ADVICE
+from isocharge.serve.port.source import has_speed
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import LARGEST_PC
 from isocharge.serve.signal_chain.leak import LeakRule
@@ -116,21 +116,25 @@ CLEAN_SHARE = 0.99
 """Smallest share of bytes in good frames with a good cable and the right baud rate, dimensionless."""
 
 
-def transmission_sentences(capture: Capture, *, uses_telnet: bool) -> Iterator[str]:
+def transmission_sentences(capture: Capture, url: str) -> Iterator[str]:
     """Yield one sentence if no frames were received, or for each fault of the transmission.
 
     Args:
         capture: The frames, with the share of intact bytes and the gaps in the frame numbers.
-        uses_telnet: Whether more bytes are frames without the escapes of the telnet protocol.
+        url: The port.
     """
     unread_line = shown(capture.parser.unread_line) if capture.parser.unread_line else ""
+    advice = "check the cable, and whether the baud rate of the board is exact"
+    if not has_speed(url):
+        advice = (
+            "if a serial server uses the telnet protocol, which doubles each byte 0xFF, set the port of the server to "
+            'raw TCP (also called "raw", "TCP server" or "TCP socket")'
+        )
     if not capture.bytes_seen:
         yield (
             "no bytes were received: check the power and the cable; if the board sends only after a request, state the "
             "request with --request"
         )
-    elif uses_telnet:
-        yield TELNET_ADVICE
     elif not capture.frames and unread_line:
         yield (
             f"the lines of text are not understood, for example {unread_line}: send the numbers of all channels in "
@@ -139,8 +143,8 @@ def transmission_sentences(capture: Capture, *, uses_telnet: bool) -> Iterator[s
     elif not capture.frames:
         yield (
             "bytes were received, but no frames were recognised: try another baud rate with --baud, or describe the "
-            "format in a device file (--device); a board without noise shows its channels only while the film is "
-            "touched"
+            f"format in a device file (--device); {advice}; a board without noise shows its channels only while the "
+            "film is touched"
         )
     elif capture.intact_share < CLEAN_SHARE:
         damaged = f"{1.0 - capture.intact_share:.1%} of the bytes do not belong to good frames"
@@ -149,8 +153,8 @@ def transmission_sentences(capture: Capture, *, uses_telnet: bool) -> Iterator[s
                 f", such as the line {unread_line}: send a number for each channel, and nan for a channel without a "
                 "value; if the line is damaged"
             )
-        yield f"{damaged}: check the cable, and whether the baud rate of the board is exact"
-    if capture.gaps.lost and not uses_telnet:
+        yield f"{damaged}: {advice}"
+    if capture.gaps.lost:
         yield f"{capture.gaps.lost} frames were lost: send fewer frames per second, or use a faster link"
 
 

@@ -20,9 +20,6 @@ from isocharge.serve.signal_chain.channels import channel_names
 BAUDS = (115200, 921600, 1000000, 2000000, 460800, 230400, 57600, 38400, 19200, 9600)
 """Baud rates to try, in this order, bit/s."""
 
-MIN_SPAN_S = 1e-3
-"""Smallest time span of received bytes, s. It keeps rates finite."""
-
 
 @dataclass
 class ReceivedData:
@@ -61,10 +58,10 @@ class ReceivedData:
         0, so that a rate computed from it is finite.
         """
         if len(self.chunks) < 2:
-            return max(self.seconds, MIN_SPAN_S)
+            return max(self.seconds, np.finfo(float).eps)
         first_to_last_s = self.chunks[-1].timestamp - self.chunks[0].timestamp
         mean_interval_s = first_to_last_s / (len(self.chunks) - 1)
-        return max(first_to_last_s + mean_interval_s, MIN_SPAN_S)
+        return max(first_to_last_s + mean_interval_s, np.finfo(float).eps)
 
     @property
     def are_datagrams(self) -> bool:

@@ -13,7 +13,6 @@ import numpy as np
 
 from isocharge.common.printable_text import printable
 from isocharge.serve.examination.board_health import (
-    CLEAN_SHARE,
     ChannelHealth,
     channel_count_sentences,
     channel_sentences,
@@ -26,8 +25,7 @@ from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, 
 from isocharge.serve.examination.press_detector import find_held_press, find_touch
 from isocharge.serve.examination.proposal import propose, recognised_frames, unit_of
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
-from isocharge.serve.port.serial_line import Request, without_telnet
-from isocharge.serve.port.source import has_speed
+from isocharge.serve.port.serial_line import Request
 from isocharge.serve.signal_chain.channels import channel_index
 from isocharge.serve.signal_chain.gain import Gain, GainRule
 
@@ -137,22 +135,6 @@ def _intact_share(received: ReceivedData, device: Device) -> float:
     return read_frames(received, device).intact_share
 
 
-def _uses_telnet(received: ReceivedData, device: Device, intact_share: float) -> bool:
-    """Return whether a serial server uses the telnet protocol, so that more bytes are frames without its escapes.
-
-    Args:
-        received: The bytes.
-        device: Settings of the board, or `ANY_BOARD`.
-        intact_share: Share of the bytes that belong to frames.
-    """
-    data = b"".join(received.data)
-    unescaped = without_telnet(data)
-    if has_speed(received.url) or unescaped == data or intact_share >= CLEAN_SHARE:
-        return False
-    chunks = [chunk._replace(data=without_telnet(chunk.data)) for chunk in received.chunks]
-    return _intact_share(replace(received, chunks=chunks), device) > intact_share
-
-
 def examine_received(
     received: ReceivedData,
     *,
@@ -182,8 +164,7 @@ def examine_received(
     if is_proposed:
         device = device_from_table({"frames": frames}, "board")
     capture = read_frames(received, device)
-    uses_telnet = _uses_telnet(received, ANY_BOARD if is_proposed else device, capture.intact_share)
-    missing = list(transmission_sentences(capture, uses_telnet=uses_telnet))
+    missing = list(transmission_sentences(capture, received.url))
     counts = capture.parser.counts
     examination = Examination(
         url=received.url,
@@ -197,7 +178,7 @@ def examine_received(
         missing=tuple(missing),
         device={} if is_proposed else dict(device.table),
     )
-    if not capture.frames or uses_telnet:
+    if not capture.frames:
         return examination
 
     values, times_s = capture.values()

@@ -145,9 +145,6 @@ class Field(Settings, frozen=True):
         return self.type_name.startswith("i")
 
 
-MAX_REQUEST_RATE_Hz = 100_000.0
-"""Highest rate of requests, Hz."""
-
 SYNC = "sync"
 """Name of the framing in which every frame begins with a sync pattern."""
 
@@ -166,7 +163,7 @@ class FrameSection(Settings, frozen=True, tag_field="format"):
     """
 
     request: Hexadecimal | None = None
-    request_Hz: Annotated[float, Meta(gt=0, le=MAX_REQUEST_RATE_Hz)] = 100.0
+    request_Hz: Annotated[float, Meta(gt=0)] = 100.0
 
 
 class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only=True):

@@ -58,9 +58,6 @@ MAX_HEADERS = 8
 SEQ_MODULI = (256, SEQ_MODULUS, 100, 1000, 10_000)
 """Values at which a frame counter in text may wrap to 0: those of 8 and 16 bits, and those of two to four digits."""
 
-DAY_US = 86_400_000_000
-"""Value at which a time of day wraps to 0, us."""
-
 
 class Layout:
     """Arrangement of the values of a frame in one line, or in a cycle of several lines.
@@ -198,7 +195,8 @@ class TextParser(DelimitedParser):
     def _describe_layout(self, layout: Layout) -> None:
         """Describe the recognised layout in the attribute `format`."""
         unit_us = round(layout.columns.clock_unit_us)
-        self.t_us_modulus = DAY_US if unit_us == TIMES_US["t_s"] else T_US_MODULUS * unit_us
+        is_time_of_day = unit_us == TIMES_US["t_s"]  # a day has 86400 s
+        self.t_us_modulus = (86_400 if is_time_of_day else T_US_MODULUS) * unit_us
         is_unnamed = not any(layout.names)
         names = f"{len(layout.names)} columns without names" if is_unnamed else ", ".join(layout.names)
         self.format = f"text: {printable(names)}"

@@ -33,17 +33,6 @@ QUIET_TIME_s = 0.002
 REPEAT_TIME_s = 0.2
 """Time after which a request without an answer is repeated, s."""
 
-TELNET_ADVICE = (
-    "the serial server uses the telnet protocol, which doubles each byte 0xFF: set the port of the server to raw TCP "
-    '(also called "raw", "TCP server" or "TCP socket")'
-)
-"""What to do if the frames can be read only after `without_telnet`."""
-
-
-def without_telnet(data: bytes) -> bytes:
-    """Return the bytes that were sent through the telnet protocol (RFC 854): 0xFF is doubled, and begins commands."""
-    return re.sub(rb"(?s)\xff(?:(\xff)|[\xfb-\xfe].)", rb"\1", data)
-
 
 @dataclass(frozen=True)
 class Request:

@@ -104,7 +104,6 @@ class Port:
             at least `silence_s` and `START_UP_s`.
 
     Attributes:
-        outages: Number of times that the port was lost and came back.
         start_up_s: Longest wait for the first byte after the port was opened, s.
         is_live: Always True, because the bytes arrive whether or not the program reads them, and are lost if the
             program does not read them.
@@ -129,7 +128,6 @@ class Port:
     ) -> None:
         """Store the settings. The docstring of the class describes the arguments."""
         self.url = url
-        self.outages = 0
         self._baud = baud
         self._silence_s = silence_s
         self._reconnect = reconnect
@@ -226,7 +224,6 @@ class Port:
             except PortLost as error:
                 data = self._read_after_reconnecting(error)
                 outage_s = time.monotonic() - wait_start_s
-                self.outages += 1
             yield Chunk(data, time.time(), time.perf_counter_ns(), outage_s)
 
     def read(self, timeout_s: float) -> Chunk | None:
@@ -353,9 +350,6 @@ def has_speed(url: str) -> bool:
 STDIN = "-"
 """Name of the standard input."""
 
-CHUNK_BYTES = 4096
-"""Largest chunk from a file, bytes."""
-
 ENTRY_POINTS = "isocharge.sources"
 """Group of the entry points through which other packages add sources."""
 
@@ -364,11 +358,9 @@ class Source(Protocol):
     """A source of the bytes of a board.
 
     Attributes:
-        outages: Number of outages of the source so far.
         is_live: Whether bytes are lost if they are not read in time.
     """
 
-    outages: int
     is_live: bool
 
     def __iter__(self) -> Iterator[Chunk]:
@@ -383,11 +375,9 @@ class FileSource:
         name: Path of the file, or - for the standard input.
 
     Attributes:
-        outages: Always 0, because a file is never lost.
         is_live: Always False, because no bytes are lost if they are read later.
     """
 
-    outages = 0
     is_live = False
 
     def __init__(self, descriptor: int, name: str) -> None:
@@ -407,7 +397,7 @@ class FileSource:
         start_s = time.time()
         is_on_disk = stat.S_ISREG(os.fstat(self._descriptor).st_mode)
         is_first_chunk = True
-        while data := os.read(self._descriptor, CHUNK_BYTES):
+        while data := os.read(self._descriptor, HEAD_BYTES):
             if is_first_chunk:
                 refuse_foreign_file(self._name, data)
             is_first_chunk = False

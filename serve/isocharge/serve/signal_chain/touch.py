@@ -60,14 +60,13 @@ class TouchRule(Rule, frozen=True, kw_only=True):
         root_count = math.sqrt(len(noise_pC))
         noise_sizes = root_count + self.sigmas * math.sqrt(0.5)
         threshold_pC = noise_sizes * noise_pC + (self.floor_pC or 0.0) / root_count
-        return np.maximum(threshold_pC, SMALLEST_THRESHOLD_PC)
+        return np.maximum(threshold_pC, np.finfo(float).eps)  # not 0, for a board without noise
 
-
-SMALLEST_THRESHOLD_PC = 1e-12
-"""Lower limit of the touch threshold, pC. It avoids a division by zero for a board without noise."""
 
 RISE_S = 0.1
 """Time constant of the mean charges that show whether the charges rise slowly, s.
+
+After the same time with small charges, the direction of the latest touch no longer matters.
 
 The charges of a press of a film of 25 um rise slowly if its force grows by less than about 0.005 N/s.
 """
@@ -77,9 +76,6 @@ OPPOSING_COSINE = -0.25
 
 The charges of a touch may have any sign, so the angle of another touch is about 90 degrees or less.
 """
-
-REST_S = 0.1
-"""Time for which the charges must be small before the direction of the latest touch no longer matters, s."""
 
 
 class Touch(Stage):
@@ -198,7 +194,7 @@ class Touch(Stage):
         if size > 1.0 and float(charge @ direction) < 0.0:
             frame.flags.append(NEGATIVE)
         self._rest_s = 0.0 if size > 1.0 else self._rest_s + frame.dt_s
-        if self._rest_s >= REST_S:
+        if self._rest_s >= RISE_S:
             self._direction = self._rest_direction
 
     @classmethod

@@ -317,7 +317,7 @@ static void update_contact(isocharge_chain *chain, const real charge_pC[N], real
     EACH(k) chain->mean[k] = charge[k] + rising * (chain->mean[k] - charge[k]);
     chain->below = size > 1 && dot(charge, chain->direction) < 0;
     chain->rest_s = size > 1 ? 0 : chain->rest_s + dt_s;
-    if (chain->rest_s >= (real)0.1)
+    if (chain->rest_s >= (real)ISOCHARGE_TOUCH_RISE_S)
         EACH(k) chain->direction[k] = ISOCHARGE_TOUCH_ANY_SIGN ? 0 : 1;
 #else
     (void)charge_pC;
