@@ -12,7 +12,7 @@ from isocharge.serve import AutoParser, Frame, encode_text
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import SequenceGaps
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.frames.text_lines import TEXT_FORMATS, Skeleton, clean_text, parse_line
+from isocharge.serve.frames.text_lines import TEXT_FORMATS, clean_text, line_values, parse_line, skeleton_pattern
 from isocharge.serve.port.source import Chunk
 
 README_OF_TELEPLOT = [
@@ -29,7 +29,7 @@ README_OF_TELEPLOT = [
 
 def names_and_values(text):
     line = parse_line(clean_text(text))
-    return line.names, Skeleton(line).values(line.text)
+    return line.names, line_values(skeleton_pattern(line), line.text)
 
 
 @pytest.mark.parametrize(("text", "names", "values"), README_OF_TELEPLOT)

@@ -38,7 +38,7 @@ from isocharge.serve.frames.frame import (
     DelimitedParser,
     Frame,
 )
-from isocharge.serve.frames.text_lines import Line, Skeleton, clean_text, header_names, parse_line
+from isocharge.serve.frames.text_lines import Line, clean_text, header_names, line_values, parse_line, skeleton_pattern
 
 MAX_LINE_LENGTH = 4096
 """Length of the longest line that is parsed, bytes."""
@@ -64,7 +64,7 @@ class Layout:
 
     Attributes:
         example: The first line, with which headers are compared.
-        skeletons: Text between the numbers of each line of a frame.
+        patterns: Regular expression of each line of a frame, in which the numbers are groups.
         names: Names of all values; empty for a value without a name.
         unnamed: Indices of the values that have no names in the lines. A header or a device file may name them.
         columns: Meanings of the values as frame counter, clock or channels.
@@ -73,7 +73,7 @@ class Layout:
     def __init__(self, lines: Sequence[Line]) -> None:
         """Determine the layout from the lines of one frame."""
         self.example = lines[0]
-        self.skeletons = [Skeleton(line) for line in lines]
+        self.patterns = [skeleton_pattern(line) for line in lines]
         names = [name for line in lines for name in line.names]
         self.unnamed = [index for index, name in enumerate(names) if not name]
         self.set_names(names)
@@ -272,8 +272,8 @@ class TextParser(DelimitedParser):
         layout = self.layout
         if layout is None:
             return None
-        for position, skeleton in enumerate(layout.skeletons):
-            values = skeleton.values(text)
+        for position, pattern in enumerate(layout.patterns):
+            values = line_values(pattern, text)
             if values is None:
                 continue
             if position != len(self._cycle):
@@ -281,7 +281,7 @@ class TextParser(DelimitedParser):
             if position != len(self._cycle):  # the beginning of this cycle is lost
                 return self._reject(size)
             self._cycle.append((values, size))
-            if len(self._cycle) < len(layout.skeletons):
+            if len(self._cycle) < len(layout.patterns):
                 return []
             values_of_lines, sizes = zip(*self._cycle, strict=True)
             self._cycle = []

@@ -20,7 +20,6 @@ import math
 import re
 from collections.abc import Callable
 from functools import reduce
-from itertools import zip_longest
 from operator import xor
 from typing import NamedTuple
 
@@ -170,7 +169,7 @@ def parse_line(text: str) -> Line:
     kinds = [token.kind for token in number_tokens]
     if "hexadecimal" in kinds and "number" in kinds[kinds.index("hexadecimal") :]:
         raise ValueError(f"expected only hexadecimal numbers after the first one, got {text[:100]!r}")
-    word_names = _names(tokens)
+    names, names_with_units = _names(tokens)
 
     skeleton = ""
     word_count = 0
@@ -182,14 +181,14 @@ def parse_line(text: str) -> Line:
             skeleton += _CODES["optional blanks"]
         elif token.is_after_blank:
             skeleton += _CODES["blanks"]
-        if token.kind in ("key", "mark") or (token.kind == "word" and token.content in word_names):
+        if token.kind in ("key", "mark") or (token.kind == "word" and token.content in names):
             skeleton += token.content
         else:
             skeleton += _CODES[number_kind if token.kind == "number" else token.kind]
     numbers = tuple(token.content for token in number_tokens)
     starts = tuple(token.start for token in number_tokens)
     is_prose = word_count >= len(numbers)
-    return Line(text, skeleton + _CODES["end"], tuple(_with_units(word_names, tokens)), numbers, starts, is_prose)
+    return Line(text, skeleton + _CODES["end"], tuple(names_with_units), numbers, starts, is_prose)
 
 
 def _has_decimal_commas(text: str) -> bool:
@@ -235,29 +234,30 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
     return tokens
 
 
-def _names(tokens: list[_Token]) -> list[str]:
-    """Return the name of each number, which is the word or the key directly before the number; empty without a name.
+def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
+    """Return the name of each number without and with its unit; empty without a name.
 
-    Words are units and not names if the first number follows no word but the last number precedes one. A name that
-    occurs several times is no name. A single name at the first of several numbers is a label of the line, unless it is
-    a name of a counter or a clock.
+    The name is the word or the key directly before the number. Words are units and not names if the first number
+    follows no word but the last number precedes one. A name that occurs several times is no name. A single name at the
+    first of several numbers is a label of the line, unless it is a name of a counter or a clock.
+
+    A unit of charge or voltage other than pC directly behind a number is added to its name, as in `A_nC`.
 
     Args:
         tokens: Parts of the line.
     """
     names = []
-    words = []  # names that are neither in quotes nor before a colon or an equals sign
-    candidate = ""
-    for previous, token in zip([None, *tokens], tokens, strict=False):
+    words = set()  # names that are neither in quotes nor before a colon or an equals sign
+    units = []
+    parts = [token for token in tokens if token.content not in ":="]
+    for previous, token, following in zip([None, *parts], parts, [*parts[1:], None], strict=False):
         if token.kind in _NUMBER_KINDS:
-            names.append(_NAMES_OF_TIMES.get(token.kind, candidate))
+            is_named = previous is not None and previous.kind in ("key", "word")
+            name = previous.content.strip("\"'") if previous is not None and is_named else ""
             if previous is not None and previous.kind == "word":
-                words.append(candidate)
-            candidate = ""
-        elif token.kind in ("key", "word"):
-            candidate = token.content.strip("\"'")
-        elif token.content not in ":=":
-            candidate = ""
+                words.add(name)
+            names.append(_NAMES_OF_TIMES.get(token.kind, name))
+            units.append("" if following is None else following.content)
 
     channels = [index for index, name in enumerate(names) if name not in TIMES_US]
     repeated = {name for name in names if names.count(name) > 1} - set(TIMES_US)
@@ -268,53 +268,33 @@ def _names(tokens: list[_Token]) -> list[str]:
         names[named[0]] = ""
     if tokens and tokens[0].content == ">" and len(names) == 2:  # `>name:time:value`
         names = [_NAMES_OF_TIMES["uptime"], next((token.content for token in tokens if token.kind == "key"), "")]
-    return names
+    names_with_units = [
+        f"{name or f'ch{number}'}_{unit}" if unit in _CHARGE_UNITS - set(names) else name
+        for number, (name, unit) in enumerate(zip(names, units, strict=True), start=1)
+    ]
+    return names, names_with_units
 
 
-def _with_units(names: list[str], tokens: list[_Token]) -> list[str]:
-    """Return the names of the numbers with units of charge or voltage other than pC added, as in `A_nC`.
+def skeleton_pattern(line: Line) -> re.Pattern[str]:
+    """Return the regular expression of all lines with the skeleton of a line. Each number is a group."""
+    patterns = {_CODES[kind]: pattern for kind, pattern in _PATTERNS.items()}
+    return re.compile("".join(patterns.get(part) or re.escape(part) for part in line.skeleton))
+
+
+def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None:
+    """Return the numbers in a line; None if the line has another skeleton.
 
     Args:
-        names: Name of each number.
-        tokens: Parts of the line. A unit is the word behind a number.
+        pattern: Result of `skeleton_pattern`.
+        text: The line.
     """
-    names_with_units: list[str] = []
-    for token, following in zip_longest(tokens, tokens[1:]):
-        if token.kind in _NUMBER_KINDS:
-            index = len(names_with_units)
-            name = names[index]
-            if following is not None and following.content in _CHARGE_UNITS - set(names):
-                name = f"{name or f'ch{index + 1}'}_{following.content}"
-            names_with_units.append(name)
-    return names_with_units
-
-
-class Skeleton:
-    """Text between the numbers of the lines of a layout.
-
-    Attributes:
-        names: Name of each number; empty for a number without a name.
-    """
-
-    def __init__(self, line: Line) -> None:
-        """Prepare the reading of lines with the skeleton of a line."""
-        self.names = line.names
-        patterns = {_CODES[kind]: pattern for kind, pattern in _PATTERNS.items()}
-        self._match = re.compile("".join(patterns.get(part) or re.escape(part) for part in line.skeleton)).fullmatch
-
-    def values(self, text: str) -> tuple[float, ...] | None:
-        """Return the numbers in a line; None if the line has another skeleton.
-
-        Args:
-            text: The line.
-        """
-        match = self._match(text)
-        if match is None:
-            return None
-        try:
-            return tuple(map(float, match.groups()))
-        except ValueError:  # a number is a time of day, is hexadecimal, has a decimal comma, or is `ovf`
-            return tuple(map(_value, match.groups()))
+    match = pattern.fullmatch(text)
+    if match is None:
+        return None
+    try:
+        return tuple(map(float, match.groups()))
+    except ValueError:  # a number is a time of day, is hexadecimal, has a decimal comma, or is `ovf`
+        return tuple(map(_value, match.groups()))
 
 
 def _value(number: str) -> float:

@@ -298,23 +298,13 @@ def _values(number_bytes: Bytes, type_name: str) -> Array:
         type_name: Type of the number: "f" for floating-point, "u" for unsigned or "i" for signed, and the size in bits.
     """
     size = number_bytes.shape[1]
-    is_float = type_name[0] == "f"
-    is_unsigned = type_name[0] == "u"
-    if is_float:
-        little_endian_type = f"<f{size}"
-        floats = np.ascontiguousarray(number_bytes).view(little_endian_type)  # shape (n, 1)
+    if type_name[0] == "f":
+        floats = np.ascontiguousarray(number_bytes).view(f"<f{size}")  # shape (n, 1)
         return floats[:, 0].astype(float)
-
-    byte_weights = 256.0 ** np.arange(size)
-    unsigned: Array = number_bytes @ byte_weights
-    if is_unsigned:
-        return unsigned
-
-    # In two's complement, the upper half of the unsigned values stands for the negative values.
-    value_count = 256.0**size
-    is_negative = unsigned >= value_count / 2
-    signed: Array = unsigned - value_count * is_negative
-    return signed
+    values: Array = number_bytes @ 256.0 ** np.arange(size)
+    if type_name[0] == "i":  # in two's complement, the upper half of the unsigned values stands for the negative values
+        values -= 256.0**size * (values >= 0.5 * 256.0**size)
+    return values
 
 
 def _bits(steps: Array, unit: float, size: int) -> float:

@@ -12,6 +12,7 @@ All checksums with a name are tried for every possible position of the first byt
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from itertools import product
 from math import gcd
 from typing import Any, NamedTuple
 
@@ -284,10 +285,15 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
         last_possible_start = min(leading_constant_count, length - size - 1)  # the checksum covers at least one byte
         possible_starts = range(last_possible_start + 1)
         orders = ORDERS if size > 1 else ORDERS[:1]  # a single byte has no byte order
+        names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
         for order in orders:
-            first_check = next(_fitting_checks(frames, size, order, possible_starts), None)
-            if first_check is not None:
-                yield first_check
+            for start, name in product(possible_starts, names):
+                if _fits(CHECKSUMS[name].compute, frames, start, size, order):
+                    keys: dict[str, Any] = {"checksum": name}  # keys of the checksum in a device file
+                    if start > 0:  # the default is that the checksum covers a frame from its first byte
+                        keys["checksum_from"] = start
+                    yield Check(size, order, keys)
+                    break
 
 
 def _drawn_rows(rows: Bytes, max_count: int = 24) -> Bytes:
@@ -303,28 +309,6 @@ def _drawn_rows(rows: Bytes, max_count: int = 24) -> Bytes:
     different_rows = np.unique(rows, axis=0)  # sorted
     drawn_indices = np.random.default_rng(0).permutation(len(different_rows))[:max_count]
     return np.asarray(different_rows[drawn_indices])
-
-
-def _fitting_checks(frames: list[bytes], size: int, order: ByteOrder, possible_starts: range) -> Iterator[Check]:
-    """Yield the checksums that fit most of the frames.
-
-    Different positions are tried for the first byte that a checksum covers. A checksum is yielded once for each
-    position with which it fits.
-
-    Args:
-        frames: The frames, which are of one length.
-        size: Number of bytes of the checksum.
-        order: Byte order of the checksum.
-        possible_starts: Positions in a frame that are tried for the first covered byte.
-    """
-    names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
-    for start in possible_starts:
-        for name in names:
-            if _fits(CHECKSUMS[name].compute, frames, start, size, order):
-                keys: dict[str, Any] = {"checksum": name}  # keys of the checksum in a device file
-                if start > 0:  # the default is that the checksum covers a frame from its first byte
-                    keys["checksum_from"] = start
-                yield Check(size, order, keys)
 
 
 def _fits(compute: Callable[[bytes], int], frames: list[bytes], start: int, size: int, order: ByteOrder) -> bool:

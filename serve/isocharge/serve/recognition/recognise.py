@@ -5,6 +5,7 @@ The format is the binary frames of isocharge, lines of text, or frames of fixed 
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
+from string import printable
 from typing import Any
 
 import numpy as np
@@ -177,9 +178,9 @@ def is_text(chunks: Sequence[bytes], min_share: float = 0.95) -> bool:
         min_share: Smallest share of printable characters in text. The other bytes may be damaged, or letters that are
             not ASCII.
     """
-    data = np.frombuffer(b"".join(chunks), np.uint8)
-    is_printable = ((data >= ord(" ")) & (data <= ord("~"))) | np.isin(data, list(b"\t\r\n\x1b"))
-    return len(data) > 0 and bool(is_printable.mean() >= min_share)
+    data = b"".join(chunks)
+    other_bytes = data.translate(None, delete=printable.encode() + b"\x1b")
+    return len(data) > 0 and len(other_bytes) <= (1.0 - min_share) * len(data)
 
 
 def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False) -> dict[str, Any] | None:
