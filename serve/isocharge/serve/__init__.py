@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     from isocharge.serve.model.predictor import Predictor
     from isocharge.serve.model.validity import Validity
     from isocharge.serve.network.http.application import asgi_app
+    from isocharge.serve.port.file_source import Chunk
     from isocharge.serve.port.recording import Recorder, Recording
-    from isocharge.serve.port.source import Chunk, Port, open_source
+    from isocharge.serve.port.source import Port, open_source
     from isocharge.serve.prediction.press_check import PressCheck, check_presses
     from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
     from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses, write_presses

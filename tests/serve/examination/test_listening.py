@@ -6,7 +6,7 @@ import pytest
 
 from isocharge.serve import examine
 from isocharge.serve.examination import listening
-from isocharge.serve.port.source import Chunk
+from isocharge.serve.port.file_source import Chunk
 
 
 class PortOfOneSpeed:

@@ -5,7 +5,7 @@ import pytest
 
 from isocharge.serve import Frame
 from isocharge.serve.frames.device_clock import DeviceClock
-from isocharge.serve.port.source import Chunk
+from isocharge.serve.port.file_source import Chunk
 
 MODULUS = 2**32
 START_S = 1_700_000_000.0

@@ -13,7 +13,7 @@ from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import SequenceGaps
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_lines import TEXT_FORMATS, clean_text, line_values, parse_line, skeleton_pattern
-from isocharge.serve.port.source import Chunk
+from isocharge.serve.port.file_source import Chunk
 
 README_OF_TELEPLOT = [
     ("myValue:1234", ("myValue",), (1234.0,)),

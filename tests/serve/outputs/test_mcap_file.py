@@ -30,14 +30,7 @@ from isocharge.serve import PredictionRecord
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.outputs.mcap_file import McapFile
 from isocharge.serve.outputs.output import OutputContext
-from isocharge.serve.outputs.ros_messages import (
-    POSE,
-    POSE_DEFINITION,
-    STRING,
-    STRING_DEFINITION,
-    WRENCH,
-    WRENCH_DEFINITION,
-)
+from isocharge.serve.outputs.ros_messages import DEFINITIONS, STRING
 from isocharge.serve.outputs.targets import Outputs
 from isocharge.serve.record.formats import record_schema
 from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking, selected_fields
@@ -183,11 +176,9 @@ def test_rosbags_reads_every_message_of_an_mcap_file(tmp_path_factory, is_ros2, 
         assert sorted(line for _, line in topics["/isocharge/record"]) == sorted(lines)
 
 
-@pytest.mark.parametrize(
-    ("name", "definition"), [(WRENCH, WRENCH_DEFINITION), (POSE, POSE_DEFINITION), (STRING, STRING_DEFINITION)]
-)
-def test_message_definitions_equal_those_of_ros2(name, definition):
-    for kind, fields in get_types_from_msg(definition, name).items():
+@pytest.mark.parametrize("name", DEFINITIONS)
+def test_message_definitions_equal_those_of_ros2(name):
+    for kind, fields in get_types_from_msg(DEFINITIONS[name], name).items():
         assert fields == ROS.fielddefs[kind], kind
 
 

@@ -7,7 +7,7 @@ from pyarrow.parquet import write_table
 
 from isocharge.common.errors import InputError, RecordingError
 from isocharge.serve import Port, Recorder, Recording, open_source
-from isocharge.serve.port.source import Chunk, FileSource
+from isocharge.serve.port.file_source import Chunk, FileSource
 from isocharge.serve.record.formats import csv_header
 
 

@@ -12,7 +12,7 @@ from isocharge.serve import BinaryParser, Predictor, device_from_table, encode_f
 from isocharge.serve.flags import BLIND, DRIFT, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import T_US_MODULUS, Frame
-from isocharge.serve.port.source import Chunk
+from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.signal_chain.gain import Gain
 from isocharge.serve.signal_chain.hum import Hum
 from isocharge.serve.signal_chain.thermal import ThermalRule

@@ -1,8 +1,9 @@
 """`isocharge serve plot`: draw the charges, the position, the force and the flags of a recording over time."""
 
-from collections.abc import Iterator
+import math
+from array import array
+from collections.abc import Iterable
 from datetime import UTC, datetime
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,7 +50,7 @@ PlottedRecord = defstruct(
 """A record of a recording, reduced to the fields that are drawn. The types are those of `PredictionRecord`."""
 
 
-def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
+def traces_of(records: Iterable[Any], where: str) -> dict[str, Array]:
     """Convert records to columns: one array for each number, each charge and each flag.
 
     The names of the electrodes are taken from the first record.
@@ -65,35 +66,20 @@ def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
     Raises:
         RecordingError: If there are no records.
     """
-    first = next(records, None)
-    if first is None:
+    columns: dict[str, array[float]] = {}
+    for record in records:
+        values = {name: getattr(record, name) for name in NUMBERS}
+        charge_pC = record.charge_pC or {}
+        values |= {f"charge_pC.{name}": charge_pC.get(name) for name in record.charge_raw_pC or ()}
+        values |= {flag: flag in record.flags for flag in MEANINGS}
+        columns = columns or {name: array("d") for name in values}
+        for name, column in columns.items():
+            value = values.get(name)
+            column.append(math.nan if value is None else value)
+    if not columns:
         raise RecordingError(f"{where}: expected at least one record, got none; replay or record it again")
-    electrodes = tuple(first.charge_raw_pC or ())
-    charge_names = [f"charge_pC.{electrode}" for electrode in electrodes]
-    names = [*NUMBERS, *charge_names, *MEANINGS]  # MEANINGS contains all flags
-
-    all_records = chain([first], records)
-    row_type = np.dtype((float, len(names)))  # None in a row becomes NaN
-    rows = np.fromiter((_record_values(record, electrodes) for record in all_records), row_type)  # shape (n, n_column)
-    columns = dict(zip(names, rows.T, strict=True))
-    unused_flags = [flag for flag in MEANINGS if not columns[flag].any()]
-    return {name: column for name, column in columns.items() if name not in unused_flags}
-
-
-def _record_values(record: Any, electrodes: tuple[str, ...]) -> tuple[Any, ...]:
-    """Return the numbers of a record, the charge of each electrode, and whether each flag of `MEANINGS` is set.
-
-    Missing values are None.
-
-    Args:
-        record: A `PlottedRecord`.
-        electrodes: Names of the electrodes, in the order of the returned charges.
-    """
-    numbers = [getattr(record, name) for name in NUMBERS]
-    charge_of_electrode = record.charge_pC or {}
-    charge_pC = [charge_of_electrode.get(name) for name in electrodes]
-    is_flag_set = [flag in record.flags for flag in MEANINGS]
-    return (*numbers, *charge_pC, *is_flag_set)
+    traces = {name: np.frombuffer(column) for name, column in columns.items()}
+    return {name: trace for name, trace in traces.items() if name not in MEANINGS or trace.any()}
 
 
 def recording_picture(traces: dict[str, Array], title: str) -> Figure:
@@ -110,7 +96,8 @@ def recording_picture(traces: dict[str, Array], title: str) -> Figure:
     figure = new_figure(12.0, 8.6)
     figure.suptitle(f"{title}: {len(time_s)} records; faint points: ± 2 standard deviations")
     heights = (1.0, 1.0, 0.8, flag_height)
-    charge_axes, position_axes, force_axes, flag_axes = figure.subplots(4, 1, sharex=True, height_ratios=heights)
+    *value_axes, flag_axes = figure.subplots(4, 1, sharex=True, height_ratios=heights)
+    charge_axes, position_axes, force_axes = value_axes
 
     for name, charge_pC in traces.items():
         if name.startswith("charge_pC."):
@@ -125,12 +112,10 @@ def recording_picture(traces: dict[str, Array], title: str) -> Figure:
         flag_time_s = time_s[traces[flag] > 0.0]
         flag_axes.plot(flag_time_s, np.full(len(flag_time_s), row), "|", color=INK)
 
-    charge_axes.set_ylabel("touch charge, pC")
-    position_axes.set_ylabel("position, mm")
-    force_axes.set_ylabel("force, N")
     flag_axes.set(yticks=range(len(flags)), yticklabels=flags, ylim=(-0.7, max(len(flags), 1) - 0.3))
     flag_axes.set_xlabel(f"time since {datetime.fromtimestamp(start_s, UTC):%Y-%m-%d %H:%M:%S} UTC, s")
-    for axes in (charge_axes, position_axes, force_axes):
+    for axes, label in zip(value_axes, ("touch charge, pC", "position, mm", "force, N"), strict=True):
+        axes.set_ylabel(label)
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(loc="upper right", fontsize=8, ncols=8, markerscale=4.0)

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from isocharge.common.errors import NoFramesError
-from isocharge.serve.port.source import STDIN
+from isocharge.serve.port.file_source import STDIN
 
 
 @contextmanager

@@ -12,8 +12,9 @@ from isocharge.common.errors import PortLost
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
 from isocharge.serve.live.device import Device
+from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.port.serial_line import UDP_SCHEME, Request
-from isocharge.serve.port.source import Chunk, Port, has_speed
+from isocharge.serve.port.source import Port, has_speed
 from isocharge.serve.presses.number_table import LARGEST
 from isocharge.serve.signal_chain.channels import channel_names
 

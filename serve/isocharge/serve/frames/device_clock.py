@@ -16,7 +16,7 @@ import math
 from collections.abc import Sequence
 
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.port.source import Chunk
+from isocharge.serve.port.file_source import Chunk
 
 BANDWIDTH_Hz = 0.05
 """Bandwidth of the loop, Hz. A jitter of 1 ms is reduced to 0.2 ms."""

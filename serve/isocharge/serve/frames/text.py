@@ -1,11 +1,11 @@
 """Parser for boards that send frames as lines of text.
 
-A board sends each frame either as a single line or as a cycle of several lines, each of which contains a part of the
-frame. `isocharge.serve.frames.text_lines` reads the numbers of each line. Lines with the same text between their
-numbers are frames. The parser recognises this layout as soon as the same kind of line, or the same cycle of lines, has
+A board writes each frame as one line, or as a cycle of lines that together contain all values of the frame. The module
+`isocharge.serve.frames.text_lines` reads the numbers of each line. Lines with the same text between their numbers
+have the same layout. The parser recognises a layout as soon as the same kind of line, or the same cycle of lines, has
 occurred three times in succession. Lines that resemble a message, such as `Channel 3 is ready`, must occur ten times,
-because a board that starts often sends several similar messages. After the recognition, lines with another layout
-are dropped and counted.
+because a board that starts often sends several similar messages. After the recognition, lines with another layout are
+dropped and counted.
 
 Reading may start in the middle of a cycle. A cycle therefore begins with the line whose name is that of the frame
 counter, or else comes first in the order of names.

@@ -17,8 +17,8 @@ from msgspec import structs
 from isocharge.common.errors import IsochargeError
 from isocharge.serve.live.stream import TouchStream
 from isocharge.serve.model.predictor import Predictor
+from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.port.recording import Marker, Recorder, Recording
-from isocharge.serve.port.source import Chunk
 from isocharge.serve.record.record import PredictionRecord
 
 Load = Callable[[], Predictor]

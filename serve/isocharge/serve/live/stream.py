@@ -17,7 +17,7 @@ from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, SequenceGaps
 from isocharge.serve.live.device import ANY_BOARD, Device, create_stages
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.port.source import Chunk
+from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord
 from isocharge.serve.signal_chain.stage import Stage
 from isocharge.serve.tracking.film_follower import FollowRule

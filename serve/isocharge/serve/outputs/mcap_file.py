@@ -19,12 +19,10 @@ from isocharge.common.extras import require
 from isocharge.common.files import as_output_errors
 from isocharge.serve.outputs.output import FileOutput
 from isocharge.serve.outputs.ros_messages import (
+    DEFINITIONS,
     POSE,
-    POSE_DEFINITION,
     STRING,
-    STRING_DEFINITION,
     WRENCH,
-    WRENCH_DEFINITION,
     pose_stamped,
     ros_time_ns,
     string_message,
@@ -72,17 +70,20 @@ class McapFile(FileOutput):
         self._writer = Writer(self._file)  # type: ignore[arg-type]  # uses only write, tell and flush
         with as_output_errors(path):
             self._writer.start(profile="ros2", library="isocharge")
-            schema_text = json.dumps(record_schema(electrodes))
-            record_channel = (
-                self._add_channel(RECORD_TOPIC, "cdr", STRING, "ros2msg", STRING_DEFINITION)
-                if is_ros2
-                else self._add_channel(RECORD_TOPIC, "json", SCHEMA_NAME, "jsonschema", schema_text)
-            )
+            if is_ros2:
+                record_channel = self._add_ros_channel(RECORD_TOPIC, STRING)
+            else:
+                schema_text = json.dumps(record_schema(electrodes))
+                record_channel = self._add_channel(RECORD_TOPIC, "json", SCHEMA_NAME, "jsonschema", schema_text)
             self._channels = {
                 RECORD_TOPIC: record_channel,
-                WRENCH_TOPIC: self._add_channel(WRENCH_TOPIC, "cdr", WRENCH, "ros2msg", WRENCH_DEFINITION),
-                POSE_TOPIC: self._add_channel(POSE_TOPIC, "cdr", POSE, "ros2msg", POSE_DEFINITION),
+                WRENCH_TOPIC: self._add_ros_channel(WRENCH_TOPIC, WRENCH),
+                POSE_TOPIC: self._add_ros_channel(POSE_TOPIC, POSE),
             }
+
+    def _add_ros_channel(self, topic: str, name: str) -> int:
+        """Register a channel of ROS 2 messages of a type, such as "std_msgs/msg/String", and return its identifier."""
+        return self._add_channel(topic, "cdr", name, "ros2msg", DEFINITIONS[name])
 
     def _add_channel(self, topic: str, encoding: str, schema_name: str, schema_encoding: str, schema: str) -> int:
         """Register a channel and the schema of its messages in the file, and return the identifier of the channel.

@@ -46,7 +46,7 @@ uint32 nanosec
 """
 
 WRENCH = "geometry_msgs/msg/WrenchStamped"
-WRENCH_DEFINITION = f"""std_msgs/Header header
+_WRENCH_DEFINITION = f"""std_msgs/Header header
 Wrench wrench
 {_SEPARATOR}MSG: geometry_msgs/Wrench
 Vector3 force
@@ -58,7 +58,7 @@ float64 z
 {_HEADER}"""
 
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-POSE_DEFINITION = f"""std_msgs/Header header
+_POSE_DEFINITION = f"""std_msgs/Header header
 PoseWithCovariance pose
 {_SEPARATOR}MSG: geometry_msgs/PoseWithCovariance
 Pose pose
@@ -78,7 +78,8 @@ float64 w 1
 {_HEADER}"""
 
 STRING = "std_msgs/msg/String"
-STRING_DEFINITION = "string data\n"
+DEFINITIONS = {STRING: "string data\n", WRENCH: _WRENCH_DEFINITION, POSE: _POSE_DEFINITION}
+"""Definition of each type of message in the notation of ROS 2, by its name."""
 
 
 def ros_time_ns(record: Mapping[str, Any]) -> int:

@@ -30,8 +30,7 @@ from isocharge.common.printable_text import is_printable
 from isocharge.common.progress import report
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.model.model_search import ModelLabel
-from isocharge.serve.port.foreign_files import HEAD_BYTES, RECORDING_START, foreign_kind
-from isocharge.serve.port.source import Chunk, Moment
+from isocharge.serve.port.file_source import HEAD_BYTES, RECORDING_START, Chunk, Moment, foreign_kind
 
 VERSION = 1
 """Version of the format of the file."""

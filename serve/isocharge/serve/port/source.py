@@ -27,12 +27,10 @@ import time
 from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Annotated, NamedTuple, Protocol, Self
-
-from msgspec import Meta
+from typing import Protocol, Self
 
 from isocharge.common.errors import InputError, PortError, PortLost
-from isocharge.serve.port.foreign_files import HEAD_BYTES, refuse_foreign_file
+from isocharge.serve.port.file_source import STDIN, Chunk, FileSource, check_file, open_file
 from isocharge.serve.port.serial_line import (
     MAX_READ_BYTES,
     OPEN_ERRORS,
@@ -55,38 +53,6 @@ Many boards restart when their port is opened, and send nothing for up to 6 s.
 """
 
 log = logging.getLogger(__name__)
-
-
-Moment = Annotated[float, Meta(ge=-1e11, le=1e11, description="a time before the year 5138, unix seconds")]
-
-
-class Chunk(NamedTuple):
-    """Bytes that arrived together, with the time of arrival.
-
-    Attributes:
-        data: The bytes, at least one byte.
-        timestamp: Host time of arrival, unix seconds.
-        clock_ns: Value of `time.perf_counter_ns` at arrival, from which latencies and the times between chunks are
-            computed.
-        outage_s: Length of the outage that ended with these bytes, s; 0 if there was no outage.
-    """
-
-    data: bytes
-    timestamp: Moment
-    clock_ns: Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
-    outage_s: Annotated[float, Meta(ge=0.0)] = 0.0
-
-    def elapsed_since(self, previous: "Chunk") -> float:
-        """Return the time since an earlier chunk of the same source, s. It does not depend on the wall clock.
-
-        All chunks of a file have the same time of arrival, so the result is 0. If the caller that created the chunks
-        states no monotonic time, so that `clock_ns` is constant, the times of arrival are used.
-        """
-        wall_s = self.timestamp - previous.timestamp
-        monotonic_ns = self.clock_ns - previous.clock_ns
-        if wall_s == 0.0 or monotonic_ns == 0:
-            return max(0.0, wall_s)
-        return max(0.0, monotonic_ns * 1e-9)
 
 
 class Port:
@@ -168,7 +134,11 @@ class Port:
         if is_path and not Path(self.url).exists():
             raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
         if is_path and Path(self.url).is_file():
-            _refuse_file(Path(self.url))
+            check_file(Path(self.url))
+            raise InputError(
+                f"{self.url}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a board "
+                "from a file"
+            )
         try:
             if self.url.startswith(UDP_SCHEME):
                 self._line = UdpSocket(self.url)
@@ -347,9 +317,6 @@ def has_speed(url: str) -> bool:
     return "://" not in url and not os.path.realpath(url).startswith("/dev/pts/")
 
 
-STDIN = "-"
-"""Name of the standard input."""
-
 ENTRY_POINTS = "isocharge.sources"
 """Group of the entry points through which other packages add sources."""
 
@@ -365,44 +332,6 @@ class Source(Protocol):
 
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks as they arrive, until the source ends."""
-
-
-class FileSource:
-    """Iterator over the chunks of a file, a pipe or the standard input, up to its end.
-
-    Args:
-        descriptor: File descriptor that is open for reading.
-        name: Path of the file, or - for the standard input.
-
-    Attributes:
-        is_live: Always False, because no bytes are lost if they are read later.
-    """
-
-    is_live = False
-
-    def __init__(self, descriptor: int, name: str) -> None:
-        """Store the file descriptor and the name."""
-        self._descriptor = descriptor
-        self._name = name
-
-    def __iter__(self) -> Iterator[Chunk]:
-        """Yield chunks until the file ends.
-
-        For a file on a disk, the arrival time of all chunks is the time at which reading began. For a pipe, the arrival
-        time of a chunk is the time at which the chunk was read.
-
-        Raises:
-            InputError: If the file is a recording, a table or another file that does not come from a board.
-        """
-        start_s = time.time()
-        is_on_disk = stat.S_ISREG(os.fstat(self._descriptor).st_mode)
-        is_first_chunk = True
-        while data := os.read(self._descriptor, HEAD_BYTES):
-            if is_first_chunk:
-                refuse_foreign_file(self._name, data)
-            is_first_chunk = False
-            arrival_s = start_s if is_on_disk else time.time()
-            yield Chunk(data, arrival_s, time.perf_counter_ns())
 
 
 def open_source(
@@ -450,25 +379,9 @@ def open_source(
     while is_path and not Path(url).exists() and time.monotonic() < deadline_s:
         time.sleep(RETRY_PAUSE_s)
     if is_path and _is_file_or_pipe(Path(url)):
-        return _open_file(Path(url))
+        return open_file(Path(url))
     remaining_s = max(0.0, deadline_s - time.monotonic())
     return Port(url, baud=baud, silence_s=silence_s, reconnect=reconnect, request=request, wait=remaining_s)
-
-
-def _refuse_file(path: Path) -> None:
-    """Raise an error for a file that was given where only a port is possible.
-
-    Args:
-        path: Path of the file.
-
-    Raises:
-        InputError: Always. If the kind of the file is recognised, the message states how to use such a file.
-    """
-    with contextlib.suppress(OSError), path.open("rb") as file:
-        refuse_foreign_file(str(path), file.read(HEAD_BYTES))
-    raise InputError(
-        f"{path}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a board from a file"
-    )
 
 
 def _is_file_or_pipe(path: Path) -> bool:
@@ -480,27 +393,3 @@ def _is_file_or_pipe(path: Path) -> bool:
         mode = path.stat().st_mode
         return stat.S_ISREG(mode) or stat.S_ISFIFO(mode)
     return False
-
-
-@contextlib.contextmanager
-def _open_file(path: Path) -> Iterator[FileSource]:
-    """Open a file or a named pipe as a source of chunks for the `with` block.
-
-    Args:
-        path: Path of the file or the pipe.
-
-    Yields:
-        The source.
-
-    Raises:
-        InputError: If the file cannot be read, or does not come from a board.
-    """
-    try:
-        file = path.open("rb", buffering=0)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a file of frames") from error
-    with file:
-        if path.is_file():  # the first bytes of a pipe cannot be read twice, so only `FileSource` checks them
-            head = os.pread(file.fileno(), HEAD_BYTES, 0)
-            refuse_foreign_file(str(path), head)
-        yield FileSource(file.fileno(), str(path))

@@ -1,0 +1,187 @@
+"""Chunks of bytes, and files, pipes and the standard input as sources of chunks.
+
+A user may give a file as a port by mistake, for example a recording, records, a table of presses, an MCAP file or a
+Parquet file. The parsers of text would misread the numbers in such files as charges from a board, so these files are
+refused.
+"""
+
+import codecs
+import os
+import shlex
+import stat
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from msgspec import Meta
+
+from isocharge.common.errors import InputError
+
+STDIN = "-"
+"""Name of the standard input."""
+
+HEAD_BYTES = 4096
+"""Number of bytes at the start of a file from which the kind of the file is recognised."""
+
+RECORDING_START = b'{"isocharge_recording"'
+RECORD_KEYS = (b'"frame_id"', b'"charge_pC"', b'"tare_pC"')
+MCAP_START = b"\x89MCAP"
+PARQUET_START = b"PAR1"
+
+PRESS_COLUMNS = {"x_mm", "y_mm", "force_N", "charge_pC.A", "flags"}
+"""Columns that only tables of presses and records have."""
+
+Moment = Annotated[float, Meta(ge=-1e11, le=1e11, description="a time before the year 5138, unix seconds")]
+
+
+class Chunk(NamedTuple):
+    """Bytes that arrived together, with the time of arrival.
+
+    Attributes:
+        data: The bytes, at least one byte.
+        timestamp: Host time of arrival, unix seconds.
+        clock_ns: Value of `time.perf_counter_ns` at arrival, from which latencies and the times between chunks are
+            computed.
+        outage_s: Length of the outage that ended with these bytes, s; 0 if there was no outage.
+    """
+
+    data: bytes
+    timestamp: Moment
+    clock_ns: Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
+    outage_s: Annotated[float, Meta(ge=0.0)] = 0.0
+
+    def elapsed_since(self, previous: "Chunk") -> float:
+        """Return the time since an earlier chunk of the same source, s. It does not depend on the wall clock.
+
+        All chunks of a file have the same time of arrival, so the result is 0. If the caller that created the chunks
+        states no monotonic time, so that `clock_ns` is constant, the times of arrival are used.
+        """
+        wall_s = self.timestamp - previous.timestamp
+        monotonic_ns = self.clock_ns - previous.clock_ns
+        if wall_s == 0.0 or monotonic_ns == 0:
+            return max(0.0, wall_s)
+        return max(0.0, monotonic_ns * 1e-9)
+
+
+def check_bytes(name: str, head: bytes) -> None:
+    """Raise an error if a file does not contain the bytes that a board sends.
+
+    Args:
+        name: Path of the file, or - for the standard input.
+        head: First bytes of the file.
+
+    Raises:
+        InputError: If the file is of another kind. The message states the kind, and how to use such a file.
+    """
+    kind = foreign_kind(name, head)
+    if kind:
+        raise InputError(f"{name}: expected a port, or a file of bytes from a board, got {kind}")
+
+
+def check_file(path: Path) -> None:
+    """Raise an error if a file on the disk does not contain the bytes that a board sends.
+
+    The first bytes of a pipe cannot be read twice, so only `FileSource` checks them.
+
+    Raises:
+        InputError: If the file is of another kind.
+    """
+    with suppress(OSError):  # reading the file reports the error
+        if path.is_file():
+            with path.open("rb") as file:
+                check_bytes(str(path), file.read(HEAD_BYTES))
+
+
+def foreign_kind(name: str, head: bytes) -> str:
+    """Return the kind of a file that does not come from a board, with advice; empty if it may come from a board.
+
+    Args:
+        name: Path of the file, or - for the standard input.
+        head: First bytes of the file. They are compared with the beginnings of known kinds of files.
+    """
+    quoted_name = shlex.quote(name)  # for the commands in the advice
+    text = head.removeprefix(codecs.BOM_UTF8).lstrip()
+    first_line, _line_feed, _next_lines = text.partition(b"\n")
+    if first_line.startswith(RECORDING_START):
+        return f"a recording; play it with: isocharge serve replay {quoted_name}"
+    if first_line.startswith(b"{") and all(key in first_line for key in RECORD_KEYS):
+        return (
+            "records of `serve stream`; records hold results; record the board with `isocharge serve stream MODEL "
+            "--port PORT --record touch.rec` and play it with `isocharge serve replay touch.rec`"
+        )
+    if head.startswith(MCAP_START):
+        return (
+            "an MCAP file; MCAP files hold results, and isocharge only writes them; play the recording that was made "
+            "beside it with `isocharge serve replay touch.rec`"
+        )
+    if head.startswith(PARQUET_START):
+        return f"a Parquet file; compute its contacts with: isocharge serve predict MODEL {quoted_name}"
+    columns = {column.strip(' "') for column in first_line.decode("utf-8", "replace").strip().split(",")}
+    if columns & PRESS_COLUMNS:
+        return (
+            f"a table of presses; compute its contacts with: isocharge serve predict MODEL {quoted_name}; if a board "
+            f"has sent these lines, use: isocharge serve stream MODEL --port - < {quoted_name}"
+        )
+    return ""
+
+
+class FileSource:
+    """Iterator over the chunks of a file, a pipe or the standard input, up to its end.
+
+    Args:
+        descriptor: File descriptor that is open for reading.
+        name: Path of the file, or - for the standard input.
+
+    Attributes:
+        is_live: Always False, because no bytes are lost if they are read later.
+    """
+
+    is_live = False
+
+    def __init__(self, descriptor: int, name: str) -> None:
+        """Store the file descriptor and the name."""
+        self._descriptor = descriptor
+        self._name = name
+
+    def __iter__(self) -> Iterator[Chunk]:
+        """Yield chunks until the file ends.
+
+        For a file on a disk, the arrival time of all chunks is the time at which reading began. For a pipe, the arrival
+        time of a chunk is the time at which the chunk was read.
+
+        Raises:
+            InputError: If the file is a recording, a table or another file that does not come from a board.
+        """
+        start_s = time.time()
+        is_on_disk = stat.S_ISREG(os.fstat(self._descriptor).st_mode)
+        is_first_chunk = True
+        while data := os.read(self._descriptor, HEAD_BYTES):
+            if is_first_chunk:
+                check_bytes(self._name, data)
+            is_first_chunk = False
+            arrival_s = start_s if is_on_disk else time.time()
+            yield Chunk(data, arrival_s, time.perf_counter_ns())
+
+
+@contextmanager
+def open_file(path: Path) -> Iterator[FileSource]:
+    """Open a file or a named pipe as a source of chunks for the `with` block.
+
+    Args:
+        path: Path of the file or the pipe.
+
+    Yields:
+        The source.
+
+    Raises:
+        InputError: If the file cannot be read, or does not come from a board.
+    """
+    check_file(path)
+    try:
+        file = path.open("rb", buffering=0)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a file of frames") from error
+    with file:
+        yield FileSource(file.fileno(), str(path))
