@@ -1,7 +1,9 @@
 """Encoder of frames with a described layout, as the firmware of a board writes them."""
 
 import sys
+from functools import partial
 
+from isocharge.serve import encode_text
 from isocharge.serve.frames.frame import FLAGS, SEQ, TIMES_US
 
 LARGEST_FLOATS = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": sys.float_info.max}
@@ -31,3 +33,24 @@ def encode_layout(layout, frame):
     for position, constant in layout.constants:
         data[position : position + len(constant)] = constant
     return bytes(data) + layout.compute_checksum(bytes(data))
+
+
+def encode_teleplot(frame):
+    """Return a frame as lines of Teleplot, as its README describes them."""
+    values = [("seq", frame.seq), *zip("ABC", frame.values, strict=True)]
+    return "".join(f">{name}:{frame.t_us / 1e3:.3f}:{value:.7g}\n" for name, value in values).encode()
+
+
+def encode_pairs(frame):
+    """Return a frame as pairs of names and values in a line."""
+    a, b, c = frame.values
+    return f"seq:{frame.seq},t_us:{frame.t_us},A:{a:.7g},B:{b:.7g},C:{c:.7g}\n".encode()
+
+
+TEXT_ENCODERS = {
+    "csv": partial(encode_text, notation="csv"),
+    "json": partial(encode_text, notation="json"),
+    "pairs": encode_pairs,
+    "teleplot": encode_teleplot,
+}
+"""Functions that write a frame as text, by the name of the notation."""

@@ -17,11 +17,10 @@ from isocharge.serve import (
     TouchStream,
     device_from_table,
     encode_frame,
-    encode_text,
 )
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.recognition.recognise import recognise
-from layout_encoder import encode_layout
+from layout_encoder import TEXT_ENCODERS, encode_layout
 
 FRAMES = [Frame(seq, 5000 * seq, (800.0 + seq, 700.0 - seq, 900.5), 0, ("A", "B", "C")) for seq in range(6)]
 
@@ -42,7 +41,7 @@ DESCRIBED = {
 
 
 def text(notation):
-    return b"".join(encode_text(frame, notation) for frame in FRAMES)
+    return b"".join(TEXT_ENCODERS[notation](frame) for frame in FRAMES)
 
 
 def stuffed(framing):

@@ -89,7 +89,7 @@ def test_random_presses_come_after_a_second_of_rest(played, solved):
     assert solved == [(*DESCRIBED, 8.0, (0.05, 0.5))]
 
 
-@pytest.mark.parametrize("frames", ["binary", "teleplot"])
+@pytest.mark.parametrize("frames", ["binary", "json"])
 def test_virtual_option_film_plays_a_random_film_without_printing_it(played, tmp_path, frames):
     """A script: half a second without touch, then one press that is held."""
     script = tmp_path / "held.toml"

@@ -13,11 +13,10 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve import AutoParser, BinaryParser, Frame, device_from_table, encode_frame, encode_text
+from isocharge.serve import AutoParser, BinaryParser, Frame, device_from_table, encode_frame
 from isocharge.serve.frames.frame import Parser, SequenceGaps
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.frames.text_lines import TEXT_FORMATS
-from layout_encoder import encode_layout
+from layout_encoder import TEXT_ENCODERS, encode_layout
 
 HEAD = [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
 FLOATS = [{"name": name, "type": "f32"} for name in "ABC"]
@@ -68,7 +67,7 @@ def binary(make=BinaryParser, lead=b""):
 
 
 def text(notation, make=TextParser):
-    encode = partial(encode_text, notation=notation)
+    encode = TEXT_ENCODERS[notation]
     return Format(make, encode, THREE, LINES, b"\n" + encode(Frame(0, 0, (1.0, 2.0, 3.0))) * 3)
 
 
@@ -97,7 +96,7 @@ FORMATS = {
     "described": described(SYNCED),
     "described with 24 bits": described(BITS_24 | {"fields": HEAD[:1] + TRIPLES}),
     "slip": described(STUFFED)._replace(encode=slip, frames=THREE, junk=SLIP_JUNK, tail=b""),
-    **{name: text(name) for name in TEXT_FORMATS},
+    **{name: text(name) for name in TEXT_ENCODERS},
     "auto binary": binary(AutoParser, encode_frame(Frame(0, 0, (1.0, 2.0, 3.0)))),
     "auto pairs": text("pairs", AutoParser),
 }

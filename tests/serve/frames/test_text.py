@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve import AutoParser, Frame, encode_text
+from isocharge.serve import AutoParser, Frame
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import SequenceGaps
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.frames.text_lines import TEXT_FORMATS, clean_text, line_values, parse_line, skeleton_pattern
+from isocharge.serve.frames.text_lines import clean_text, line_values, parse_line, skeleton_pattern
 from isocharge.serve.port.file_source import Chunk
+from layout_encoder import TEXT_ENCODERS
 
 README_OF_TELEPLOT = [
     ("myValue:1234", ("myValue",), (1234.0,)),
@@ -289,9 +290,9 @@ FRAMES = st.builds(
 
 
 @settings(derandomize=True)
-@given(FRAMES, st.sampled_from(sorted(TEXT_FORMATS)))
+@given(FRAMES, st.sampled_from(sorted(TEXT_ENCODERS)))
 def test_text_lines_round_trip_in_every_notation(frame, notation):
-    parsed = TextParser().feed(b"\n" + encode_text(frame, notation) * 3)
+    parsed = TextParser().feed(b"\n" + TEXT_ENCODERS[notation](frame) * 3)
     assert len(parsed) == 3
     latest = parsed[-1]
     assert latest.values == pytest.approx(frame.values, rel=1e-6)

@@ -168,7 +168,7 @@ def test_bytes_that_a_sensor_ignores_do_not_block_their_sender(film):
 
 
 def test_unplugged_port_returns_under_the_same_link(film, tmp_path):
-    encode = lambda frame: encode_text(frame, "pairs")  # noqa: E731
+    encode = lambda frame: encode_text(frame, "json")  # noqa: E731
     faults = Faults(unplug_every_s=0.8, unplug_s=0.3)
     with VirtualSensor(
         film.charges, steady(rate_Hz=500.0), faults=faults, encode=encode, link=tmp_path / "film"

@@ -85,7 +85,7 @@ def virtual_command(
         ),
     ] = None,
     frames: Annotated[
-        Literal["binary", "csv", "pairs", "teleplot", "json"], typer.Option("--frames", help="Format of the frames.")
+        Literal["binary", "csv", "json"], typer.Option("--frames", help="Format of the frames.")
     ] = "binary",
 ) -> None:
     """Play a sensor: simulate presses that wander over the film, and send their charges as frames on a pseudo-terminal.

@@ -18,10 +18,10 @@ are neither names nor followed by a colon or an equals sign may change from line
 import json
 import math
 import re
-from collections.abc import Callable
 from functools import reduce
 from operator import xor
-from typing import NamedTuple
+from string import ascii_uppercase
+from typing import Literal, NamedTuple
 
 from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US, Frame
 
@@ -342,62 +342,20 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
     return names if are_names and are_different else ()
 
 
-def _named_values(frame: Frame) -> list[tuple[str, str]]:
-    """Return the name and the value of the frame counter, of the clock and of each channel as texts.
+def encode_text(frame: Frame, notation: Literal["csv", "json"]) -> bytes:
+    """Encode a frame as a line of text, in which the values of the channels have seven significant digits.
 
-    Channels without names are called A, B, C, and so on. The values of channels have seven significant digits.
-    """
-    named_values = []
-    if frame.seq is not None:
-        named_values.append((SEQ, str(frame.seq)))
-    if frame.t_us is not None:
-        named_values.append(("t_us", str(frame.t_us)))
-    channel_names = frame.names
-    if not channel_names:
-        channel_names = tuple(chr(ord("A") + channel) for channel in range(len(frame.values)))
-    for name, value in zip(channel_names, frame.values, strict=True):
-        named_values.append((name, f"{value:.7g}"))
-    return named_values
-
-
-def _write_csv(frame: Frame) -> str:
-    """Return the values of the channels with commas between them. The counter and the clock are left out."""
-    return ",".join(f"{value:.7g}" for value in frame.values)
-
-
-def _write_pairs(frame: Frame) -> str:
-    """Return a pair `name:value` for the counter, the clock and each channel, with commas between the pairs."""
-    return ",".join(f"{name}:{value}" for name, value in _named_values(frame))
-
-
-def _write_teleplot(frame: Frame) -> str:
-    """Return a line `>name:time:value` for the counter and for each channel. The time is the clock in ms."""
-    time = "" if frame.t_us is None else f"{frame.t_us / 1e3:.3f}:"
-    return "\n".join(f">{name}:{time}{value}" for name, value in _named_values(frame) if name not in TIMES_US)
-
-
-def _write_json(frame: Frame) -> str:
-    """Return a JSON object that contains the counter, the clock and the channels."""
-    fields = ", ".join(f"{json.dumps(name)}: {value}" for name, value in _named_values(frame))
-    return "{" + fields + "}"
-
-
-TEXT_FORMATS: dict[str, Callable[[Frame], str]] = {
-    "csv": _write_csv,
-    "pairs": _write_pairs,
-    "teleplot": _write_teleplot,
-    "json": _write_json,
-}
-"""Functions that write a frame, by the name of the notation. The CSV contains only the channels and has no header."""
-
-
-def encode_text(frame: Frame, notation: str) -> bytes:
-    """Encode a frame as a line of text, or as several lines for Teleplot.
-
-    The values of the channels are written with seven significant digits.
+    Channels without names are called A, B, C, and so on.
 
     Args:
         frame: Frame to write.
-        notation: A key of `TEXT_FORMATS`.
+        notation: Whether the line is a CSV row that contains only the channels, or a JSON object that also contains the
+            frame counter and the clock.
     """
-    return (TEXT_FORMATS[notation](frame) + "\n").encode()
+    values = [f"{value:.7g}" for value in frame.values]
+    if notation == "csv":
+        return (",".join(values) + "\n").encode()
+    names = frame.names or ascii_uppercase
+    fields = {SEQ: frame.seq, "t_us": frame.t_us, **dict(zip(names, values, strict=False))}
+    members = (f"{json.dumps(name)}: {value}" for name, value in fields.items() if value is not None)
+    return ("{" + ", ".join(members) + "}\n").encode()

@@ -27,7 +27,7 @@ import time
 from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 from isocharge.common.errors import InputError, PortError, PortLost
 from isocharge.serve.port.file_source import STDIN, Chunk, FileSource, check_file, open_file
@@ -334,26 +334,15 @@ class Source(Protocol):
         """Yield chunks as they arrive, until the source ends."""
 
 
-def open_source(
-    url: str,
-    *,
-    baud: int = 115200,
-    silence_s: float = 5.0,
-    reconnect: bool = False,
-    request: Request | None = None,
-    wait: float = 0.0,
-) -> contextlib.AbstractContextManager[Source]:
+def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> contextlib.AbstractContextManager[Source]:
     """Return a context manager that opens a port, a file or the standard input as a source of chunks.
 
     The function waits until the path exists. The port or the file is opened when the context is entered.
 
     Args:
         url: Device path or URL of a port, path of a file or of a named pipe, or - for the standard input.
-        baud: Baud rate of a serial port, bit/s.
-        silence_s: Time without a byte after which a port is considered lost, s.
-        reconnect: Whether to open a lost port repeatedly until it is back, instead of raising an error.
-        request: Request that the board needs for each frame; None for a board that sends frames by itself.
         wait: Time to wait until the port can be opened or the file exists, s; see `Port`.
+        port_settings: Other settings of a `Port`, such as `baud` and `reconnect`.
 
     Raises:
         InputError: If the file cannot be read, or is a recording, a table or another file that does not come from a
@@ -381,7 +370,7 @@ def open_source(
     if is_path and _is_file_or_pipe(Path(url)):
         return open_file(Path(url))
     remaining_s = max(0.0, deadline_s - time.monotonic())
-    return Port(url, baud=baud, silence_s=silence_s, reconnect=reconnect, request=request, wait=remaining_s)
+    return Port(url, wait=remaining_s, **port_settings)
 
 
 def _is_file_or_pipe(path: Path) -> bool:

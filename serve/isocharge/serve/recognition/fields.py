@@ -8,7 +8,6 @@ channels are adjacent and have the same type. The weights were fitted to random 
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import Literal, NamedTuple
 
@@ -68,11 +67,11 @@ def identify_clock(steps: Array, frame_rate_Hz: float, tolerance: float = 0.06) 
     return CLOCKS[nearest_tick_rate_Hz] if deviations[nearest_tick_rate_Hz] < tolerance else None
 
 
-@dataclass(frozen=True)
 class Weights:
     """Contributions of the parts of a frame to the score of a division, in bits.
 
-    The fields, the padding and the checksum are parts of a frame. The division with the lowest score is chosen.
+    The fields, the padding and the checksum are parts of a frame. The division with the lowest score is chosen. The
+    weights were fitted to random boards.
 
     Attributes:
         channel_group: Contribution of a group of adjacent channels of one type.
@@ -82,11 +81,11 @@ class Weights:
         fraction: Share of the bits of a floating-point number that belong to its significant digits, dimensionless.
     """
 
-    channel_group: float = 4.0
-    channel: float = 1.65
-    constant: float = 0.8
-    noise: float = 8.0
-    fraction: float = 0.65
+    channel_group = 4.0
+    channel = 1.65
+    constant = 0.8
+    noise = 8.0
+    fraction = 0.65
 
 
 class Part(NamedTuple):
@@ -120,7 +119,7 @@ class Part(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights: Weights) -> list[list[Part]]:
+def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[list[Part]]:
     """List the possible parts of a frame that begin at each byte.
 
     A part is a single byte without a meaning (padding), or a number of one of the types `TYPES`. The first byte of the
@@ -132,7 +131,6 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights:
             of a row, but they begin at the same position in all rows.
         order: Byte order of the numbers.
         frame_rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
-        weights: Contributions to the score.
 
     Returns:
         For each of the `length` bytes, a list of parts, of which the first is padding.
@@ -144,7 +142,7 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights:
     byte_step = 1 if order == "little" else -1  # reverses big-endian numbers, so that the lowest byte comes first
     parts_at_each_byte: list[list[Part]] = []
     for position in range(length):
-        pad_score = weights.constant if is_constant[position] else weights.noise
+        pad_score = Weights.constant if is_constant[position] else Weights.noise
         parts = [Part("pad", "pad", 1, pad_score)]  # one byte of padding
         for type_name in TYPES:  # such as "u16", whose size is 16 bits
             size = int(type_name[1:]) // 8  # in bytes
@@ -154,7 +152,7 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights:
                 number_bytes = rows[:, position:end][:, ::byte_step]
                 byte_is_constant = is_constant[position:end][::byte_step]
                 byte_is_zero = is_zero[position:end][::byte_step]
-                parts += _number_parts(number_bytes, byte_is_constant, byte_is_zero, type_name, frame_rate_Hz, weights)
+                parts += _number_parts(number_bytes, byte_is_constant, byte_is_zero, type_name, frame_rate_Hz)
         parts_at_each_byte.append(parts)
     return parts_at_each_byte
 
@@ -165,7 +163,6 @@ def _number_parts(
     is_zero: Booleans,
     type_name: str,
     frame_rate_Hz: float,
-    weights: Weights,
 ) -> Iterator[Part]:
     """Yield the possible parts of a frame for bytes that contain a number of a given type.
 
@@ -179,11 +176,10 @@ def _number_parts(
         is_zero: Whether each byte is always 0, shape (size,).
         type_name: Type of the number, such as "u16", "i16" or "f32".
         frame_rate_Hz: Number of frames per second, Hz.
-        weights: Contributions to the score.
     """
     size = len(is_constant)  # bytes
     if is_constant.all():
-        yield Part("channel", type_name, size, weights.constant, is_constant=True)
+        yield Part("channel", type_name, size, Weights.constant, is_constant=True)
         return
     is_float = type_name[0] == "f"
     is_unsigned = type_name[0] == "u"
@@ -197,9 +193,9 @@ def _number_parts(
         min_magnitude, max_magnitude = PLAUSIBLE_MAGNITUDES
         if not min_magnitude < magnitude < max_magnitude:
             return
-        # The share `weights.fraction` of the bytes contains digits. Low bytes that are always 0 contain no digits.
+        # The share `Weights.fraction` of the bytes contains digits. Low bytes that are always 0 contain no digits.
         low_zero_byte_count = np.argmin(is_zero)  # index of the lowest byte that is not always 0
-        digit_byte_count = weights.fraction * size - low_zero_byte_count
+        digit_byte_count = Weights.fraction * size - low_zero_byte_count
         unit = magnitude * 256.0**-digit_byte_count
     if is_unsigned:
         half_range = 1 << (8 * size - 1)
@@ -220,12 +216,12 @@ def _number_parts(
 
     # The magnitude is counted as one more step. The score of a type is therefore lower if the values in this type are
     # close to 0 or, for an unsigned type, close to the middle of its range.
-    channel_score = weights.channel + _bits(np.append(steps, magnitude), unit, size)
+    channel_score = Weights.channel + _bits(np.append(steps, magnitude), unit, size)
     yield Part("channel", type_name, size, channel_score)
 
 
 def split_frame(
-    parts_at_each_byte: Sequence[Sequence[Part]], sync_lengths: Iterable[int], weights: Weights
+    parts_at_each_byte: Sequence[Sequence[Part]], sync_lengths: Iterable[int]
 ) -> tuple[float, int, tuple[Part, ...]]:
     """Divide a frame into parts so that the score of the division is as low as possible.
 
@@ -237,7 +233,6 @@ def split_frame(
         parts_at_each_byte: Parts that may begin at each byte before the checksum.
         sync_lengths: Possible lengths of the sync pattern, bytes; 0 if the frame has no sync pattern. If several
             lengths have the lowest score, the shortest of them is chosen.
-        weights: Contributions to the score.
 
     Returns:
         The score in bits, the length of the sync pattern in bytes, and the parts after the sync pattern.
@@ -248,7 +243,7 @@ def split_frame(
         """Find the division with the lowest score for the bytes from a given position to the end.
 
         The function tries each part that may begin at the position, and calls itself for the bytes after the part.
-        Adjacent channels of one type form a group. A channel that begins a group adds `weights.channel_group` to the
+        Adjacent channels of one type form a group. A channel that begins a group adds `Weights.channel_group` to the
         score. A channel with a constant value cannot begin a group.
 
         Args:
@@ -273,7 +268,7 @@ def split_frame(
             rest_score, rest_parts = best_division(position + part.size, part.channel_type)
             score = part.score + rest_score
             if begins_group:
-                score = part.score + weights.channel_group + rest_score
+                score = part.score + Weights.channel_group + rest_score
             if score < best_score:
                 best_score = score
                 best_parts = (part, *rest_parts)
@@ -283,7 +278,7 @@ def split_frame(
     for sync_length in sync_lengths:
         score, _ = best_division(sync_length, "")
         if sync_length == 1:  # a sync of a single byte is rare
-            score += weights.constant
+            score += Weights.constant
         scored_sync_lengths.append((score, sync_length))
     lowest_score, best_sync_length = min(scored_sync_lengths)  # of equal scores, the one with the shortest pattern
     _, best_parts = best_division(best_sync_length, "")

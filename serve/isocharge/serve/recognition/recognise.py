@@ -28,12 +28,9 @@ from isocharge.serve.recognition.framing import (
     usual_bytes,
 )
 
-WEIGHTS = Weights()
-"""Weights that were fitted to random boards."""
-
 
 def described_frames_section(
-    chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False, weights: Weights = WEIGHTS
+    chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False
 ) -> dict[str, Any] | None:
     """Recognise frames of fixed length, and return the section `[frames]` of a device file that describes them.
 
@@ -46,7 +43,6 @@ def described_frames_section(
         chunks: Received bytes, divided as they arrived.
         seconds: Time in which the bytes arrived, s. The unit of a clock is derived from this time.
         are_datagrams: Whether each chunk is a datagram.
-        weights: Contributions to the score.
     """
     byte_count = sum(len(chunk) for chunk in chunks)
     examined_share = min(1.0, MAX_EXAMINED_BYTES / max(1, byte_count))  # 1 if there are no bytes
@@ -56,16 +52,14 @@ def described_frames_section(
     for _framing, divisions_of_framing in groupby(divisions, key=lambda division: division.framing):
         scored_sections: list[tuple[float, dict[str, Any]]] = []
         for division in divisions_of_framing:
-            scored_sections += _scored_sections(division, examined_seconds, weights)
+            scored_sections += _scored_sections(division, examined_seconds)
         if scored_sections:
             _, best_section = min(scored_sections, key=lambda score_and_section: score_and_section[0])
             return best_section
     return None
 
 
-def _scored_sections(
-    division: FrameDivision, seconds: float, weights: Weights
-) -> Iterator[tuple[float, dict[str, Any]]]:
+def _scored_sections(division: FrameDivision, seconds: float) -> Iterator[tuple[float, dict[str, Any]]]:
     """Yield the score of each possible description of the frames, together with its section `[frames]`.
 
     At most one description is yielded for each combination of a first byte, a checksum and a byte order. Descriptions
@@ -77,7 +71,6 @@ def _scored_sections(
     Args:
         division: Division of the stream into windows. A window is a sequence of bytes with the length of a frame.
         seconds: Time in which the stream arrived, s.
-        weights: Contributions to the score.
     """
     length = division.length
     rows = division.rows()  # each row contains a window and the bytes of the next window
@@ -102,7 +95,7 @@ def _scored_sections(
     covered_share = min(1.0, len(division.window_starts) * length / stream_bytes)  # share of the bytes inside frames
     frame_rate_Hz = stream_bytes / length / seconds  # as if all bytes of the stream belonged to frames
     for order in ORDERS:
-        parts_in_window = possible_parts(rows, order, frame_rate_Hz, weights)  # parts that may begin at each byte
+        parts_in_window = possible_parts(rows, order, frame_rate_Hz)  # parts that may begin at each byte
         if not has_check:  # try frames without a checksum
             starts_and_checks = [(start, Check(0, order, {})) for start in starts]
         for start, check in starts_and_checks:
@@ -111,12 +104,12 @@ def _scored_sections(
             # The sync pattern has at most as many bytes as there are possible sync bytes from its beginning on.
             max_sync_length = int(np.argmin([*np.roll(may_be_sync, -start)[:MAX_CONSTANT_BYTES], False]))
             sync_lengths = range(1, max_sync_length + 1) if has_sync else [0]
-            score, sync_length, parts = split_frame(parts_before_check, sync_lengths, weights)
+            score, sync_length, parts = split_frame(parts_before_check, sync_lengths)
             has_channel = any(part.role == "channel" for part in parts)
             if has_channel:
                 sync = np.roll(usual, -start)[:sync_length].tobytes()
-                # Each byte outside of all frames contributes `weights.noise` bits.
-                bits_per_byte = covered_share * score / length + (1.0 - covered_share) * weights.noise
+                # Each byte outside of all frames contributes `Weights.noise` bits.
+                bits_per_byte = covered_share * score / length + (1.0 - covered_share) * Weights.noise
                 yield bits_per_byte, _frames_section(division, sync, check, order, parts)
 
 
