@@ -84,7 +84,7 @@ def _write(folder):
     with Recorder(folder / "touch.rec", "linear/1", {"tare": {"frames": 10}}) as recorder:
         for k in range(3):
             recorder.chunk(Chunk(bytes(9), 1e9 + k, k, 0.0), ['{"timestamp": 1.0, "latency_us": 9.0}'])
-            recorder.tare()
+            recorder.event(tare=True)
     return {
         "sensor": ("sensor.toml", load_sensor),
         "device": ("device.toml", _load_device),

@@ -21,7 +21,7 @@ def recorded(tmp_path):
     with Recorder(path, "linear/1", {"tare": {"frames": 10}}) as recorder:
         for number, chunk in enumerate(CHUNKS):
             if number == 2:
-                recorder.tare()
+                recorder.event(tare=True)
             records = [f'{{"timestamp": 1.0, "latency_us": {10.0 * record}}}' for record in range(number)]
             recorder.chunk(chunk, records)
     return path
@@ -132,9 +132,9 @@ def test_events_and_records_are_read_in_their_order(tmp_path):
     path = tmp_path / "touch.rec"
     with Recorder(path, "m/1", {}, name="left") as recorder:
         recorder.chunk(CHUNKS[0], ['{"timestamp": 5.0, "latency_us": 7.0, "x_mm": 2.5}'])
-        recorder.mark(Marker(1e9, "now"))
-        recorder.model("m/2")
-        recorder.tare()
+        recorder.event(marker=Marker(1e9, "now"))
+        recorder.event(use="m/2")
+        recorder.event(tare=True)
         recorder.chunk(CHUNKS[3], [])
     recording = Recording(path)
     assert recording.name == "left"

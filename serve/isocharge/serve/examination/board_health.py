@@ -15,9 +15,8 @@ from isocharge.serve.examination.press_detector import HeldPress
 from isocharge.serve.live.device import Device
 from isocharge.serve.port.source import has_speed
 from isocharge.serve.signal_chain.channels import Channels
-from isocharge.serve.signal_chain.gain import LARGEST_PC
 from isocharge.serve.signal_chain.leak import LeakRule
-from isocharge.serve.signal_chain.stage import Setup
+from isocharge.serve.signal_chain.stage import LARGEST, Setup
 from isocharge.serve.signal_chain.tare import TareRule
 
 MAINS_HZ = (50.0, 60.0)
@@ -65,7 +64,7 @@ def measure_channel_health(
 
     A constant, a slope (the drift) and the hum at each mains frequency are fitted to the values by least squares. The
     hum is left out if the time is too short or the frame rate too low. The noise is the standard deviation of the
-    residuals. The function ignores NaN and values whose magnitude is larger than `LARGEST_PC`.
+    residuals. The function ignores NaN and values whose magnitude is larger than `LARGEST`.
 
     Args:
         name: Name of the channel.
@@ -80,7 +79,7 @@ def measure_channel_health(
     Returns:
         The number of unusable values, and the other results, which are None if the channel has no usable value.
     """
-    is_usable = np.abs(charge_pC) <= LARGEST_PC  # false for NaN
+    is_usable = np.abs(charge_pC) <= LARGEST  # false for NaN
     unusable_count = int(np.count_nonzero(~is_usable))
     unusable_value = f"{charge_pC[~is_usable][0]:g}" if unusable_count else ""
     if unusable_count == is_usable.size:

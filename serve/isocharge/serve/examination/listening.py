@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import compress
 
 import numpy as np
 
@@ -61,8 +62,7 @@ class ReceivedData:
         if len(self.chunks) < 2:
             return max(self.seconds, np.finfo(float).eps)
         first_to_last_s = self.chunks[-1].timestamp - self.chunks[0].timestamp
-        mean_interval_s = first_to_last_s / (len(self.chunks) - 1)
-        return max(first_to_last_s + mean_interval_s, np.finfo(float).eps)
+        return max(first_to_last_s * len(self.chunks) / (len(self.chunks) - 1), np.finfo(float).eps)
 
     @property
     def are_datagrams(self) -> bool:
@@ -170,13 +170,8 @@ class Capture:
     @property
     def rate_Hz(self) -> float:
         """Frame rate, Hz; 0 if there are fewer than two frames, or if the times of the frames do not increase."""
-        if len(self.frames) < 2:
-            return 0.0
-        span_s = self.times_s[-1] - self.times_s[0]
-        if span_s <= 0.0:
-            return 0.0
-        interval_count = len(self.frames) - 1
-        return interval_count / span_s
+        span_s = self.times_s[-1] - self.times_s[0] if self.times_s else 0.0
+        return (len(self.times_s) - 1) / span_s if span_s > 0.0 else 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -193,16 +188,12 @@ class Capture:
             cannot read in single precision is infinite.
         """
         channel_count = len(self.frames[-1].values)
-        rows = []
-        times_s = []
-        for frame, time_s in zip(self.frames, self.times_s, strict=True):
-            if len(frame.values) == channel_count:
-                rows.append(frame.values)
-                times_s.append(time_s)
-        values = np.array(rows, dtype=float)
+        is_used = [len(frame.values) == channel_count for frame in self.frames]
+        values = np.array([frame.values for frame in compress(self.frames, is_used)], dtype=float)
+        times_s = np.array(self.times_s)[is_used]
         is_too_large = np.abs(values) > LARGEST
         values[is_too_large] = np.copysign(np.inf, values[is_too_large])
-        return values, np.array(times_s) - times_s[0]
+        return values, times_s - times_s[0]
 
 
 def read_frames(received: ReceivedData, device: Device) -> Capture:

@@ -26,11 +26,9 @@ from isocharge.serve.examination.press_detector import find_held_press, find_tou
 from isocharge.serve.examination.proposal import propose, recognised_frames, unit_of
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
 from isocharge.serve.port.serial_line import Request
+from isocharge.serve.recognition.framing import INTACT_SHARE
 from isocharge.serve.signal_chain.channels import channel_index
 from isocharge.serve.signal_chain.gain import Gain, GainRule
-
-RIGHT_BAUD_SHARE = 0.5
-"""Smallest share of bytes in good frames at the right baud rate, dimensionless."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ def examine(
     """
 
     def has_frames(received_at_baud: ReceivedData) -> bool:
-        return _intact_share(received_at_baud, device) > RIGHT_BAUD_SHARE
+        return _intact_share(received_at_baud, device) >= INTACT_SHARE
 
     received = listen(url, bauds, seconds, request or device.request, has_frames, wait)
     return examine_received(received, device=device, electrodes=electrodes, gain=gain)

@@ -39,8 +39,6 @@ from msgspec import Meta, field
 from isocharge.common.structs import Finite, Settings, WrongKey
 from isocharge.serve.frames.frame import (
     FLAGS,
-    SEQ_MODULUS,
-    T_US_MODULUS,
     ChecksumError,
     Columns,
     Frame,
@@ -250,22 +248,6 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         flags_column = names.index(FLAGS) if FLAGS in names else None
         return Columns(names, scales, flags_column)
 
-    @property
-    def seq_modulus(self) -> int:
-        """Value at which the field `seq` wraps to 0. The value is `SEQ_MODULUS` if there is no field `seq`."""
-        position = self.columns.seq_column
-        if position is None:  # frames have no counter
-            return SEQ_MODULUS
-        return self.fields[position].modulus
-
-    @property
-    def t_us_modulus(self) -> int:
-        """Time in us at which the clock field wraps to 0. The value is `T_US_MODULUS` if there is no clock field."""
-        position = self.columns.clock_column
-        if position is None:  # frames have no clock
-            return T_US_MODULUS
-        return round(self.fields[position].modulus * self.columns.clock_unit_us)
-
     @cached_property
     def three_byte_fields(self) -> tuple[tuple[int, bool], ...]:
         """Fields of three bytes. Each element contains the position of a field and whether the field is signed.
@@ -351,9 +333,19 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
 
 def _parser_arguments(layout: FrameLayout) -> tuple[str, int, int]:
-    """Return the arguments of `Parser` for a layout: the description of the format and the two moduli."""
+    """Return the arguments of `Parser` for a layout: the description of the format and the two moduli.
+
+    Without a counter or a clock, its modulus is not used.
+    """
     names = ", ".join(field.name for field in layout.fields)
-    return f"described frames of {layout.length} bytes: {names}", layout.seq_modulus, layout.t_us_modulus
+    columns = layout.columns
+    seq_modulus = layout.fields[columns.seq_column or 0].modulus
+    clock_modulus = layout.fields[columns.clock_column or 0].modulus
+    return (
+        f"described frames of {layout.length} bytes: {names}",
+        seq_modulus,
+        round(clock_modulus * columns.clock_unit_us),
+    )
 
 
 class SyncParser(Parser):

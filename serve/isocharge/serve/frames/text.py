@@ -44,16 +44,13 @@ MAX_LINE_LENGTH = 4096
 """Length of the longest line that is parsed, bytes."""
 
 MAX_CYCLE_LINES = 64
-"""Largest number of lines that make one frame."""
+"""Largest number of lines that make one frame, and of lines that are kept as possible headers."""
 
 RECOGNITION_REPEATS = 3
 """Number of times in succession that a layout must occur before it is recognised."""
 
 MESSAGE_REPEATS = 10
 """Number of times in succession that a layout that resembles a message must occur before it is recognised."""
-
-MAX_HEADERS = 8
-"""Number of lines without numbers that are kept, because one of them may be the header of the following lines."""
 
 SEQ_MODULI = (256, SEQ_MODULUS, 100, 1000, 10_000)
 """Values at which a frame counter in text may wrap to 0: those of 8 and 16 bits, and those of two to four digits."""
@@ -112,7 +109,7 @@ class TextParser(DelimitedParser):
         self.layout: Layout | None = None
         self._columns = columns
         self._meanings = dict(meanings or {})
-        self._headers: deque[str] = deque(maxlen=MAX_HEADERS)  # lines without numbers
+        self._headers: deque[str] = deque(maxlen=MAX_CYCLE_LINES)  # lines without numbers
         self.seq_modulus = SEQ_MODULI[0]
         self._last_seq = 0
         self._is_first_line = True  # whether the next line is the first line of a connection

@@ -76,7 +76,7 @@ class RecordedStream:
 
     def request_marker(self, marker: Marker) -> None:
         """Request to write a marker to the recording. Without a recording, the marker is ignored."""
-        self._requests.append(partial(self._mark, marker))
+        self._requests.append(partial(self._record_event, marker=marker))
 
     def request_model(self, load: Load) -> None:
         """Request to replace the present model by another model.
@@ -154,7 +154,7 @@ class RecordedStream:
         self._stream.restart()
         present_label = self.predictor.metadata.label
         if recorder.model_label != present_label:  # the model has changed since the request
-            recorder.model(present_label)
+            recorder.event(use=present_label)
 
     def _end_recording(self) -> None:
         """End the present recording, and close its recorder unless the caller has opened the recorder."""
@@ -163,10 +163,10 @@ class RecordedStream:
         if recorder is not None and recorder is not self._caller_recorder:
             recorder.close()
 
-    def _mark(self, marker: Marker) -> None:
-        """Write a marker to the recording, if there is a recording."""
+    def _record_event(self, **event: bool | str | Marker) -> None:
+        """Write an event to the recording, if there is a recording; see `Recorder.event`."""
         if self.recorder is not None:
-            self.recorder.mark(marker)
+            self.recorder.event(**event)
 
     def _continue_loading(self) -> None:
         """Use a requested model if it has been loaded, and begin to load the next requested model if there is one.
@@ -204,15 +204,13 @@ class RecordedStream:
             )
             return
         new_label = new_predictor.metadata.label
-        if self.recorder is not None:
-            self.recorder.model(new_label)
+        self._record_event(use=new_label)
         log.warning("%s serves from now on, after %s", new_label, present_label)
 
     def _tare(self) -> None:
         """Measure the tare again, and write the request to the recording."""
         self._stream.tare()
-        if self.recorder is not None:
-            self.recorder.tare()
+        self._record_event(tare=True)
 
 
 def replay(

@@ -199,9 +199,7 @@ class Press:
         mean_pC = charge_pC.mean(axis=0)
         scatter_pC = (charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)).std(axis=0)
 
-        window_s = float(times_s[-1] - times_s[0])
-        reason = self._shaking(mean_pC, scatter_pC, noise_pC)
-        reason = reason or self._drifting(mean_pC, scatter_pC, slope_pC_per_s, window_s)
+        reason = self._unsteady(mean_pC, scatter_pC, slope_pC_per_s, float(times_s[-1] - times_s[0]), noise_pC)
         if not reason:
             flags = dict.fromkeys(flag for frame in self._window for flag in frame.flags)  # each flag once
             return SteadyPress(mean_pC, scatter_pC, self.end_s - self.begin_s, len(self._window), tuple(flags))
@@ -210,40 +208,34 @@ class Press:
             self.reason = reason
         return None
 
-    def _shaking(self, charge_pC: Array, scatter_pC: Array, noise_pC: Array) -> str:
-        """Return the reason if a charge scatters too much; empty if the scatter of all charges is small.
+    def _unsteady(
+        self, charge_pC: Array, scatter_pC: Array, slope_pC_per_s: Array, window_s: float, noise_pC: Array
+    ) -> str:
+        """Return the reason if a charge scatters or drifts too much; empty if the press is steady.
 
         The charges scatter because of the noise at rest, and because a hand varies its force.
 
         Args:
             charge_pC: Mean charges, shape (n_electrode,), pC.
             scatter_pC: Scatter of the charges, shape (n_electrode,), pC.
-            noise_pC: Standard deviation of the charges at rest, shape (n_electrode,), pC.
-        """
-        expected_scatter_pC = np.hypot(noise_pC, self.RELATIVE_NOISE * np.abs(charge_pC).mean())
-        relative_scatter = scatter_pC / expected_scatter_pC
-        worst = int(relative_scatter.argmax())
-        if relative_scatter[worst] <= self.MAX_SCATTER_SIGMAS:
-            return ""
-        return f"the charge of {self._electrodes[worst]} shakes by {scatter_pC[worst]:.2g} pC"
-
-    def _drifting(self, charge_pC: Array, scatter_pC: Array, slope_pC_per_s: Array, window_s: float) -> str:
-        """Return the reason if a charge drifts too much; empty if the drift of all charges is small.
-
-        Args:
-            charge_pC: Mean charges, shape (n_electrode,), pC.
-            scatter_pC: Scatter of the charges, shape (n_electrode,), pC.
             slope_pC_per_s: Slopes of the lines, shape (n_electrode,), pC/s.
             window_s: Length of the window, s.
+            noise_pC: Standard deviation of the charges at rest, shape (n_electrode,), pC.
         """
+        mean_magnitude_pC = np.abs(charge_pC).mean()
+        max_scatter_pC = self.MAX_SCATTER_SIGMAS * np.hypot(noise_pC, self.RELATIVE_NOISE * mean_magnitude_pC)
+        worst = int((scatter_pC / max_scatter_pC).argmax())
+        if scatter_pC[worst] > max_scatter_pC[worst]:
+            return f"the charge of {self._electrodes[worst]} shakes by {scatter_pC[worst]:.2g} pC"
+
         # The change of a line through n values has the standard deviation sqrt(12 / n) times that of one value.
         drift_std_pC = scatter_pC * math.sqrt(12.0 / len(self._window))
         # A charge that is smaller than the mean magnitude may change as much as a charge of the mean magnitude.
-        reference_pC = np.maximum(np.abs(charge_pC), np.abs(charge_pC).mean())
+        reference_pC = np.maximum(np.abs(charge_pC), mean_magnitude_pC)
         max_drift_pC = self.MAX_RELATIVE_DRIFT * reference_pC + self.DRIFT_SIGMAS * drift_std_pC
-        relative_drift = np.abs(slope_pC_per_s) * window_s / max_drift_pC
-        worst = int(relative_drift.argmax())
-        if relative_drift[worst] <= 1.0:
+        drift_pC = np.abs(slope_pC_per_s) * window_s
+        worst = int((drift_pC / max_drift_pC).argmax())
+        if drift_pC[worst] <= max_drift_pC[worst]:
             return ""
         return (
             f"the charge of {self._electrodes[worst]} changes by {slope_pC_per_s[worst]:.2g} pC per second from "

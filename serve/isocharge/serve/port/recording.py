@@ -129,17 +129,9 @@ class Recorder:
         self._size_before_last_chunk = self._file.tell()
         self._write("\n".join([chunk_line, *records]))
 
-    def tare(self) -> None:
-        """Write a request for a new tare."""
-        self._write('{"tare": true}')
-
-    def model(self, label: str) -> None:
-        """Write the label (`name/version`) of the model that computes all records after this line."""
-        self._write(json.dumps({"use": label}))
-
-    def mark(self, marker: Marker) -> None:
-        """Write a moment that the user has marked."""
-        self._write(json.dumps({"marker": list(marker)}))
+    def event(self, **event: bool | str | Marker) -> None:
+        """Write an event: `tare=True` for a request for a new tare, `use=label` for a new model, or `marker=marker`."""
+        self._write(encode(event).decode())
 
     def _write(self, lines: str) -> None:
         """Append complete lines to the file.

@@ -1,7 +1,6 @@
 """Assignment of the channels of a frame to the electrodes."""
 
 import re
-from collections.abc import Iterable
 from json import dumps
 from operator import itemgetter
 
@@ -93,7 +92,7 @@ class Channels(Stage):
         names = frame.names
         if not names:
             return None
-        advice = [] if self._allows_any_unit else _unit_advice(names)
+        advice = "" if self._allows_any_unit else _unit_advice(names)
         words = [set(_words_of(name.casefold())) for name in names]
         indices = [
             [index for index, channel_words in enumerate(words) if channel_words.issuperset(electrode_words)]
@@ -107,18 +106,18 @@ class Channels(Stage):
             raise self._assignment_error(frame, advice)
         return None
 
-    def _assignment_error(self, frame: Frame, advice: Iterable[str] = ()) -> ChargeError:
+    def _assignment_error(self, frame: Frame, advice: str = "") -> ChargeError:
         """Return the error for a frame whose channels cannot be assigned to the electrodes.
 
         Args:
             frame: The frame.
-            advice: Sentences about single channels.
+            advice: Part of a sentence about a channel, which begins with a semicolon; empty without advice.
         """
         number = "a frame" if frame.seq is None else f"frame {frame.seq}"
         example_keys = ", ".join(f'{electrode} = "..."' for electrode in self._electrodes)
         return ChargeError(
             f"{self._reader} expects {len(self._electrodes)} charges {self._electrodes}, {number} has "
-            f"{len(frame.values)} {channel_names(frame)}{''.join(f'; {sentence}' for sentence in advice)}; choose the "
+            f"{len(frame.values)} {channel_names(frame)}{advice}; choose the "
             f"model of this sensor, or say in the device file which is which: [channels] {example_keys}"
         )
 
@@ -187,10 +186,10 @@ def stated_unit(name: str) -> str:
     return last_word if other_words and last_word in {"pC", *OTHER_CHARGE_UNITS} - {"C"} else ""
 
 
-def _unit_advice(names: tuple[str, ...]) -> list[str]:
+def _unit_advice(names: tuple[str, ...]) -> str:
     """Return advice for the first channel whose name states a unit other than pC; empty without such a channel."""
     for name in names:
         unit = stated_unit(name)
         if unit not in ("", "pC"):
-            return [f"channel {shown(name)} is in {unit}: convert it to pC, or state the charge of a unit in [gain]"]
-    return []
+            return f"; channel {shown(name)} is in {unit}: convert it to pC, or state the charge of a unit in [gain]"
+    return ""

