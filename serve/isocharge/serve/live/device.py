@@ -45,7 +45,7 @@ from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain, Saturation
 from isocharge.serve.signal_chain.hum import Hum
 from isocharge.serve.signal_chain.leak import Integrator, Leak
-from isocharge.serve.signal_chain.stage import R, Rule, Setting, Setup, Share, Stage
+from isocharge.serve.signal_chain.stage import R, Rule, Setting, Setup, Share, Stage, find_rule
 from isocharge.serve.signal_chain.tare import Tare
 from isocharge.serve.signal_chain.thermal import Warming, warming_ratios
 from isocharge.serve.signal_chain.touch import Touch
@@ -215,7 +215,6 @@ class Device(Settings, frozen=True):
             reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
             predictor: Model of the stream; None for a stream that computes only touch charges.
         """
-        has_currents = self.front_end == "current"
         return Setup(
             electrodes,
             self.rules,
@@ -223,14 +222,13 @@ class Device(Settings, frozen=True):
             predictor,
             reader,
             self.where,
-            has_currents=has_currents,
-            has_any_sign=has_currents,
+            has_currents=self.front_end == "current",
+            has_any_sign=self.front_end == "current",
         )
 
     def rule(self, rule_class: type[R]) -> R | None:
         """Return the settings of a class, or None if their stage is switched off."""
-        rule = self.rules.get(rule_class)
-        return rule if isinstance(rule, rule_class) else None
+        return find_rule(self.rules, rule_class)
 
 
 def create_stages(setup: Setup, *, needs_contact: bool = False) -> list[Stage]:

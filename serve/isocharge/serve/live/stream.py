@@ -97,7 +97,7 @@ class ReadingStream:
         self._device = device
         self._setup = device.setup(electrodes, reader, predictor)
         has_film = predictor is None or "film" in predictor.metadata.sensor  # false for a model of presses alone
-        self._setup.has_any_sign = self._setup.has_currents or has_any_sign or not has_film
+        self._setup.has_any_sign |= has_any_sign or not has_film
         self._before_restart = StreamTotals()  # counts of the time before the latest `restart`
         self._begin()
 

@@ -30,7 +30,7 @@ from isocharge.common.printable_text import is_printable
 from isocharge.common.progress import report
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.model.model_search import ModelLabel
-from isocharge.serve.port.file_source import HEAD_BYTES, RECORDING_START, Chunk, Moment, foreign_kind
+from isocharge.serve.port.file_source import RECORDING_START, Chunk, Moment, foreign_kind
 
 VERSION = 1
 """Version of the format of the file."""
@@ -212,15 +212,13 @@ class Recording:
         try:
             if not path.is_file():
                 raise RecordingError("there is no file of that name")
-            with path.open("rb") as binary_file:
-                head = binary_file.read(HEAD_BYTES)
-            if not head.startswith(RECORDING_START):
-                kind = foreign_kind(str(path), head)
+            with path.open("rb") as file:
+                first_line = file.readline(LONGEST_ENTRY)  # empty if the file is empty
+            if not first_line.startswith(RECORDING_START):
+                kind = foreign_kind(str(path), first_line)
                 if kind:
                     raise RecordingError(f"got {kind}")
-            with path.open(encoding="utf-8") as file:
-                first_line = next(bounded_lines(file, LONGEST_ENTRY), "")  # empty if the file is empty
-            header = parse_json(first_line, "first line", RecordingError, _Header)
+            header = parse_json(first_line.decode(), "first line", RecordingError, _Header)
         except (OSError, ValueError) as error:  # RecordingError is a ValueError
             raise RecordingError(
                 f"{path}: expected a recording of `serve stream --record` ({cut(str(error))})"

@@ -58,6 +58,17 @@ NOT_IN_C = (
 """Part of the message about a stage that cannot be exported to C."""
 
 
+def find_rule(rules: Mapping[type[Rule], Rule], rule_class: type[R]) -> R | None:
+    """Return the settings of a class, or None if their stage is switched off.
+
+    Args:
+        rules: Settings of each stage that is switched on, by their class.
+        rule_class: The class.
+    """
+    rule = rules.get(rule_class)
+    return rule if isinstance(rule, rule_class) else None
+
+
 @dataclass(slots=True)
 class Setup:
     """Settings and objects that the stages of a stream share.
@@ -92,8 +103,7 @@ class Setup:
 
     def rule(self, rule_class: type[R]) -> R | None:
         """Return the settings of a class, or None if their stage is switched off."""
-        rule = self.rules.get(rule_class)
-        return rule if isinstance(rule, rule_class) else None
+        return find_rule(self.rules, rule_class)
 
     def for_each_electrode(self, key: str, setting: float | Mapping[str, float]) -> Array:
         """Return the value of a setting for each electrode, shape (n_electrode,).
