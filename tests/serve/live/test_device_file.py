@@ -120,7 +120,7 @@ def test_device_file_with_a_request(device):
 
 WRONG = [
     ('[frames]\nrequest = "hello"\n', r"frames\.request: expected bytes in hexadecimal, as in '20 4E', got 'hello'"),
-    ('[frames]\nrequest = "3F"\nrequest_Hz = 0\n', r"frames\.request_Hz: expected a number above 0"),
+    ('[frames]\nrequest = "3F"\nrequest_Hz = 0\n', r"frames\.request_Hz: expected a positive number"),
     ("[gain]\noffset = 1\n", "key 'gain.pC_per_unit' is missing"),
     ("[gane]\n", r"unknown key 'gane'; did you mean 'gain'\? Known are name, front_end, frames, channels, gain"),
     ("[tare]\nframe = 50\n", r"unknown key 'tare.frame'; did you mean 'frames'\? Known are on, frames, noise_limit_pC"),

@@ -36,7 +36,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, field
 
-from isocharge.common.structs import Finite, Settings, WrongKey
+from isocharge.common.structs import Finite, Positive, Settings, WrongKey
 from isocharge.serve.frames.frame import (
     FLAGS,
     ChecksumError,
@@ -161,7 +161,7 @@ class FrameSection(Settings, frozen=True, tag_field="format"):
     """
 
     request: Hexadecimal | None = None
-    request_Hz: Annotated[float, Meta(gt=0)] = 100.0
+    request_Hz: Positive = 100.0
 
 
 class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only=True):
