@@ -42,30 +42,6 @@ def modbus_crc(data):
     return struct.pack("<H", crc)
 
 
-def test_frames_of_a_robotiq_sensor():
-    data = bytes.fromhex("20 4E") + struct.pack("<6h", 1234, -567, 89, 1000, -2000, 3)
-    (frame,) = SyncParser(LAYOUTS["robotiq_ft300"]).feed(data + modbus_crc(data))
-    assert frame.values == pytest.approx((12.34, -5.67, 0.89, 1.0, -2.0, 0.003))
-    assert frame.names == ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-    assert frame.seq is None
-    assert frame.t_us is None
-
-
-def test_frames_of_an_optoforce_sensor():
-    data = bytes((170, 7, 8, 10)) + struct.pack(">HHhhh", 65535, 0, 100, -200, 16037)
-    (frame,) = SyncParser(LAYOUTS["optoforce_omd"]).feed(data + struct.pack(">H", sum(data) & 0xFFFF))
-    assert frame.seq == 65535
-    assert frame.values == (100.0, -200.0, 16037.0)
-
-
-def test_frames_of_a_bota_force_sensor():
-    body = struct.pack("<H6fIf", 0, 1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 123456, 23.5)
-    data = b"\xaa" + body + struct.pack("<H", x_25(body))
-    (frame,) = SyncParser(LAYOUTS["bota_sensone"]).feed(data)
-    assert frame.t_us == 123456
-    assert frame.values == (1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 23.5)
-
-
 def x_25(data):
     """Compute CRC-16/X-25 by the standard library.
 
@@ -74,6 +50,38 @@ def x_25(data):
     reversed_bytes = bytes(int(f"{byte:08b}"[::-1], 2) for byte in data)
     crc = binascii.crc_hqx(reversed_bytes, 0xFFFF)
     return int(f"{crc:016b}"[::-1], 2) ^ 0xFFFF
+
+
+ROBOTIQ_BODY = bytes.fromhex("20 4E") + struct.pack("<6h", 1234, -567, 89, 1000, -2000, 3)
+OPTOFORCE_BODY = bytes((170, 7, 8, 10)) + struct.pack(">HHhhh", 65535, 0, 100, -200, 16037)
+BOTA_BODY = struct.pack("<H6fIf", 0, 1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 123456, 23.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "seq", "t_us", "values"),
+    [
+        ("robotiq_ft300", ROBOTIQ_BODY + modbus_crc(ROBOTIQ_BODY), None, None, (12.34, -5.67, 0.89, 1.0, -2.0, 0.003)),
+        (
+            "optoforce_omd",
+            OPTOFORCE_BODY + struct.pack(">H", sum(OPTOFORCE_BODY) & 0xFFFF),
+            65535,
+            None,
+            (100.0, -200.0, 16037.0),
+        ),
+        (
+            "bota_sensone",
+            b"\xaa" + BOTA_BODY + struct.pack("<H", x_25(BOTA_BODY)),
+            None,
+            123456,
+            (1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 23.5),
+        ),
+    ],
+)
+def test_frames_of_sensors_as_their_makers_describe_them(name, data, seq, t_us, values):
+    (frame,) = SyncParser(LAYOUTS[name]).feed(data)
+    assert (frame.seq, frame.t_us) == (seq, t_us)
+    assert frame.values == pytest.approx(values)
+    assert frame.names == tuple(field.name for field in LAYOUTS[name].channels)
 
 
 COUNTS = st.lists(st.integers(-32768, 32767), min_size=7, max_size=7)
