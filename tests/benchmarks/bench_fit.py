@@ -37,7 +37,7 @@ from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.data.presses import LOWEST_CHARGE
 from isocharge.train.training.contact_training import LinearTargets, contact_stage
 from isocharge.train.training.fit import threads_and_seed
-from isocharge.train.training.network import InverseNetwork, WhitenedFeatures, fold_network
+from isocharge.train.training.network import InverseNetwork, WhitenedFeatures, fold_network, logarithmic_features
 
 NOISE = noise_model("reference")
 N_COPIES = 4
@@ -113,7 +113,11 @@ class Case:
 
     def network(self) -> InverseNetwork:
         """Return an untrained network of the default size."""
-        return InverseNetwork(self.domain, WhitenedFeatures.fit_logarithms(self.train.charge), NetworkConfig())
+        return InverseNetwork(
+            self.domain,
+            WhitenedFeatures.fit(logarithmic_features(self.train.charge), self.train.charge),
+            NetworkConfig(),
+        )
 
 
 class Adam:

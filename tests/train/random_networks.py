@@ -48,4 +48,4 @@ def random_network(n_electrode, hidden, misfit_hidden, *, is_int8=False, activat
         scale = np.abs(second.weight).max(axis=0) / LARGEST_INT8
         rounded = Layer(np.round(second.weight / scale) * scale, second.bias)
         layers = replace(layers, hidden=(first, rounded))
-    return FoldedNetwork(logarithmic_features(np.full(n_electrode, np.log(TYPICAL_pC))), layers)
+    return FoldedNetwork(logarithmic_features(np.full((1, n_electrode), TYPICAL_pC)), layers)

@@ -33,7 +33,7 @@ OUTPUTS = {"contact": 3, "contact_std": 3, CORRELATION: 3, "misfit": 1}
 COLUMNS = {"contact": slice(0, 3), "contact_std": slice(3, 6), "misfit": slice(6, 7), CORRELATION: slice(7, 10)}
 """Columns of each output among the ten values of a `Contact`."""
 
-N_WITHOUT_CORRELATION = 7
+N_WITHOUT_CORRELATION = COLUMNS[CORRELATION].start
 """Number of values of a `Contact` before its correlations."""
 
 EXTERNAL_DATA = b"\x0a\x08location"

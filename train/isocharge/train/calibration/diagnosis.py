@@ -7,6 +7,7 @@ search, separate checks find positions outside the film, dead channels, and chan
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -200,49 +201,37 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     if not len(placed_presses):
         return []
     misfits = {
-        sentence: _contact_misfit(contact, charge, charges)
+        sentence: misfit(replace(placed_presses, contact=contact, charge_pC=charge), charges)
         for sentence, contact, charge in _possible_corrections(placed_presses, charges)
     }
-    limit = BETTER_MISFIT_RATIO * misfit(presses, charges)
+    limit = BETTER_MISFIT_RATIO * misfit(placed_presses, charges)
     best = min(misfits.values())
     clear = [name for name, value in misfits.items() if value < limit and BETTER_MISFIT_RATIO * value <= best]
     return sorted(clear, key=lambda sentence: misfits[sentence])
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
-    """Return the misfit of all presses with a known place and force; see `_contact_misfit`.
+    """Compute how much the charges of presses differ from those of the film that agrees best with them.
 
-    If there are no such presses, the misfit is 0. Correctly recorded presses usually have a misfit of about 1. A misfit
-    of 20 indicates a mistake in the records.
+    The films are those of `expected_charges`, which differ in their pretension. The misfit of one film is computed from
+    the logarithms of the ratios of measured charges to the charges of the film. It is the sum of two terms. The first
+    term is the mean squared deviation of the logarithms from their median, divided by `SCATTER_STD` squared. Each
+    squared deviation is limited to `MAX_SQUARED_DEVIATION`. The second term is the squared median of the logarithms,
+    divided by `OFFSET_STD` squared. The function returns the smallest misfit of all films. Correctly recorded presses
+    usually have a misfit of about 1, and a misfit of 20 indicates a mistake in the records.
 
     Args:
-        presses: The measured presses.
-        charges: Charges of a film and of similar films.
+        presses: The measured presses, of which those with a known place and force are used. Without such presses, the
+            misfit is 0. If most of them lie outside the domain of the films, the misfit is infinite.
+        charges: Solved film, from which the charges of the films with other pretensions follow.
     """
-    placed_presses = presses[presses.placed]
-    if not len(placed_presses):
+    placed = presses[presses.placed]
+    if not len(placed):
         return 0.0
-    return _contact_misfit(placed_presses.contact, placed_presses.charge_pC, charges)
-
-
-def _contact_misfit(contact: Array, charge: Array, charges: FilmCharges) -> float:
-    """Compute the misfit between measured charges and the charges of the most similar film.
-
-    The misfit of one film is computed from the logarithms of the ratio of measured charge to expected charge. It is the
-    sum of two terms. The first term is the mean squared deviation of these logarithms from their median, divided by
-    `SCATTER_STD` squared. Each squared deviation is limited to `MAX_SQUARED_DEVIATION`. The second term is the squared
-    median of the logarithms, divided by `OFFSET_STD` squared. The function returns the smallest misfit of all films.
-
-    Args:
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        charge: Measured charges, shape (n, n_electrode), pC; NaN where a charge was not measured.
-        charges: Charges of a film and of similar films. The misfit is infinite if most of the contacts lie outside
-            their domain.
-    """
-    if charges.domain.is_outside(contact).mean() > 0.5:
+    if charges.domain.is_outside(placed.contact).mean() > 0.5:
         return np.inf
     # The offset of a film is the median over all charges, shape (n_film,).
-    log_ratio = _log_ratio(charge, expected_charges(charges, contact))  # shape (n_film, n, n_electrode)
+    log_ratio = _log_ratio(placed.charge_pC, expected_charges(charges, placed.contact))  # (n_film, n, n_electrode)
     offset = np.nanmedian(log_ratio, axis=(1, 2))
     squared_deviation = np.minimum((log_ratio - offset[:, None, None]) ** 2, MAX_SQUARED_DEVIATION)
     scatter = np.nanmean(squared_deviation, axis=(1, 2))

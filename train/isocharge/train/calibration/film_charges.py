@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Piezo, Probe, Sensor
+from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Probe, Sensor
 from isocharge.simulate.forward.derivative_maps import NODE_COUNT
 from isocharge.simulate.sensor.film_properties import PRETENSION, FilmProperty, changed_film
 
@@ -212,7 +212,7 @@ class _Reading:
         Returns:
             Derivatives, shape (n, n_electrode, n_property), pC per unit.
         """
-        derivatives = self._mechanical(contact, charge) | self._coefficients(contact)
+        derivatives = self._mechanical(contact, charge)
         derivatives["crosstalk"] = charge.sum(axis=1, keepdims=True) - charge
         for electrode, name in enumerate(self._sensor.electrode_names):
             own_charge = np.zeros_like(charge)
@@ -270,19 +270,6 @@ class _Reading:
         if larger_probe is not None:
             step = STEP * self._prior.std[self._prior.index(PROBE_RADIUS)]
             derivatives[PROBE_RADIUS] = (self._read(larger_probe).charges(contact) - same_charge) / step
-        return derivatives
-
-    def _coefficients(self, contact: Array) -> dict[str, Array]:
-        """Compute the derivatives with respect to the piezoelectric coefficients, of which the charges are linear."""
-        piezo = self._sensor.piezo
-        derivatives = {}
-        for name, unit_piezo, factor in (
-            ("d31", Piezo(1.0, 0.0), piezo.d31),
-            ("d32", Piezo(0.0, 1.0), piezo.d32),
-            ("d12", Piezo(0.0, 0.0, d12=1.0), 1.0),  # the property is d12 itself, the others are logarithms
-        ):
-            unit_film = replace(self.film, sensor=replace(self.film.sensor, piezo=unit_piezo))
-            derivatives[name] = factor * unit_film.charges(contact)
         return derivatives
 
     def _read_difference(self, one: FilmProperty, contact: Array) -> Array:

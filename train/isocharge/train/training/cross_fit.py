@@ -42,7 +42,14 @@ from isocharge.train.training.contact_training import contact_stage
 from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.fit import Answers, Fitted, threads_and_seed, train_perceptron
 from isocharge.train.training.misfit_training import draw_charges, misfit_stage
-from isocharge.train.training.network import InverseNetwork, Posterior, WhitenedFeatures, as_tensor, fold_network
+from isocharge.train.training.network import (
+    InverseNetwork,
+    Posterior,
+    WhitenedFeatures,
+    as_tensor,
+    fold_network,
+    signed_features,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -106,7 +113,8 @@ def fit_presses(
     domain = PressedArea.of_contacts(labelled.contact)
     noise = ChannelNoise.estimate(labelled.charge, domain.to_unit(labelled.contact))
     with threads_and_seed(training.threads, training.seed):
-        features = WhitenedFeatures.fit_signed(labelled.charge, noise.transition_charge(labelled.charge))
+        transition_charge = noise.transition_charge(labelled.charge)
+        features = WhitenedFeatures.fit(signed_features(labelled.charge, transition_charge), labelled.charge)
         # The first network will be returned. The other networks each belong to one fold of the cross-validation.
         network, *fold_networks = (
             InverseNetwork(domain, features, settings.network, force_std) for _ in range(1 + HELD_PARTS)

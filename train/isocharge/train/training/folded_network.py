@@ -90,7 +90,7 @@ class ChargeFeatures:
         return np.asarray(np.arcsinh(ratio) - self.mean)
 
 
-LARGEST_INT8 = 127
+LARGEST_INT8 = np.iinfo(np.int8).max
 """Largest absolute value of the integers by which weights are represented in 8 bits, in units of their scale."""
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from isocharge.common.arrays import Array
+from isocharge.serve.model.validity import MISFIT_LIMIT
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.train.data.channel_noise import ChannelNoise, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
@@ -57,17 +58,9 @@ OUTSIDE_SHARE = 0.25
 If the dataset has no such presses, there are no such examples.
 """
 
-MIN_CHANGE = 1e-4
-"""Change of |residual|^2 below which a search for the nearest contact ends, relative to 1 + |residual|^2."""
 
-SEARCH_STARTS = 3
-"""Number of starts of a search for the nearest contact."""
-
-FOCUS_MISFIT = 10.0
-"""Misfit at which the weight of an example is half of the largest weight, in standard deviations of the noise.
-
-It is twice the smallest threshold of the flag `misfit`.
-"""
+FOCUS_MISFIT = 2.0 * MISFIT_LIMIT
+"""Misfit at which the weight of an example is half of the largest weight, in standard deviations of the noise."""
 
 
 def misfit_examples(
@@ -98,7 +91,7 @@ def misfit_examples(
         outside_charge = noise.add(outside.train.charge[rows], rng)
     drawn_charge = draw_charges(rng, split.train.charge, noise, count - len(outside_charge))
     charge = np.clip(np.concatenate([drawn_charge, outside_charge]), limits.low_pC, limits.high_pC)
-    _, residual = search(split.field, charge, noise.sigma(charge), starts=SEARCH_STARTS, min_change=MIN_CHANGE)
+    _, residual = search(split.field, charge, noise.sigma(charge))
     return np.stack([charge, residual])
 
 

@@ -57,28 +57,7 @@ class WhitenedFeatures:
     matrix: Array
 
     @classmethod
-    def fit_logarithms(cls, charge: Array) -> "WhitenedFeatures":
-        """Fit whitened logarithms to positive charges.
-
-        Args:
-            charge: Charges of presses without noise, shape (n, n_electrode), pC.
-        """
-        clipped_charge = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
-        mean_logarithm = np.log(clipped_charge).mean(axis=0)
-        return cls._fit(logarithmic_features(mean_logarithm), charge)
-
-    @classmethod
-    def fit_signed(cls, charge: Array, typical: Array) -> "WhitenedFeatures":
-        """Fit whitened inverse hyperbolic sines to charges of both signs.
-
-        Args:
-            charge: Charges of presses, shape (n, n_electrode), pC.
-            typical: Charge above which the noise is proportional to the charge, shape (n_electrode,), pC.
-        """
-        return cls._fit(signed_features(charge, typical), charge)
-
-    @classmethod
-    def _fit(cls, charge_features: ChargeFeatures, charge: Array) -> "WhitenedFeatures":
+    def fit(cls, charge_features: ChargeFeatures, charge: Array) -> "WhitenedFeatures":
         """Fit the mean and the whitening matrix to the charge features of presses.
 
         Args:
@@ -89,17 +68,18 @@ class WhitenedFeatures:
         return cls(charge_features, mean, matrix)
 
 
-def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
+def logarithmic_features(charge: Array) -> ChargeFeatures:
     """Return features for positive charges: the logarithms of charge / typical charge.
 
     The typical charge of an electrode is the power of two nearest to the geometric mean of its charges. A division by a
     power of two is exact in float32. The logarithms of the quotients are near 0, where float32 has the smallest errors.
 
     Args:
-        mean_logarithm: Mean of the logarithms of the charges in pC, shape (n_electrode,).
+        charge: Charges of presses without noise, shape (n, n_electrode), pC.
     """
+    clipped_charge = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
     return ChargeFeatures(
-        typical_pC=2.0 ** np.round(mean_logarithm / np.log(2.0)),
+        typical_pC=2.0 ** np.round(np.log2(clipped_charge).mean(axis=0)),
         low_pC=np.array(LOWEST_CHARGE),
         high_pC=np.array(HIGHEST_CHARGE),
     )
@@ -113,7 +93,7 @@ def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
 
     Args:
         charge: Charges of presses, shape (n, n_electrode), pC.
-        typical: Typical charge of each electrode, shape (n_electrode,), pC.
+        typical: Charge of each electrode above which the noise is proportional to the charge, shape (n_electrode,), pC.
     """
     asinh_charge = np.arcsinh(charge / typical)
     lowest = asinh_charge.min(axis=0)

@@ -23,7 +23,14 @@ from isocharge.train.data.presses import (
     split_by_position,
 )
 from isocharge.train.training.config import TrainingConfig
-from isocharge.train.training.network import WhitenedFeatures
+from isocharge.train.training.network import WhitenedFeatures, logarithmic_features, signed_features
+
+SIGNED_FEATURE_SCALE = 0.1
+"""Charge above which features of charges of both signs are logarithmic, dimensionless.
+
+It is relative to the charge above which the noise is proportional to the charge. On a taut uniaxial film, the value 0.1
+gave smaller position errors than the value 1.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,61 +115,26 @@ def invertible_domain(
     Raises:
         DatasetError: If the radius of the disk is less than `SMALLEST_SHARE` of the radius of the field.
     """
-    requested_domain = field.domain
-    if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
-        return requested_domain, ()
-    fold_radius = _fold_radius(field, noise)
-    if not fold_radius < requested_domain.radius:
-        return requested_domain, ()
-
-    if fold_radius < SMALLEST_SHARE * requested_domain.radius:
-        raise DatasetError(
-            f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of "
-            f"{requested_domain.radius:g} mm asked for: beyond, two contacts give the same charges; add an "
-            "electrode, or take a biaxial film"
-        )
-    return requested_domain.within(fold_radius), (_fold_caution(field, presses, fold_radius),)
-
-
-def _fold_caution(field: ChargeSeries, presses: LabelledPresses, fold_radius: float) -> str:
-    """Return a sentence that states the radius of a certain fold, to which the domain is reduced.
-
-    The sentence also names the command that tracks contacts beyond the fold.
-
-    Args:
-        field: Charge field, whose domain is not reduced yet.
-        presses: The presses, some of which lie beyond the fold.
-        fold_radius: Distance of the fold from the centre, mm.
-    """
     requested_radius = field.domain.radius
-    remaining_count = len(presses.within(fold_radius))
+    if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
+        return field.domain, ()
+    area = working_area(within(field, SEARCHED_RADIUS_RATIO * requested_radius), noise, search_pairs=False)
+    fold_radius = float(f"{area.unambiguous_radius:.6g}")
+    if not np.isfinite(area.fold_radius) or fold_radius >= requested_radius:
+        return field.domain, ()
+
+    if fold_radius < SMALLEST_SHARE * requested_radius:
+        raise DatasetError(
+            f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of {requested_radius:g} mm "
+            "asked for: beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
+        )
     caution = (
         f"the map from contacts to charges folds beyond {fold_radius:g} mm: two contacts give the same charges there; "
-        f"the model is trained for {fold_radius:g} mm, not {requested_radius:g} mm, on {remaining_count} of "
-        f"{len(presses)} presses"
+        f"the model is trained for {fold_radius:g} mm, not {requested_radius:g} mm, on "
+        f"{len(presses.within(fold_radius))} of {len(presses)} presses; 'serve stream --track' follows contacts to "
+        f"{requested_radius:g} mm"
     )
-    return f"{caution}; 'serve stream --track' follows contacts to {requested_radius:g} mm"
-
-
-def _fold_radius(field: ChargeSeries, noise: NoiseModel) -> float:
-    """Return the rounded radius of the largest disk without folds, mm, or infinity if the domain has no fold.
-
-    Args:
-        field: Charge field in whose domain folds are searched for.
-        noise: Noise of good presses.
-    """
-    area = working_area(within(field, SEARCHED_RADIUS_RATIO * field.domain.radius), noise, search_pairs=False)
-    if not np.isfinite(area.fold_radius):
-        return np.inf
-    return float(f"{area.unambiguous_radius:.6g}")
-
-
-SIGNED_FEATURE_SCALE = 0.1
-"""Charge above which features of charges of both signs are logarithmic, dimensionless.
-
-It is relative to the charge above which the noise is proportional to the charge. On a taut uniaxial film, the value 0.1
-gave smaller position errors than the value 1.
-"""
+    return field.domain.within(fold_radius), (caution,)
 
 
 @dataclass(frozen=True)
@@ -226,9 +198,9 @@ class Split:
         charge = self.train.charge
         has_both_signs = self.train.signed or self.test.signed
         if not has_both_signs:
-            return WhitenedFeatures.fit_logarithms(charge)
+            return WhitenedFeatures.fit(logarithmic_features(charge), charge)
         channel_noise = ChannelNoise.alike(noise, charge.shape[1])
         # The typical charge of a channel is the charge above which the noise would be proportional to the charge if the
         # white noise were multiplied by `SIGNED_FEATURE_SCALE`.
         smaller_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
-        return WhitenedFeatures.fit_signed(charge, smaller_noise.transition_charge(charge))
+        return WhitenedFeatures.fit(signed_features(charge, smaller_noise.transition_charge(charge)), charge)
