@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM, MeasuredPresses
+from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM
 from isocharge.simulate import Domain
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.solver.stress_limit import force_within_stress
@@ -215,14 +215,14 @@ def _ideal_presses(
     force_std: float = FORCE_STD,
 ) -> tuple[PressData, Array]:
     """Return presses whose charges are exactly those of a film, and their contacts (x, y, ln F)."""
+    charge = charges.charges(unknowns[problem.prior.layout.film], contact)
     count = len(contact)
-    presses = MeasuredPresses(
-        contact=contact,
-        charge_pC=charges.charges(unknowns[problem.prior.layout.film], contact),
-        position_std_mm=np.full(count, position_std_mm),
-        force_std=np.full(count, force_std),
-        electrodes=problem.electrodes,
-        lines=tuple(range(1, count + 1)),
+    data = PressData(
+        charge=charge,
+        charge_std=problem.noise.sigma(charge),
+        noise=problem.noise,
+        contact=np.column_stack([contact[:, :2], np.log(contact[:, 2])]),
+        contact_std=np.tile([position_std_mm, position_std_mm, force_std], (count, 1)),
+        time=np.linspace(-0.5, 0.5, count),
     )
-    data = PressData.of(presses, problem.noise, problem.solved_domain)
     return data, data.contact
