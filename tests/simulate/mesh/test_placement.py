@@ -30,9 +30,9 @@ def probes(draw) -> Probe:
     if kind == "circle":
         return Circle(size)
     if kind == "ellipse":
-        return Ellipse(2.0 * size, 2.0 * size * draw(st.floats(0.2, 1.0)), angle)
+        return Ellipse(2.0 * size, max(0.02, 2.0 * size * draw(st.floats(0.2, 1.0))), angle)
     if kind == "rectangle":
-        return Polygon.rectangle(2.0 * size, 2.0 * size * draw(st.floats(0.1, 1.0)), angle)
+        return Polygon.rectangle(2.0 * size, max(0.02, 2.0 * size * draw(st.floats(0.1, 1.0))), angle)
     if kind == "triangle":
         return Polygon.triangle(1.7 * size, angle)
     gaps = np.array(draw(st.lists(st.floats(0.4, 1.0), min_size=4, max_size=8)))

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import shapely
 
 from isocharge.simulate import (
     Circle,
@@ -64,10 +65,12 @@ def boundary_points(probe: Probe, count: int) -> np.ndarray:
     return probe.boundary(2.0 * np.pi * np.arange(count) / count)
 
 
-def grid_of(probe: Probe, count: int = 801) -> np.ndarray:
-    """Return the points of a square grid round the footprint, shape (count^2,), mm."""
+def grid_in(probe: Probe, count: int = 801) -> np.ndarray:
+    """Return the points of a square grid that lie in the footprint, shape (n,), mm."""
     line = 1.01 * probe.reach * np.linspace(-1.0, 1.0, count)
-    return (line[:, None] + 1j * line).ravel()
+    points = (line[:, None] + 1j * line).ravel()
+    footprint = shapely.Polygon(to_corners(boundary_points(probe, 4000)))
+    return points[shapely.contains_xy(footprint, points.real, points.imag)]
 
 
 def test_area_reach_and_period_are_the_closed_forms(shape):
@@ -81,24 +84,6 @@ def test_boundary_goes_round_the_area_anticlockwise(shape):
     assert np.abs(points).max() == pytest.approx(shape.reach, rel=1e-3)
 
 
-def test_footprint_contains_the_points_inside_its_boundary(shape):
-    points = boundary_points(shape.probe, 97)
-    assert shape.probe.contains((1.0 - 1e-9) * points).all()
-    assert not shape.probe.contains((1.0 + 1e-9) * points).any()
-
-
-def test_covered_area_of_a_triangle_is_that_of_a_grid(shape):
-    """The triangle is the half-plane below a line through the footprint."""
-    at = 0.3 - 0.2j
-    size = 10.0 * shape.reach
-    corners = np.array([(at.real - size, at.imag - size), (at.real + size, at.imag - size), (at.real, at.imag + 0.2)])
-    grid = grid_of(shape.probe)
-    left = np.interp(grid.real, [-size, 0.0, size], [-size, 0.2, -size])
-    share = (shape.probe.contains(grid) & (grid.imag < left)).mean()
-    expected = share * (2.02 * shape.reach) ** 2
-    assert shape.probe.covered_area(corners, at) == pytest.approx(expected, rel=5e-3)
-
-
 @pytest.mark.parametrize("at", [(0.0, 0.0), (5.0, -3.0)], ids=["centre", "off centre"])
 def test_farthest_distance_is_that_of_the_farthest_boundary_point(shape, at):
     expected = np.abs(complex(*at) + boundary_points(shape.probe, 20000)).max()
@@ -106,20 +91,20 @@ def test_farthest_distance_is_that_of_the_farthest_boundary_point(shape, at):
 
 
 def test_mean_of_the_relative_pressure_is_one_and_its_centre_is_the_centroid(shape):
-    grid = grid_of(shape.probe)
-    inside = grid[shape.probe.contains(grid)]
+    inside = grid_in(shape.probe)
     pressure = shape.probe.pressure(inside)
     assert pressure.mean() == pytest.approx(1.0, rel=5e-3)
     assert abs((pressure * inside).mean()) < 5e-3 * shape.reach
 
 
 def test_force_share_of_a_triangle_is_that_of_a_grid(shape):
+    """The triangle is the part below two lines through the footprint."""
     at = 0.3 - 0.2j
     size = 10.0 * shape.reach
     corners = np.array([(at.real - size, at.imag - size), (at.real + size, at.imag - size), (at.real, at.imag + 0.2)])
-    grid = grid_of(shape.probe)
-    pressure = np.where(shape.probe.contains(grid), shape.probe.pressure(grid), 0.0)
-    below = grid.imag < np.interp(grid.real, [-size, 0.0, size], [-size, 0.2, -size])
+    inside = grid_in(shape.probe)
+    pressure = shape.probe.pressure(inside)
+    below = inside.imag < np.interp(inside.real, [-size, 0.0, size], [-size, 0.2, -size])
     expected = pressure[below].sum() / pressure.sum()
     assert shape.probe.force_share(corners, at) == pytest.approx(expected, abs=3e-3)
 

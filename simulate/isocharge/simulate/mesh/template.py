@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Complexes, Integers
+from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.probe import Circle, Polygon, Probe
@@ -89,14 +89,6 @@ class SampleCurve(CurvedProbe):
             Points x + iy, same shape, mm.
         """
         return np.asarray(SAMPLE_REACH * np.exp(1j * parameter))
-
-    def contains(self, points: Complexes) -> Booleans:
-        """Return whether points lie in the circle.
-
-        Args:
-            points: Points x + iy, any shape, mm.
-        """
-        return np.asarray(np.abs(points) <= SAMPLE_REACH)
 
     def rotated(self, angle: float) -> Self:
         """Return the footprint itself, because a rotation does not change a circle."""

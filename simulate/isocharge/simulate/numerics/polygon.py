@@ -54,27 +54,6 @@ def to_corners(z: Complexes) -> Array:
     return np.stack([z.real, z.imag], axis=1)
 
 
-def min_edge_cross_product(corners: Complexes, points: Complexes) -> Array:
-    """Compute the smallest cross product that each point has with an edge of a convex polygon.
-
-    For each edge, the cross product of two vectors is computed: the edge vector, and the vector from the start of the
-    edge to the point. The cross product equals the length of the edge times the signed distance of the point from the
-    line through the edge. The cross product is positive if the point lies on the left of the edge. The smallest cross
-    product is therefore positive for points inside the polygon, and negative for points outside.
-
-    Args:
-        corners: Corners x + iy, anticlockwise, shape (n,).
-        points: Points x + iy, any shape.
-
-    Returns:
-        Smallest cross product of each point, in the shape of `points` and the square of their unit.
-    """
-    edge = np.roll(corners, -1) - corners
-    offset = points[..., None] - corners  # shape (..., n): from the start of each edge to the point
-    cross_product = (np.conj(edge) * offset).imag
-    return np.asarray(cross_product.min(axis=-1))
-
-
 def shared_area(first: Complexes, second: Complexes) -> float:
     """Compute the area of the intersection of two polygons.
 

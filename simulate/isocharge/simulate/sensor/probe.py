@@ -13,25 +13,30 @@ All lengths are in mm. The suffix `@30` rotates the footprint by 30 degrees anti
 the centroid of its footprint.
 """
 
+import numpy as np
+
 from isocharge.common.errors import SceneError, cut
-from isocharge.simulate.sensor.probe_shapes.base import Probe, ProbeNotation
-from isocharge.simulate.sensor.probe_shapes.circle import Circle
+from isocharge.simulate.sensor.probe_shapes.base import NUMBER, Probe, ProbeNotation
 from isocharge.simulate.sensor.probe_shapes.ellipse import Ellipse
-from isocharge.simulate.sensor.probe_shapes.finger import Finger
 from isocharge.simulate.sensor.probe_shapes.polygon import Polygon
+from isocharge.simulate.sensor.probe_shapes.round import Circle, Finger
 
 __all__ = ["PROBE_HELP", "Circle", "Ellipse", "Finger", "Polygon", "Probe", "parse_probe"]
 
-PROBE_SHAPES: tuple[type[Probe], ...] = (
-    Circle,
-    Polygon,
-    Ellipse,
-    Finger,
+PROBE_SHAPES = (
+    ProbeNotation("circle", "RADIUS", Circle),
+    ProbeNotation("rectangle", "WIDTHxHEIGHT", Polygon.rectangle),
+    ProbeNotation("triangle", "SIDE", Polygon.triangle),
+    ProbeNotation(
+        "polygon",
+        "X,Y;X,Y;X,Y",
+        lambda *coordinates: Polygon.of(np.reshape(coordinates, (-1, 2))),
+        pattern=rf"{NUMBER},{NUMBER}(?:;{NUMBER},{NUMBER})+",
+    ),
+    ProbeNotation("ellipse", "WIDTHxHEIGHT", Ellipse),
+    ProbeNotation("finger", "RADIUS", Finger),
 )
-"""All probe shapes. The parser, the help text and the error messages are derived from this list."""
-
-NOTATIONS: tuple[ProbeNotation, ...] = tuple(notation for shape in PROBE_SHAPES for notation in shape.notations)
-"""Notations of all probe shapes."""
+"""Notations of all probe shapes. The parser, the help text and the error messages are derived from this list."""
 
 
 def _join_with_or(forms: list[str]) -> str:
@@ -40,7 +45,7 @@ def _join_with_or(forms: list[str]) -> str:
 
 
 PROBE_HELP = (
-    f"Footprint, mm: {_join_with_or([notation.form for notation in NOTATIONS])}; @DEGREES at the end rotates the "
+    f"Footprint, mm: {_join_with_or([notation.form for notation in PROBE_SHAPES])}; @DEGREES at the end rotates the "
     "footprint anticlockwise."
 )
 """Help text of command-line options whose value is the notation of a probe."""
@@ -55,11 +60,11 @@ def parse_probe(text: str) -> Probe:
     Raises:
         SceneError: If the text is not the notation of a probe, or no such footprint can exist.
     """
-    for notation in NOTATIONS:
+    for notation in PROBE_SHAPES:
         probe = notation.parse(text.strip())
         if probe is not None:
             return probe
-    forms = [f"'{notation.form}'" for notation in NOTATIONS]
+    forms = [f"'{notation.form}'" for notation in PROBE_SHAPES]
     raise SceneError(
         f"probe {cut(text)!r}: expected {_join_with_or(forms)} in mm, each optionally rotated as in 'triangle:4.0@30' "
         "(degrees)"

@@ -13,11 +13,11 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Complexes
+from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
 from isocharge.simulate.numerics.polygon import area_of, shared_area, to_complex, to_corners
 from isocharge.simulate.sensor.size_check import check_range
@@ -25,11 +25,8 @@ from isocharge.simulate.sensor.size_check import check_range
 NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 """Regular expression of a decimal number in the notation of a probe."""
 
-MIN_REACH = 0.02
-"""Smallest accepted reach of a footprint, mm. The reach is the distance of the farthest point from the centroid."""
-
-MIN_SIDE = 1e-3
-"""Smallest accepted length of a side or an axis of a footprint, mm."""
+MIN_LENGTH = 0.02
+"""Smallest accepted radius, side, axis or reach of a footprint, mm. A smaller value was probably given in metres."""
 
 CORE_SHARE = 0.45 * math.sqrt(2.0)
 """Ratio of the distance of a corner of the core polygon from the centroid to that of the boundary, dimensionless."""
@@ -45,13 +42,13 @@ class ProbeNotation:
     Attributes:
         name: Word before the colon.
         parameters: Text after the colon. Each word of capital letters stands for a number (mm).
-        build: Function that creates the probe from the numbers and the rotation (rad, anticlockwise).
+        build: Function that creates the probe without a rotation from the numbers.
         pattern: Regular expression of the text after the colon. If it is empty, it is derived from `parameters`.
     """
 
     name: str
     parameters: str
-    build: Callable[[list[float], float], "Probe"]
+    build: Callable[..., "Probe"]
     pattern: str = ""
 
     @property
@@ -78,7 +75,7 @@ class ProbeNotation:
             return None
         numbers = [float(number) for number in re.findall(NUMBER, match["parameters"])]
         degrees = float(match["degrees"] or 0.0)
-        return self.build(numbers, float(np.deg2rad(degrees)))
+        return self.build(*numbers).rotated(float(np.deg2rad(degrees)))
 
 
 @dataclass(frozen=True)
@@ -108,9 +105,6 @@ class Probe(ABC):
     subclass overrides `has_uniform_pressure`, `pressure` and `force_share`. Subclasses, such as `Circle`, `Ellipse`,
     `Finger` and `Polygon`, are frozen dataclasses.
     """
-
-    notations: ClassVar[tuple[ProbeNotation, ...]]
-    """Notations that `parse_probe` accepts for this shape."""
 
     @property
     @abstractmethod
@@ -179,23 +173,14 @@ class Probe(ABC):
             Points x + iy relative to the centroid, of the shape of `parameter`, mm.
         """
 
-    @abstractmethod
-    def contains(self, points: Complexes) -> Booleans:
-        """Return whether each point lies in the footprint or on its boundary.
-
-        Args:
-            points: Points x + iy relative to the centroid, any shape, mm.
-
-        Returns:
-            Whether each point lies in the footprint, of the shape of `points`.
-        """
-
     def rotated(self, angle: float) -> Self:
         """Return a copy of the probe that is rotated further about its centroid.
 
         Args:
             angle: Further rotation, anticlockwise, rad.
         """
+        if self.is_axisymmetric:  # a rotation does not change a circle
+            return self
         return replace(self, angle=self.angle + angle)  # type: ignore[type-var]
 
     def farthest_distance(self, at: tuple[float, float]) -> float:
@@ -205,18 +190,6 @@ class Probe(ABC):
             at: Position (x, y) of the centroid relative to the centre of the film, mm.
         """
         return float(np.abs(complex(*at) + self.outline).max())
-
-    def covered_area(self, corners: Array, at: complex) -> float:
-        """Return the area that the footprint and a convex polygon have in common, mm^2.
-
-        The area of a curved footprint is that of its outline, times the ratio of both areas.
-
-        Args:
-            corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
-            at: Position of the centroid of the footprint as x + iy, mm.
-        """
-        outline_area = area_of(to_corners(self.outline))
-        return shared_area(to_complex(corners), at + self.outline) * self.area / outline_area
 
     @property
     def has_uniform_pressure(self) -> bool:
@@ -238,11 +211,14 @@ class Probe(ABC):
     def force_share(self, corners: Array, at: complex) -> float:
         """Return the fraction of the force that acts on a convex polygon of the film, from 0 to 1.
 
+        For a curved footprint, the fraction is computed from its outline.
+
         Args:
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
             at: Position of the centroid of the footprint as x + iy, mm.
         """
-        return self.covered_area(corners, at) / self.area
+        area_in_polygon = shared_area(to_complex(corners), at + self.outline)
+        return area_in_polygon / area_of(to_corners(self.outline))
 
     @property
     def is_axisymmetric(self) -> bool:
@@ -253,20 +229,22 @@ class Probe(ABC):
 class CurvedProbe(Probe):
     """Base class of probes with a convex footprint whose boundary is smooth.
 
-    A subclass has a field `angle` and implements `boundary`, `contains`, `notation`, `area`, `reach` and `period`. The
-    class `CurvedProbe` implements all other methods of `Probe`. A subclass may override these methods with closed
-    formulas.
+    A subclass has a field `angle` and implements `boundary`, `notation`, `area`, `reach` and `period`. The class
+    `CurvedProbe` implements all other methods of `Probe`. A subclass may override these methods with closed formulas.
     """
 
     @property
     def topology(self) -> FootprintTopology:
         """Topology with a core polygon, and a layer of blocks between the core polygon and the boundary.
 
-        The core polygon has the rotational symmetry of the footprint.
+        The core polygon has the rotational symmetry of the footprint. The layer around a circular footprint reaches up
+        to the innermost circle of the mesh.
         """
-        symmetry_order = round(math.tau / self.period)  # number of rotations that map the footprint onto itself
-        n_corner = 4 if symmetry_order in (1, 2) else symmetry_order
-        return FootprintTopology(n_corner, is_curved=True, fills_circle=False)
+        # A circle, and a footprint that only a half turn or a full turn maps onto itself, has a core with four corners.
+        n_corner = 4
+        if 0.0 < self.period < 0.9 * math.pi:
+            n_corner = round(math.tau / self.period)
+        return FootprintTopology(n_corner, is_curved=True, fills_circle=self.is_axisymmetric)
 
     @property
     def outline(self) -> Complexes:
@@ -293,27 +271,14 @@ def check_angle(angle: float) -> None:
         raise SceneError(f"probe angle: expected a finite number, got {angle}")
 
 
-def check_reach(reach: float, what: str = "probe reach") -> None:
-    """Raise an error if a footprint is so small that its size was probably given in metres.
+def check_length(what: str, length: float) -> None:
+    """Raise an error if a length of a footprint is infinite, or so small that it was probably given in metres.
 
     Args:
-        reach: Distance of the farthest point of the footprint from its centroid, mm.
-        what: Name of the reach in the error message.
+        what: Name of the length in the error message.
+        length: Radius, side, axis or reach of the footprint, mm.
 
     Raises:
-        SceneError: If `reach` is below `MIN_REACH` or infinite.
+        SceneError: If `length` is below `MIN_LENGTH` or infinite.
     """
-    check_range(what, reach, (MIN_REACH, np.inf), "mm", SceneError)
-
-
-def check_side(what: str, length: float) -> None:
-    """Raise an error if a side or an axis of a footprint is too short or infinite.
-
-    Args:
-        what: Name of the side or axis in the error message.
-        length: Length of the side or axis, mm.
-
-    Raises:
-        SceneError: If `length` is below `MIN_SIDE` or infinite.
-    """
-    check_range(what, length, (MIN_SIDE, np.inf), "mm", SceneError)
+    check_range(what, length, (MIN_LENGTH, np.inf), "mm", SceneError)

@@ -1,17 +1,12 @@
 """Probe with an elliptical footprint."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Complexes
-from isocharge.simulate.sensor.probe_shapes.base import (
-    CurvedProbe,
-    ProbeNotation,
-    check_angle,
-    check_reach,
-    check_side,
-)
+from isocharge.common.arrays import Array, Complexes
+from isocharge.simulate.sensor.probe_shapes.base import CurvedProbe, check_angle, check_length
 from isocharge.simulate.sensor.size_check import tidy
 
 
@@ -29,13 +24,13 @@ class Ellipse(CurvedProbe):
     height: float
     angle: float = 0.0
 
-    notations = (ProbeNotation("ellipse", "WIDTHxHEIGHT", lambda axes, angle: Ellipse(axes[0], axes[1], angle)),)
+    period = math.pi
+    """Smallest rotation that maps the ellipse onto itself, rad. It is half a turn."""
 
     def __post_init__(self) -> None:
-        check_side("probe width", self.width)
-        check_side("probe height", self.height)
+        check_length("probe width", self.width)
+        check_length("probe height", self.height)
         check_angle(self.angle)
-        check_reach(self.reach)
 
     @property
     def notation(self) -> str:
@@ -52,18 +47,7 @@ class Ellipse(CurvedProbe):
         """Distance from the centre to the farthest point of the ellipse, mm. It is half of the longer axis."""
         return 0.5 * max(self.width, self.height)
 
-    @property
-    def period(self) -> float:
-        """Smallest rotation that maps the ellipse onto itself, rad. It is half a turn."""
-        return float(np.pi)
-
     def boundary(self, parameter: Array) -> Complexes:
         """Return points x + iy of the ellipse, mm. The parameter is the eccentric angle, rad."""
         before_rotation = 0.5 * self.width * np.cos(parameter) + 0.5j * self.height * np.sin(parameter)
         return np.asarray(before_rotation * np.exp(1j * self.angle))
-
-    def contains(self, points: Complexes) -> Booleans:
-        """Return whether each point x + iy (mm, relative to the centre) lies in the ellipse."""
-        unrotated = points * np.exp(-1j * self.angle)
-        squared_ratio = (2.0 * unrotated.real / self.width) ** 2 + (2.0 * unrotated.imag / self.height) ** 2
-        return np.asarray(squared_ratio <= 1.0)

@@ -5,24 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Complexes
+from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError, cut
-from isocharge.simulate.numerics.polygon import (
-    area_of,
-    centroid_of,
-    is_convex,
-    min_edge_cross_product,
-    to_complex,
-)
-from isocharge.simulate.sensor.probe_shapes.base import (
-    NUMBER,
-    FootprintTopology,
-    Probe,
-    ProbeNotation,
-    check_angle,
-    check_reach,
-    check_side,
-)
+from isocharge.simulate.numerics.polygon import area_of, centroid_of, is_convex, to_complex, to_corners
+from isocharge.simulate.sensor.probe_shapes.base import FootprintTopology, Probe, check_angle, check_length
 from isocharge.simulate.sensor.size_check import tidy
 
 MAX_CORNERS = 64
@@ -31,16 +17,13 @@ MAX_CORNERS = 64
 A polygon with more corners has nearly the charges of a circle, which needs fewer unknowns.
 """
 
-CORNERS_PATTERN = rf"{NUMBER},{NUMBER}(?:;{NUMBER},{NUMBER})+"
-"""Regular expression of the corners `X,Y;X,Y;...` of a polygon in the notation of a probe."""
-
 
 @dataclass(frozen=True)
 class Polygon(Probe):
     """Probe with a convex polygonal footprint and a uniform pressure.
 
     Attributes:
-        corners: Corners (x, y) before the rotation, relative to the centroid, anticlockwise, mm.
+        corners: Corners (x, y) before the rotation, anticlockwise, mm. They are stored relative to the centroid.
         angle: Rotation about the centroid, anticlockwise, rad.
         name: Kind of polygon in the notation: "rectangle", "triangle" or "polygon".
     """
@@ -49,19 +32,8 @@ class Polygon(Probe):
     angle: float = 0.0
     name: str = "polygon"
 
-    notations = (
-        ProbeNotation("rectangle", "WIDTHxHEIGHT", lambda sides, angle: Polygon.rectangle(sides[0], sides[1], angle)),
-        ProbeNotation("triangle", "SIDE", lambda sides, angle: Polygon.triangle(sides[0], angle)),
-        ProbeNotation(
-            "polygon",
-            "X,Y;X,Y;X,Y",
-            lambda numbers, angle: Polygon.of(np.array(numbers).reshape(-1, 2), angle),
-            CORNERS_PATTERN,
-        ),
-    )
-
     def __post_init__(self) -> None:
-        """Check that the corners form a convex polygon whose centroid is the origin.
+        """Check that the corners form a convex polygon, and shift them such that its centroid becomes the origin.
 
         Raises:
             SceneError: If the corners do not form such a polygon, or if the polygon is too small.
@@ -76,16 +48,15 @@ class Polygon(Probe):
             raise SceneError(
                 f"probe: expected a convex polygon with its corners anticlockwise, got {cut(str(corners.tolist()))} mm"
             )
-        rounding_tolerance = 1e-9 * np.linalg.norm(corners, axis=1).max()
-        if not np.linalg.norm(centroid_of(corners)) <= rounding_tolerance:
-            raise SceneError(
-                f"probe: expected corners relative to their centroid, got {corners.tolist()} mm; use Polygon.of"
-            )
-        check_reach(self.reach)
+        # Corners that are relative to their centroid are stored as they are, without further rounding errors.
+        centroid = centroid_of(corners)
+        if np.linalg.norm(centroid) > 1e-9 * self.reach:
+            object.__setattr__(self, "corners", _as_tuples(corners - centroid))  # the dataclass is frozen
+        check_length("probe reach", self.reach)
 
     @classmethod
     def of(cls, corners: Array, angle: float = 0.0, name: str = "polygon") -> "Polygon":
-        """Create a polygon from its corners. The corners are shifted such that the centroid becomes the origin.
+        """Create a polygon from an array of corners.
 
         Args:
             corners: Corners (x, y) relative to any point, anticlockwise, shape (n, 2), mm.
@@ -95,12 +66,7 @@ class Polygon(Probe):
         Raises:
             SceneError: If the corners do not form a convex polygon, or if the polygon is too small.
         """
-        # Invalid corners have no centroid and are not shifted. The constructor then raises the error.
-        points = np.asarray(corners, dtype=float)
-        is_table = points.ndim == 2 and 3 <= len(points) <= MAX_CORNERS and points.shape[1] == 2
-        if is_table and np.isfinite(points).all() and is_convex(points):
-            points = points - centroid_of(points)
-        return cls(tuple((float(x), float(y)) for x, y in points), angle, name)
+        return cls(_as_tuples(corners), angle, name)
 
     @classmethod
     def rectangle(cls, width: float, height: float, angle: float = 0.0) -> "Polygon":
@@ -111,8 +77,8 @@ class Polygon(Probe):
             height: Length of the sides along y before the rotation, mm.
             angle: Rotation about the centroid, anticlockwise, rad.
         """
-        check_side("probe width", width)
-        check_side("probe height", height)
+        check_length("probe width", width)
+        check_length("probe height", height)
         x = 0.5 * width
         y = 0.5 * height
         return cls(((x, y), (-x, y), (-x, -y), (x, -y)), angle, "rectangle")
@@ -125,11 +91,10 @@ class Polygon(Probe):
             side: Length of the sides, mm.
             angle: Rotation about the centroid, anticlockwise, rad.
         """
-        check_side("probe side", side)
+        check_length("probe side", side)
         circumradius = side / np.sqrt(3.0)
         corner_angles = 0.5 * np.pi + 2.0 * np.pi / 3.0 * np.arange(3)
-        corners = np.exp(1j * corner_angles) * circumradius
-        return cls(tuple((float(corner.real), float(corner.imag)) for corner in corners), angle, "triangle")
+        return cls.of(to_corners(np.exp(1j * corner_angles) * circumradius), angle, "triangle")
 
     @property
     def notation(self) -> str:
@@ -196,6 +161,7 @@ class Polygon(Probe):
         corner_parameter = 2.0 * np.pi * (np.arange(corners.size) + 0.5) / (corners.size - 1)
         return np.asarray(np.interp(parameter, corner_parameter, corners, period=2.0 * np.pi))
 
-    def contains(self, points: Complexes) -> Booleans:
-        """Return whether each point x + iy (mm, relative to the centroid) lies in the polygon."""
-        return np.asarray(min_edge_cross_product(self.outline, points) >= 0.0)
+
+def _as_tuples(corners: Array) -> tuple[tuple[float, float], ...]:
+    """Convert corners (x, y) of shape (n, 2) into nested tuples, which can be compared and hashed."""
+    return tuple((float(x), float(y)) for x, y in corners)

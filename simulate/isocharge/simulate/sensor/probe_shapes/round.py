@@ -1,4 +1,4 @@
-"""Probe that presses like a fingertip, with a circular footprint and a Hertzian pressure.
+"""Probes with a circular footprint: a circle with a uniform pressure, and a fingertip with a Hertzian pressure.
 
 A soft sphere that is pressed against a flat surface touches the surface in a circle of radius a. If F is the force, the
 pressure at the distance r from the centre of this circle is p(r) = p0 sqrt(1 - (r / a)^2), with the maximum
@@ -11,8 +11,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.numerics.polygon import area_in_disk, to_complex
-from isocharge.simulate.sensor.probe_shapes.base import ProbeNotation
-from isocharge.simulate.sensor.probe_shapes.circle import RoundProbe
+from isocharge.simulate.sensor.probe_shapes.base import CurvedProbe, check_length
 from isocharge.simulate.sensor.size_check import tidy
 
 PEAK_PRESSURE = 1.5
@@ -20,6 +19,64 @@ PEAK_PRESSURE = 1.5
 
 PRESSURE_LEVELS = 48
 """Number of pressure levels over which the force on an area is integrated."""
+
+
+@dataclass(frozen=True)
+class RoundProbe(CurvedProbe):
+    """Base class of probes with a circular footprint.
+
+    A subclass implements `notation`. A subclass whose pressure is not uniform also overrides `pressure`.
+
+    Attributes:
+        radius: Radius of the footprint, mm.
+    """
+
+    radius: float
+
+    angle = 0.0
+    """Rotation of the footprint, rad. The rotation is always zero, because a rotation does not change a circle."""
+
+    period = 0.0
+    """Period of the footprint. The period is always zero, because every rotation maps a circle onto itself."""
+
+    def __post_init__(self) -> None:
+        check_length("probe radius", self.radius)
+
+    @property
+    def area(self) -> float:
+        """Area of the footprint, mm^2."""
+        return float(np.pi * self.radius**2)
+
+    @property
+    def reach(self) -> float:
+        """Radius of the circle, which is the distance from its centre to its farthest point, mm."""
+        return self.radius
+
+    def boundary(self, parameter: Array) -> Complexes:
+        """Return points x + iy of the circle, mm. The parameter is the polar angle, rad."""
+        return np.asarray(self.radius * np.exp(1j * parameter))
+
+    def farthest_distance(self, at: tuple[float, float]) -> float:
+        """Return the distance from the centre of the film to the farthest point of the circle, mm."""
+        return float(np.hypot(*at)) + self.radius
+
+    def force_share(self, corners: Array, at: complex) -> float:
+        """Return the fraction of a uniformly distributed force that acts on a convex polygon of the film."""
+        return float(area_in_disk(to_complex(corners), at, self.radius)) / self.area
+
+
+@dataclass(frozen=True)
+class Circle(RoundProbe):
+    """Probe with a circular footprint and a uniform pressure.
+
+    Attributes:
+        radius: Radius of the footprint, mm.
+    """
+
+    @property
+    def notation(self) -> str:
+        """Notation of this probe, which `parse_probe` converts back into the probe."""
+        return f"circle:{tidy(self.radius)}"
 
 
 @dataclass(frozen=True)
@@ -31,17 +88,12 @@ class Finger(RoundProbe):
             fingertip.
     """
 
-    notations = (ProbeNotation("finger", "RADIUS", lambda numbers, _angle: Finger(numbers[0])),)
+    has_uniform_pressure = False
 
     @property
     def notation(self) -> str:
         """Notation of this probe, which `parse_probe` converts back into the probe."""
         return f"finger:{tidy(self.radius)}"
-
-    @property
-    def has_uniform_pressure(self) -> bool:
-        """Always False, because the Hertzian pressure is not uniform."""
-        return False
 
     def pressure(self, points: Complexes) -> Array:
         """Return the Hertzian pressure at points, divided by the mean pressure. It is zero outside the footprint.
