@@ -149,14 +149,14 @@ class FilmCharges:
             Charges, shape (n, n_electrode), pC, and their derivatives, shape (n, n_electrode, n_property), pC per unit
             of the property.
         """
-        reading = _Reading(self, values)
-        solved_charge = reading.film.charges(contact)
-        jacobian = reading.jacobian(contact, solved_charge)
+        sensor = self._electrodes(values)
+        solved_charge = _read(self.film, sensor).charges(contact)
+        jacobian = self._jacobian(sensor, contact, solved_charge)
 
         # First-order change by the mechanical properties. It is applied to the logarithm of a charge, unless the charge
         # is negative or changes its sign.
         change = values - self.values
-        change[reading.exact] = 0.0
+        change[~self.prior.changes_stress] = 0.0  # their effect is exact
         charge_change = jacobian @ change
         log_change = np.divide(charge_change, solved_charge, out=np.zeros_like(solved_charge), where=solved_charge > 0)
         is_logarithmic = (solved_charge > 0.0) & (np.abs(log_change) < MAX_LOG_CHANGE)
@@ -171,61 +171,42 @@ class FilmCharges:
             values: Properties of the film, shape (n_property,).
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
         """
-        return _Reading(self, values).film.derivatives(contact)
+        return _read(self.film, self._electrodes(values)).derivatives(contact)
 
-
-class _Reading:
-    """A solved film that is read by electrodes with other properties.
-
-    Attributes:
-        film: Forward map of the solved film, with the piezoelectric coefficients, gains and positions of the electrodes
-            of other properties.
-        exact: Indices of the properties whose effect is exact, because they do not change the stress.
-    """
-
-    def __init__(self, charges: FilmCharges, values: Array) -> None:
-        """Place the electrodes.
+    def _electrodes(self, values: Array) -> Sensor:
+        """Return a sensor with the electrodes and the piezoelectric coefficients of given properties.
 
         Args:
-            charges: The solved film.
-            values: Properties, shape (n_property,). Of these, only those of the electrodes and of the coefficients are
-                used.
+            values: Properties, shape (n_property,). Those that change the stress are not used.
         """
-        self._charges = charges
-        self._prior = charges.prior
-        is_exact = ~charges.prior.changes_stress
-        self.exact = np.flatnonzero(is_exact)
-        self._sensor, _ = charges.prior.film(np.where(is_exact, values, charges.values))
-        self.film = self._read(charges.film)
+        sensor, _ = self.prior.film(np.where(self.prior.changes_stress, self.values, values))
+        return sensor
 
-    def _read(self, forward_map: ForwardMap) -> ForwardMap:
-        """Return a forward map with the electrodes and coefficients of this reading."""
-        return replace(forward_map, sensor=replace(self._sensor, film=forward_map.sensor.film))
-
-    def jacobian(self, contact: Array, charge: Array) -> Array:
+    def _jacobian(self, sensor: Sensor, contact: Array, charge: Array) -> Array:
         """Compute the derivatives of the charges with respect to all properties.
 
         Args:
+            sensor: Sensor with the electrodes and the coefficients.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             charge: Charges of the solved film at these contacts, shape (n, n_electrode), pC.
 
         Returns:
             Derivatives, shape (n, n_electrode, n_property), pC per unit.
         """
-        derivatives = self._mechanical(contact, charge)
+        derivatives = self._mechanical(sensor, contact, charge)
         derivatives["crosstalk"] = charge.sum(axis=1, keepdims=True) - charge
-        for electrode, name in enumerate(self._sensor.electrode_names):
+        for electrode, name in enumerate(sensor.electrode_names):
             own_charge = np.zeros_like(charge)
             own_charge[:, electrode] = charge[:, electrode]
             derivatives[f"gain {name}"] = own_charge
         columns = [
-            derivatives[one.name] if one.name in derivatives else self._read_difference(one, contact)
-            for one in self._prior.properties
+            derivatives[one.name] if one.name in derivatives else self._read_difference(sensor, one, contact)
+            for one in self.prior.properties
         ]
         even_jacobian = np.stack(columns, axis=2)
-        return even_jacobian + self._secant_correction(contact, charge, even_jacobian)
+        return even_jacobian + self._secant_correction(sensor, contact, charge, even_jacobian)
 
-    def _secant_correction(self, contact: Array, charge: Array, jacobian: Array) -> Array:
+    def _secant_correction(self, sensor: Sensor, contact: Array, charge: Array, jacobian: Array) -> Array:
         """Compute the change of the derivatives from the axisymmetric film to the solved film, along their difference.
 
         The charges are assumed to be quadratic along the line between both films. The derivative at the solved film
@@ -233,6 +214,7 @@ class _Reading:
         only along this line (Broyden 1965).
 
         Args:
+            sensor: Sensor with the electrodes and the coefficients.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             charge: Charges of the solved film at these contacts, shape (n, n_electrode), pC.
             jacobian: Derivatives of the axisymmetric film, shape (n, n_electrode, n_property), pC per unit.
@@ -240,41 +222,46 @@ class _Reading:
         Returns:
             Change of the derivatives, shape (n, n_electrode, n_property), pC per unit.
         """
-        charges = self._charges
-        step = np.where(self._prior.changes_stress, charges.values - charges.even_values, 0.0)
-        scaled_step = step / self._prior.std**2
+        step = np.where(self.prior.changes_stress, self.values - self.even_values, 0.0)
+        scaled_step = step / self.prior.std**2
         length = float(step @ scaled_step)  # squared, in prior standard deviations
-        if length == 0.0 or charges.film.probe.is_axisymmetric != self._prior.probe.is_axisymmetric:
+        if length == 0.0 or self.film.probe.is_axisymmetric != self.prior.probe.is_axisymmetric:
             return np.zeros_like(jacobian)
-        even_charge = self._read(charges.same_probe).charges(contact)
+        even_charge = _read(self.same_probe, sensor).charges(contact)
         deviation = charge - even_charge - jacobian @ step
         return np.asarray(2.0 * deviation[:, :, None] * scaled_step / length)
 
-    def _mechanical(self, contact: Array, charge: Array) -> dict[str, Array]:
+    def _mechanical(self, sensor: Sensor, contact: Array, charge: Array) -> dict[str, Array]:
         """Compute the derivatives with respect to the properties that change the stress.
 
         The stress in units of Young's modulus E depends on E, the thickness h and the force F only through F / (E h)
         and the tensions divided by E. The small effect of the bending is neglected here.
         """
-        slopes = self._charges.slopes
-        derivatives = replace(slopes, film=self._read(slopes.film), fields=self._read(slopes.fields)).jacobian(contact)
-        force_slope = self.film.derivatives(contact)[:, :, 2]
+        film, fields = _read(self.slopes.film, sensor), _read(self.slopes.fields, sensor)
+        derivatives = replace(self.slopes, film=film, fields=fields).jacobian(contact)
+        force_slope = _read(self.film, sensor).derivatives(contact)[:, :, 2]
         derivatives["thickness"] = -force_slope
-        values = dict(zip(self._prior.names, self._charges.values.tolist(), strict=True))
+        values = dict(zip(self.prior.names, self.values.tolist(), strict=True))
         for name in UNEVEN_TENSIONS:  # shares of the pretension
             derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + values[name] * derivatives[name]
             derivatives[name] = values[PRETENSION.name] * derivatives[name]
         derivatives["young"] = charge - force_slope - values[PRETENSION.name] * derivatives[PRETENSION.name]
-        same_charge = self._read(self._charges.same_probe).charges(contact)
-        larger_probe = self._charges.larger_probe
-        if larger_probe is not None:
-            step = STEP * self._prior.std[self._prior.index(PROBE_RADIUS)]
-            derivatives[PROBE_RADIUS] = (self._read(larger_probe).charges(contact) - same_charge) / step
+        if self.larger_probe is not None:
+            step = STEP * self.prior.std[self.prior.index(PROBE_RADIUS)]
+            same_charge, larger_charge = (
+                _read(one, sensor).charges(contact) for one in (self.same_probe, self.larger_probe)
+            )
+            derivatives[PROBE_RADIUS] = (larger_charge - same_charge) / step
         return derivatives
 
-    def _read_difference(self, one: FilmProperty, contact: Array) -> Array:
+    def _read_difference(self, sensor: Sensor, one: FilmProperty, contact: Array) -> Array:
         """Compute the derivative with respect to a property that does not change the stress, by central differences."""
         step = STEP * one.std
-        sensors = [changed_film(self.film.sensor, self.film.probe, {one.name: change})[0] for change in (step, -step)]
-        forward, backward = (replace(self.film, sensor=sensor).charges(contact) for sensor in sensors)
+        sensors = [changed_film(sensor, self.film.probe, {one.name: change})[0] for change in (step, -step)]
+        forward, backward = (_read(self.film, changed).charges(contact) for changed in sensors)
         return np.asarray((forward - backward) / (2.0 * step))
+
+
+def _read(forward_map: ForwardMap, sensor: Sensor) -> ForwardMap:
+    """Return the map of a solved film that is read by the electrodes and coefficients of a sensor."""
+    return replace(forward_map, sensor=replace(sensor, film=forward_map.sensor.film))
