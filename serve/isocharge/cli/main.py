@@ -11,11 +11,8 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.serve.app import serve_app
 from isocharge.cli.shared.lazy import LazyCommand, lazy_group
 from isocharge.cli.shared.terminal import open_closed_streams, say, show, warnings_to_stderr
-from isocharge.cli.simulate.app import simulate_app
-from isocharge.cli.train.app import train_app
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.extras import package_version
 
@@ -32,6 +29,89 @@ app = lazy_group(
         ),
     },
 )
+
+simulate_app = lazy_group(
+    "Compute the charges of presses, and the accuracy with which charges determine a press.",
+    {
+        "point": LazyCommand(
+            "isocharge.cli.simulate.point:point_command",
+            "Compute the charges and the deflection of one press.",
+            extra="simulate",
+        ),
+        "sweep": LazyCommand(
+            "isocharge.cli.simulate.sweep:sweep_command",
+            "Compute the charges of many presses and write them as a dataset for training.",
+            extra="simulate",
+        ),
+        "identify": LazyCommand(
+            "isocharge.cli.simulate.identify:identify_command",
+            "Compute error limits, folds and the working area of a sensor.",
+            extra="simulate",
+        ),
+        "design": LazyCommand(
+            "isocharge.cli.simulate.design:design_command",
+            "Search for the electrode positions with the smallest position errors.",
+            extra="design",
+        ),
+    },
+)
+
+train_app = lazy_group(
+    "Train models on simulated or measured charges; calibrate films; compare methods.",
+    {
+        "fit": LazyCommand(
+            "isocharge.cli.train.fit:fit_command", "Train a network and write its model folder.", extra="train"
+        ),
+        "press": LazyCommand(
+            "isocharge.cli.train.press:press_command",
+            "Record presses at a port, and write them to a file.",
+            extra="train",
+        ),
+        "calibrate": LazyCommand(
+            "isocharge.cli.train.calibrate:calibrate_command",
+            "Fit a real film to some presses, and write its model folder.",
+            extra="train",
+        ),
+        "report": LazyCommand(
+            "isocharge.cli.train.report:report_command", "Compare methods: speed against error.", extra="train"
+        ),
+        "export-c": LazyCommand(
+            "isocharge.cli.train.export_c:export_c_command", "Write a model as C source.", extra="train"
+        ),
+    },
+)
+
+serve_app = lazy_group(
+    "Estimate contacts from charges: from a file, from a sensor's port, over HTTP. Or play a virtual sensor.",
+    {
+        "predict": LazyCommand(
+            "isocharge.cli.serve.predict:predict_command", "Estimate the contacts of the charges in a file."
+        ),
+        "check": LazyCommand(
+            "isocharge.cli.serve.check:check_command", "Measure the errors of a model on measured presses."
+        ),
+        "stream": LazyCommand(
+            "isocharge.cli.serve.stream:stream_command", "Follow a sensor live: a record for every frame of charges."
+        ),
+        "replay": LazyCommand(
+            "isocharge.cli.serve.stream:replay_command", "Play a recording again, as it was or with other settings."
+        ),
+        "plot": LazyCommand("isocharge.cli.serve.plot:plot_command", "Draw a recording.", extra="simulate"),
+        "doctor": LazyCommand(
+            "isocharge.cli.serve.doctor:doctor_command", "Say what a port sends, and what is wrong with it."
+        ),
+        "http": LazyCommand("isocharge.cli.serve.http:http_command", "Serve models over HTTP and gRPC.", extra="http"),
+        "virtual": LazyCommand(
+            "isocharge.cli.serve.virtual:virtual_command",
+            "Play a virtual sensor on a pseudo-terminal.",
+            extra="simulate",
+        ),
+        "bench": LazyCommand(
+            "isocharge.cli.serve.bench:bench_command", "Measure speed against error of a model on this machine."
+        ),
+    },
+)
+
 app.add_typer(simulate_app, name="simulate")
 app.add_typer(train_app, name="train")
 app.add_typer(serve_app, name="serve")

@@ -109,7 +109,7 @@ def test_plot_draws_a_recording(command, recorded, tmp_path, figures):
     ("lines", "message"),
     [
         ([], "expected at least one record, got none"),
-        (['{"timestamp": 1.0}'], "line 2: damaged .*key 'x_mm' is missing"),
+        (['{"timestamp": 1.0}'], "line 2: damaged .*key 't_device_us' is missing"),
         (["nonsense", "{}"], "line 2: damaged"),
     ],
 )

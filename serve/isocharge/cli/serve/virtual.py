@@ -9,9 +9,8 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 
-from isocharge.cli.shared.forward_maps import ROUNDING_MARGIN
+from isocharge.cli.shared.forward_maps import ROUNDING_MARGIN, ProbeOption
 from isocharge.cli.shared.options import SensorArgument
-from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import announce, say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import film_charges, measure_function, random_script
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS

@@ -1,10 +1,13 @@
-"""Functions that several commands with forward maps use, for workers, progress, stress and simulated presses."""
+"""Option `--probe`, and functions for workers, radius, stress and simulated presses, of commands with forward maps."""
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import typer
 
 from isocharge.cli.shared.options import parse_radius_mm, worker_count
 from isocharge.cli.shared.terminal import say
@@ -12,6 +15,9 @@ from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.simulate import Dataset, Film, Probe, Sensor, Sweep, noise_model, read_dataset, working_area
 from isocharge.simulate.execution.workers import dask_workers, local_workers
+from isocharge.simulate.sensor.probe import PROBE_HELP
+
+ProbeOption = Annotated[str, typer.Option("--probe", metavar="SHAPE", help=PROBE_HELP)]
 
 ROUNDING_MARGIN = 1.0 + 1e-6
 """Factor by which the radius and the largest force of a forward map are increased, because rounding may move the

@@ -2,12 +2,12 @@
 
 The help of a group is therefore printed without importing the commands of the group.
 
-The value of some options may be omitted, as in `--live` or `--live 8080`. Typer requires a value for every option that
-is not a flag. Commands of the class `OptionalValueCommand` therefore insert the default value into the command line
-before Typer parses the command line.
+The value of the option `--live` may be omitted, as in `--live` or `--live 8080`. Typer requires a value for every
+option that is not a flag. A group therefore inserts the default value into the command line before Typer parses the
+command line.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -17,43 +17,20 @@ from typer.core import TyperCommand, TyperGroup
 
 from isocharge.common.extras import require
 
-
-class OptionalValue(NamedTuple):
-    """Description of an option whose value may be omitted.
-
-    Attributes:
-        default: Value of the option if the command line contains the option without a value.
-        is_value: Function that returns whether the next word of the command line is the value of the option. Other
-            words are arguments of the command or other options.
-    """
-
-    default: str
-    is_value: Callable[[str], bool]
-
-
-def is_address(word: str) -> bool:
-    """Return whether a word of the command line looks like PORT or HOST:PORT."""
-    return word.isdecimal() or (":" in word and not word.startswith("-"))
-
-
 DEFAULT_LIVE_ADDRESS = "127.0.0.1:8001"
 """Address of the live page if `--live` has no value."""
 
-OPTIONAL_VALUES = {"--live": OptionalValue(DEFAULT_LIVE_ADDRESS, is_address)}
-"""All options whose value may be omitted, by their names."""
 
+def insert_live_address(words: Sequence[str]) -> list[str]:
+    """Insert the default address after each option `--live` whose value is omitted.
 
-def insert_omitted_values(words: Sequence[str]) -> list[str]:
-    """Insert the default value after each option whose value is omitted.
-
-    The value of an option is omitted if the next word of the command line is not suitable as its value. The function
-    `is_value` of the option decides whether a word is suitable.
+    The next word of the command line is the value if it looks like PORT or HOST:PORT.
 
     Args:
         words: The command line. Words after `--` are arguments and remain as they are.
 
     Example:
-        >>> insert_omitted_values(["--live", "--seconds", "5"])
+        >>> insert_live_address(["--live", "--seconds", "5"])
         ['--live', '127.0.0.1:8001', '--seconds', '5']
     """
     completed_words: list[str] = []
@@ -61,21 +38,11 @@ def insert_omitted_values(words: Sequence[str]) -> list[str]:
         if word == "--":
             return [*completed_words, *words[index:]]
         completed_words.append(word)
-        option = OPTIONAL_VALUES.get(word)
-        if option is None:
-            continue
-        is_last = index + 1 == len(words)
-        if is_last or not option.is_value(words[index + 1]):
-            completed_words.append(option.default)
+        next_word = "".join(words[index + 1 : index + 2])  # empty after the last word
+        is_address = next_word.isdecimal() or (":" in next_word and not next_word.startswith("-"))
+        if word == "--live" and not is_address:
+            completed_words.append(DEFAULT_LIVE_ADDRESS)
     return completed_words
-
-
-class OptionalValueCommand(TyperCommand):
-    """A command that accepts the options in `OPTIONAL_VALUES` without a value."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert omitted values into the command line, and parse the completed command line."""
-        return super().parse_args(ctx, insert_omitted_values(args))
 
 
 class LazyCommand(NamedTuple):
@@ -120,6 +87,7 @@ def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer
             name, command, remaining_args = super().resolve_command(ctx, args)
             if name is not None and name in commands:
                 command = load_command(commands[name])
+                remaining_args = insert_live_address(remaining_args)
             return name, command, remaining_args
 
     return typer.Typer(
@@ -146,7 +114,7 @@ def load_command(command: LazyCommand) -> TyperCommand:
 
     # Typer makes a command only from an app. An app with a single function becomes one command without subcommands.
     single_command_app = typer.Typer(add_completion=False, rich_markup_mode=None)
-    single_command_app.command(cls=OptionalValueCommand)(command_function)
+    single_command_app.command()(command_function)
     typer_command = typer.main.get_command(single_command_app)
     typer_command.name = None  # the group that contains the command names it
     return typer_command  # type: ignore[return-value]

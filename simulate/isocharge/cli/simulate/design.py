@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import executor_for, warn_of_stress
+from isocharge.cli.shared.forward_maps import ProbeOption, executor_for, warn_of_stress
 from isocharge.cli.shared.options import (
     ForceOption,
     NewFolderOption,
@@ -13,7 +13,6 @@ from isocharge.cli.shared.options import (
     StressLimitOption,
     WorkersOption,
 )
-from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_result, shown_progress
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError

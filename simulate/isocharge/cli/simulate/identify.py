@@ -7,9 +7,8 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import executor_for
+from isocharge.cli.shared.forward_maps import ProbeOption, executor_for
 from isocharge.cli.shared.options import ForceRangeOption, JsonOption, NoiseOption, SensorArgument, WorkersOption
-from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_result, shown_progress
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import InputError

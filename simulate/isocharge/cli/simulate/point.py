@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from isocharge.cli.shared.forward_maps import ProbeOption
 from isocharge.cli.shared.options import (
     ForceOption,
     JsonOption,
@@ -12,7 +13,6 @@ from isocharge.cli.shared.options import (
     parse_position,
     parse_side_force,
 )
-from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_result
 from isocharge.common.errors import InputError
 from isocharge.simulate import (

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from isocharge.cli.shared.forward_maps import ProbeOption
 from isocharge.cli.shared.options import JsonOption, StressLimitOption, refuse, worker_count
 from isocharge.cli.shared.press_options import (
     ForceStdOption,
@@ -16,7 +17,6 @@ from isocharge.cli.shared.press_options import (
     SensorOption,
     read_press_file,
 )
-from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.simulate import load_sensor, local_workers, parse_probe

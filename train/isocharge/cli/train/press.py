@@ -9,10 +9,10 @@ from typing import Annotated
 
 import typer
 
+from isocharge.cli.shared.forward_maps import ProbeOption
 from isocharge.cli.shared.options import DeviceOption, StressLimitOption, worker_count
 from isocharge.cli.shared.port_hints import no_frames_advice_added
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, RadiusOption, SensorOption
-from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT

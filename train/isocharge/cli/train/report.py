@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
+from isocharge.cli.shared.forward_maps import ProbeOption
 from isocharge.cli.shared.options import JsonOption, ModelsOption, NewFolderOption
 from isocharge.cli.shared.press_options import read_press_file
-from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
