@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.live_page import LiveOption, page_address
+from isocharge.cli.shared.live_page import LiveOption
 from isocharge.cli.shared.options import ConfigOption
 from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError
@@ -75,11 +75,10 @@ def demo_command(
             from isocharge.cli.demo.full_demo import run_demo
         run_demo(output, seconds, config, sensor)
         return
-    address = page_address(live, token=None)
     with require("simulate", "http"):
         from isocharge.cli.demo.live_film import show_live_film
 
-        show_live_film(address, seconds, sensor)
+        show_live_film(live, seconds, sensor)
 
 
 def _write_playground(path: Path) -> None:

@@ -2,18 +2,21 @@
 
 from contextlib import ExitStack, closing
 from functools import partial
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from isocharge.cli.shared.live_page import PageFeed, live_page, warnings_on_page
+from isocharge.cli.shared.live_page import PageFeed, live_page
 from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import ModelError
 from isocharge.serve import Port, Predictor, Recorder, TouchStream, find_model, load_model
 from isocharge.serve.live.recorded_stream import RecordedStream
-from isocharge.serve.network.address import Address
 from isocharge.simulate import Circle, ForwardMap, load_sensor
+
+if TYPE_CHECKING:
+    from isocharge.serve.viewer.live_page import LivePage
 
 DEFAULT_SENSOR = "three-25um-biaxial"
 """Name of the sensor of the demo, and of its released model."""
@@ -37,16 +40,17 @@ def played_radius_mm(sensor: str) -> float:
     return round(float(np.hypot(*corners_mm.T).min()), 2)
 
 
-def show_live_film(address: Address, seconds: float | None, sensor_name: str | None = None) -> None:
+def show_live_film(live: str, seconds: float | None, sensor_name: str | None = None) -> None:
     """Play a virtual sensor, estimate its contacts with a released model, and show the contacts on the live page.
 
     Args:
-        address: Address at which the page listens.
+        live: Value of `--live`: address at which the page listens.
         seconds: Time after which the demo stops, s; None to stop at Ctrl-C.
         sensor_name: Name of the sensor and of its released model; None for `DEFAULT_SENSOR`.
 
     Raises:
         ModelError: If there is no released model with this name.
+        InputError: If the address has another form than PORT or HOST:PORT.
     """
     sensor = sensor_name or DEFAULT_SENSOR
     predictor = Predictor(sensor)
@@ -56,8 +60,7 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
         stack.enter_context(until_stopped())
 
         # The page starts before the film is solved, so that the user can open it meanwhile.
-        metadata = predictor.metadata
-        page = stack.enter_context(live_page(address, token=None, name=sensor, metadata=metadata))
+        page = cast("LivePage", stack.enter_context(live_page(live, sensor, predictor.metadata)))  # `live` is given
         with shown_progress():
             radius_mm = played_radius_mm(sensor)
             forward_map = ForwardMap.build(load_sensor(sensor), Circle(1.0), radius_mm, DEFAULT_PLAYED_FORCE_RANGE)
@@ -67,7 +70,6 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
 
         # A recording that the page begins has every frame, and neither a device file nor a name of the film.
         new_recorder = partial(Recorder, device={})
-        stack.enter_context(warnings_on_page(page))
         feed = PageFeed(page, touch, stream, new_recorder)
 
         say("Ctrl-C stops")

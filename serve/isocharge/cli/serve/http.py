@@ -22,7 +22,7 @@ from isocharge.cli.shared.live_page import (
 from isocharge.cli.shared.terminal import announce, on_signal, say, unless_hung_up, write_stderr
 from isocharge.common.errors import IsochargeError
 from isocharge.common.extras import require
-from isocharge.serve.network.address import Address, Tls, Token, check_exposure
+from isocharge.serve.network.address import Address, Tls, check_exposure
 from isocharge.serve.network.browser_check import BrowserCheck
 from isocharge.serve.network.http import Application, HttpServer
 from isocharge.serve.network.metrics import RequestLog, Traffic
@@ -75,13 +75,12 @@ def http_command(
     Example: isocharge serve http --port 8000
     """
     # Check the options that protect the server.
-    token = given_token(token)
+    secret = given_token(token)
     address = Address(host, port, uds)
     # The gRPC server listens on the host even if the HTTP server listens on a Unix socket.
     most_exposed_address = address if grpc_port is None else Address(host)
-    check_exposure(most_exposed_address, has_token=token is not None)
+    check_exposure(most_exposed_address, has_token=secret is not None)
     tls = given_tls(tls_cert, tls_key)
-    secret = None if token is None else Token(token)
     # Pages of other sites can neither send the token nor reach a Unix socket, so every host name is then accepted.
     browser_check = BrowserCheck(host, allow_host or (), any_host=secret is not None or uds is not None)
 

@@ -21,9 +21,6 @@ from isocharge.cli.shared.live_page import (
     TlsKeyOption,
     TokenOption,
     live_page,
-    page_address,
-    page_tls,
-    warnings_on_page,
 )
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption, WaitOption
 from isocharge.cli.shared.port_hints import no_frames_advice_added, no_frames_hint
@@ -232,8 +229,6 @@ def stream_command(
     """
     if name is not None and not (name and is_printable(name)):
         raise InputError(f"--name: expected printable characters, got {shown(name)}")
-    address = None if live is None else page_address(live, token)  # None for no page
-    tls = page_tls(live, tls_cert, tls_key)
 
     # The options take precedence over the settings of the device file.
     predictor = Predictor(model, models=models)
@@ -250,11 +245,16 @@ def stream_command(
     outputs: Outputs | None = None  # until the port is open
     with ExitStack() as stack:  # closes the contexts in reverse order
         stack.enter_context(until_stopped())
-        page = None
-        if address is not None:
-            page = stack.enter_context(
-                live_page(address, token, touch.frame_id, predictor.metadata, tls=tls, allow_host=allow_host)
-            )
+        page_context = live_page(
+            live,
+            touch.frame_id,
+            predictor.metadata,
+            token=token,
+            tls_cert=tls_cert,
+            tls_key=tls_key,
+            allow_host=allow_host,
+        )
+        page = stack.enter_context(page_context)
         stack.enter_context(timer)
         source = stack.enter_context(open_source(port, baud=baud, reconnect=True, request=board.request, wait=wait))
 
@@ -268,7 +268,6 @@ def stream_command(
         if page is not None:
             # The page must not begin a recording if the command itself records the stream.
             new_recorder = None if recorder else partial(Recorder, device=board.table, name=name)
-            stack.enter_context(warnings_on_page(page))
             writers.append(PageFeed(page, touch, stream, new_recorder).write)
         if recorder:
             stack.enter_context(recorder)
@@ -336,9 +335,6 @@ def replay_command(
 
     Example: isocharge serve replay touch.rec --real-time
     """
-    address = None if live is None else page_address(live, token)
-    tls = page_tls(live, tls_cert, tls_key)
-
     # The model, the board and the name of the film are those of the recording, unless an option replaces them.
     recording = Recording(file)
     folder = find_model(model, models) if model else find_labelled_model(recording.model, models)
@@ -353,21 +349,21 @@ def replay_command(
 
     latencies: deque[float] = deque(maxlen=LATENCIES)
     outputs = command_outputs(output, touch, is_live=False)
-    with until_stopped(), outputs:
-        if address is None:
+    page_context = live_page(
+        live,
+        file.name,
+        predictor.metadata,
+        is_recording=True,
+        token=token,
+        tls_cert=tls_cert,
+        tls_key=tls_key,
+        allow_host=allow_host,
+    )
+    with until_stopped(), page_context as page, outputs:
+        if page is None:
             write_records(play(), [outputs.write], latencies)
         else:
-            page = live_page(
-                address,
-                token,
-                file.name,
-                predictor.metadata,
-                is_recording=True,
-                tls=tls,
-                allow_host=allow_host,
-            )
-            with page as open_page:
-                _play_on_page(play, open_page, PageFeed(open_page, touch), outputs, latencies)
+            _play_on_page(play, page, PageFeed(page, touch), outputs, latencies)
     say(summary(touch, latencies))
     if outputs.has_incomplete_file:
         incomplete = ", ".join(outputs.not_written)

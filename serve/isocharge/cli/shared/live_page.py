@@ -4,9 +4,10 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
+from urllib.parse import urlsplit
 
 import typer
 from msgspec import structs
@@ -28,9 +29,6 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 """Host of the page if `--live` contains only a port."""
-
-MAX_PORT = 65535
-"""Largest number of a TCP port."""
 
 STATE_INTERVAL_S = 0.25
 """Time between two messages with the counters, s."""
@@ -95,90 +93,99 @@ def given_tls(certificate: Path | None, key: Path | None) -> Tls | None:
     return None
 
 
-def page_tls(live: str | None, certificate: Path | None, key: Path | None) -> Tls | None:
-    """Return the TLS files of the live page, or None if there is no certificate.
+def given_token(token: str | None) -> Token | None:
+    """Return the token that the option or the environment contains, or None if there is no token.
+
+    If the environment variable `ISOCHARGE_TOKEN` is empty, the token is an empty text, which is refused. Typer alone
+    would treat an empty token as a missing token.
 
     Raises:
-        InputError: If the key is given without a certificate, or a certificate without a page.
+        InputError: If the token cannot be used.
     """
-    tls = given_tls(certificate, key)
-    if tls is not None and live is None:
-        raise InputError("--tls-cert: expected --live too, because only the page uses TLS, got the certificate alone")
-    return tls
+    text = os.environ.get("ISOCHARGE_TOKEN") if token is None else token
+    return None if text is None else Token(text)
 
 
-def given_token(token: str | None) -> str | None:
-    """Return the token that the option or the environment contains.
-
-    If the environment variable `ISOCHARGE_TOKEN` is empty, the function returns an empty text. Typer alone would treat
-    an empty token as a missing token.
-    """
-    return os.environ.get("ISOCHARGE_TOKEN") if token is None else token
-
-
-def page_address(live: str, token: str | None) -> Address:
+def page_address(live: str) -> Address:
     """Return the address at which the page listens.
 
     Args:
         live: Value of `--live`: PORT or HOST:PORT.
-        token: Value of `--token`; None if the option is not given.
 
     Raises:
-        InputError: If `live` has another form, or if other machines could see the page without a token.
+        InputError: If `live` has another form.
     """
-    host, colon, port = live.rpartition(":")
-    if not colon:  # only a port
-        host = LOOPBACK
-    # The length is checked before the conversion, because `int` refuses very long texts.
-    is_short_number = port.isascii() and port.isdecimal() and len(port) <= len(str(MAX_PORT))
-    is_port = is_short_number and int(port) <= MAX_PORT
-    is_valid_address = host != "" and is_port
-    if not is_valid_address:
-        raise InputError(f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}")
-    bare_host = host.removeprefix("[").removesuffix("]")  # IPv6 addresses are written in brackets
-    address = Address(bare_host, int(port))
-    check_exposure(address, has_token=given_token(token) is not None)
-    return address
+    place = live if ":" in live else f"{LOOPBACK}:{live}"
+    try:
+        url = urlsplit(f"//{place}")
+        if not url.hostname or url.port is None or url.netloc != place:
+            raise ValueError("expected a host and a port")
+        return Address(url.hostname, url.port)
+    except ValueError as error:  # also if the port is no number up to 65535
+        raise InputError(
+            f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}"
+        ) from error
 
 
 @contextmanager
 def live_page(
-    address: Address,
-    token: str | None,
+    live: str | None,
     name: str,
     metadata: ModelMetadata,
     *,
     is_recording: bool = False,
-    tls: Tls | None = None,
+    token: str | None = None,
+    tls_cert: Path | None = None,
+    tls_key: Path | None = None,
     allow_host: Iterable[str] | None = None,
-) -> Iterator["LivePage"]:
+) -> Iterator["LivePage | None"]:
     """Context manager that serves the page of a stream in a separate thread, and prints the address of the page.
 
+    The page also shows the warnings of `isocharge.serve` for some seconds. Without `--live`, the context manager yields
+    None.
+
     Args:
-        address: Address at which the page listens.
-        token: Value of `--token`.
+        live: Value of `--live`; None if the option is not given.
         name: Name of the stream, which the page shows.
         metadata: Metadata of the model that estimates the contacts.
         is_recording: Whether the stream is a recording.
-        tls: Certificate and key; None for no TLS.
-        allow_host: Values of `--allow-host`; None if the option is not given.
+        token: Value of `--token`.
+        tls_cert: Value of `--tls-cert`.
+        tls_key: Value of `--tls-key`.
+        allow_host: Values of `--allow-host`.
 
     Raises:
         MissingExtra: If the extra `http` is not installed.
-        InputError: If a value of `--allow-host` is not a host name, or the token or a TLS file cannot be used.
+        InputError: If the value of an option is wrong, other machines could see the page without a token, or a
+            certificate is given without a page.
         ListenError: If the address is in use or impossible.
     """
+    tls = given_tls(tls_cert, tls_key)
+    if live is None:
+        if tls is not None:
+            raise InputError(
+                "--tls-cert: expected --live too, because only the page uses TLS, got the certificate alone"
+            )
+        yield None
+        return
+    address = page_address(live)
+    secret = given_token(token)
+    check_exposure(address, has_token=secret is not None)
     with require("http"):
         from isocharge.serve.viewer.live_page import LivePage, serve_page
 
-    text = given_token(token)
-    secret = None if text is None else Token(text)
     browser_check = BrowserCheck(address.host, allow_host or (), any_host=secret is not None)
     description = describe_film(name, metadata)
     page = LivePage(description, is_recording=is_recording, token=secret, browser_check=browser_check)
-    with serve_page(page, address, tls) as url:
-        page_name = "replay page" if is_recording else "live page"
-        say(f"{page_name}: {url}")
+    handler = logging.Handler()
+    handler.emit = lambda record: page.update(  # type: ignore[method-assign]
+        note={"text": record.getMessage(), "at": time.time()}
+    )
+    logger = logging.getLogger("isocharge.serve")
+    with serve_page(page, address, tls) as url, ExitStack() as stack:
+        logger.addHandler(handler)
+        stack.callback(logger.removeHandler, handler)
+        say(f"{'replay' if is_recording else 'live'} page: {url}")
         yield page
 
 
@@ -263,18 +270,3 @@ class PageFeed:
         else:
             stream.request_recording(None)
             self._page.update(recording=None)
-
-
-@contextmanager
-def warnings_on_page(page: "LivePage") -> Iterator[None]:
-    """Context manager that shows the warnings of `isocharge.serve` on a page for some seconds."""
-    handler = logging.Handler()
-    handler.emit = lambda record: page.update(  # type: ignore[method-assign]
-        note={"text": record.getMessage(), "at": time.time()}
-    )
-    logger = logging.getLogger("isocharge.serve")
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
