@@ -106,8 +106,9 @@ def test_wrong_charge_tables_are_refused(text, message):
 
 def test_contacts_as_csv_with_flags(film, predictor):
     out = io.StringIO()
-    contacts = predictor.predict_batch(film.charge_pC([1.0, 9.0, 9.0], [0.5, 0.0, 0.0], [1.0, 0.25, 99.0]))
-    write_contacts(contacts, out, predictor.validity)
+    charge_pC = film.charge_pC([1.0, 9.0, 9.0], [0.5, 0.0, 0.0], [1.0, 0.25, 99.0])
+    contacts = predictor.predict_batch(charge_pC)
+    write_contacts(charge_pC, predictor, out)
     header, *rows = (line.split(",") for line in out.getvalue().splitlines())
     assert header == [*Contacts._fields[:7], "flags"]
     assert [row[-1] for row in rows] == ["", "outside", "outside beyond"]
@@ -143,7 +144,7 @@ def test_charges_within_the_noise_get_no_position(charges):
     assert press["force_N"] == pytest.approx(1.0, rel=0.02)
 
     out = io.StringIO()
-    write_contacts(predictor.predict_batch(rows), out, predictor.validity, rows)
+    write_contacts(rows, predictor, out)
     assert out.getvalue().splitlines()[1] == ",,0.000000,,,,,"
 
 

@@ -14,7 +14,7 @@ from isocharge.common.errors import InputError
 from isocharge.common.files import bounded_lines
 from isocharge.serve import Predictor, load_device, read_charges, table_records, write_contacts
 from isocharge.serve.live.device import NoiseRule
-from isocharge.serve.prediction.table import blocks, read_charge_file
+from isocharge.serve.prediction.table import read_charge_file
 
 
 def predict_command(
@@ -51,9 +51,7 @@ def predict_command(
             for record in table_records(charge_pC, predictor):
                 print(record.to_json(), flush=True)  # a reader of a pipe receives each record at once
         else:
-            for index, block in enumerate(blocks(charge_pC)):
-                contacts = predictor.predict_batch(block)
-                write_contacts(contacts, sys.stdout, predictor.validity, block, has_header=index == 0)
+            write_contacts(charge_pC, predictor, sys.stdout)
             sys.stdout.flush()
 
 

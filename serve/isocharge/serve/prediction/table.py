@@ -16,10 +16,9 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ChargeError
-from isocharge.serve.model.contact import Contact, Contacts
+from isocharge.serve.model.contact import Contact
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
-from isocharge.serve.model.validity import Validity
 from isocharge.serve.presses.csv_table import CsvTable
 from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, TableSource, ignored_columns_message
 from isocharge.serve.presses.table_file import open_table
@@ -104,59 +103,29 @@ def _read_electrode_charges(table: NumberTable, electrodes: tuple[str, ...], war
     return np.column_stack([columns.values[name] for name in electrodes])
 
 
-def write_contacts(
-    contacts: Contacts,
-    out: TextIO,
-    validity: Validity | None = None,
-    charge_pC: Array | None = None,
-    *,
-    has_header: bool = True,
-) -> None:
-    """Write contacts as CSV with one row for each press.
+def write_contacts(charge_pC: Array, predictor: Predictor, out: TextIO) -> None:
+    """Write the contacts of a table of charges as CSV, with one row for each press.
 
-    The columns are the attributes of `Contact` without the correlations. Numbers have six decimals.
+    The columns are the attributes of `Contact` without the correlations, and `flags`, in which the flags of a press are
+    separated by blanks. Numbers have six decimals. If the charges of a press do not exceed the noise of the model, its
+    force is 0, and its other cells are empty.
 
     Args:
-        contacts: The contacts of n presses.
+        charge_pC: Charges, shape (n, electrodes), pC.
+        predictor: The model.
         out: Text file to which the rows are written.
-        validity: Domain of the model. If it is given, a column `flags` is added, in which the flags of a press are
-            separated by blanks.
-        charge_pC: Charges of the presses, shape (n, electrodes), pC. If the charges and `validity` are given, a press
-            whose charges do not exceed the noise has the force 0, and its other cells are empty.
-        has_header: Whether the header is written. It is omitted for the second and each further part of a table.
-    """
-    is_touch = np.ones(len(contacts.x_mm), dtype=bool)  # whether each press is a touch; without charges, all are
-    if validity is not None and charge_pC is not None:
-        is_touch = validity.is_touch(charge_pC)
 
+    Raises:
+        ChargeError: If the charges do not fit the model.
+    """
+    names = Contact._fields[:N_WITHOUT_CORRELATION]
     writer = csv.writer(out, lineterminator="\n")
-    names = Contacts._fields[:N_WITHOUT_CORRELATION]
-    header = names if validity is None else (*names, "flags")
-    if has_header:
-        writer.writerow(header)
-
-    rows = np.column_stack(contacts)[:, : len(names)].tolist()
-    flags = [()] * len(rows) if validity is None else validity.batch_flags(contacts)
-    for values, is_press_touch, words in zip(rows, is_touch.tolist(), flags, strict=True):
-        cells = [f"{value:.6f}" for value in values]
-        if not is_press_touch:
-            cells = ["0.000000" if name == "force_N" else "" for name in names]
-        if validity is not None:
-            cells.append(" ".join(words) if is_press_touch else "")
-        writer.writerow(cells)
-
-
-def blocks(rows: Array) -> Iterator[Array]:
-    """Yield successive blocks of `MAX_BATCH` rows of an array. The last block may have fewer rows.
-
-    An array without rows is one empty block. The caller processes only one block at a time, because the model and
-    Python numbers need a hundred times as much memory as the array.
-
-    Args:
-        rows: Array of shape (n, ...).
-    """
-    for start in range(0, max(len(rows), 1), MAX_BATCH):
-        yield rows[start : start + MAX_BATCH]
+    writer.writerow((*names, "flags"))
+    for _, values, flags in _predicted_rows(charge_pC, predictor):
+        if values is None:
+            writer.writerow("0.000000" if name == "force_N" else "" for name in (*names, "flags"))
+        else:
+            writer.writerow((*[f"{value:.6f}" for value in values[: len(names)]], " ".join(flags)))
 
 
 def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
@@ -174,28 +143,44 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
         ChargeError: If the charges do not fit the model.
     """
     metadata = predictor.metadata
-    for block in blocks(charge_pC):
+    for charges, values, flags in _predicted_rows(charge_pC, predictor):
+        yield PredictionRecord(
+            timestamp=None,
+            t_device_us=None,
+            seq=None,
+            **(NO_CONTACT if values is None else dict(zip(Contact._fields, values, strict=True))),
+            contact=values is not None,
+            charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
+            charge_raw_pC=None,
+            tare_pC=None,
+            flags=flags,
+            latency_us=None,
+            model=metadata.label,
+            frame_id=metadata.frame_id,
+        )
+
+
+def _predicted_rows(
+    charge_pC: Array, predictor: Predictor
+) -> Iterator[tuple[list[float], list[float] | None, tuple[str, ...]]]:
+    """Yield the charges, the values of the contact in the order of `Contact`, and the flags of each row of a table.
+
+    The contact is None, without flags, if the charges of the row do not exceed the noise. At most `MAX_BATCH`
+    rows are processed at a time, because the model and Python numbers need a hundred times as much memory as the array.
+
+    Args:
+        charge_pC: Charges, shape (n, electrodes), pC.
+        predictor: The model.
+
+    Raises:
+        ChargeError: If the charges do not fit the model.
+    """
+    for start in range(0, max(len(charge_pC), 1), MAX_BATCH):  # an array without rows is one empty block
+        block = charge_pC[start : start + MAX_BATCH]
         contacts = predictor.predict_batch(block)
         flags_of_rows = predictor.validity.batch_flags(contacts)
-        is_touch_of_rows = predictor.validity.is_touch(block)
-        for row, charges in enumerate(block.tolist()):
-            is_touch = bool(is_touch_of_rows[row])
-            contact_fields = NO_CONTACT
-            if is_touch:
-                # `contacts` contains one array over the rows for each attribute of `Contact`.
-                contact = Contact(*(float(column[row]) for column in contacts))
-                contact_fields = contact._asdict()
-            yield PredictionRecord(
-                timestamp=None,
-                t_device_us=None,
-                seq=None,
-                **contact_fields,
-                contact=is_touch,
-                charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
-                charge_raw_pC=None,
-                tare_pC=None,
-                flags=flags_of_rows[row] if is_touch else (),
-                latency_us=None,
-                model=metadata.label,
-                frame_id=metadata.frame_id,
-            )
+        is_touch_of_rows = predictor.validity.is_touch(block).tolist()
+        values_of_rows = np.asarray(contacts).tolist()
+        rows = zip(block.tolist(), values_of_rows, flags_of_rows, is_touch_of_rows, strict=True)
+        for charges, values, flags, is_touch in rows:
+            yield (charges, values, flags) if is_touch else (charges, None, ())
