@@ -184,7 +184,7 @@ BAD = [
     (
         ("simulate", "point", SENSOR, "--probe", "rectangle:4x0"),
         2,
-        "SceneError: probe height: expected at least 0.001 mm",
+        "SceneError: probe height: expected at least 0.02 mm",
     ),
     (("simulate", "point", SENSOR, "--theory", "magic"), 2, "SceneError: theory: expected one of"),
     (("simulate", "point", SENSOR, "--accuracy", "0"), 2, "InputError: --accuracy: expected"),
