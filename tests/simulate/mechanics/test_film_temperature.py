@@ -70,5 +70,5 @@ def test_sensor_file_contains_expansion_coefficients(tmp_path):
 
 
 def test_expansion_in_ppm_instead_of_1_per_K_is_refused():
-    with pytest.raises(SensorError, match=r"film expansion: expected -1000 to 1000 ppm/K, got 1e\+08 ppm/K"):
+    with pytest.raises(SensorError, match=r"film.expansion_ppm_per_K: expected -1000 to 1000 ppm/K, got 1e\+08 ppm/K"):
         film_with(expansion=(100.0, 100.0))

@@ -158,7 +158,7 @@ class DesignCase:
         if self.sensor.readout != "edge":
             return
         for electrode in self.kept_electrodes:
-            if electrode.square and abs(_side_of(electrode) - self.square_side) > 1e-6:  # allows for rounding errors
+            if electrode.side is not None and abs(electrode.side - self.square_side) > 1e-6:  # rounding errors
                 raise InputError(
                     f"side: with the readout 'edge' all squares have one side, got {self.square_side:g} mm"
                 )
@@ -172,10 +172,8 @@ class DesignCase:
         """
         if self.side is not None:
             return float(self.side)
-        squares = [electrode for electrode in self.sensor.electrodes if electrode.square]
-        if not squares:
-            return DEFAULT_SIDE
-        return _side_of(squares[0])
+        sides = (electrode.side for electrode in self.sensor.electrodes)
+        return next((side for side in sides if side is not None), DEFAULT_SIDE)
 
     @property
     def kept_electrodes(self) -> tuple[Electrode, ...]:
@@ -317,9 +315,3 @@ class DesignCase:
             "rim_mm": self.rim,
             "seed": self.seed,
         }
-
-
-def _side_of(square: Electrode) -> float:
-    """Return the side of a square electrode, mm."""
-    lower_left, lower_right, *_ = square.corners
-    return float(lower_right[0] - lower_left[0])

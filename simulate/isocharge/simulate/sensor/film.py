@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -13,31 +13,43 @@ from isocharge.simulate.sensor.size_check import check_range
 Surface = Literal["middle", "top", "bottom"]
 """Surface at which the stress of the film is read. The top is the surface that the probe touches."""
 
-FILM_LIMITS = {
-    "radius": (1.0, math.inf, "mm"),
-    "thickness": (1e-4, math.inf, "mm"),
-    "young": (1.0, 1e6, "MPa"),  # from a soft rubber to nearly diamond
-    "poisson": (0.0, 0.4999, ""),
-    "pretension": (-10.0, 300.0, "MPa"),  # a slack film wrinkles; stretched PVDF breaks
-    "(T11 - T22) / 2": (-300.0, 300.0, "MPa"),
-    "T12": (-300.0, 300.0, "MPa"),
-    "young, E1 / E2": (0.1, 10.0, ""),  # the solver has been tested in this range
-    "shear": (1.0, 1e6, "MPa"),
-    "axis": (-math.inf, math.inf, "rad"),
-    "oval": (-0.1, 0.1, ""),  # the mesh has been tested in this range
-    "oval_axis": (-math.inf, math.inf, "rad"),
-    "back_volume": (1.0, math.inf, "mm^3"),
-    "static_pressure": (-1e4, 1e4, "Pa"),  # a film of 25 um bulges by several millimetres
-    "expansion": (-1e3, 1e3, "ppm/K"),
-    "ring_expansion": (-1e3, 1e3, "ppm/K"),
+
+class FilmNumber(NamedTuple):
+    """Unit and accepted range of a property of a film in a sensor file.
+
+    Attributes:
+        key: Key of the section `film`, which contains the unit. Some keys belong to several properties.
+        unit: Unit of the value in the file.
+        factor: Value in the file divided by the value of the attribute of `Film`.
+        smallest: Smallest accepted value, in the unit of the file.
+        largest: Largest accepted value, in the unit of the file.
+    """
+
+    key: str
+    unit: str
+    factor: float
+    smallest: float
+    largest: float
+
+
+FILM_NUMBERS = {
+    "radius": FilmNumber("radius_mm", "mm", 1.0, 1.0, math.inf),
+    "thickness": FilmNumber("thickness_um", "um", 1e3, 0.1, math.inf),
+    "young": FilmNumber("young_GPa", "GPa", 1e-3, 1e-3, 1e3),  # from a soft rubber to nearly diamond
+    "young_ratio": FilmNumber("young_GPa, E1 / E2", "", 1.0, 0.1, 10.0),  # the solver has been tested in this range
+    "poisson": FilmNumber("poisson", "", 1.0, 0.0, 0.4999),
+    "pretension": FilmNumber("pretension_MPa", "MPa", 1.0, -10.0, 300.0),  # slack wrinkles; stretched PVDF breaks
+    "deviator": FilmNumber("pretension_MPa, (T11 - T22) / 2 and T12", "MPa", 1.0, -300.0, 300.0),
+    "shear": FilmNumber("shear_GPa", "GPa", 1e-3, 1e-3, 1e3),
+    "axis": FilmNumber("axis_deg", "deg", math.degrees(1.0), -math.inf, math.inf),
+    "oval": FilmNumber("oval", "", 1.0, -0.1, 0.1),  # the mesh has been tested in this range
+    "oval_axis": FilmNumber("oval_axis_deg", "deg", math.degrees(1.0), -math.inf, math.inf),
+    "back_volume": FilmNumber("back_volume_mm3", "mm^3", 1.0, 1.0, math.inf),
+    "static_pressure": FilmNumber("static_pressure_Pa", "Pa", 1e6, -1e4, 1e4),  # a film of 25 um bulges by millimetres
+    "expansion": FilmNumber("expansion_ppm_per_K", "ppm/K", 1e6, -1e3, 1e3),
+    "ring_expansion": FilmNumber("ring_expansion_ppm_per_K", "ppm/K", 1e6, -1e3, 1e3),
 }
-"""Smallest and largest accepted value of each property of a film, and its unit.
-
-Smaller lengths and volumes were probably given in metres, and larger stresses in pascals.
-"""
-
-UNIT_FACTORS = {"Pa": 1e6, "ppm/K": 1e6}
-"""Factors that convert a value in MPa or 1/K into a unit of `FILM_LIMITS`. All other units are those of `Film`."""
+"""Unit and accepted range of each attribute of `Film`. The sensor file is read and written according to this table."""
 
 PIEZO_LIMITS = (1e-3, 1e5)
 """Smallest accepted magnitude of a coefficient that is not zero, and largest magnitude, pC/N or pC/(mm^2 K).
@@ -147,18 +159,16 @@ class Film:
         Raises:
             SensorError: If a property is outside its accepted range.
         """
-        half_difference, shear_tension = self.deviator
-        other_names = {"young, E1 / E2": self.young_ratio, "(T11 - T22) / 2": half_difference, "T12": shear_tension}
-        values = {**vars(self), **other_names}
-        for name, (low, high, unit) in FILM_LIMITS.items():
-            value = values[name]
-            for number in value if isinstance(value, tuple) else (value,):
-                if number is not None:  # an optional property
-                    value_in_unit = number * UNIT_FACTORS.get(unit, 1.0)
-                    check_range(f"film {name}", value_in_unit, (low, high), unit, SensorError)
+        for attribute, number in FILM_NUMBERS.items():
+            value = getattr(self, attribute)
+            for component in value if isinstance(value, tuple) else (value,):
+                if component is not None:  # an optional property
+                    limits = (number.smallest, number.largest)
+                    value_in_file = component * number.factor
+                    check_range(f"film.{number.key}", value_in_file, limits, number.unit, SensorError)
         if self.thickness > 0.1 * self.radius:
             raise SensorError(
-                f"film thickness: expected at most a tenth of the radius ({self.radius:g} mm), "
+                f"film.thickness_um: expected at most a tenth of the radius ({self.radius:g} mm), "
                 f"got {self.thickness:.6g} mm; this is a solid, not a film"
             )
 

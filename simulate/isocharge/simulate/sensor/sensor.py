@@ -8,7 +8,7 @@ the direction of the push. The units are mm, N, MPa and pC.
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import combinations
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import shapely
@@ -107,14 +107,9 @@ class Electrode:
         Returns:
             The electrode, whose corners start at the lower left corner.
         """
-        x, y = centre
-        half_side = 0.5 * side
-        left = x - half_side
-        right = x + half_side
-        bottom = y - half_side
-        top = y + half_side
-        corners = ((left, bottom), (right, bottom), (right, top), (left, top))
-        return cls(name, corners)
+        directions = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+        corners = np.array(centre) + 0.5 * side * directions
+        return cls(name, _as_tuples(corners.tolist()))
 
     def with_trace(self, path: Corners, width: float) -> "Electrode":
         """Return a copy of the electrode with an additional trace on the front.
@@ -127,19 +122,23 @@ class Electrode:
             SensorError: If the path has fewer than two points or repeats a point, or if the trace crosses itself.
         """
         outline = to_corners(trace_outline(to_complex(np.array(path)), width))
-        polygon = tuple((float(x), float(y)) for x, y in outline)
+        polygon = _as_tuples(outline.tolist())
         check_polygon(f"trace of electrode {self.name!r}", polygon)
         return replace(self, more=(*self.more, polygon))
 
     @cached_property
-    def square(self) -> bool:
-        """Whether the electrode is like one that `of_square` creates. The edge readout accepts only such electrodes."""
+    def side(self) -> float | None:
+        """Side of an electrode that is like one that `of_square` creates, mm; None for all other electrodes.
+
+        The edge readout accepts only such squares.
+        """
         if self.more or self.back or len(self.corners) != 4:
-            return False
+            return None
         (left, _), (right, _), *_ = self.corners
         side = right - left
         square = Electrode.of_square(self.name, self.centre, side)
-        return side > 0.0 and np.allclose(self.corners, square.corners, rtol=0.0, atol=1e-9 * side)
+        is_square = side > 0.0 and np.allclose(self.corners, square.corners, rtol=0.0, atol=1e-9 * side)
+        return side if is_square else None
 
     @property
     def front(self) -> tuple[Corners, ...]:
@@ -324,7 +323,7 @@ class Sensor:
         _check_layout(self.electrodes)
         for electrode in self.electrodes:
             _check_on_film(electrode, self.film, self.calibration)
-            if self.readout == "edge" and not electrode.square:
+            if self.readout == "edge" and electrode.side is None:
                 raise SensorError(f"readout 'edge' needs square electrodes, but {electrode.name!r} is a polygon")
 
     @property
@@ -370,7 +369,7 @@ def electrode_index(sensor: Sensor, name: str) -> int:
     return sensor.electrode_names.index(name)
 
 
-def _as_tuples(value: object) -> object:
+def _as_tuples(value: Any) -> Any:
     """Convert nested lists and arrays into nested tuples, which can be compared and hashed.
 
     All other values are returned unchanged.
@@ -439,24 +438,16 @@ def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -
     """
     placed_corners = calibration.place(np.concatenate(electrode.collecting_polygons))  # shape (n, 2), mm
     corner_angle = np.arctan2(placed_corners[:, 1], placed_corners[:, 0])
-    if (np.linalg.norm(placed_corners, axis=1) < film.rim_distance(corner_angle)).all():
-        return
-
-    # Describe the position and the size of the electrode in the error message.
-    centre = placed_corners.mean(axis=0)
-    x, y = centre
-    if electrode.square:
-        (left, _), (right, _), *_ = electrode.corners
-        extent = f"half side {_short_text(0.5 * (right - left))} mm"
-    else:
-        farthest = np.linalg.norm(placed_corners - centre, axis=1).max()
-        extent = f"corners up to {_short_text(farthest)} mm from it"
-    hint = "; end its traces before the rim" if electrode.more else ""
-    rim_distance = float(film.rim_distance(np.arctan2(y, x)))  # in the direction of the electrode
-    raise SensorError(
-        f"electrode {electrode.name!r} lies outside the film: centre ({_short_text(x)}, {_short_text(y)}) mm, "
-        f"{extent}, film radius {_short_text(rim_distance)} mm{hint}"
-    )
+    rim_distance = film.rim_distance(corner_angle)
+    margin = rim_distance - np.linalg.norm(placed_corners, axis=1)
+    if not (margin > 0.0).all():
+        worst = np.argmin(margin)
+        x, y = placed_corners[worst]
+        hint = "; end its traces before the rim" if electrode.more else ""
+        raise SensorError(
+            f"electrode {electrode.name!r} lies outside the film: corner ({x:.6g}, {y:.6g}) mm, film radius "
+            f"{rim_distance[worst]:.6g} mm{hint}"
+        )
 
 
 def check_polygon(where: str, polygon: Corners) -> None:
@@ -482,8 +473,3 @@ def check_polygon(where: str, polygon: Corners) -> None:
             f"{where}: expected a polygon that does not cross itself, with its corners anticlockwise, got "
             f"{shown(corners.tolist())} mm"
         )
-
-
-def _short_text(value: float) -> str:
-    """Return a number as text with at most six significant digits. The text is for error messages."""
-    return str(float(f"{value:.6g}"))

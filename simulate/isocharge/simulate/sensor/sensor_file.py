@@ -28,8 +28,8 @@ from isocharge.common.structs import (
     read_toml,
 )
 from isocharge.common.toml_text import to_toml
-from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, FILM_LIMITS, Film, Piezo, Surface
-from isocharge.simulate.sensor.sensor import Calibration, Corners, Electrode, Readout, Sensor
+from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, FILM_NUMBERS, Film, Piezo, Surface
+from isocharge.simulate.sensor.sensor import Calibration, Electrode, Readout, Sensor
 from isocharge.simulate.sensor.size_check import tidy
 
 MAX_COORDINATE_mm = 1e6
@@ -43,23 +43,18 @@ SIDE = "side_mm"
 Coordinate = Annotated[float, Meta(ge=-MAX_COORDINATE_mm, le=MAX_COORDINATE_mm)]
 Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm, each at most {MAX_COORDINATE_mm:g}")]
 
-
-MIN_THICKNESS_um = 1e3 * FILM_LIMITS["thickness"][0]
-THICKNESS = f"at least {MIN_THICKNESS_um:g} um"
-MIN_YOUNG_GPa, MAX_YOUNG_GPa = (1e-3 * limit for limit in FILM_LIMITS["young"][:2])
-MODULUS = f"a modulus from {MIN_YOUNG_GPa:g} to {MAX_YOUNG_GPa:g} GPa (PVDF: 1 to 9 GPa)"
-Modulus_GPa = Annotated[float, Meta(ge=MIN_YOUNG_GPa, le=MAX_YOUNG_GPa, description=MODULUS)]
+Length = Annotated[float, Meta(gt=0.0, le=MAX_COORDINATE_mm)]
 
 
 class FilmTable(Settings, frozen=True):
     """Content of the section `film` of a sensor file, with the mechanical properties of the film."""
 
-    radius_mm: Annotated[float, Meta(gt=0.0, le=MAX_COORDINATE_mm)]
-    thickness_um: Annotated[float, Meta(ge=MIN_THICKNESS_um, le=MAX_COORDINATE_mm, description=THICKNESS)]
-    young_GPa: Modulus_GPa | Annotated[list[Modulus_GPa], Meta(min_length=2, max_length=2)]
+    radius_mm: Length
+    thickness_um: Length
+    young_GPa: Positive | Annotated[list[Positive], Meta(min_length=2, max_length=2)]
     poisson: Finite
     pretension_MPa: Finite | Annotated[list[Finite], Meta(min_length=3, max_length=3)] = 0.0
-    shear_GPa: Modulus_GPa | None = None
+    shear_GPa: Positive | None = None
     axis_deg: Finite = 0.0
     oval: Finite = 0.0
     oval_axis_deg: Finite = 0.0
@@ -69,23 +64,11 @@ class FilmTable(Settings, frozen=True):
     ring_expansion_ppm_per_K: Finite = 1e6 * ALUMINIUM_EXPANSION
 
 
-FILM_ATTRIBUTES = {
-    "radius_mm": ("radius", 1.0),
-    "thickness_um": ("thickness", 1e3),
-    "poisson": ("poisson", 1.0),
-    "shear_GPa": ("shear", 1e-3),
-    "axis_deg": ("axis", math.degrees(1.0)),
-    "oval": ("oval", 1.0),
-    "oval_axis_deg": ("oval_axis", math.degrees(1.0)),
-    "back_volume_mm3": ("back_volume", 1.0),
-    "static_pressure_Pa": ("static_pressure", 1e6),
-    "ring_expansion_ppm_per_K": ("ring_expansion", 1e6),
-}
-"""Attribute of `Film` for each key of the section `film` with one number, and its unit in units of the key."""
-
-
 class PiezoTable(Settings, frozen=True):
-    """Content of the section `piezo` of a sensor file. The piezoelectric coefficients are in pC/N."""
+    """Content of the section `piezo` of a sensor file, in the order of the attributes of `Piezo`.
+
+    The piezoelectric coefficients are in pC/N.
+    """
 
     d31: Finite
     d32: Finite
@@ -208,13 +191,12 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
         SensorError: If a key or a value is invalid.
     """
     file = convert(table, SensorTable, where, SensorError)
-    piezo = file.piezo
     calibration = file.calibration
     with error_prefix(f"{where}: ", SensorError):
         return Sensor(
             name=file.name,
             film=_film(file.film),
-            piezo=Piezo(piezo.d31, piezo.d32, piezo.d33, piezo.pyro_uC_per_m2_K, piezo.d12),
+            piezo=Piezo(*msgspec.structs.astuple(file.piezo)),
             electrodes=tuple(_electrodes(file.electrodes)),
             readout=file.readout,
             surface=file.surface,
@@ -238,7 +220,6 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
     Raises:
         SensorError: If a sensor file cannot describe the sensor.
     """
-    piezo = sensor.piezo
     calibration = sensor.calibration
     return {
         "name": sensor.name,
@@ -246,16 +227,14 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
         "surface": sensor.surface,
         "film": film_to_dict(sensor.film),
         "piezo": {
-            "d31": tidy(piezo.d31),
-            "d32": tidy(piezo.d32),
-            "d33": tidy(piezo.d33),
-            "pyro_uC_per_m2_K": tidy(piezo.pyro),
-            **({"d12": tidy(piezo.d12)} if piezo.d12 else {}),
+            key: tidy(coefficient)
+            for key, coefficient in zip(PiezoTable.__struct_fields__, vars(sensor.piezo).values(), strict=True)
+            if key != "d12" or coefficient
         },
         "electrodes": _electrode_tables(sensor),
         "calibration": {
             "gain": dict(calibration.gain),
-            "shift_mm": [tidy(value) for value in calibration.shift],
+            "shift_mm": _tidy_all(calibration.shift),
             "rotation_deg": tidy(float(np.rad2deg(calibration.rotation))),
             **({"crosstalk": tidy(calibration.crosstalk)} if calibration.crosstalk else {}),
         },
@@ -271,28 +250,32 @@ def film_to_dict(film: Film) -> dict[str, Any]:
     Args:
         film: Film to be converted.
     """
-    numbers = {
-        key: None if getattr(film, attribute) is None else tidy(getattr(film, attribute) * unit)
-        for key, (attribute, unit) in FILM_ATTRIBUTES.items()
-    }
     half_difference, shear_tension = film.deviator
     tension = (film.pretension + half_difference, film.pretension - half_difference, shear_tension)
 
     # If E is the geometric mean of the moduli and r^2 = E1 / E2, the moduli are E1 = E r and E2 = E / r.
     root_of_ratio = math.sqrt(film.young_ratio)
-    moduli = (1e-3 * film.young * root_of_ratio, 1e-3 * film.young / root_of_ratio)
-    table: dict[str, Any] = {
-        "radius_mm": numbers.pop("radius_mm"),
-        "thickness_um": numbers.pop("thickness_um"),
-        "young_GPa": tidy(moduli[0]) if film.young_ratio == 1.0 else [tidy(modulus) for modulus in moduli],
-        "poisson": numbers.pop("poisson"),
-        "pretension_MPa": [tidy(part) for part in tension] if any(film.deviator) else tidy(film.pretension),
+    moduli = (film.young * root_of_ratio, film.young / root_of_ratio)
+    values: dict[str, Any] = {
+        **vars(film),
+        "young": film.young if film.young_ratio == 1.0 else moduli,
+        "pretension": tension if any(film.deviator) else film.pretension,
     }
-    default_of_key: dict[str, Any] = {field.name: field.default for field in msgspec.structs.fields(FilmTable)}
-    if film.expansion is not None:
-        table["expansion_ppm_per_K"] = [tidy(1e6 * coefficient) for coefficient in film.expansion]
-        del default_of_key["ring_expansion_ppm_per_K"]  # a film that expands is always written with its ring
-    return table | {key: number for key, number in numbers.items() if number != default_of_key.get(key)}
+    table: dict[str, Any] = {}
+    for attribute, number in FILM_NUMBERS.items():
+        value = values[attribute]
+        if isinstance(value, tuple):
+            table[number.key] = [tidy(component * number.factor) for component in value]
+        elif value is not None:
+            table[number.key] = tidy(value * number.factor)
+
+    # The pretension is always written, and the expansion of the ring for a film that expands.
+    always = {"pretension_MPa"} if film.expansion is None else {"pretension_MPa", "ring_expansion_ppm_per_K"}
+    return {
+        field.name: table[field.name]
+        for field in msgspec.structs.fields(FilmTable)
+        if field.name in table and (field.name in always or table[field.name] != field.default)
+    }
 
 
 def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
@@ -347,11 +330,7 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
     Raises:
         SensorError: If the readout requires squares, and the sides of the squares differ.
     """
-    squares = [electrode for electrode in sensor.electrodes if electrode.square]
-    sides = {}
-    for square in squares:
-        lower_left, lower_right, *_ = square.corners
-        sides[square.name] = tidy(lower_right[0] - lower_left[0])
+    sides = {electrode.name: tidy(electrode.side) for electrode in sensor.electrodes if electrode.side is not None}
     if sensor.readout == "edge" and len(set(sides.values())) > 1:
         raise SensorError(
             f"readout 'edge' needs squares, and in a sensor file all squares have one side: got {sides} mm"
@@ -361,29 +340,20 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
     if shared_side is not None:
         tables[SIDE] = shared_side
     for electrode in sensor.electrodes:
-        if electrode.square and sides[electrode.name] == shared_side:
-            tables[electrode.name] = [tidy(value) for value in electrode.centre]
+        if electrode.name in sides and sides[electrode.name] == shared_side:
+            tables[electrode.name] = _tidy_all(electrode.centre)
         else:
-            tables[electrode.name] = _polygon_table(electrode)
+            polygons = {"more_mm": electrode.more, "back_mm": electrode.back}
+            tables[electrode.name] = {
+                "polygon_mm": _tidy_all(electrode.corners),
+                **{key: _tidy_all(value) for key, value in polygons.items() if value},
+            }
     return tables
 
 
-def _polygon_table(electrode: Electrode) -> dict[str, Any]:
-    """Convert an electrode into a table of polygons for the section `electrodes` of a sensor file.
-
-    The table contains traces as polygons.
-    """
-    table: dict[str, Any] = {"polygon_mm": _corners(electrode.corners)}
-    if electrode.more:
-        table["more_mm"] = [_corners(polygon) for polygon in electrode.more]
-    if electrode.back:
-        table["back_mm"] = [_corners(polygon) for polygon in electrode.back]
-    return table
-
-
-def _corners(polygon: Corners) -> list[list[float]]:
-    """Return the corners (x, y) of a polygon as lists of rounded numbers, mm."""
-    return [[tidy(value) for value in corner] for corner in polygon]
+def _tidy_all(values: Any) -> Any:
+    """Round all numbers of nested tuples, and return them as nested lists."""
+    return [_tidy_all(value) for value in values] if isinstance(values, tuple) else tidy(values)
 
 
 def _film(table: FilmTable) -> Film:
@@ -400,35 +370,28 @@ def _film(table: FilmTable) -> Film:
     """
     # Young's moduli along both axes, and their geometric mean. The mean of equal values is not computed, because it
     # would have a rounding error.
-    if isinstance(table.young_GPa, list):
-        young_1, young_2 = table.young_GPa
-    else:
-        young_1 = young_2 = table.young_GPa
-    mean_young = young_1 if young_1 == young_2 else float(np.sqrt(young_1 * young_2))
+    values: dict[str, Any] = msgspec.structs.asdict(table)
+    young_1, young_2 = _along_axes(table.young_GPa)
+    values["young_GPa"] = young_1 if young_1 == young_2 else math.sqrt(young_1 * young_2)
 
     # Components of the pretension, and the mean of the components along x and y
-    if isinstance(table.pretension_MPa, list):
-        tension_11, tension_22, tension_12 = table.pretension_MPa
-    else:
-        tension_11 = tension_22 = table.pretension_MPa
-        tension_12 = 0.0
-    mean_tension = tension_11 if tension_11 == tension_22 else 0.5 * (tension_11 + tension_22)
-
+    tension_11, tension_22, tension_12, *_ = [*_along_axes(table.pretension_MPa), 0.0]
+    values["pretension_MPa"] = tension_11 if tension_11 == tension_22 else 0.5 * (tension_11 + tension_22)
     numbers: dict[str, Any] = {
-        attribute: None if getattr(table, key) is None else getattr(table, key) / unit
-        for key, (attribute, unit) in FILM_ATTRIBUTES.items()
+        attribute: values[number.key] / number.factor
+        for attribute, number in FILM_NUMBERS.items()
+        if isinstance(values.get(number.key), float)
     }
-    expansion = table.expansion_ppm_per_K
-    if isinstance(expansion, float):
-        expansion = [expansion, expansion]
-    return Film(
-        young=1e3 * mean_young,
-        pretension=mean_tension,
-        deviator=(0.5 * (tension_11 - tension_22), tension_12),
-        young_ratio=young_1 / young_2,
-        expansion=None if expansion is None else (expansion[0] / 1e6, expansion[1] / 1e6),
-        **numbers,
-    )
+    if table.expansion_ppm_per_K is not None:
+        along, across = _along_axes(table.expansion_ppm_per_K)
+        numbers["expansion"] = (along / 1e6, across / 1e6)
+    deviator = (0.5 * (tension_11 - tension_22), tension_12)
+    return Film(**numbers, deviator=deviator, young_ratio=young_1 / young_2)
+
+
+def _along_axes(value: float | list[float]) -> list[float]:
+    """Return the components of a property along both axes, which are equal if the file contains one number."""
+    return value if isinstance(value, list) else [value, value]
 
 
 def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:

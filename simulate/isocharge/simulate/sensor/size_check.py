@@ -4,6 +4,9 @@ import math
 
 from isocharge.common.errors import InputError
 
+OTHER_UNITS = {"mm": ("m", 1e3), "um": ("mm", 1e3), "MPa": ("Pa", 1e-6), "GPa": ("MPa", 1e-3)}
+"""For some units, another unit in which a value is easily given by mistake, and the factor that converts the value."""
+
 
 def tidy(value: float) -> float:
     """Round a number to twelve significant digits, in order to remove the rounding errors of unit conversions."""
@@ -13,7 +16,7 @@ def tidy(value: float) -> float:
 def check_range(what: str, value: float, allowed: tuple[float, float], unit: str, error: type[InputError]) -> None:
     """Raise an error if a quantity is infinite or outside its accepted range.
 
-    The message converts a length that was probably given in metres, and a stress that was probably given in pascals.
+    If the value was probably given in a unit of `OTHER_UNITS`, the message converts it.
 
     Args:
         what: Name of the quantity in the error message.
@@ -29,10 +32,9 @@ def check_range(what: str, value: float, allowed: tuple[float, float], unit: str
     if low <= value <= high and math.isfinite(value):
         return
     hint = ""
-    if unit == "mm" and 0.0 < value < low:
-        hint = f"; {value:.6g} m are {1e3 * value:.6g} mm"
-    if unit == "MPa" and high < value < math.inf:
-        hint = f"; {value:.6g} Pa are {1e-6 * value:.6g} MPa"
+    other_unit, factor = OTHER_UNITS.get(unit, ("", math.nan))
+    if low <= factor * value <= high:
+        hint = f"; {value:.6g} {other_unit} are {factor * value:.6g} {unit}"
     expected = f"at least {low:g}" if high == math.inf else f"{low:g} to {high:g}"
     space = " " if unit else ""
     raise error(f"{what}: expected {expected}{space}{unit}, got {value:.6g}{space}{unit}{hint}")
