@@ -3,19 +3,8 @@
 import json
 
 import numpy as np
-import pytest
 
-from isocharge.common.json_values import finite_or_none, plain_values
-
-
-@pytest.mark.parametrize(
-    ("value", "expected"),
-    [(1.5, 1.5), (0, 0.0), (np.float32(0.5), 0.5), (np.nan, None), (np.inf, None), (-np.inf, None), (None, None)],
-)
-def test_a_number_that_is_not_finite_is_none(value, expected):
-    plain = finite_or_none(value)
-    assert plain == expected
-    assert type(plain) is type(expected)
+from isocharge.common.json_values import plain_values
 
 
 def test_nested_values_become_json():

@@ -284,7 +284,7 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     """The sweep, the training and the maps are replaced. The errors are those on the card of the released model."""
     figures, released, out = [], find_model(SENSOR), tmp_path / "first-light"
     for name, stub in {
-        "SAMPLES": 40,
+        "N_SIMULATED_PRESSES": 40,
         "solve_maps": partial(kept, solve_maps),
         "fit": lambda *_: None,
         "release": lambda _, folder, **__: load_model(shutil.copytree(released, folder / "1")),

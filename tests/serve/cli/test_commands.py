@@ -73,13 +73,6 @@ def test_check_of_a_film_that_fits(measured, models, command):
     assert lines[-1].split() == ["verdict", "fits:", "noise", "explains", "the", "errors"]
 
 
-def test_check_of_a_film_that_does_not_fit_and_of_too_few_presses(measured, models, command):
-    code, out, _ = command("serve", "check", "linear", measured(scale=0.9), "--models", models)
-    assert (code, "forces are 1.111 +- 0.0041 times the measured ones" in out) == (1, True)
-    code, out, _ = command("serve", "check", "linear", measured(count=1), "--models", models)
-    assert (code, "too few presses to say" in out) == (1, True)
-
-
 def test_check_options_position_std_and_force_std(measured, models, command):
     words = ["serve", "check", "linear", measured(scale=0.97), "--models", models, "--json"]
     assert [command(*words, "--force-std", share)[0] for share in (0.01, 0.05)] == [1, 0]

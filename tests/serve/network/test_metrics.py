@@ -44,21 +44,6 @@ def value(samples, name, **labels):
     return samples[(f"isocharge_{name}", *sorted(labels.items()))]
 
 
-def test_requests_are_counted_by_route_and_status(handler):
-    for path, content in ((INFER, body([1, 2, 3])), (INFER, body([1, 2])), (INFER, b"{"), ("/v2", b""), ("/nope", b"")):
-        handler.answer("GET" if path == "/v2" else "POST", path, [], content)
-    samples = scrape(handler)
-    infer = {"transport": "http", "route": "/v2/models/{model}/infer"}
-    for count, labels in (
-        (1, infer | {"status": "200"}),
-        (2, infer | {"status": "400"}),
-        (1, {"transport": "http", "route": "/v2", "status": "200"}),
-        (1, {"transport": "http", "route": "unknown", "status": "404"}),
-    ):
-        assert value(samples, "requests_total", **labels) == count
-    assert value(samples, "inferences_refused_total", model="linear", version="2") == 2
-
-
 def test_clients_cannot_create_series(handler):
     """The number of series stays small with any number of paths, models, versions and methods."""
     rng = np.random.default_rng(0)
@@ -128,20 +113,3 @@ def test_metrics_need_the_token(store):
 
 
 BEARER = [(b"authorization", b"Bearer yes")]
-
-
-def test_health_ready_states_the_reason(film, tmp_path):
-    """The answer needs no token, and therefore names no files. The index, which needs it, has the reasons."""
-    film.write(tmp_path)
-    (film.write(tmp_path, version=2) / "golden.json").unlink()
-    handler = Handler(open_model_store(tmp_path), token=Token("yes"))
-    assert handler.answer("GET", "/v2/health/ready", [], b"").body == b'{"ready":true}'
-    handler.answer("POST", "/v2/repository/models/linear/unload", BEARER, b"")
-    status, _, body, _ = handler.answer("GET", "/v2/health/ready", [], b"")
-    assert status == 400
-    assert "no model is loaded" in json.loads(body)["error"]
-    (tmp_path / "linear/1/golden.json").unlink()
-    handler.answer("POST", "/v2/repository/models/linear/load", BEARER, b"")
-    rows = json.loads(handler.answer("POST", "/v2/repository/index", BEARER, b"").body)
-    assert all("golden.json: missing" in row["reason"] for row in rows)
-    assert handler.answer("POST", "/v2/repository/index", [], b"").status == 401

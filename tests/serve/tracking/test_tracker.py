@@ -226,18 +226,6 @@ def test_touch_continues_if_the_clock_is_set_back():
     assert track(tracker, None, 50.2) == (None, "release")
 
 
-@pytest.mark.parametrize("set_back_s", [0.002, 0.1, 50.0])
-def test_tracked_contact_is_correct_directly_after_the_clock_was_set_back(set_back_s):
-    """The filter begins again, so that the first tracked contact is the contact of the frame."""
-    tracker = new_tracker()
-    update_all(tracker, noisy_contacts(slide(50.0)[0][:450]), begin_s=100.0)
-    contact, *_ = noisy_contacts([2.0 + 1.0j])
-    tracked, _ = track(tracker, contact, 100.449 - set_back_s)
-    assert (tracked.x_mm, tracked.y_mm) == pytest.approx((contact.x_mm, contact.y_mm), abs=1e-9)
-    assert (tracked.x_std_mm, tracked.y_std_mm) == pytest.approx((STD, STD), rel=1e-6)
-    assert all(math.isfinite(value) for value in structs.astuple(tracked))
-
-
 @pytest.mark.parametrize("frames_per_time", [2, 10])
 def test_frames_with_the_same_time_are_smoothed(frames_per_time):
     """A board without a clock sends ten frames in a chunk, or a board at 2 kHz states its time in milliseconds."""

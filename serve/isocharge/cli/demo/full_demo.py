@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from isocharge.cli.demo.live_film import DEFAULT_SENSOR, played_radius_mm
+from isocharge.cli.shared.forward_maps import N_SIMULATED_PRESSES
 from isocharge.cli.shared.terminal import say, show_result, shown_progress, this_command
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.arrays import Array
@@ -31,15 +32,6 @@ from isocharge.simulate.plots.film import (
 from isocharge.train import fit, load_config, release
 from isocharge.train.data.contact_errors import position_error
 
-SAMPLES = 24_000
-"""Number of presses on which the model is trained."""
-
-SEED = 0
-"""Seed of the presses of training and of the live part."""
-
-RATE_HZ = 200.0
-"""Frames per second of the virtual sensor, Hz."""
-
 LIVE_S = 10.0
 """Duration of the live part, s."""
 
@@ -60,7 +52,7 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
     folder = output or Path("demo-output")
     sensor = load_sensor(sensor_name or DEFAULT_SENSOR)
     probe = Circle(1.0)
-    sweep = Sweep(played_radius_mm(sensor.name), samples=SAMPLES, seed=SEED)
+    sweep = Sweep(played_radius_mm(sensor.name), samples=N_SIMULATED_PRESSES)
     durations_s: dict[str, float] = {}
     with new_folder(folder) as draft:
         with _demo_step(
@@ -78,7 +70,7 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
             predictor = Predictor(model.folder)
         with _demo_step(
             "serve",
-            f"a virtual sensor sends {RATE_HZ:g} frames/s over a pseudo-terminal, the model answers live",
+            "a virtual sensor sends frames over a pseudo-terminal, the model answers live",
             durations_s,
         ):
             followed, totals = _follow_live(forward_map, predictor, seconds or LIVE_S)
@@ -121,17 +113,18 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
         the stream.
     """
     touch = TouchStream(predictor)
-    frame_count = round(seconds * RATE_HZ)
-    print_interval = round(PRINT_INTERVAL_S * RATE_HZ)
     followed = []
     say("   estimated: x mm, y mm, N   true: x mm, y mm, N")
-    with virtual_sensor(forward_map, "reference", SEED, RATE_HZ) as sensor, Port(sensor.url) as port:
+    with virtual_sensor(forward_map, "reference", seed=0) as sensor, Port(sensor.url) as port:
+        rate_Hz = sensor.script.rate_Hz
+        frame_count = round(seconds * rate_Hz)
+        print_interval = round(PRINT_INTERVAL_S * rate_Hz)
         all_records = (record for chunk in port for record in touch.feed(chunk))
         records = islice(all_records, frame_count)
         script = np.column_stack([sensor.script.x_mm, sensor.script.y_mm, sensor.script.force_N])
         for frame_number, record in enumerate(track(records, "following", frame_count), start=1):
             # The script that the virtual sensor repeats contains the true press of this frame.
-            row = round(1e-6 * (record.t_device_us or 0) * RATE_HZ) % len(script)
+            row = round(1e-6 * (record.t_device_us or 0) * rate_Hz) % len(script)
             true_contact = script[row] if sensor.script.touching[row] else None
             contact = np.array([record.x_mm, record.y_mm, record.force_N], float) if record.contact else None
             if true_contact is not None and contact is not None:

@@ -8,6 +8,7 @@ from contextlib import ExitStack, closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -25,11 +26,11 @@ from isocharge.cli.shared.live_page import (
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption, WaitOption
 from isocharge.cli.shared.port_hints import no_frames_advice_added, no_frames_hint
 from isocharge.cli.shared.terminal import (
-    StopTimer,
     on_signal,
     say,
     stdout_is_ready,
     stdout_writer,
+    stop_timer,
     unless_hung_up,
     until_stopped,
 )
@@ -241,7 +242,7 @@ def stream_command(
     latencies: deque[float] = deque(maxlen=LATENCIES)
     recorder = Recorder(record, predictor.metadata.label, board.table, name) if record else None
     stream = RecordedStream(touch, recorder)
-    timer = StopTimer(seconds)
+    has_expired = Event()
     outputs: Outputs | None = None  # until the port is open
     with ExitStack() as stack:  # closes the contexts in reverse order
         stack.enter_context(until_stopped())
@@ -255,7 +256,7 @@ def stream_command(
             allow_host=allow_host,
         )
         page = stack.enter_context(page_context)
-        stack.enter_context(timer)
+        stack.enter_context(stop_timer(seconds, has_expired))
         source = stack.enter_context(open_source(port, baud=baud, reconnect=True, request=board.request, wait=wait))
 
         # The handlers of the signals only request changes, which the stream carries out later.
@@ -282,13 +283,13 @@ def stream_command(
             say(summary(touch, latencies))
     if outputs is None:
         say(f"{port}: the command was stopped before the port was open")
-        raise typer.Exit(int(timer.has_expired))
+        raise typer.Exit(int(has_expired.is_set()))
     has_no_frames = touch.totals().frames == 0
     if has_no_frames:
         say(f"no frames were recognised; {no_frames_hint(port, device)}")
     say_missing_records(outputs)
     is_recording_incomplete = recorder is not None and recorder.failed
-    is_without_result = has_no_frames and timer.has_expired
+    is_without_result = has_no_frames and has_expired.is_set()
     if is_recording_incomplete or outputs.has_incomplete_file or is_without_result:
         raise typer.Exit(1)
 

@@ -18,7 +18,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pty import STDERR_FILENO, STDIN_FILENO, STDOUT_FILENO
-from typing import Any, Self
+from threading import Event
+from typing import Any
 
 import typer
 
@@ -204,44 +205,6 @@ def until_stopped() -> Iterator[None]:
         signal.signal(signal.SIGTERM, previous_handler)
 
 
-class StopTimer:
-    """Context manager that interrupts its block after a given time, even while the command waits for a port.
-
-    A timer of the system sends the signal SIGALRM, whose handler raises KeyboardInterrupt, as Ctrl-C does.
-
-    Attributes:
-        has_expired: Whether the timer, and not Ctrl-C, has interrupted the block.
-    """
-
-    def __init__(self, seconds: float | None) -> None:
-        """Store the time, s, which must be positive; None for no limit."""
-        self.has_expired = False
-        self._seconds = seconds
-        self._previous_handler: Any = None
-
-    def __enter__(self) -> Self:
-        """Start the timer."""
-        if self._seconds is not None:
-            self._previous_handler = signal.signal(signal.SIGALRM, self._interrupt)
-            signal.setitimer(signal.ITIMER_REAL, self._seconds)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stop the timer."""
-        if self._seconds is not None:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(signal.SIGALRM, self._previous_handler)
-
-    def _interrupt(self, *_: object) -> None:
-        """Interrupt the block. The timer calls this method as the handler of the signal SIGALRM.
-
-        Raises:
-            KeyboardInterrupt: Always.
-        """
-        self.has_expired = True
-        raise KeyboardInterrupt
-
-
 @contextmanager
 def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[None]:
     """Context manager that calls the function `act` whenever the given signal arrives during the block."""
@@ -250,6 +213,29 @@ def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[Non
         yield
     finally:
         signal.signal(number, previous_handler)
+
+
+@contextmanager
+def stop_timer(seconds: float | None, has_expired: Event) -> Iterator[None]:
+    """Context manager that interrupts its block after a given time, even while the command waits for a port.
+
+    A timer of the system sends the signal SIGALRM, whose handler raises KeyboardInterrupt, as Ctrl-C does.
+
+    Args:
+        seconds: The time, s, which must be positive; None for no limit.
+        has_expired: Event that is set if the timer, and not Ctrl-C, has interrupted the block.
+    """
+
+    def interrupt() -> None:
+        has_expired.set()
+        raise KeyboardInterrupt
+
+    with on_signal(signal.SIGALRM, interrupt):
+        signal.setitimer(signal.ITIMER_REAL, seconds or 0.0)  # 0 starts no timer
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 def _interrupt() -> None:

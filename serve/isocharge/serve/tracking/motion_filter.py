@@ -243,10 +243,12 @@ class MotionFilter:
 class ContactFilter:
     """Filter that smooths the position and the force of one contact over successive frames.
 
-    Some errors of a model, such as its approximation error and the errors of the gains, are the same in every frame of
-    a held contact. Smoothing does not reduce these constant errors. The filter therefore uses only the variance of the
-    errors that change from frame to frame. The variance of the constant errors is added to that of the smoothed values.
-    The estimate of the noise applies to the whole touch, even if frames begin a new contact.
+    The errors of a model have two parts. One part changes from frame to frame, such as the noise of the charges. The
+    other part is the same in every frame of a held contact, such as the approximation error of the model and the errors
+    of the gains. Smoothing reduces only the first part. The filter therefore weights the frames by the variance of the
+    first part alone, and adds the variance of the second part to that of the smoothed values.
+
+    The noise is estimated from all frames of a touch, also if the touch has several contacts one after the other.
     """
 
     def __init__(self, constant_variance_share: float) -> None:

@@ -13,9 +13,8 @@ from isocharge.serve.model.charge_file import read_charge_map
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.record.record import NO_TRACKING, OtherContact, TrackedContact, Tracking
 from isocharge.serve.signal_chain.stage import Rule, Setup, Share, Stage
-from isocharge.serve.tracking.contact_mixture import ContactMixture
+from isocharge.serve.tracking.contact_mixture import ContactHypothesis, ContactMixture
 from isocharge.serve.tracking.film_follower import FollowRule
-from isocharge.serve.tracking.mixture_components import ContactHypothesis
 from isocharge.serve.tracking.motion_filter import VELOCITY, ContactFilter
 
 CERTAIN_PROBABILITY = 0.97

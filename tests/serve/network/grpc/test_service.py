@@ -139,17 +139,6 @@ def test_server_with_tls(handler, authority, tls_files):
         pass
 
 
-def test_message_of_an_internal_error_is_logged_and_not_sent(serve, store, monkeypatch, caplog):
-    def fail(*_):
-        raise ZeroDivisionError("a secret")
-
-    monkeypatch.setattr(store, "loaded_versions", fail)
-    with pytest.raises(grpc.RpcError, match="internal error") as caught:
-        call(serve()(), "ServerReady")
-    assert caught.value.code() is grpc.StatusCode.INTERNAL
-    assert "a secret" in caplog.text
-
-
 def test_compiled_protocol_file_equals_the_source(tmp_path):
     """Only the descriptors are compared, because compilers differ in details."""
     compiled = tmp_path / "new.binpb"
