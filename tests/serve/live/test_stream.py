@@ -9,7 +9,6 @@ from isocharge.common.errors import ChargeError, PortError
 from isocharge.serve import (
     Chunk,
     Frame,
-    TouchStream,
     device_from_table,
     encode_frame,
     open_source,
@@ -87,31 +86,6 @@ def test_record_before_the_tare(predictor):
         assert record.flags == ("tare",)
         assert (record.contact, record.force_N, record.charge_pC, record.tare_pC) == (False, 0.0, None, None)
         assert record.charge_raw_pC == {"A": 12.0, "B": -7.0, "C": 3.0}
-
-
-@pytest.mark.parametrize("disturbance", ["wall clock +1 h", "wall clock -1 h", "stall of 1 s"])
-def test_host_clock_and_stalls_do_not_change_the_force_of_a_board_without_a_clock(film, predictor, disturbance):
-    """The amplifier leaks. The steps of the leak are times between frames, not between wall times."""
-    device = device_from_table({"leak": {"tau_s": 10.0}}, "")
-    output = np.zeros((1200, 3))
-    output[400:] = press_charges(film) * np.exp(-0.005 * np.arange(800) / 10.0)[:, None]
-    lines = [",".join(f"{value:.9g}" for value in row).encode() + b"\n" for row in output]
-
-    def forces_N(jump_s, stall_frames):
-        touch = TouchStream(predictor, device)
-        records = list(touch.feed(Chunk(lines[0], 1e9, 0)))
-        number = 1
-        while number < len(lines):
-            stop = number + (stall_frames if number == 500 else 1)
-            time_s = 0.005 * (stop - 1)
-            wall_s = 1e9 + time_s + jump_s * (number > 500)
-            records += touch.feed(Chunk(b"".join(lines[number:stop]), wall_s, round(1e9 * time_s)))
-            number = stop
-        return [record.force_N for record in records]
-
-    jump_s = {"wall clock +1 h": 3600.0, "wall clock -1 h": -3600.0}.get(disturbance, 0.0)
-    stall_frames = 200 if disturbance == "stall of 1 s" else 1
-    assert forces_N(jump_s, stall_frames) == pytest.approx(forces_N(0.0, 1), rel=1e-6)
 
 
 @pytest.mark.parametrize("data", [b"", b"hello, film\n"])

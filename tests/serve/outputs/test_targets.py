@@ -171,6 +171,7 @@ def test_ctrl_c_while_an_output_closes_spoils_no_other_output(record, tmp_path, 
     with pytest.raises(KeyboardInterrupt):
         outputs.__exit__(None, None, None)
     assert path.read_text("utf-8") == record().to_json() + "\n"
+    assert outputs.not_written == {"mine": None}  # the command must not report success
 
 
 def test_added_kind_that_cannot_tell_what_it_accepts_is_named(add_kind):
@@ -199,20 +200,3 @@ def test_output_that_fails_does_not_end_the_live_stream(record, caplog):
         "broken: stopped (broken: the output failed (RuntimeError: no such table)); the records after that are missing"
         in caplog.text
     )
-
-
-def test_output_whose_close_is_stopped_by_ctrl_c_is_incomplete(record, monkeypatch):
-    """The file of a replay is then removed, so the command must not report success."""
-
-    def stop():
-        raise KeyboardInterrupt
-
-    output = SimpleNamespace(write=lambda _: None, close=stop)
-    kind = OutputKind(form="x:", accepts=lambda target: target == "x:", open=lambda *_: output)
-    monkeypatch.setattr("isocharge.serve.outputs.targets.OUTPUT_KINDS", (kind,))
-    outputs = Outputs(["x:"], context())
-    with outputs:
-        outputs.write(record)
-        with pytest.raises(KeyboardInterrupt):
-            outputs.close()
-    assert outputs.has_incomplete_file

@@ -201,19 +201,6 @@ def test_invalid_frame_passes_no_stage(value, gain):
         np.testing.assert_array_equal(reading.charge_pC, expected.charge_pC)
 
 
-def test_time_of_invalid_frames_counts_for_the_next():
-    """The leak is corrected for the time since the last valid frame.
-
-    This time is 0.5 s, of which 0.2 s belong to invalid frames. The time constant is 1 s.
-    """
-    chain = StageRunner(tare={"on": False}, touch={"on": False}, leak={"tau_s": 1.0, "learn": False})
-    for charge_pC, dt_s in ((0.0, 0.1), (0.0, 0.1), (100.0, 0.1), (np.nan, 0.05), (np.inf, 0.15)):
-        chain.advance(np.full(3, charge_pC), 0.0, dt_s)
-    decayed_pC = 100.0 * np.exp(np.full(3, -0.5))
-    reading = chain.advance(decayed_pC, 0.0, 0.3)
-    np.testing.assert_allclose(reading.charge_pC, 100.0)
-
-
 def test_flags_of_the_frame_come_before_those_of_the_chain():
     reading = StageRunner().advance(OFFSET, 0.0, 0.0, limited=True, flags=("gap",))
     assert reading.flags == ("gap", "tare", "saturated")
