@@ -8,7 +8,7 @@ from isocharge.serve import Frame, Validity, device_from_table
 from isocharge.serve.flags import INVALID, in_order
 from isocharge.serve.frames.frame import SATURATED_BIT
 from isocharge.serve.live.device import create_stages
-from isocharge.serve.signal_chain.stage import Setup
+from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
 
 
@@ -26,7 +26,7 @@ class StageRunner:
         predictor = None
         if misfit is not None:
             predictor = SimpleNamespace(predict_batch=lambda charge_pC: SimpleNamespace(misfit=misfit(charge_pC)))
-        self.stages = create_stages(device.setup(tuple("ABCDEFGH"[:n_electrode]), predictor=predictor))
+        self.stages = create_stages(Setup(tuple("ABCDEFGH"[:n_electrode]), device, predictor))
 
     def advance(self, values, t_s, dt_s, *, limited=False, flags=()):
         """Process a frame, and return it with its flags in their order."""
@@ -52,7 +52,7 @@ class StageRunner:
 
 def new_tracker(mixture=None, **settings):
     """Return a tracker with settings of the section `[track]`, and with a mixture for a film with a fold."""
-    tracker = Tracker(Setup((), {TrackRule: TrackRule(**settings)}))
+    tracker = Tracker(Setup((), Device(rules={TrackRule: TrackRule(**settings)})))
     if mixture is not None:
         tracker._mixture = mixture
         tracker._mixture_validity = Validity(mixture.charges.corners_mm, (0.0, np.inf))

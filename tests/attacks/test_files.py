@@ -28,6 +28,7 @@ from isocharge.serve.live.device import create_stages
 from isocharge.serve.model.charge_file import FILE, read_charge_map
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.virtual_sensor.script import load_script
 from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
@@ -99,7 +100,7 @@ def _write(folder):
 def _load_device(path):
     device = load_device(path)
     device.parser().feed(b"\xa5\x5a123456")
-    create_stages(device.setup(("A", "B", "C", "D")))
+    create_stages(Setup(("A", "B", "C", "D"), device))
 
 
 def _read_charges(path):
@@ -185,7 +186,7 @@ def test_tables_with_junk(attack, model):
 
 
 def read_device(value, where):
-    create_stages(device_from_table(value, where).setup(("A", "B", "C")))
+    create_stages(Setup(("A", "B", "C"), device_from_table(value, where)))
 
 
 @pytest.fixture

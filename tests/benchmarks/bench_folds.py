@@ -23,7 +23,7 @@ from shared import options, print_results
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import read_charge_map
-from isocharge.serve.signal_chain.stage import Setup
+from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
 from isocharge.simulate import Circle, ForwardMap, noise_model
 from isocharge.simulate.forward.charge_map import ChargeMap
@@ -160,7 +160,7 @@ def main() -> None:
     charges = read_charge_map(predictor.folder, metadata.electrodes)
     if charges is None or not charges.is_folded:
         raise SystemExit(f"{asked.model}: no charges.npz: its map does not fold; give the model of the lines above")
-    tracker = Tracker(Setup(metadata.electrodes, {TrackRule: TrackRule()}, predictor=predictor))
+    tracker = Tracker(Setup(metadata.electrodes, Device(rules={TrackRule: TrackRule()}), predictor=predictor))
     radius = charges.domain.radius
     sensor = sensor_from_dict(dict(metadata.sensor))
     forward_map = ForwardMap.build(sensor, Circle(1.0), radius + MAP_MARGIN_mm, metadata.force_range_N)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from isocharge.serve.frames.formats import AutoParser
     from isocharge.serve.frames.frame import Frame
     from isocharge.serve.frames.text_lines import encode_text
-    from isocharge.serve.live.device import Device, device_from_table, load_device
+    from isocharge.serve.live.device import device_from_table, load_device
     from isocharge.serve.live.steady_press import PressWatch
     from isocharge.serve.live.stream import ReadingStream, TouchStream, stream
     from isocharge.serve.model.contact import Contact, Contacts
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
     from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses, write_presses
     from isocharge.serve.record.record import PredictionRecord
+    from isocharge.serve.signal_chain.stage import Device
     from isocharge.serve.virtual_sensor.script import Faults, Script, wander
     from isocharge.serve.virtual_sensor.sensor import VirtualSensor
 else:  # hidden from type checkers, which would otherwise accept every misspelt name

@@ -24,7 +24,7 @@ from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain, SaturationRule
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import Leak, LeakRule
-from isocharge.serve.signal_chain.stage import Setup
+from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
 from isocharge.serve.signal_chain.touch import TouchRule
@@ -72,7 +72,7 @@ def device(tmp_path):
 
 def test_device_file_with_all_sections(device):
     board = device(FULL)
-    setup = board.setup(ELECTRODES)
+    setup = Setup(ELECTRODES, board)
     assert (board.name, board.channels["A"]) == ("bench board 3", "adc1")
     np.testing.assert_array_equal(Gain(setup).gain_pC, [0.5, -0.25, 0.5])
     np.testing.assert_array_equal(Leak.c_settings(setup)["tau_s"], [10.0, 10.2, 9.9])
@@ -99,7 +99,7 @@ def converted(board, values):
     """Return the charges of values that a board sends, shape (3,), pC."""
     frame = Frame(None, None, ())
     frame.sent = np.asarray(values)
-    Gain(board.setup(ELECTRODES)).step(frame)
+    Gain(Setup(ELECTRODES, board)).step(frame)
     return frame.charge_pC
 
 
@@ -167,7 +167,7 @@ def test_setting_for_other_electrodes_is_refused(device):
     with pytest.raises(
         DeviceError, match=r"one for each of the electrodes \('A', 'B', 'C'\), got \{'A': 1.0, 'B': 1.0\}"
     ):
-        create_stages(board.setup(ELECTRODES))
+        create_stages(Setup(ELECTRODES, board))
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_setting_for_other_electrodes_is_refused(device):
 )
 def test_channel_of_each_electrode(names, channels, picked):
     frame = Frame(0, 0, (1.0, 2.0, 3.0), names=names)
-    Channels(Setup(ELECTRODES, channels=channels)).step(frame)
+    Channels(Setup(ELECTRODES, Device(channels=channels))).step(frame)
     assert frame.sent.tolist() == picked
 
 
@@ -208,7 +208,7 @@ def test_channel_of_each_electrode(names, channels, picked):
 )
 def test_unknown_channels_are_refused(names, channels, message):
     assigned = {"A": "1", "B": "2", "C": "3"} | channels if channels else {}
-    stage = Channels(Setup(ELECTRODES, channels=assigned, where="board.toml"))
+    stage = Channels(Setup(ELECTRODES, Device(channels=assigned, where="board.toml")))
     with pytest.raises(ChargeError, match=message):
         stage.step(Frame(0, 0, (1.0,) * (len(names) or 3), names=names))
 

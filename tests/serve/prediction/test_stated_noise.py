@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from isocharge.cli.main import app
 from isocharge.serve import Frame, Predictor, device_from_table
 from isocharge.serve.live.device import create_stages
+from isocharge.serve.signal_chain.stage import Setup
 from isocharge.simulate import Circle, ForwardMap, NoiseModel, load_sensor
 
 NAME = "four-25um-biaxial"
@@ -68,7 +69,7 @@ def test_smaller_noise_than_in_the_training_changes_nothing(released):
 def test_device_file_with_noise_widens_the_contacts_of_a_stream_and_of_predict(released, tmp_path):
     charge_pC = np.array([1200.0, 800.0, 700.0, 900.0])
     device = device_from_table({"noise": {"gain": 0.015}}, "b")
-    setup = device.setup(released.metadata.electrodes, predictor=released)
+    setup = Setup(released.metadata.electrodes, device, released)
     (prediction,) = create_stages(setup, needs_contact=True)
     frame = Frame(None, None, (), charge_pC=charge_pC, is_contact=True)
     prediction.step(frame)

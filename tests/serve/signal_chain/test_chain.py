@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from isocharge.common.errors import TareError
 from isocharge.serve import Frame
-from isocharge.serve.signal_chain.stage import Setup
+from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.signal_chain.tare import TareRule, measure_tare
 from isocharge.serve.signal_chain.touch import Touch, TouchRule
 from stage_runner import StageRunner
@@ -82,7 +82,7 @@ THRESHOLD_PC = np.sqrt(3.0) + 6.0 / np.sqrt(2.0) + 10.0 / np.sqrt(3.0)
 
 def touch_stage():
     """Return a stage that detects touches, with its default settings."""
-    return Touch(Setup(("A", "B", "C"), {TouchRule: TouchRule()}))
+    return Touch(Setup(("A", "B", "C"), Device(rules={TouchRule: TouchRule()})))
 
 
 def detect(touch, charge_pC, noise_pC, base_relax_s=math.inf):
@@ -127,7 +127,7 @@ def test_noise_exceeds_the_touch_threshold_rarely_with_any_number_of_electrodes(
 @pytest.mark.parametrize("ratios", [(1.0, -1.0, 0.0), (-1.0, 0.8, -0.3), (-1.0, -1.0, -1.0)])
 def test_touch_is_detected_from_charges_of_any_sign(ratios):
     """The charges of a sensor without a film may have any sign, and their sum may be zero or negative."""
-    touch = Touch(Setup(("A", "B", "C"), {TouchRule: TouchRule()}, has_any_sign=True))
+    touch = Touch(Setup(("A", "B", "C"), Device(rules={TouchRule: TouchRule()}), has_any_sign=True))
     contacts = []
     for force in (0.0, 0.0, 100.0, 100.0, 0.0, 0.0, 0.0, -100.0, 0.0):
         frame = Frame(None, None, (), dt_s=0.1)
@@ -141,7 +141,7 @@ def test_touch_is_detected_from_charges_of_any_sign(ratios):
 @pytest.mark.parametrize("has_any_sign", [False, True])
 def test_end_of_a_long_press_with_a_leak_is_no_touch(has_any_sign):
     """A press of 5 s loses 39 % of its charge (tau = 10 s), and the release leaves the lost charge with a minus."""
-    touch = Touch(Setup(("A", "B", "C"), {TouchRule: TouchRule()}, has_any_sign=has_any_sign))
+    touch = Touch(Setup(("A", "B", "C"), Device(rules={TouchRule: TouchRule()}), has_any_sign=has_any_sign))
     dt_s = 1.0 / RATE_HZ
     output_pC = np.zeros(3)
     contacts, flags = [], []

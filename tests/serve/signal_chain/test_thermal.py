@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from isocharge.serve.signal_chain.stage import Setup
+from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.signal_chain.thermal import ThermalRule, Warming
 from stage_runner import StageRunner
 
@@ -40,7 +40,7 @@ def misfit_of(film):
 def warming_stage(misfit):
     """Return a stage that estimates the warming with a misfit function."""
     predictor = SimpleNamespace(predict_batch=lambda charge_pC: SimpleNamespace(misfit=misfit(charge_pC)))
-    return Warming(Setup(tuple("ABCD"), {ThermalRule: ThermalRule()}, predictor=predictor))
+    return Warming(Setup(tuple("ABCD"), Device(rules={ThermalRule: ThermalRule()}), predictor=predictor))
 
 
 def follow_warming(film, common_charges_pC, seed=0):

@@ -15,6 +15,7 @@ from isocharge.serve.frames.frame import T_US_MODULUS, Frame
 from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.signal_chain.gain import Gain
 from isocharge.serve.signal_chain.hum import Hum
+from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.thermal import ThermalRule
 from isocharge.serve.signal_chain.touch import TouchRule
 from isocharge.train.export_c.folder import device_header
@@ -102,7 +103,7 @@ def draw_frames(board, seed, seconds=20.0):
     charge += np.where(is_pressed, 30.0, 0.0)[:, None] * rng.random()
     charge[rng.choice(np.flatnonzero(is_pressed), 3)] *= 40.0  # spikes, which are not peaks of a press
 
-    gain = Gain(device(board).setup(ELECTRODES))
+    gain = Gain(Setup(ELECTRODES, device(board)))
     values = charge / gain.gain_pC + gain.zero
     for invalid in (np.nan, np.inf, -np.inf, 3e9, 1e300):
         values[rng.integers(0, count, 2), rng.integers(0, n_electrode, 2)] = invalid

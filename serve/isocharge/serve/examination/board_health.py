@@ -12,11 +12,10 @@ from isocharge.common.errors import ChargeError, shown
 from isocharge.common.printable_text import printable
 from isocharge.serve.examination.listening import Capture
 from isocharge.serve.examination.press_detector import HeldPress
-from isocharge.serve.live.device import Device
 from isocharge.serve.port.source import has_speed
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.leak import LeakRule
-from isocharge.serve.signal_chain.stage import LARGEST, Setup
+from isocharge.serve.signal_chain.stage import LARGEST, Device, Setup
 from isocharge.serve.signal_chain.tare import TareRule
 
 MAINS_HZ = (50.0, 60.0)

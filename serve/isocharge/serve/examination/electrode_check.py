@@ -17,12 +17,11 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import PressCheckError
 from isocharge.common.printable_text import printable
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.live.device import Device
 from isocharge.serve.live.steady_press import Press
 from isocharge.serve.live.stream import ReadingStream
 from isocharge.serve.port.source import Port
 from isocharge.serve.signal_chain.gain import GainRule
-from isocharge.serve.signal_chain.stage import Rule
+from isocharge.serve.signal_chain.stage import Device, Rule
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.touch import TouchRule
 

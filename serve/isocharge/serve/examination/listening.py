@@ -12,12 +12,12 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import PortLost
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
-from isocharge.serve.live.device import Device
 from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.port.serial_line import UDP_SCHEME, Request
 from isocharge.serve.port.source import Port, has_speed
 from isocharge.serve.presses.number_table import LARGEST
 from isocharge.serve.signal_chain.channels import channel_names
+from isocharge.serve.signal_chain.stage import Device
 
 BAUDS = (115200, 921600, 1000000, 2000000, 460800, 230400, 57600, 38400, 19200, 9600)
 """Baud rates to try, in this order, bit/s."""

@@ -24,11 +24,12 @@ from isocharge.serve.examination.board_health import (
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
 from isocharge.serve.examination.press_detector import find_held_press, find_touch
 from isocharge.serve.examination.proposal import propose, recognised_frames, unit_of
-from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
+from isocharge.serve.live.device import ANY_BOARD, device_from_table
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.recognition.framing import INTACT_SHARE
 from isocharge.serve.signal_chain.channels import channel_index
 from isocharge.serve.signal_chain.gain import Gain, GainRule
+from isocharge.serve.signal_chain.stage import Device, Setup
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ def examine_received(
         table = propose(capture, values[is_rest], frames, electrodes, gain or {})
         electrodes = electrodes or tuple(table.get("channels", {}))
         device = device_from_table({key: value for key, value in table.items() if gain or key != "gain"}, "board")
-        Gain(device.setup(electrodes))  # raises an error for the numbers of other electrodes
+        Gain(Setup(electrodes, device))  # raises an error for the numbers of other electrodes
     electrode_at_position = electrodes_by_position(capture, device)
     unit = "pC" if device.rule(GainRule) is not None else unit_of(capture)
     charges = values[is_rest][:, list(electrode_at_position)]  # shape (n, n_electrode)

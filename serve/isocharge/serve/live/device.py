@@ -29,7 +29,7 @@ the file has no such section. An unknown key causes an error.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from msgspec import defstruct, field, structs
 
@@ -37,15 +37,13 @@ from isocharge.common.errors import ChargeError, DeviceError
 from isocharge.common.structs import Settings, convert, read_toml
 from isocharge.serve.flags import FILM
 from isocharge.serve.frames.formats import AutoFrames, Frames
-from isocharge.serve.frames.frame import Frame, Parser
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.frames.frame_layout import FrameLayout
-from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.port.serial_line import Request
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain, Saturation
 from isocharge.serve.signal_chain.hum import Hum
 from isocharge.serve.signal_chain.leak import Integrator, Leak
-from isocharge.serve.signal_chain.stage import R, Rule, Setting, Setup, Share, Stage, find_rule
+from isocharge.serve.signal_chain.stage import Device, FrontEnd, Rule, Setting, Setup, Share, Stage
 from isocharge.serve.signal_chain.tare import Tare
 from isocharge.serve.signal_chain.thermal import Warming, warming_ratios
 from isocharge.serve.signal_chain.touch import Touch
@@ -79,7 +77,7 @@ class Prediction(Stage):
     def __init__(self, setup: Setup) -> None:
         """Store the limits within which contacts are valid, which are those of the calibrated film."""
         self._setup = setup
-        noise = setup.rule(NoiseRule)
+        noise = setup.device.rule(NoiseRule)
         if noise is not None:
             setup.predictor = setup.model.with_noise(noise.white_pC, noise.gain)
         self._validity = setup.model.validity
@@ -108,7 +106,7 @@ class FollowFilm(Stage):
         """
         predictor = setup.model
         self._validity = predictor.validity  # of the calibrated film
-        self._follower = FilmFollower(predictor, setup.rule(FollowRule), warming_ratios(setup))
+        self._follower = FilmFollower(predictor, setup.device.rule(FollowRule), warming_ratios(setup))
 
     def step(self, frame: Frame) -> None:
         """Correct the contact for the estimated pretension of the film, and then update the estimate with the frame.
@@ -151,9 +149,6 @@ STAGES: tuple[type[Stage], ...] = (
 )
 """All stages in the order in which they process a frame. The device file and the export to C follow from the stages."""
 
-FrontEnd = Literal["charge", "current"]
-"""What the values of a board are: charges, or currents. A current is the charge of one sampling interval."""
-
 DeviceSections = defstruct(
     "DeviceSections",
     [
@@ -171,64 +166,6 @@ DeviceSections = defstruct(
     frozen=True,
 )
 """Content of a device file. Each stage with settings has a section."""
-
-
-class Device(Settings, frozen=True):
-    """Settings of a board, as its device file states them.
-
-    Attributes:
-        name: Name of the board.
-        front_end: Whether the values of the board are charges or currents.
-        frames: Format of the frames.
-        channels: Name or number of the channel of each electrode; empty without the section `[channels]`.
-        rules: Settings of each stage that is switched on, by their class.
-        table: Content of the device file without any conversion, which is stored in recordings.
-        where: Name of the file, for messages.
-    """
-
-    name: str = "unnamed board"
-    front_end: FrontEnd = "charge"
-    frames: Frames = AutoFrames()
-    channels: dict[str, str] = field(default_factory=dict)
-    rules: Mapping[type[Rule], Rule] = field(default_factory=dict)
-    table: Mapping[str, Any] = field(default_factory=dict)
-    where: str = "device"
-
-    @property
-    def request(self) -> Request | None:
-        """Request that the board answers with a frame, or None if the board sends frames without requests."""
-        if self.frames.request is None:
-            return None
-        return Request(bytes.fromhex(self.frames.request), self.frames.request_Hz)
-
-    def parser(self) -> Parser:
-        """Return a new parser that reads the frames of the board."""
-        return self.frames.parser()
-
-    def setup(
-        self, electrodes: tuple[str, ...], reader: str = "the sensor", predictor: Predictor | None = None
-    ) -> Setup:
-        """Return what the stages of a stream share.
-
-        Args:
-            electrodes: Names of the electrodes, in the order of the charges.
-            reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
-            predictor: Model of the stream; None for a stream that computes only touch charges.
-        """
-        return Setup(
-            electrodes,
-            self.rules,
-            self.channels,
-            predictor,
-            reader,
-            self.where,
-            has_currents=self.front_end == "current",
-            has_any_sign=self.front_end == "current",
-        )
-
-    def rule(self, rule_class: type[R]) -> R | None:
-        """Return the settings of a class, or None if their stage is switched off."""
-        return find_rule(self.rules, rule_class)
 
 
 def create_stages(setup: Setup, *, needs_contact: bool = False) -> list[Stage]:
@@ -264,7 +201,7 @@ def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> 
         ChargeError: If an electrode has no channel.
     """
     if isinstance(device.frames, FrameLayout):
-        channels = Channels(device.setup(electrodes, reader))
+        channels = Channels(Setup(electrodes, device, reader=reader))
         channels.channel_indices(device.frames.frame_of_zeros())  # raises an error if an electrode has no channel
         return
     missing = [name for name in electrodes if name not in device.channels]

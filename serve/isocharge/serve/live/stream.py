@@ -15,11 +15,11 @@ from isocharge.common.errors import ModelError, NoFramesError, shown
 from isocharge.serve.flags import RECONNECTED, in_order
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, SequenceGaps
-from isocharge.serve.live.device import ANY_BOARD, Device, create_stages
+from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord
-from isocharge.serve.signal_chain.stage import Stage
+from isocharge.serve.signal_chain.stage import Device, Setup, Stage
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule
 
@@ -95,7 +95,7 @@ class ReadingStream:
             DeviceError: If the device file contains settings for other electrodes.
         """
         self._device = device
-        self._setup = device.setup(electrodes, reader, predictor)
+        self._setup = Setup(electrodes, device, predictor, reader)
         has_film = predictor is None or "film" in predictor.metadata.sensor  # false for a model of presses alone
         self._setup.has_any_sign |= has_any_sign or not has_film
         self._before_restart = StreamTotals()  # counts of the time before the latest `restart`
@@ -272,7 +272,7 @@ class TouchStream(ReadingStream):
     @property
     def has_tracking(self) -> bool:
         """Whether contacts are tracked. If contacts are tracked, the records contain the fields of `Tracking`."""
-        return self._setup.rule(TrackRule) is not None
+        return self._device.rule(TrackRule) is not None
 
     @property
     def has_film(self) -> bool:
@@ -280,7 +280,7 @@ class TouchStream(ReadingStream):
 
         If the film is followed, the records contain the field `film`.
         """
-        return self._setup.rule(FollowRule) is not None
+        return self._device.rule(FollowRule) is not None
 
     def tare(self) -> None:
         """Discard the tare and the present touch, and measure the tare again from the next quiet frames."""

@@ -34,11 +34,11 @@ class Channels(Stage):
             setup: Settings of all stages.
             any_unit: Whether the names of the channels may contain any unit, even if the gain is not known.
         """
-        self._allows_any_unit = any_unit or setup.rule(GainRule) is not None
+        self._allows_any_unit = any_unit or setup.device.rule(GainRule) is not None
         self._electrodes = setup.electrodes
-        self._channels = setup.channels
+        self._channels = setup.device.channels
         self._reader = setup.reader
-        self._where = setup.where
+        self._where = setup.device.where
         # Names, number of values and channel indices of the previous frame. `step` uses the indices again.
         self._previous_names: tuple[str, ...] | None = None  # None before the first frame
         self._previous_n_values = -1

@@ -62,7 +62,7 @@ class Gain(Stage):
 
     def __init__(self, setup: Setup) -> None:
         """Set the conversion. Without settings, the values are charges in pC."""
-        rule = setup.rule(GainRule)
+        rule = setup.device.rule(GainRule)
         self.gain_pC = np.ones(len(setup.electrodes))
         self.zero = np.zeros(len(setup.electrodes))
         if rule is not None:
@@ -118,7 +118,7 @@ class Saturation(Stage):
 
     def __init__(self, setup: Setup) -> None:
         """Begin without a press."""
-        rule = setup.rule(SaturationRule)
+        rule = setup.device.rule(SaturationRule)
         self._limit_pC = None if rule is None else rule.limit_pC
         self._is_saturated = False
 

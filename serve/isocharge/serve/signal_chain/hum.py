@@ -60,7 +60,7 @@ class Hum(Stage):
 
     def __init__(self, setup: Setup) -> None:
         """Begin with an estimate of zero hum."""
-        self._rule = setup.rule(HumRule) or HumRule()
+        self._rule = setup.device.rule(HumRule) or HumRule()
         self._phasor_pC: Complexes = np.zeros(len(setup.electrodes), dtype=complex)  # amplitude and phase by channel
         self._unit_phasor = 1.0 + 0.0j  # phasor of magnitude 1 that turns with the mains frequency
         self._previous_pC: Array | None = None  # charges of the previous frame

@@ -135,14 +135,14 @@ class Leak(OffsetStage):
     def __init__(self, setup: Setup) -> None:
         """Store the settings. The state begins at the first frame after the tare."""
         super().__init__(setup)
-        self._rule = setup.rule(LeakRule) or LeakRule()
+        self._rule = setup.device.rule(LeakRule) or LeakRule()
         self._tau_s = setup.for_each_electrode("leak.tau_s", self._rule.tau_s)
         self.reset()
 
     @classmethod
     def is_used(cls, setup: Setup) -> bool:
         """Return whether the device file states the leak of charge amplifiers."""
-        return super().is_used(setup) and not setup.has_currents
+        return super().is_used(setup) and not setup.device.has_currents
 
     def reset(self) -> None:
         """Discard the state. A new state begins at the first frame after the next tare."""
@@ -219,7 +219,7 @@ class Integrator(Leak):
     @classmethod
     def is_used(cls, setup: Setup) -> bool:
         """Return whether the board sends currents."""
-        return setup.has_currents
+        return setup.device.has_currents
 
     def step(self, frame: Frame) -> None:
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.

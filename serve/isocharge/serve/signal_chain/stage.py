@@ -8,17 +8,19 @@ export to C follow from the list.
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, TypeVar
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
-from msgspec import Meta, structs
+from msgspec import Meta, field, structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DeviceError
 from isocharge.common.structs import Settings
-from isocharge.serve.frames.frame import Frame
+from isocharge.serve.frames.formats import AutoFrames, Frames
+from isocharge.serve.frames.frame import Frame, Parser
 from isocharge.serve.model.predictor import Predictor
+from isocharge.serve.port.serial_line import Request
 
 LARGEST = 1_000_000_000
 """Largest value of a setting, in the unit of the setting, and largest charge of a valid reading, pC.
@@ -58,15 +60,55 @@ NOT_IN_C = (
 """Part of the message about a stage that cannot be exported to C."""
 
 
-def find_rule(rules: Mapping[type[Rule], Rule], rule_class: type[R]) -> R | None:
-    """Return the settings of a class, or None if their stage is switched off.
+FrontEnd = Literal["charge", "current"]
+"""What the values of a board are: charges, or currents. A current is the charge of one sampling interval."""
 
-    Args:
+
+class Device(Settings, frozen=True):
+    """Settings of a board, as its device file states them.
+
+    Attributes:
+        name: Name of the board.
+        front_end: Whether the values of the board are charges or currents.
+        frames: Format of the frames.
+        channels: Name or number of the channel of each electrode; empty without the section `[channels]`.
         rules: Settings of each stage that is switched on, by their class.
-        rule_class: The class.
+        table: Content of the device file without any conversion, which is stored in recordings.
+        where: Name of the file, for messages.
     """
-    rule = rules.get(rule_class)
-    return rule if isinstance(rule, rule_class) else None
+
+    name: str = "unnamed board"
+    front_end: FrontEnd = "charge"
+    frames: Frames = AutoFrames()
+    channels: dict[str, str] = field(default_factory=dict)
+    rules: Mapping[type[Rule], Rule] = field(default_factory=dict)
+    table: Mapping[str, Any] = field(default_factory=dict)
+    where: str = "device"
+
+    @property
+    def has_currents(self) -> bool:
+        """Whether each value of the board is a current, which is the charge of one sampling interval."""
+        return self.front_end == "current"
+
+    @property
+    def request(self) -> Request | None:
+        """Request that the board answers with a frame, or None if the board sends frames without requests."""
+        if self.frames.request is None:
+            return None
+        return Request(bytes.fromhex(self.frames.request), self.frames.request_Hz)
+
+    def parser(self) -> Parser:
+        """Return a new parser that reads the frames of the board."""
+        return self.frames.parser()
+
+    def rule(self, rule_class: type[R]) -> R | None:
+        """Return the settings of a class, or None if their stage is switched off."""
+        rule = self.rules.get(rule_class)
+        return rule if isinstance(rule, rule_class) else None
+
+
+NO_SETTINGS = Device()
+"""Settings that switch on only the stages that each stream has."""
 
 
 @dataclass(slots=True)
@@ -75,35 +117,29 @@ class Setup:
 
     Attributes:
         electrodes: Names of the electrodes, in the order of the charges.
-        rules: Settings of each stage that the device file switches on, by their class.
-        channels: Name or number of the channel by electrode name; empty if the device file assigns no channels.
+        device: Settings of the board.
         predictor: The present model; None if a stream computes only touch charges.
         reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
-        where: Name of the device file, for messages.
         offset_stage: Last stage that stores the charge at rest; None until a stage is created.
-        has_currents: Whether each value of the board is a current, which is the charge of one sampling interval.
         has_any_sign: Whether the charges of a touch may have any sign. Otherwise, most of them are positive.
     """
 
     electrodes: tuple[str, ...]
-    rules: Mapping[type[Rule], Rule] = field(default_factory=dict)
-    channels: Mapping[str, str] = field(default_factory=dict)
+    device: Device = NO_SETTINGS
     predictor: Predictor | None = None
     reader: str = "the sensor"
-    where: str = "device"
     offset_stage: "OffsetStage | None" = None
-    has_currents: bool = False
     has_any_sign: bool = False
+
+    def __post_init__(self) -> None:
+        """Allow any sign for a board that sends currents."""
+        self.has_any_sign |= self.device.has_currents
 
     @property
     def model(self) -> Predictor:
         """The present model of a stream that has a model."""
         assert self.predictor is not None
         return self.predictor
-
-    def rule(self, rule_class: type[R]) -> R | None:
-        """Return the settings of a class, or None if their stage is switched off."""
-        return find_rule(self.rules, rule_class)
 
     def for_each_electrode(self, key: str, setting: float | Mapping[str, float]) -> Array:
         """Return the value of a setting for each electrode, shape (n_electrode,).
@@ -118,8 +154,8 @@ class Setup:
         numbers = setting if isinstance(setting, Mapping) else dict.fromkeys(self.electrodes, setting)
         if set(numbers) != set(self.electrodes):
             raise DeviceError(
-                f"{self.where}: {key}: expected a number, or one for each of the electrodes {self.electrodes}, got "
-                f"{setting}"
+                f"{self.device.where}: {key}: expected a number, or one for each of the electrodes "
+                f"{self.electrodes}, got {setting}"
             )
         return np.array([numbers[name] for name in self.electrodes], dtype=float)
 
@@ -159,7 +195,7 @@ class Stage(ABC):
     @classmethod
     def is_used(cls, setup: Setup) -> bool:
         """Return whether a stream has this stage."""
-        is_switched_on = cls.is_required or cls.rule_class in setup.rules
+        is_switched_on = cls.is_required or cls.rule_class in setup.device.rules
         has_model = setup.predictor is not None or not cls.needs_model
         return is_switched_on and has_model
 
@@ -180,7 +216,7 @@ class Stage(ABC):
         Raises:
             DeviceError: If the stage does not exist in C with these settings.
         """
-        rule = setup.rule(cls.rule_class)
+        rule = setup.device.rule(cls.rule_class)
         settings = {} if rule is None else structs.asdict(rule)
         return {name: value for name, value in settings.items() if name != "on"}
 

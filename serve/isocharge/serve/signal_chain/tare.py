@@ -69,8 +69,8 @@ class Tare(OffsetStage):
     def __init__(self, setup: Setup) -> None:
         """Begin without a tare."""
         super().__init__(setup)
-        self._rule = setup.rule(TareRule)
-        if self._rule is not None and setup.has_currents:  # at rest, a current of any size is an offset
+        self._rule = setup.device.rule(TareRule)
+        if self._rule is not None and setup.device.has_currents:  # at rest, a current of any size is an offset
             self._rule = structs.replace(self._rule, offset_limit_pC=math.inf)
         self._setup = setup
         self._tare_pC: Array | None = None  # charge at rest
@@ -172,11 +172,11 @@ class Tare(OffsetStage):
         Raises:
             DeviceError: If the tare is too long for the memory of the C program.
         """
-        rule = setup.rule(TareRule)
+        rule = setup.device.rule(TareRule)
         if rule is not None and not 1 <= rule.frames <= MAX_TARE_FRAMES_IN_C:
             raise DeviceError(
-                f"{setup.where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES_IN_C} for a signal "
-                f"chain in C, which stores all frames of the tare, got {rule.frames}"
+                f"{setup.device.where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES_IN_C} for a "
+                f"signal chain in C, which stores all frames of the tare, got {rule.frames}"
             )
         return super().c_settings(setup)
 

@@ -80,7 +80,7 @@ class Warming(Stage):
     def __init__(self, setup: Setup) -> None:
         """Begin with an estimated warming of zero."""
         self._setup = setup
-        self._rule = setup.rule(ThermalRule) or ThermalRule()
+        self._rule = setup.device.rule(ThermalRule) or ThermalRule()
         self._ratios = warming_ratios(setup)
         self.reset()
 
@@ -163,7 +163,7 @@ class Warming(Stage):
         warming_ratios(setup)  # raises an error for too few electrodes
         settings = super().c_settings(setup)
         if settings.pop("pC_per_K", None) is not None:
-            raise DeviceError(f"{setup.where}: common_mode.pC_per_K: {NOT_IN_C}")
+            raise DeviceError(f"{setup.device.where}: common_mode.pC_per_K: {NOT_IN_C}")
         return settings
 
 
@@ -178,13 +178,13 @@ def warming_ratios(setup: Setup) -> Array | float:
         DeviceError: If there are too few electrodes, if the charges of all electrodes are 0, or if the setting states
             numbers for other electrodes.
     """
-    rule = setup.rule(ThermalRule)
+    rule = setup.device.rule(ThermalRule)
     if rule is None:
         return 1.0
     if len(setup.electrodes) < MIN_ELECTRODES:
         raise DeviceError(
-            f"{setup.where}: common_mode: expected four electrodes or more, the model has {setup.electrodes}; with "
-            "three every set of charges fits some contact, and warming cannot be separated from force: remove the "
+            f"{setup.device.where}: common_mode: expected four electrodes or more, the model has {setup.electrodes}; "
+            "with three every set of charges fits some contact, and warming cannot be separated from force: remove the "
             "section"
         )
     if rule.pC_per_K is None:
@@ -192,5 +192,7 @@ def warming_ratios(setup: Setup) -> Array | float:
     charge_pC_per_K = setup.for_each_electrode("common_mode.pC_per_K", rule.pC_per_K)
     mean_magnitude_pC_per_K = float(np.abs(charge_pC_per_K).mean())
     if mean_magnitude_pC_per_K == 0.0:
-        raise DeviceError(f"{setup.where}: common_mode.pC_per_K: expected a number other than 0, got {rule.pC_per_K}")
+        raise DeviceError(
+            f"{setup.device.where}: common_mode.pC_per_K: expected a number other than 0, got {rule.pC_per_K}"
+        )
     return charge_pC_per_K / mean_magnitude_pC_per_K

@@ -110,8 +110,8 @@ class Touch(Stage):
     def __init__(self, setup: Setup) -> None:
         """Begin without a touch."""
         self._setup = setup
-        rule = setup.rule(TouchRule)
-        self._rule = None if rule is None else rule.resolved(has_currents=setup.has_currents)
+        rule = setup.device.rule(TouchRule)
+        self._rule = None if rule is None else rule.resolved(has_currents=setup.device.has_currents)
         self._noise_pC: Array | None = None  # noise of the latest tare
         self._threshold_pC = np.zeros(len(setup.electrodes))  # touch thresholds with this noise
         self.reset()
@@ -200,10 +200,10 @@ class Touch(Stage):
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
         """Return the settings, whether the charges of a touch may have any sign, and the time constant of the mean."""
-        rule = setup.rule(TouchRule)
+        rule = setup.device.rule(TouchRule)
         settings = super().c_settings(setup)
         if rule is not None:
-            resolved = rule.resolved(has_currents=setup.has_currents)
+            resolved = rule.resolved(has_currents=setup.device.has_currents)
             settings |= {"floor_pC": resolved.floor_pC, "release_share": resolved.release_share}
         return settings | {"any_sign": setup.has_any_sign, "rise_s": RISE_S}
 

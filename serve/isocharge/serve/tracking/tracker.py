@@ -149,11 +149,11 @@ class Tracker(Stage):
         Raises:
             ModelError: If the file `charges.npz` of the model is damaged.
         """
-        rule = setup.rule(TrackRule) or TrackRule()
+        rule = setup.device.rule(TrackRule) or TrackRule()
         self._filter = ContactFilter(constant_variance_share=rule.lasting**2)
         self._mixture: ContactMixture | None = None
         predictor = setup.predictor
-        if predictor is not None and setup.rule(FollowRule) is None:
+        if predictor is not None and setup.device.rule(FollowRule) is None:
             charges = read_charge_map(predictor.folder, predictor.metadata.electrodes)  # None without the file
             if charges is not None and charges.is_folded:
                 self._mixture = ContactMixture(charges, predictor.metadata.noise)

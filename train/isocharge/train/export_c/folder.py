@@ -12,9 +12,9 @@ import numpy as np
 
 from isocharge.common.errors import DeviceError
 from isocharge.common.files import new_folder, refuse_existing, write_whole
-from isocharge.serve.live.device import ANY_BOARD, STAGES, Device, check_channels
+from isocharge.serve.live.device import ANY_BOARD, STAGES, check_channels
 from isocharge.serve.model.model_folder import load_model
-from isocharge.serve.signal_chain.stage import NOT_IN_C
+from isocharge.serve.signal_chain.stage import NOT_IN_C, Device, Setup
 from isocharge.train.export_c.c_text import c_comment, c_double, c_doubles, source_text
 from isocharge.train.export_c.model_source import model_header, model_source, self_test
 from isocharge.train.model_release.onnx_graph import read_graph
@@ -37,10 +37,9 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
         DeviceError: If the device file is for other electrodes, if its tare is too long for C, or if it uses a stage
             that does not exist in C.
     """
-    setup = device.setup(electrodes)
-    if setup.has_currents:
+    setup = Setup(electrodes, device, has_any_sign=has_any_sign)
+    if setup.device.has_currents:
         raise DeviceError(f"{device.where}: front_end: {NOT_IN_C}")
-    setup.has_any_sign = has_any_sign
     lines = []
     sections_of_host = []
     for stage in STAGES:
