@@ -63,6 +63,3 @@ def test_a_minute_of_rest_gives_no_touch():
     part = load_amplifier("bench").start(3, RATE_HZ, np.random.default_rng(0))
     _, contact = undo(part, np.zeros((12_000, 3)), 0)
     assert not contact.any()
-
-
-PRESS_PC = np.array([800.0, 400.0, 300.0, 500.0])
