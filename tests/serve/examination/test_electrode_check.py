@@ -25,7 +25,7 @@ from kept import kept
 
 RATE_HZ = 200.0
 REST_S = 0.9
-PRESS_S = 0.6
+PRESS_S = 0.5
 FRAMES_AT_ONCE = 4
 END_S = 60.0
 """Time without a press at the end of a script, s."""
@@ -81,12 +81,14 @@ def sensor_with_wiring(charges, directions, wiring, gain=1.0, unit_pC=1.0, **opt
 def check(monkeypatch):
     """Return a function that checks the electrodes of a virtual sensor in simulated time."""
 
-    def check_in_simulated_time(sensor, electrodes, unit="pC", timeout_s=20.0):
+    def check_in_simulated_time(sensor, electrodes, unit="pC", rest_span=8.0, timeout_s=20.0):
         port = SimulatedPort(sensor)
         monkeypatch.setattr(electrode_check, "time", SimpleNamespace(monotonic=lambda: port.now_s))
         channels = {electrode: str(number + 1) for number, electrode in enumerate(electrodes)}
         requests = []
-        result = check_electrodes(port, device_from_table({}, "test"), channels, requests.append, unit, timeout_s)
+        result = check_electrodes(
+            port, device_from_table({}, "test"), channels, requests.append, unit, rest_span, timeout_s
+        )
         assert requests[0].startswith("wait")
         presses = [sentence for sentence in requests if sentence.startswith("press near")]
         assert list(dict.fromkeys(sentence.split()[3].rstrip(",") for sentence in presses)) == list(electrodes)
@@ -120,7 +122,7 @@ def test_swapped_channels_of_the_simulated_film(check, unit, unit_pC):
     places = np.array([electrode.centre for electrode in sensor.electrodes])
     directions = places / np.linalg.norm(places, axis=1, keepdims=True)
     board = sensor_with_wiring(film_charges(forward_map), 0.99 * directions, (0, 2, 1), (1.0, -2.0, 0.7), unit_pC)
-    result = check(board, "ABC", unit)
+    result = check(board, "ABC", unit, 8.0 / unit_pC)
     assert result.found == {"A": "1", "B": "3", "C": "2"}
     assert result.inverted == ("2",)
     assert "check the signs of the gain" in "\n".join(result.sentences)
@@ -160,6 +162,11 @@ def test_press_right_after_the_request_is_accepted(film, check, delay_s):
     assert result.found == {"A": "2", "B": "1", "C": "3"}
 
 
+def test_finger_that_is_on_the_film_at_first_is_waited_for(film, check):
+    sensor = sensor_with_wiring(film.charges, film.directions[[2, 0, 1, 2]], (1, 0, 2), first_rest_s=0.1)
+    assert check(sensor, "ABC").found == {"A": "2", "B": "1", "C": "3"}
+
+
 def test_settings_of_single_electrodes_move_with_their_channels():
     table = {
         "name": "board",
@@ -185,7 +192,7 @@ def test_doctor_writes_the_order_of_the_channels_found_by_presses(film, models, 
     wiring = (1, 0, 2)
     sensor = sensor_with_wiring(film.charges, film.directions, wiring, first_rest_s=60.0)
 
-    def check_and_press(port, device, channels, ask, unit):
+    def check_and_press(port, device, channels, ask, *rest):
         def ask_and_press(sentence):
             ask(sentence)
             if sentence.startswith("press near electrode"):
@@ -193,7 +200,7 @@ def test_doctor_writes_the_order_of_the_channels_found_by_presses(film, models, 
                 presses = press_script(film.directions[[electrode]], end_s=2.0)
                 sensor.use(lambda contact: film.charges(contact)[:, list(wiring)], presses)
 
-        return check_electrodes(port, device, channels, ask_and_press, unit)
+        return check_electrodes(port, device, channels, ask_and_press, *rest)
 
     monkeypatch.setattr(doctor, "check_electrodes", check_and_press)
     with sensor:

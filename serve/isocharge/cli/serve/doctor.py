@@ -172,7 +172,8 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
         channel_of_electrode = {name: name for name in channel_names}
 
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
-        return check_electrodes(port, device, channel_of_electrode, say, examination.unit)
+        rest_span = max(channel.span_pC or 0.0 for channel in examination.channels)
+        return check_electrodes(port, device, channel_of_electrode, say, examination.unit, rest_span)
 
 
 def port_lines() -> Iterator[str]:

@@ -63,6 +63,7 @@ def check_electrodes(
     channels: Mapping[str, str],
     ask: Callable[[str], None],
     unit: str = "pC",
+    rest_span: float = math.inf,
     timeout_s: float = 60.0,
 ) -> ElectrodeCheck:
     """For each electrode, ask the user for a press near it, and find the channel that changes most under this press.
@@ -73,6 +74,7 @@ def check_electrodes(
         channels: Assumed channel of each electrode, by the name of the electrode.
         ask: Function that is called with a sentence that asks the user to wait or to press.
         unit: Unit of the charges: "pC", "counts" or another unit.
+        rest_span: Largest minus smallest charge of a channel at rest. The film is touched if the charges vary more.
         timeout_s: Time to wait for each press, s.
 
     Returns:
@@ -86,7 +88,7 @@ def check_electrodes(
     electrodes = list(channels)
     channel_names = list(channels.values())
     ask("wait, and do not touch the film, until the rest level is known")
-    frames = _charge_frames(port, device, channels, unit)
+    frames = _charge_frames(port, device, channels, unit, rest_span)
     changes = np.array([_charges_of_press(frames, electrode, ask, timeout_s) for electrode in electrodes])
     columns = assign_channels(changes, electrodes)
 
@@ -168,20 +170,23 @@ def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str
     return {**table, **moved_sections, "channels": dict(check.found)}
 
 
-def _charge_frames(port: Port, device: Device, channels: Mapping[str, str], unit: str) -> Iterator[Frame]:
+def _charge_frames(
+    port: Port, device: Device, channels: Mapping[str, str], unit: str, rest_span: float
+) -> Iterator[Frame]:
     """Yield the frames of a board with their touch charges in the order of the electrodes.
 
-    If the gain is unknown, the charges have the unit of the board. The tare therefore accepts any noise and any offset,
-    and the charges of a touch may have any sign.
+    If the gain is unknown, the charges have the unit of the board. The tare therefore accepts any offset, and the
+    charges of a touch may have any sign.
 
     Args:
         port: The open port.
         device: Settings of the board, of which the frames, the kind of the front end and the gain are used.
         channels: Channel of each electrode, by the name of the electrode.
         unit: Unit of the charges. A touch changes counts and charges in pC by more than the default threshold.
+        rest_span: Largest minus smallest charge of a channel at rest, which the noise of a tare does not exceed.
     """
     rules: dict[type[Rule], Rule] = {
-        TareRule: TareRule(noise_limit_pC=math.inf, offset_limit_pC=math.inf, patience=0),
+        TareRule: TareRule(noise_limit_pC=rest_span, offset_limit_pC=math.inf, patience=0),
         TouchRule: TouchRule() if unit in ("pC", "counts") else TouchRule(floor_pC=0.0),
     }
     gain = device.rule(GainRule)
