@@ -60,6 +60,10 @@ def presses_on(problem, synthetic, unknowns, count, rng):
     return measured_presses(problem, with_rig_errors(contact, rng), charge)
 
 
+def film_estimate(problem, synthetic, presses):
+    return estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
+
+
 @pytest.mark.usefixtures("_one_hypothesis")
 def test_estimate_minimises_the_sum_of_squares_of_all_unknowns_and_contacts(problem, synthetic):
     """SciPy searches for the unknowns and the contacts together, of which some were not measured."""
@@ -124,8 +128,7 @@ def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(prob
         hypothesis = all_hypotheses[rng.choice(len(all_hypotheses), p=probability / probability.sum())]
         unknowns = draw_unknowns(problem, hypothesis, rng)
         presses = presses_on(replace(problem, noise=hypothesis.errors.noise), synthetic, unknowns, 8, rng)
-        data = PressData.of(presses, problem.noise, problem.solved_domain)
-        film = estimate(synthetic, data, problem.prior).film
+        film = film_estimate(problem, synthetic, presses).film
         gain = ContactSensitivity.of(problem, synthetic, film.values).film_gain[:, :2]
         # The offset and the drift of the session are not errors of later contacts in this comparison.
         lasting = np.r_[problem.prior.layout.film, problem.prior.layout.coefficients]
@@ -140,9 +143,9 @@ def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(prob
 
 def test_bad_press_is_left_out_and_hardly_changes_the_estimate(problem, synthetic):
     values, _, presses = rig(problem, synthetic, 12, seed=4)
-    good = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
+    good = film_estimate(problem, synthetic, presses)
     presses.contact[3, 0] += 3.0
-    found = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
+    found = film_estimate(problem, synthetic, presses)
     assert np.flatnonzero(found.is_bad).tolist() == [3]
     assert found.press_chi2[3] > 20.0 > good.press_chi2.max()
     std = np.sqrt(np.diag(good.film.covariance))
@@ -156,7 +159,7 @@ def test_noise_is_estimated_and_noisy_presses_are_not_bad(problem, synthetic, ga
     noisy = replace(problem, noise=NoiseModel("bench", 1.0, gain))
     for seed in range(3):
         _, _, presses = rig(noisy, synthetic, 20, seed=seed)
-        found = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
+        found = film_estimate(problem, synthetic, presses)
         assert least <= found.film.noise.gain <= most
         assert not found.is_bad.any()
 
@@ -167,7 +170,7 @@ def test_positions_worse_than_stated_are_not_taken_for_noise(problem, synthetic,
         values, _, presses = rig(problem, synthetic, 20, seed=seed)
         scatter_mm = np.sqrt(ratio**2 - 1.0) * presses.position_std_mm[:, None]
         presses.contact[:, :2] += scatter_mm * np.random.default_rng(seed).standard_normal((20, 2))
-        found = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
+        found = film_estimate(problem, synthetic, presses)
         assert found.hypothesis.errors.position_ratio == ratio
         assert found.film.noise == problem.noise
         assert found.is_bad.sum() <= 1
@@ -177,13 +180,13 @@ def test_positions_worse_than_stated_are_not_taken_for_noise(problem, synthetic,
 def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synthetic):
     """Four charges have one number more than a contact has unknowns, and the estimate before knows the rest."""
     values, _, presses = rig(problem, synthetic, 20, seed=5)
-    before = estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior).film
+    before = film_estimate(problem, synthetic, presses).film
     changed = values.copy()
     changed[0] += 0.3 if values[0] < 2.0 else -0.3
     _, contact, touches = rig(problem, synthetic, 40, seed=6, values=changed)
     touches.contact[:] = np.nan
     prior = Prior(problem.prior.layout, before.drifted())
-    found = estimate(synthetic, PressData.of(touches, problem.noise, problem.solved_domain), prior)
+    found = film_estimate(replace(problem, earlier=prior.earlier), synthetic, touches)
     std = found.film.std("pretension")
     assert abs(found.film.value("pretension") - changed[0]) < 3.0 * std
     assert std < 0.6 * np.sqrt(prior.earlier.covariance[0, 0])

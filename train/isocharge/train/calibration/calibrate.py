@@ -139,12 +139,12 @@ def _fit_even_film(
     problem: CalibrationProblem, data: PressData, charges: FilmCharges, executor: Executor | None
 ) -> Estimation:
     """Solve axisymmetric films and estimate the properties in turn, until the estimate hardly changes."""
-    estimation = _estimated(problem, data, charges, None)
+    estimation = estimate(charges, data, problem.prior)
     for _ in range(MAX_SOLVED_FILMS - 1):
         values = estimation.film.film_values
         if _solved_distance(estimation.charges, values) < SAME_FILM_STD:
             break
-        estimation = _estimated(problem, data, solve_even(problem, executor, values), estimation)
+        estimation = estimate(solve_even(problem, executor, values), data, problem.prior, estimation)
     return estimation
 
 
@@ -160,17 +160,8 @@ def _fit_uneven_film(
         charges, values = estimation.charges, estimation.film.film_values
         if _is_exact(charges, values, estimation.contact):
             break
-        estimation = _estimated(problem, data, charges.solved(values, executor), estimation)
+        estimation = estimate(charges.solved(values, executor), data, problem.prior, estimation)
     return estimation
-
-
-def _estimated(
-    problem: CalibrationProblem, data: PressData, charges: FilmCharges, previous: Estimation | None
-) -> Estimation:
-    """Estimate the unknowns with one solved film, beginning with a previous estimate."""
-    if previous is None:
-        return estimate(charges, data, problem.prior)
-    return estimate(charges, data, problem.prior, previous.film.values, previous.contact)
 
 
 def _solved_distance(charges: FilmCharges, values: Array) -> float:

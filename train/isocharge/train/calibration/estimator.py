@@ -205,9 +205,7 @@ class Estimation:
         return self.chi2 > max(UNEXPLAINED_CHI2 * self.redundancy, improbable_chi2)
 
 
-def estimate(
-    charges: FilmCharges, data: PressData, prior: Prior, start: Array | None = None, contact: Array | None = None
-) -> Estimation:
+def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Estimation | None = None) -> Estimation:
     """Estimate a film from presses, with the derivatives of one solved film.
 
     The search begins with the stated errors of the presses. If a press seems bad, the search is repeated with larger
@@ -218,12 +216,11 @@ def estimate(
         charges: Charges of a solved film and of similar films.
         data: The presses with their stated errors, and with the smallest possible noise.
         prior: Prior distribution of the unknowns.
-        start: Unknowns from which the search begins; None for the prior mean.
-        contact: Contacts (x, y, F) from which the search begins, shape (n, 3); None for the measured contacts.
+        previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
     """
     all_hypotheses = list(hypotheses(data.noise))
     assumed = PressErrors(data.noise)
-    estimation = _estimate_with_errors(charges, data, assumed, prior, all_hypotheses, start, contact)
+    estimation = _estimate_with_errors(charges, data, assumed, prior, all_hypotheses, previous)
     probable = estimation.hypothesis.errors
     if estimation.is_bad.any():
         probable = PressErrors(all_hypotheses[-1].errors.noise, LARGER_POSITION_RATIO)
@@ -231,9 +228,7 @@ def estimate(
         if probable == assumed:
             break
         assumed = probable
-        estimation = _estimate_with_errors(
-            charges, data, assumed, prior, all_hypotheses, estimation.film.values, estimation.contact
-        )
+        estimation = _estimate_with_errors(charges, data, assumed, prior, all_hypotheses, estimation)
         probable = estimation.hypothesis.errors
     return estimation
 
@@ -244,8 +239,7 @@ def _estimate_with_errors(
     assumed: PressErrors,
     prior: Prior,
     all_hypotheses: list[Hypothesis],
-    start: Array | None,
-    contact: Array | None,
+    previous: Estimation | None,
 ) -> Estimation:
     """Search for the film and for bad presses with assumed errors, and estimate the film under all hypotheses.
 
@@ -255,13 +249,15 @@ def _estimate_with_errors(
         assumed: Errors of the presses that the search assumes.
         prior: Prior distribution of the unknowns.
         all_hypotheses: The hypotheses.
-        start: Unknowns from which the search begins; None for the prior mean.
-        contact: Contacts (x, y, F) from which the search begins, shape (n, 3); None for the measured contacts.
+        previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
     """
     data = stated.with_errors(assumed)
     layout = prior.layout
-    unknowns = prior.mean if start is None else start
-    log_contact = data.contact if contact is None else np.column_stack([contact[:, :2], np.log(contact[:, 2])])
+    unknowns = prior.mean
+    log_contact = data.contact
+    if previous is not None:
+        unknowns = previous.film.values
+        log_contact = np.column_stack([previous.contact[:, :2], np.log(previous.contact[:, 2])])
     found = _search(charges, data, prior, unknowns, log_contact)
     unknowns, log_contact = found.state, found.contacts.copy()
     redundancy = _redundancy(data)

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate import NoiseModel, noise_model
+from isocharge.train.data.contact_errors import rounded
 
 NEIGHBOURS = 16
 """Number of contacts to which a plane is fitted, which is four times the number of its coefficients."""
@@ -162,8 +163,8 @@ class ChannelNoise:
         """Return the noise model as it is stored in the metadata of a model."""
         return {
             "name": self.name,
-            "white_pC": [float(f"{white:.4g}") for white in self.white],
-            "gain": [float(f"{gain:.4g}") for gain in self.gain],
+            "white_pC": [rounded(white) for white in self.white],
+            "gain": [rounded(gain) for gain in self.gain],
         }
 
 

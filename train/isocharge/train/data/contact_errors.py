@@ -15,6 +15,11 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+def rounded(value: float | np.floating) -> float:
+    """Round a number to four significant digits, as in the metadata."""
+    return float(f"{value:.4g}")
+
+
 def position_error(contact: Array, truth: Array) -> Array:
     """Compute the distance between the estimated and the true position of each contact.
 

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from isocharge.common.arrays import Booleans
 from isocharge.serve.model.metadata import UnnoticedPresses
 from isocharge.simulate import Domain
+from isocharge.train.data.contact_errors import rounded
 from isocharge.train.data.presses import LabelledPresses
 
 FORCE_RATIO = 10.0
@@ -92,6 +93,6 @@ class OutsidePresses:
         return UnnoticedPresses(
             from_mm=round(self.domain.radius, 4),
             to_mm=round(self.outer, 4),
-            force_N=(float(f"{smallest_force:.4g}"), float(f"{max_force:.4g}")),
+            force_N=(rounded(smallest_force), rounded(max_force)),
             share=tuple(tuple(ring) for ring in shares.tolist()),
         )

@@ -12,7 +12,7 @@ from isocharge.serve.model.contact import Contacts
 from isocharge.serve.model.metadata import ModelMetadata, UnnoticedPresses
 from isocharge.serve.model.validity import Validity
 from isocharge.train.data.channel_noise import Noise, misfit_noise
-from isocharge.train.data.contact_errors import ContactErrorStatistics, position_error
+from isocharge.train.data.contact_errors import ContactErrorStatistics, position_error, rounded
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.fit import Fitted
 
@@ -129,11 +129,6 @@ def _misfit_percentiles(good_misfits: Array) -> dict[str, float]:
         "misfit_p99": rounded(np.percentile(good_misfits, 99.0)),
         "misfit_p999": rounded(np.percentile(good_misfits, 99.9)),
     }
-
-
-def rounded(value: float | np.floating) -> float:
-    """Round a number to four significant digits, as in the metadata."""
-    return float(f"{value:.4g}")
 
 
 def _measure_detection(

@@ -16,7 +16,7 @@ from isocharge.common.errors import ModelError
 from isocharge.common.structs import convert
 from isocharge.serve.model.golden import contact_floors
 from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
-from isocharge.serve.model.model_folder import check_target, write_model
+from isocharge.serve.model.model_folder import write_model
 from isocharge.serve.model.validity import disk_corners
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.channel_noise import misfit_noise
@@ -206,7 +206,6 @@ def release(
         TrainingError: If the exported graph and the network disagree.
     """
     names = fitted.sensor.electrode_names
-    check_target(folder, version, names)
     package_versions = {name: installed_version(name) for name in ("isocharge", "numpy", "onnx", "onnxruntime")}
     metadata_without_unnoticed = ModelMetadata(
         name=folder.resolve().name,

@@ -18,7 +18,7 @@ from isocharge.serve.model.validity import inside_polygon
 from isocharge.simulate import Dataset, limits_at, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.charge_fit import fit_charge_series
-from isocharge.train.data.contact_errors import ContactErrorStatistics, rms
+from isocharge.train.data.contact_errors import ContactErrorStatistics, rms, rounded
 from isocharge.train.data.presses import (
     FEWEST_MEASURED,
     HELD_PARTS,
@@ -29,7 +29,6 @@ from isocharge.train.data.presses import (
     presses_of,
     split_by_position,
 )
-from isocharge.train.model_release.evaluate import rounded
 from isocharge.train.report.methods import METHOD_BUILDERS, FittingTask, Method, model_method
 from isocharge.train.training.config import TrainingConfig
 

@@ -25,7 +25,7 @@ from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import PressError, cut
 from isocharge.serve.presses.measured_presses import MeasuredPresses, presses_text
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
-from isocharge.train.data.contact_errors import rms
+from isocharge.train.data.contact_errors import rms, rounded
 from isocharge.train.data.measured_sensor import LEAST_RANGE, MeasuredSensor, PressedArea, check_measured_presses
 from isocharge.train.data.presses import (
     FEWEST,
@@ -144,8 +144,8 @@ def fit_presses(
     made_with = _made_with(settings, labelled, (position_factor, force_factor))
     if force_std is not None:
         made_with["constant_force"] = {
-            "force_N": float(f"{np.exp(domain.centre[2]):.4g}"),
-            "force_std": float(f"{force_std:.4g}"),
+            "force_N": rounded(np.exp(domain.centre[2])),
+            "force_std": rounded(force_std),
             "is_known": bool(presses.placed.any()),
         }
     return Fitted(
@@ -178,7 +178,7 @@ def _made_with(settings: FitConfig, presses: LabelledPresses, std_factors: tuple
             "presses": len(presses),
             "places": len(np.unique(presses.contact[:, :2], axis=0)),
             "folds": HELD_PARTS,
-            "std_factors": [float(f"{factor:.4g}") for factor in std_factors],
+            "std_factors": [rounded(factor) for factor in std_factors],
         },
     }
 
