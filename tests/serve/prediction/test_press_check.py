@@ -15,7 +15,7 @@ from scipy import stats
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, Predictor, check_presses
-from isocharge.serve.prediction.agreement import binomial_distribution, chi_squared_survival, common_error
+from isocharge.serve.prediction.press_errors import binomial_distribution, chi_squared_survival, common_error
 
 RIG_STD_MM = 0.05
 RIG_FORCE_STD = 0.004

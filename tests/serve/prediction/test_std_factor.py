@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from isocharge.serve.prediction.agreement import REGION_QUANTILES, StdFactor
+from isocharge.serve.prediction.press_errors import REGION_QUANTILES, StdFactor
 
 
 def draw(rng, count, scale, degrees_of_freedom):

@@ -22,17 +22,15 @@ from isocharge.common.json_values import plain_values
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.validity import Validity
-from isocharge.serve.prediction.agreement import (
-    TEST_SIGNIFICANCE,
-    Agreement,
-    StdFactor,
-    binomial_distribution,
-    chi_squared_deviate,
-)
 from isocharge.serve.prediction.press_errors import (
     FORCE,
     NOT_TRAINED,
+    TEST_SIGNIFICANCE,
+    Agreement,
     PressErrors,
+    StdFactor,
+    binomial_distribution,
+    chi_squared_deviate,
     misfit_limit,
     press_errors,
 )

@@ -91,10 +91,6 @@ def _designed_polygons(parts: dict[str, Any], name: str) -> list[Polygon]:
     part = parts[name]
     if isinstance(part, dict):
         return [part["polygon_mm"], *part.get("more_mm", [])]
-    x_mm, y_mm = part
     half_side_mm = 0.5 * parts["side_mm"]
-    left = x_mm - half_side_mm
-    right = x_mm + half_side_mm
-    bottom = y_mm - half_side_mm
-    top = y_mm + half_side_mm
-    return [[[left, bottom], [right, bottom], [right, top], [left, top]]]
+    corners_mm = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * half_side_mm + part
+    return [corners_mm.tolist()]
