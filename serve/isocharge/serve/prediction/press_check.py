@@ -45,9 +45,6 @@ MAX_BAD_FRACTION = 0.1
 MISFIT_FRACTION = 0.01
 """Fraction of good presses whose misfit is above the limit `misfit_p99` of the model."""
 
-MIN_COMMON_SIGNIFICANCE = 3.0
-"""Significance above which a common shift or a common scale factor is reported, in standard deviations."""
-
 
 @dataclass(frozen=True)
 class ErrorSummary:
@@ -369,19 +366,21 @@ def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[s
 def _common_notes(agreement: Agreement) -> Iterator[str]:
     """Yield a note about a common shift of all positions, and a note about a common scale factor of all forces.
 
-    Each of the two notes is only yielded if the shift or the deviation of the scale factor from 1 is significant.
+    Each of the two notes is only yielded if the shift or the deviation of the scale factor from 1 would be as large by
+    chance with a probability of at most `TEST_SIGNIFICANCE`.
 
     Args:
         agreement: Tests of the errors, which contain the common errors of x, y and the force.
     """
     mean, std, significance = agreement.common
+    limit = NormalDist().inv_cdf(1.0 - 0.5 * TEST_SIGNIFICANCE)  # errors of both signs count
     x_shift_mm, y_shift_mm, force_scale_change = mean
-    if np.nanmax(np.abs(significance[:FORCE]), initial=0.0) > MIN_COMMON_SIGNIFICANCE:
+    if np.nanmax(np.abs(significance[:FORCE]), initial=0.0) > limit:
         yield (
             f"positions are off by ({x_shift_mm:.2g}, {y_shift_mm:.2g}) +- {std[:FORCE].max():.2g} mm on the average: "
             "electrodes or rig are shifted"
         )
-    if abs(significance[FORCE]) > MIN_COMMON_SIGNIFICANCE:
+    if abs(significance[FORCE]) > limit:
         yield (
             f"forces are {1.0 + force_scale_change:.4g} +- {std[FORCE]:.2g} times the measured ones on the average, as "
             "after a change of pretension, d31 or gains"

@@ -207,11 +207,8 @@ def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tup
     return tuple(reasons.tolist())
 
 
-SIGNIFICANCE = 0.01
-"""Probability that a model that fits is rejected. Each of the three tests has a third of this probability."""
-
-TEST_SIGNIFICANCE = SIGNIFICANCE / 3.0
-"""Probability that one test rejects a model that fits."""
+TEST_SIGNIFICANCE = 0.01 / 3.0
+"""Probability that one test rejects a model that fits. The three tests together reject it with a probability of 1 %."""
 
 MAX_ACCEPTED_CHI_SQUARED = 1.1
 """Chi-squared per degree of freedom up to which the scatter is always accepted, dimensionless.

@@ -40,6 +40,7 @@ from isocharge.serve.network.protocol.response import (
 from isocharge.serve.record.record import PredictionRecord
 from isocharge.serve.viewer.tape import (
     FLAG_BITS,
+    HISTORY_S,
     MAX_DRAWN_SAMPLES,
     RecordedTape,
     Tape,
@@ -56,9 +57,6 @@ REQUEST_PATH = "/request"
 
 PAGE_LIMITS = ServerLimits(body_bytes=1 << 12, connections=64)
 """Limits of the server of the page. A browser uses one or two connections, and its requests are short."""
-
-HISTORY_S = 10.0
-"""Time span of the earlier samples that a new browser receives, s. The traces of the page have this length."""
 
 MAX_MARKERS = 200
 """Number of the latest markers that the page shows."""

@@ -100,8 +100,11 @@ LIVE_SAMPLES = 1 << 14
 They cover 16 s at 1 kHz. A browser that falls further behind misses samples.
 """
 
-RATE_SAMPLES = 400
-"""Number of the latest samples from whose times the frame rate of the board is computed."""
+HISTORY_S = 10.0
+"""Time span of the earlier samples that a new browser receives, s. The traces of the page have this length.
+
+The frame rate of the board is computed over the same time span.
+"""
 
 MAX_DRAWN_SAMPLES = 600
 """Largest number of samples that the page draws in a line: of a response to one request, or of an overview."""
@@ -164,11 +167,11 @@ class Tape:
         return self.timestamp(self.oldest), self.timestamp(self.total - 1)
 
     def rate_Hz(self) -> float | None:
-        """Compute the frame rate, Hz, from the times of the latest samples. Return None if the rate is unknown."""
-        times_s = self.samples(self.total - RATE_SAMPLES, self.total)["timestamp"]
-        if len(times_s) < 2 or not times_s[-1] > times_s[0]:  # also if a time is NaN
-            return None
-        return float((len(times_s) - 1) / (times_s[-1] - times_s[0]))
+        """Compute the frame rate of the last `HISTORY_S` seconds, Hz. Return None if the rate is unknown."""
+        _, end_s = self.span()
+        first = self.first_number_after(end_s - HISTORY_S)
+        duration_s = end_s - self.timestamp(first)
+        return (self.total - 1 - first) / duration_s if duration_s > 0.0 else None  # None also if a time is NaN
 
     def close(self) -> None:
         """Close the file of the samples if the tape has a file."""
