@@ -60,17 +60,10 @@ def read_whole(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
             `strerror` of the exception states the reason.
     """
     with open_regular(path) as file:
-        if os.fstat(file.fileno()).st_size > max_bytes:
-            raise _too_large_error(path, max_bytes)
         data = file.read(max_bytes + 1)
-    if len(data) > max_bytes:  # the file has grown since its size was determined
-        raise _too_large_error(path, max_bytes)
+    if len(data) > max_bytes:
+        raise OSError(errno.EFBIG, f"larger than {max_bytes} bytes", str(path))
     return data
-
-
-def _too_large_error(path: Path, max_bytes: int) -> OSError:
-    """Return the exception for a file that is larger than `max_bytes`."""
-    return OSError(errno.EFBIG, f"larger than {max_bytes} bytes", str(path))
 
 
 def bounded_lines(file: TextIO, max_characters: int = MAX_LINE_CHARACTERS) -> Iterator[str]:

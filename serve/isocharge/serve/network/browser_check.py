@@ -18,6 +18,7 @@ Programs other than browsers send neither `Origin` nor `Sec-Fetch-Site`. In the 
 therefore checks only the header `Host`.
 """
 
+import re
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from urllib.parse import urlsplit
@@ -144,6 +145,10 @@ def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
     return values
 
 
+_NAME = re.compile(r"[a-z0-9_.-]+")
+"""Host name, or IPv4 address, in lower case."""
+
+
 def host_name(text: str) -> str:
     """Check a value of the option --allow-host, and return the host name in lower case.
 
@@ -155,14 +160,9 @@ def host_name(text: str) -> str:
             port or a path.
     """
     name = text.strip().lower()
-    is_printable_ascii = name.isascii() and name.isprintable()
-    has_forbidden_character = any(character in name for character in "/@?#%* ,\\")  # no host name contains these
-
-    is_bracketed = name.startswith("[") and name.endswith("]")
-    if is_bracketed:
+    if name.startswith("[") and name.endswith("]"):
         name = name[1:-1]
-    has_port = ":" in name and ip_address(name) is None  # the only names with colons are IPv6 addresses
-    if not name or not is_printable_ascii or has_forbidden_character or has_port:
+    if not _NAME.fullmatch(name) and ip_address(name) is None:
         raise InputError(f"--allow-host: expected a host name without scheme, port and path, got {text!r:.100}")
     return name.removesuffix(".")  # "example.org." is the same host as "example.org"
 

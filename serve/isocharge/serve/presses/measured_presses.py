@@ -254,6 +254,8 @@ def read_presses(
     expected_header = f"a header with {', '.join(CONTACT)} and {expected_electrodes} (charges in pC)"
     with open_table(path, (*(electrodes or ()), *PRESS_RULES), PressError, expected_header) as table:
         electrode_names = _electrode_columns(table) if electrodes is None else tuple(electrodes)
+        with error_prefix(f"{path}: ", PressError):
+            _check_electrodes(electrode_names)
         chosen_rules = table.choose_columns(dict.fromkeys(electrode_names, CHARGE_RULE), optional=PRESS_RULES)
         columns = _read_rows(table, chosen_rules)
 
