@@ -16,7 +16,6 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
 SENSOR = load_sensor("four-25um-biaxial")
 PROBE = Circle(1.0)
@@ -83,14 +82,6 @@ def test_presses_near_the_rim_of_an_oval_film_are_solved(at):
 def test_presses_beyond_the_rim_of_an_oval_film_raise_error(at):
     with pytest.raises(SceneError, match="probe off the film"):
         press(replace(SENSOR.film, pretension=1.0, oval=0.02), PROBE, at, 0.1)
-
-
-def test_sensor_file_stores_all_imperfections():
-    sensor = replace(SENSOR, film=replace(ALL, shear=1000.0), piezo=replace(SENSOR.piezo, d12=0.5))
-    sensor = replace(sensor, calibration=replace(sensor.calibration, crosstalk=0.01))
-    table = sensor_to_dict(sensor)
-    assert table["film"]["pretension_MPa"] == [1.33, 0.67, 0.2]
-    assert sensor_to_dict(sensor_from_dict(table)) == table
 
 
 def test_crosstalk_adds_a_share_of_the_charges_of_the_other_electrodes():

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.common.errors import SensorError
-from isocharge.simulate import load_sensor, write_sensor
+from isocharge.simulate import load_sensor
 from isocharge.simulate.mechanics.film_temperature import tension_change, warmed
 
 YOUNG = 3000.0
@@ -57,18 +56,3 @@ def test_warmed_sensor_of_a_biaxial_film_stays_axisymmetric():
     assert warm.film.is_axisymmetric
     assert warm.film.pretension == pytest.approx(0.8 - 0.5e-4 * YOUNG / (1.0 - POISSON))
     assert warmed(load_sensor("four-25um-biaxial"), 5.0) == load_sensor("four-25um-biaxial")
-
-
-def test_sensor_file_contains_expansion_coefficients(tmp_path):
-    sensor = replace(load_sensor("four-25um-uniaxial"), film=film_with(expansion=(-5e-6, 1e-4), ring_expansion=5e-6))
-    write_sensor(sensor, tmp_path / "drawn.toml")
-    text = (tmp_path / "drawn.toml").read_text()
-    assert "expansion_ppm_per_K = [-5.0, 100.0]\nring_expansion_ppm_per_K = 5.0" in text
-    assert load_sensor(tmp_path / "drawn.toml").film == sensor.film
-    write_sensor(load_sensor("four-25um-uniaxial"), tmp_path / "plain.toml")
-    assert "expansion" not in (tmp_path / "plain.toml").read_text()
-
-
-def test_expansion_in_ppm_instead_of_1_per_K_is_refused():
-    with pytest.raises(SensorError, match=r"film.expansion_ppm_per_K: expected -1000 to 1000 ppm/K, got 1e\+08 ppm/K"):
-        film_with(expansion=(100.0, 100.0))

@@ -27,6 +27,9 @@ def three() -> Sensor:
         ({"deviator": (0.0, 301.0)}, r"film.pretension_MPa, .* and T12: expected -300 to 300 MPa, got 301 MPa"),
         ({"thickness": 5.0}, r"film.thickness_um: expected at most a tenth of the radius \(45 mm\), got 5 mm"),
         ({"radius": 0.045}, r"film.radius_mm: expected at least 1 mm, got 0\.045 mm; 0\.045 m are 45 mm"),
+        ({"back_volume": np.nan}, r"film.back_volume_mm3: expected at least 1 mm\^3, got nan"),
+        ({"static_pressure": -1.0}, r"film.static_pressure_Pa: expected -10000 to 10000 Pa, got -1e\+06 Pa"),
+        ({"expansion": (1e-4, 100.0)}, r"film.expansion_ppm_per_K: expected -1000 to 1000 ppm/K, got 1e\+08 ppm/K"),
         ({"young": 3e6}, "film.young_GPa: .* got 3000 GPa; 3000 MPa are 3 GPa"),
     ],
 )

@@ -237,6 +237,43 @@ def test_written_sensor_file_reads_as_the_built_in_sensor(name, tmp_path):
         write_sensor(load_sensor(name), path)
 
 
+def test_every_property_of_a_film_is_written_in_the_unit_of_its_key():
+    sensor = load_sensor("three-25um-biaxial")
+    film = Film(
+        *(45.0, 0.025, 3000.0, 0.34, 1.0, (0.33, 0.2)),
+        young_ratio=1.44,
+        shear=1000.0,
+        axis=np.pi / 6.0,
+        oval=0.02,
+        oval_axis=-np.pi / 4.0,
+        back_volume=127000.0,
+        static_pressure=2e-6,
+        expansion=(-5e-6, 1e-4),
+    )
+    calibration = Calibration(crosstalk=0.01)
+    table = sensor_to_dict(replace(sensor, film=film, piezo=replace(sensor.piezo, d12=0.5), calibration=calibration))
+    assert table["film"] == {
+        "radius_mm": 45.0,
+        "thickness_um": 25.0,
+        "young_GPa": [3.6, 2.5],
+        "poisson": 0.34,
+        "pretension_MPa": [1.33, 0.67, 0.2],
+        "shear_GPa": 1.0,
+        "axis_deg": 30.0,
+        "oval": 0.02,
+        "oval_axis_deg": -45.0,
+        "back_volume_mm3": 127000.0,
+        "static_pressure_Pa": 2.0,
+        "expansion_ppm_per_K": [-5.0, 100.0],
+        "ring_expansion_ppm_per_K": 23.0,
+    }
+    assert (table["piezo"]["d12"], table["calibration"]["crosstalk"]) == (0.5, 0.01)
+    again = sensor_from_dict(table)
+    assert sensor_to_dict(again) == table
+    np.testing.assert_allclose([*again.film.expansion, again.film.axis], [-5e-6, 1e-4, np.pi / 6.0])
+    assert list(sensor_to_dict(sensor)["film"]) == list(table["film"])[:5]  # optional keys are omitted
+
+
 def test_squares_of_a_second_size_are_written_as_polygons():
     """The file has one side for all squares."""
     base = load_sensor("three-25um-biaxial")

@@ -10,7 +10,6 @@ from scipy.integrate import cumulative_simpson, solve_bvp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import brentq
 
-from isocharge.common.errors import SensorError
 from isocharge.simulate import (
     Circle,
     Film,
@@ -23,7 +22,6 @@ from isocharge.simulate import (
     load_sensor,
     press,
     touch_charge,
-    write_sensor,
 )
 from isocharge.simulate.solver.error_estimate import mesh_error
 
@@ -210,27 +208,3 @@ def test_forward_map_of_a_film_with_a_closed_back_equals_direct_solves():
     forward_map = ForwardMap.build(sensor, Circle(1.0), 4.0, (0.3, 0.5))
     charge = touch_charge(sensor, press(sensor.film, Circle(1.0), (-2.0, 3.2), 0.35))
     np.testing.assert_allclose(forward_map.charges(np.array([[-2.0, 3.2, 0.35]]))[0], charge, rtol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("film", "message"),
-    [
-        ({"back_volume": 0.0}, "film back_volume: expected at least 1 mm"),
-        ({"back_volume": -5.0}, "film back_volume: expected at least 1 mm"),
-        ({"back_volume": float("nan")}, "film back_volume: expected at least 1 mm"),
-        ({"static_pressure": 1.0}, "film static_pressure: expected -10000 to 10000 Pa, got 1e"),
-        ({"static_pressure": float("nan")}, "film static_pressure: expected"),
-    ],
-)
-def test_invalid_back_pressures_raise_sensor_errors(film, message):
-    with pytest.raises(SensorError, match=message):
-        sensor_with(**film)
-
-
-def test_sensor_file_contains_back_volume_and_static_pressure(tmp_path):
-    sensor = sensor_with(back_volume=127000.0, static_pressure=2e-6)
-    write_sensor(sensor, tmp_path / "closed.toml")
-    assert "back_volume_mm3 = 127000.0\nstatic_pressure_Pa = 2.0" in (tmp_path / "closed.toml").read_text()
-    assert load_sensor(tmp_path / "closed.toml").film == sensor.film
-    write_sensor(sensor_with(), tmp_path / "vented.toml")
-    assert "back" not in (tmp_path / "vented.toml").read_text()

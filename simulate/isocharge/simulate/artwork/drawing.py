@@ -21,17 +21,8 @@ with require("design"):
     from ezdxf.addons.drawing.svg import SVGBackend
     from ezdxf.document import Drawing
 
-LAYERS = {"FILM": 7, "ELECTRODES": 1, "NAMES": 8}
+LAYERS = {"FILM": 7, "ELECTRODES": 1, "NAMES": 8, "BACK": 5}
 """Names of the layers of a drawing, and their colours in the AutoCAD colour index."""
-
-BACK_COLOUR = 5
-"""Colour of the layer BACK in the AutoCAD colour index.
-
-This layer exists only if the sensor file describes the metal of the back.
-"""
-
-TEXT_HEIGHT = 2.0
-"""Height of the letters in a drawing, mm."""
 
 MARGIN = 5.0
 """Margin around an SVG drawing, mm."""
@@ -40,8 +31,8 @@ MARGIN = 5.0
 def draw_layout(sensor: Sensor) -> Drawing:
     """Create a drawing of the film, the electrodes, their names, and the metal of the back.
 
-    The electrodes are closed polylines at their nominal positions. The layer `BACK` exists only if the back is not
-    completely covered with metal.
+    The electrodes are closed polylines at their nominal positions. The layer `BACK` is empty if the back is completely
+    covered with metal.
 
     Args:
         sensor: Sensor with the layout.
@@ -66,15 +57,13 @@ def draw_layout(sensor: Sensor) -> Drawing:
 
     # Draw the metal of the back. Electrodes may share it, so equal polygons are drawn only once.
     back_polygons = dict.fromkeys(polygon for electrode in sensor.electrodes for polygon in electrode.back)
-    if back_polygons:
-        document.layers.add("BACK", color=BACK_COLOUR)
     for polygon in back_polygons:
         space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "BACK"})
     return document
 
 
 def _draw_name(space: Any, electrode: Electrode) -> None:
-    """Write the name of an electrode at the rightmost corner of its pad.
+    """Write the name of an electrode at the rightmost corner of its pad, in the standard height of ezdxf (2.5 mm).
 
     Characters that are not printable are replaced.
 
@@ -83,7 +72,7 @@ def _draw_name(space: Any, electrode: Electrode) -> None:
         electrode: Electrode whose name is written.
     """
     letters = [letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in electrode.name]
-    text = space.add_text("".join(letters), height=TEXT_HEIGHT, dxfattribs={"layer": "NAMES"})
+    text = space.add_text("".join(letters), dxfattribs={"layer": "NAMES"})
     rightmost_corner = max(electrode.corners)  # tuples (x, y) are compared by x first
     text.set_placement(rightmost_corner)
 

@@ -245,8 +245,7 @@ class Measurement:
         # `_variance_ratio` is the variance of the film divided by the variance of the air.
         innovation_std = math.sqrt((1.0 - air_decay * air_decay) / self._variance_ratio) * amplifier.temperature_rms
         innovations = innovation_std * self.rng.standard_normal(time.size)
-        air_start = [air_decay * self._air_temperature]
-        drift, _ = scipy.signal.lfilter([1.0], [1.0, -air_decay], innovations, zi=air_start)
+        drift = _decaying_sum(air_decay, innovations, self._air_temperature)
 
         # The temperature step of the air has the shape of a trapezium: it rises, remains constant, and falls again.
         time_since_step = time - amplifier.step_at
@@ -255,11 +254,7 @@ class Measurement:
         air_temperature = drift + amplifier.step * relative_step
 
         # The film is a low-pass filter: film[n] = film_decay * film[n - 1] + (1 - film_decay) * air[n]
-        film_start = [film_decay * self._film_temperature]
-        film_temperature: Array
-        film_temperature, _ = scipy.signal.lfilter(
-            [1.0 - film_decay], [1.0, -film_decay], air_temperature, zi=film_start
-        )
+        film_temperature = _decaying_sum(film_decay, (1.0 - film_decay) * air_temperature, self._film_temperature)
 
         # Store the state for the next call. The step of the air is not stored, because it follows from the time.
         self._air_temperature = float(drift[-1])
@@ -284,11 +279,8 @@ class Measurement:
 
         # Each channel has its own time constant. Its filter is output[n] = decay * output[n - 1] + inputs[n].
         decays = np.exp(-1.0 / (self.rate * self.leak_time))
-        output = np.empty_like(inputs)
-        for channel, decay in enumerate(decays):
-            start = [decay * self._output[channel]]
-            channel_output, _ = scipy.signal.lfilter([1.0], [1.0, -decay], inputs[:, channel], zi=start)
-            output[:, channel] = channel_output
+        channels = zip(decays.tolist(), inputs.T, self._output.tolist(), strict=True)
+        output = np.stack([_decaying_sum(*channel) for channel in channels], axis=1)
         self._output = output[-1]
         return output
 
@@ -313,3 +305,18 @@ class Measurement:
         highest_code = 2 ** (bits - 1) - 1
         codes = np.clip(np.round(clipped_output / charge_per_code), lowest_code, highest_code)
         return np.asarray(codes * charge_per_code)
+
+
+def _decaying_sum(decay: float, inputs: Array, previous: float) -> Array:
+    """Compute the outputs output[n] = decay * output[n - 1] + inputs[n] of a first-order low-pass filter.
+
+    Args:
+        decay: Factor by which the output decays between two readings.
+        inputs: Inputs, shape (n,).
+        previous: Output before the first input.
+
+    Returns:
+        Outputs, shape (n,).
+    """
+    outputs, _ = scipy.signal.lfilter([1.0], [1.0, -decay], inputs, zi=[decay * previous])
+    return np.asarray(outputs)

@@ -51,14 +51,15 @@ class BackPressure:
             Energy, dimensionless. It is infinite if the film displaces the whole volume of the air.
         """
         volume = self._volume(deflection)
-        static_work = self.groups.static_pressure * volume
-        has_trapped_air = self.groups.compression != 0.0
-        if not has_trapped_air:
-            return -static_work / self._copies
-        # `_relative_air_energy` is divided by p0 V0. In scaled units, the volume V0 of the air is 1 / compression.
-        energy_unit = self.groups.ambient_pressure / self.groups.compression
-        air_energy = energy_unit * self._relative_air_energy(deflection)
-        return (air_energy - static_work) / self._copies
+        energy = -self.groups.static_pressure * volume
+        if self.groups.compression != 0.0:
+            displaced_share = self.groups.compression * volume
+            if displaced_share >= 1.0:
+                return np.inf
+            # The energy of the air is divided by p0 V0. In scaled units, the volume V0 of the air is 1 / compression.
+            energy_unit = self.groups.ambient_pressure / self.groups.compression
+            energy += energy_unit * (-np.log1p(-displaced_share) - displaced_share)
+        return float(energy / self._copies)
 
     def forces(self, deflection: Array) -> Array:
         """Compute the derivatives of the energy with respect to the deflection of each node.
@@ -74,9 +75,7 @@ class BackPressure:
         displaced_share = self.groups.compression * self._volume(deflection)
         if displaced_share >= 1.0:
             return np.full_like(deflection, np.inf)
-        air_pressure = 0.0  # if no air is trapped, or if no volume is displaced
-        if displaced_share != 0.0:
-            air_pressure = self.groups.ambient_pressure * displaced_share / (1.0 - displaced_share)
+        air_pressure = self.groups.ambient_pressure * displaced_share / (1.0 - displaced_share)
         pressure = air_pressure - self.groups.static_pressure
         return pressure * self.weights
 
@@ -90,30 +89,6 @@ class BackPressure:
         pressure_per_volume = self.groups.ambient_pressure * self.groups.compression / (1.0 - displaced_share) ** 2
         return float(self._copies * pressure_per_volume)
 
-    def static_work(self, deflection: Array) -> float:
-        """Compute the work of the static pressure on the meshed part of the film.
-
-        Args:
-            deflection: Scaled deflection W at the nodes, shape (n_node,).
-        """
-        return self.groups.static_pressure * self._volume(deflection) / self._copies
-
     def _volume(self, deflection: Array) -> float:
         """Compute the integral of the scaled deflection W over the whole film."""
         return self._copies * float(self.weights @ deflection)
-
-    def _relative_air_energy(self, deflection: Array) -> float:
-        """Compute the energy of the trapped air, divided by p0 V0.
-
-        The result is -ln(1 - x) - x, where x = V / V0 is the displaced share of the volume of the air.
-
-        Args:
-            deflection: Scaled deflection W at the nodes, shape (n_node,).
-
-        Returns:
-            Energy, dimensionless. It is infinite if the film displaces the whole volume of the air.
-        """
-        displaced_share = self.groups.compression * self._volume(deflection)
-        if displaced_share >= 1.0:
-            return np.inf
-        return float(-np.log1p(-displaced_share) - displaced_share)

@@ -47,7 +47,7 @@ class ElasticFilm:
         groups: Dimensionless groups of the press.
         membrane: Stretching energy.
         bending: Bending energy; None if the theory omits bending.
-        back: Energy of the pressure on the whole film; None if no such pressure acts.
+        back: Energy of the pressure on the whole film.
     """
 
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
@@ -55,17 +55,12 @@ class ElasticFilm:
         self.groups = groups
         self.membrane = Membrane(geometry, groups)
         self.bending = Bending(geometry, groups.bending) if groups.bending > 0.0 else None
-        self.back = BackPressure(geometry, groups) if groups.has_back_pressure else None
+        self.back = BackPressure(geometry, groups)
 
     @property
     def unknowns_per_node(self) -> int:
         """Number of unknowns per node in the linear solves. Bending has an auxiliary unknown."""
         return 3 if self.bending is None else 4
-
-    @property
-    def has_side_load(self) -> bool:
-        """Whether the force of the probe has a component in the plane of the film."""
-        return self.groups.side_load != (0.0, 0.0)
 
     def energy(self, field: Array) -> float:
         """Compute the potential energy of a field as the stored energy minus the work of the probe.
@@ -78,11 +73,9 @@ class ElasticFilm:
         stored_energy = self.membrane.energy(field)
         if self.bending is not None:
             stored_energy += self.bending.energy(deflection)
-        if self.back is not None:
-            stored_energy += self.back.energy(deflection)
+        stored_energy += self.back.energy(deflection)
         work = self.groups.load * float(self.geometry.load @ deflection)
-        if self.has_side_load:
-            work += float(self.geometry.load @ in_plane @ np.array(self.groups.side_load))
+        work += float(self.geometry.load @ in_plane @ np.array(self.groups.side_load))
         return stored_energy - work
 
     def residual(self, field: Array) -> Array:
@@ -102,19 +95,17 @@ class ElasticFilm:
 
         # Subtract the force of the probe perpendicular to the film, and its force in the plane of the film.
         residual[:, 2] -= self.groups.load * self.geometry.load
-        if self.has_side_load:
-            residual[:, :2] -= np.outer(self.geometry.load, self.groups.side_load)
+        residual[:, :2] -= np.outer(self.geometry.load, self.groups.side_load)
 
         # `back.forces` is the derivative of the energy, which is the negative force of the pressure on the whole film.
         # Therefore the derivative is added.
-        if self.back is not None:
-            residual[:, 2] += self.back.forces(deflection)
+        residual[:, 2] += self.back.forces(deflection)
         return residual
 
     @property
     def load_scale(self) -> float:
         """Norm of the nodal forces of the probe, or of the static pressure if there is no probe."""
-        if self.groups.load == 0.0 and self.back is not None:
+        if self.groups.load == 0.0:
             return abs(self.groups.static_pressure) * float(np.linalg.norm(self.back.weights))
         return self.groups.load * float(np.linalg.norm(self.geometry.load))
 
@@ -124,8 +115,8 @@ class ElasticFilm:
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
         """
-        if self.groups.load == 0.0 and self.back is not None:
-            return abs(self.back.static_work(field[:, 2]))
+        if self.groups.load == 0.0:
+            return abs(self.groups.static_pressure * float(self.back.weights @ field[:, 2]))
         return self.groups.load * abs(float(self.geometry.load @ field[:, 2]))
 
     def in_plane_scale(self, field: Array) -> float:

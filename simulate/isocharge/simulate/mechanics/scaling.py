@@ -77,7 +77,7 @@ class DimensionlessGroups:
         anisotropy: Direction-dependent properties.
         side_load: Side force (Fx, Fy) divided by E h a A^2, in the axes of the press.
         static_pressure: Static pressure divided by E h A^3 / a, positive in the direction of the push.
-        ambient_pressure: Pressure of the atmosphere divided by E h A^3 / a. Zero if the back is vented.
+        ambient_pressure: Pressure of the atmosphere divided by E h A^3 / a.
         compression: Displaced share of the volume of the air behind the film, divided by the integral of the scaled
             deflection W over the film. Zero if the back is vented.
     """
@@ -119,14 +119,9 @@ class DimensionlessGroups:
         force_unit = film.young * film.thickness * film.radius * squared_amplitude**1.5
         pressure_unit = film.young * film.thickness * squared_amplitude**1.5 / film.radius
 
-        # Rotate the side force into the axes of the press.
-        side_load = (0.0, 0.0)
-        if any(side_force):
-            side_x, side_y = side_force
-            along_press = side_x * np.cos(angle) + side_y * np.sin(angle)
-            across_press = side_y * np.cos(angle) - side_x * np.sin(angle)
-            side_unit = side_force_unit(film, squared_amplitude)
-            side_load = (float(along_press / side_unit), float(across_press / side_unit))
+        # Rotate the side force, as a complex number Fx + i Fy, into the axes of the press.
+        rotation = complex(np.cos(angle), -np.sin(angle))
+        side_load = complex(*side_force) * rotation / side_force_unit(film, squared_amplitude)
 
         # The unit of the displaced volume is a^3 A. The compression is this unit divided by the volume of the air.
         compression = 0.0
@@ -139,16 +134,11 @@ class DimensionlessGroups:
             bending=slenderness(film) / squared_amplitude if bending else 0.0,
             poisson=film.poisson,
             anisotropy=_anisotropy(film, squared_amplitude, angle),
-            side_load=side_load,
+            side_load=(side_load.real, side_load.imag),
             static_pressure=film.static_pressure / pressure_unit,
-            ambient_pressure=AMBIENT_PRESSURE / pressure_unit if compression else 0.0,
+            ambient_pressure=AMBIENT_PRESSURE / pressure_unit,
             compression=compression,
         )
-
-    @property
-    def has_back_pressure(self) -> bool:
-        """Whether a pressure acts on the whole film."""
-        return self.static_pressure != 0.0 or self.compression != 0.0
 
     @property
     def without_probe(self) -> "DimensionlessGroups":

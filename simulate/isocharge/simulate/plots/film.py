@@ -1,6 +1,6 @@
 """Functions that draw parts of a film to scale, such as electrodes, charge maps and deflections."""
 
-from math import atan2, cos, hypot, sin
+import cmath
 from typing import Any
 
 import numpy as np
@@ -13,12 +13,6 @@ from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.plots.figure import FELT, INK
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
-
-DRAWN_RADIUS = 0.999999
-"""Radius up to which the deflection is drawn, in film radii, dimensionless.
-
-The radius is less than 1, because rounding could move points on the rim out of the film.
-"""
 
 
 def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool = True, ink: str = INK) -> None:
@@ -131,7 +125,7 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
         equilibrium: Equilibrium of the film under a press.
     """
     radius = equilibrium.film.radius
-    x, y = _polar_grid(DRAWN_RADIUS * radius, rings=240, angles=361)
+    x, y = _polar_grid(equilibrium.film.inner_radius, rings=240, angles=361)
     points = np.stack([x.ravel(), y.ravel()], axis=1)
     depth = deflection(equilibrium, points).reshape(x.shape)
     shades = axes.contourf(x, y, depth, levels=24, cmap="viridis_r")
@@ -150,11 +144,9 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
         equilibrium: Equilibrium of the film under a press.
     """
     # Draw the deflection downwards. The horizontal axis is the signed distance from the centre along the line.
-    distance_along_section = np.linspace(-DRAWN_RADIUS, DRAWN_RADIUS, 801) * equilibrium.film.radius
-    x, y = equilibrium.at
-    distance = hypot(x, y)
-    angle = atan2(y, x)
-    section_points = np.outer(distance_along_section, [cos(angle), sin(angle)])
+    distance_along_section = np.linspace(-1.0, 1.0, 801) * equilibrium.film.inner_radius
+    distance, angle = cmath.polar(complex(*equilibrium.at))
+    section_points = np.outer(distance_along_section, [np.cos(angle), np.sin(angle)])
     depth = deflection(equilibrium, section_points)
     axes.plot(distance_along_section, -depth, color=INK, lw=1.5)
 

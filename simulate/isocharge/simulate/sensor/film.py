@@ -130,14 +130,10 @@ class Film:
         return self.back_volume is not None or self.static_pressure != 0.0
 
     @property
-    def is_anisotropic(self) -> bool:
-        """Whether the elasticity or the pretension depends on the direction."""
-        return self.deviator != (0.0, 0.0) or self.young_ratio != 1.0 or self.shear is not None
-
-    @property
     def is_axisymmetric(self) -> bool:
         """Whether the properties of the film remain unchanged if the film is rotated about its centre."""
-        return not self.is_anisotropic and self.oval == 0.0
+        is_isotropic = self.deviator == (0.0, 0.0) and self.young_ratio == 1.0 and self.shear is None
+        return is_isotropic and self.oval == 0.0
 
     def rotated(self, angle: float) -> Self:
         """Return the film after a rotation about its centre.
