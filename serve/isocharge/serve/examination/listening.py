@@ -124,20 +124,16 @@ def _listen_at_baud(url: str, baud: int, seconds: float, request: Request | None
         wait: Time to wait until the port can be opened, s.
     """
     received = ReceivedData(url, baud, request)
-    with Port(url, baud=baud, request=request, wait=wait) as port:
+    # If the port is lost, the bytes that were received before the loss are returned.
+    with Port(url, baud=baud, request=request, wait=wait) as port, suppress(PortLost):
         start_s = time.monotonic()
-        with suppress(PortLost):
-            first_chunk = port.read(port.start_up_s)
-            if first_chunk is not None:
-                start_s = time.monotonic()
-                received.chunks.append(first_chunk)
-        while received.chunks and (remaining_s := start_s + seconds - time.monotonic()) > 0.0:
-            try:
-                chunk = port.read(remaining_s)
-            except PortLost:
-                break  # the bytes that were received before the loss are returned
-            if chunk is not None:  # otherwise no bytes have arrived in the remaining time
-                received.chunks.append(chunk)
+        chunk = port.read(port.start_up_s)
+        if chunk is not None:
+            start_s = time.monotonic()
+        while chunk is not None:
+            received.chunks.append(chunk)
+            remaining_s = start_s + seconds - time.monotonic()
+            chunk = port.read(remaining_s) if remaining_s > 0.0 else None
     received.seconds = time.monotonic() - start_s
     return received
 

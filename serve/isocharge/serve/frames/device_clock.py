@@ -171,22 +171,14 @@ class DeviceClock:
             self._latest_host_s = -math.inf  # allows the host time of the next reading to be earlier
         # A provisional fit relies on the arrival of only one chunk. A fit that begins at this arrival replaces it.
         if was_clock_set or self._is_fit_provisional:
-            self._begin_fit(arrival_s)
+            self._fitted_host_s = arrival_s
+            self._fit_age_s = 0.0
+            self.rate = 1.0
+            self._is_fit_provisional = False
         else:
             step_s = (self._device_us - self._fitted_us) * 1e-6  # since the previous correction of the fit
             self._continue_fit(delay_s, step_s)
         self._fitted_us = self._device_us
-
-    def _begin_fit(self, arrival_s: float) -> None:
-        """Begin a new fit, assuming that the latest reading was taken when its chunk arrived.
-
-        Args:
-            arrival_s: Arrival of the chunk, unix seconds.
-        """
-        self._fitted_host_s = arrival_s
-        self._fit_age_s = 0.0
-        self.rate = 1.0
-        self._is_fit_provisional = False
 
     def _continue_fit(self, delay_s: float, step_s: float) -> None:
         """Correct the fit with one step of a second-order delay-locked loop (Adriaensen 2005).
