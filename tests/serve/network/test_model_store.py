@@ -138,9 +138,14 @@ def test_load_and_unload_add_and_remove_versions(film, store, folder):
     for name in ("linear", "later"):
         store.load(name)
     assert labels(store) == ["later/1", "linear/1", "linear/2", "linear/3"]
-    shutil.rmtree(folder / "2")
+    (film.write(folder.parent, version=4) / "golden.json").unlink()
+    with pytest.raises(ModelError, match=r"golden\.json: missing"):
+        store.load("linear")
+    for version in ("2", "4"):
+        shutil.rmtree(folder / version)
     store.load("linear")
     assert labels(store) == ["later/1", "linear/1", "linear/3"]
+    assert store.refusals() == []
     shutil.rmtree(folder)
     with pytest.raises(ModelNotFound, match="'linear' is not found in the repository"):
         store.load("linear")

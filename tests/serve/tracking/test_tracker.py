@@ -10,6 +10,7 @@ from msgspec import structs
 from isocharge.serve import Chunk, Contact, Device, Frame, TouchStream, encode_frame
 from isocharge.serve.flags import INVALID
 from isocharge.serve.live.device import device_from_table, with_settings
+from isocharge.serve.record.record import TrackedContact
 from isocharge.serve.tracking.motion_filter import (
     ACCELERATION_DENSITY,
     HELD_DRIFT,
@@ -17,7 +18,7 @@ from isocharge.serve.tracking.motion_filter import (
     SPEED_CHANGE_RATE,
     MotionFilter,
 )
-from isocharge.serve.tracking.tracker import TrackRule
+from isocharge.serve.tracking.tracker import TouchEvents, TrackRule
 from stage_runner import new_tracker, track
 
 STD = 0.06
@@ -213,6 +214,16 @@ def test_event_tap_of_a_short_press_and_event_release_of_a_short_slide():
     swipe = update_all(tracker, noisy_contacts(0.1 * np.arange(100)), begin_s=2.0)
     assert events_of(swipe) == ["press", "slide"]
     assert track(tracker, None, 2.1) == (None, "release")
+
+
+@pytest.mark.parametrize(("duration_s", "event"), [(0.15, "tap"), (0.5, "release")])
+def test_long_touch_without_hold_or_slide_is_no_tap(duration_s, event):
+    """It is uncertain whether the contact moves or rests."""
+    tracked = TrackedContact(0.0, 0.0, 1.0, STD, STD, 0.003, 0.0, 0.0, moving=0.7)
+    events = TouchEvents()
+    events.begin(tracked, 10.0)
+    assert events.step(tracked, 10.0 + duration_s) is None
+    assert events.end(10.0 + duration_s) == event
 
 
 def test_touch_continues_if_the_clock_is_set_back():

@@ -96,6 +96,7 @@ def test_a_recording_cannot_be_changed(start_page):
         {"do": "shutdown"},
         {"do": "record"},
         {"do": "marker", "text": "x" * 81},
+        {"do": "marker", "text": "a\nb"},
         {"do": "read", "first": -1},
         {"do": "read", "most": 601},
         [],
@@ -104,6 +105,7 @@ def test_a_recording_cannot_be_changed(start_page):
     ],
 )
 def test_wrong_request_is_refused_with_the_reason(client, content):
+    client.page.act = lambda _: None
     status, _, body = client.send("POST", "/request", content)
     assert status == 400
     assert json.loads(body)["error"]
