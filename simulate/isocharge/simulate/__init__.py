@@ -35,9 +35,8 @@ if TYPE_CHECKING:
     from isocharge.simulate.identifiability.working_area import working_area
     from isocharge.simulate.layout.case import DesignCase
     from isocharge.simulate.layout.design import design
-    from isocharge.simulate.measuring_chain.amplifier import Amplifier
+    from isocharge.simulate.measuring_chain.amplifier import Amplifier, load_amplifier, noise_model
     from isocharge.simulate.measuring_chain.noise import NoiseModel
-    from isocharge.simulate.measuring_chain.noise_file import load_amplifier, noise_model
     from isocharge.simulate.mechanics.theory import Theory
     from isocharge.simulate.mesh.blocks import Resolution
     from isocharge.simulate.sensor.film import Film, Piezo

@@ -18,7 +18,7 @@ from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
 from isocharge.simulate import Circle, load_sensor, noise_model, parse_probe
-from isocharge.simulate.artwork.design_folder import write_design
+from isocharge.simulate.artwork import write_design
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Goal, Nuisances
 from isocharge.simulate.layout.design import design
 

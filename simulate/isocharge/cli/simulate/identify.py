@@ -14,9 +14,8 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import InputError
 from isocharge.common.files import new_folder, refuse_existing
 from isocharge.simulate import identify, load_sensor, noise_model, parse_probe
-from isocharge.simulate.plots.error_maps import identification_picture
+from isocharge.simulate.plots.error_maps import identification_picture, mirror_picture
 from isocharge.simulate.plots.figure import picture_bytes
-from isocharge.simulate.plots.mirror_map import mirror_picture
 
 PICTURE = "identify.png"
 """File name of the picture in the output folder."""

@@ -27,8 +27,7 @@ from isocharge.simulate.dataset.shards import (
     write_dataset,
     write_files,
 )
-from isocharge.simulate.execution.blas import single_threaded_blas
-from isocharge.simulate.execution.workers import in_order
+from isocharge.simulate.execution.workers import in_order, single_threaded_blas
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.probe import Circle, Probe

@@ -12,14 +12,17 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import lru_cache, partial
 from importlib.metadata import version
 from typing import Any, TypeVar
 
+from threadpoolctl import ThreadpoolController
+
 from isocharge.common.errors import InputError, WorkersLost
 from isocharge.common.extras import require
-from isocharge.simulate.execution.blas import single_threaded_blas
+
+_CONTROLLER = ThreadpoolController()
 
 Job = TypeVar("Job")
 
@@ -136,6 +139,16 @@ def run_same_code(versions: str, function: Callable[[Job], Result], job: Job) ->
         )
     with single_threaded_blas():
         return function(job)
+
+
+def single_threaded_blas() -> AbstractContextManager[object]:
+    """Return a context manager within which BLAS uses only one thread.
+
+    Operations on many small matrices are faster with one thread. Several threads would often wait for each other in
+    busy loops. Such waits are long if other processes use the remaining cores.
+    """
+    limiter: AbstractContextManager[object] = _CONTROLLER.limit(limits=1, user_api="blas")
+    return limiter
 
 
 def cores() -> int:

@@ -20,8 +20,7 @@ from isocharge.common.arrays import Array, Booleans, Complexes
 from isocharge.common.contact_domain import Domain, as_contacts
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SolveError
-from isocharge.simulate.execution.blas import single_threaded_blas
-from isocharge.simulate.execution.workers import in_order
+from isocharge.simulate.execution.workers import in_order, single_threaded_blas
 from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.forward.family import (
     Family,

@@ -10,8 +10,7 @@ from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import InputError
 from isocharge.simulate.forward.family import check_family
 from isocharge.simulate.identifiability.cramer_rao import cramer_rao
-from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.measuring_chain.noise_file import NOISE_LEVELS
+from isocharge.simulate.measuring_chain.noise import NOISE_LEVELS, NoiseModel
 from isocharge.simulate.numerics.disk import lattice, square_grid
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor, electrode_index

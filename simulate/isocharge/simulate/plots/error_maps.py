@@ -1,4 +1,4 @@
-"""Pictures of an identification or a design that show the lower limit of the position error over the film."""
+"""Pictures that show the lower limit of the position error, or the mirror region of a sensor, over the film."""
 
 from typing import Any
 
@@ -9,6 +9,7 @@ from matplotlib.ticker import ScalarFormatter
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.identifiability.identification import Identification
+from isocharge.simulate.identifiability.mirror_region import MirrorRegion
 from isocharge.simulate.layout.case import NO_NUISANCES
 from isocharge.simulate.layout.design import Design
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
@@ -140,3 +141,37 @@ def _add_colour_bar(figure: Figure, coloured_area: Any, axes: list[Any]) -> None
     colour_bar = figure.colorbar(coloured_area, ax=axes, label=ERROR_LABEL, shrink=0.85, extend="max")
     colour_bar.ax.yaxis.set_major_formatter(ScalarFormatter())
     colour_bar.ax.yaxis.set_minor_formatter(ScalarFormatter())
+
+
+def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
+    """Draw a map of the presses outside the working area that have the charges of a press inside it.
+
+    Args:
+        sensor: Sensor whose mirror region is drawn.
+        mirror: Mirror region of the sensor.
+
+    Returns:
+        Figure with the clamp, the working area, the electrodes, and the share of such presses at each position.
+    """
+    figure = new_figure(7.4, 6.4)
+    axes = figure.subplots()
+
+    # Compute the corners of the cells, shape (n_ring + 1, n_sector + 1). A cell is the part of a ring in one sector.
+    n_sector = mirror.share.shape[1]
+    edge_angle = 2.0 * np.pi * np.arange(n_sector + 1) / n_sector
+    corner_x = np.outer(mirror.edges, np.cos(edge_angle))
+    corner_y = np.outer(mirror.edges, np.sin(edge_angle))
+    shades = axes.pcolormesh(corner_x, corner_y, mirror.share, vmin=0.0, vmax=1.0, cmap="Reds")
+    figure.colorbar(shades, ax=axes, label="share of the forces that cannot be noticed", shrink=0.85)
+
+    film_radius = sensor.film.radius
+    draw_circle(axes, film_radius, color=INK, lw=2.0)
+    draw_circle(axes, mirror.inner, color=INK, ls="--", lw=1.6)
+    draw_electrodes(axes, sensor)
+    title = (
+        f"{sensor.name}: {100.0 * mirror.total_share:.2g} % of the presses of {mirror.forces[0]:.2g} to "
+        f"{mirror.forces[-1]:.2g} N\noutside the working area (dashed, {mirror.inner:.3g} mm) cannot be noticed"
+    )
+    axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title=title)
+    axes.margins(0.03)
+    return figure

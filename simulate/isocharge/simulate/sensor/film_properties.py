@@ -21,7 +21,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import SceneError, SensorError
-from isocharge.simulate.sensor.film import PIEZO_LIMITS, Film, Piezo
+from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Calibration, Sensor
 
@@ -125,6 +125,7 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
     """
     value = dict.fromkeys((one.name for one in FILM_PROPERTIES), 0.0)
     value |= {PRETENSION.name: sensor.film.pretension, **values}
+    piezo = sensor.piezo
     calibration = sensor.calibration
     shift_x, shift_y = calibration.shift
     gains = {
@@ -135,7 +136,12 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
     changed_sensor = replace(
         sensor,
         film=_changed_mechanics(sensor.film, value),
-        piezo=_changed_piezo(sensor.piezo, value),
+        piezo=replace(
+            piezo,
+            d31=piezo.d31 * math.exp(value["d31"]),
+            d32=piezo.d32 * math.exp(value["d32"]),
+            d12=piezo.d12 + value["d12"],
+        ),
         calibration=Calibration(
             gain=calibration.gain | gains,
             shift=(shift_x + value["shift_x"], shift_y + value["shift_y"]),
@@ -178,18 +184,6 @@ def _increased(size: float, axis: float, addition: complex) -> tuple[float, floa
         return size, axis
     total = cmath.rect(size, 2.0 * axis) + addition
     return abs(total), 0.5 * cmath.phase(total)
-
-
-def _changed_piezo(piezo: Piezo, value: Mapping[str, float]) -> Piezo:
-    """Change the piezoelectric coefficients of a film; see `changed_film`."""
-    d12 = piezo.d12 + value["d12"]
-    smallest, _ = PIEZO_LIMITS
-    return replace(
-        piezo,
-        d31=piezo.d31 * math.exp(value["d31"]),
-        d32=piezo.d32 * math.exp(value["d32"]),
-        d12=d12 if abs(d12) >= smallest else 0.0,  # a sensor does not accept a tiny coefficient
-    )
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError
-from isocharge.simulate.execution.blas import single_threaded_blas
+from isocharge.simulate.execution.workers import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import side_force_unit
 from isocharge.simulate.solver.assembly import assembly

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
-from isocharge.simulate.execution.blas import single_threaded_blas
+from isocharge.simulate.execution.workers import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.stress import stress_rotation
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval

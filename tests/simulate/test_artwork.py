@@ -8,7 +8,7 @@ import pytest
 from svgelements import SVG, Path
 
 from isocharge.simulate import Electrode, load_sensor
-from isocharge.simulate.artwork.drawing import draw_layout, to_dxf, to_svg
+from isocharge.simulate.artwork import draw_layout, to_dxf, to_svg
 
 MICROMETRE = 1e-3
 """One micrometre, mm."""
