@@ -88,14 +88,6 @@ def test_the_reference_lists_every_command():
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        ["demo"],
-        ["serve", "stream", "three-25um-biaxial", "--port", "film"],
-        ["serve", "replay", "touch.rec"],
-    ],
-)
-@pytest.mark.parametrize(
     ("option", "address"),
     [
         ([], None),
@@ -105,14 +97,8 @@ def test_the_reference_lists_every_command():
         (["--live=localhost:8080"], "localhost:8080"),
     ],
 )
-def test_live_takes_an_address_or_none(words, option, address):
-    assert parse([*words, *option])["live"] == address
-    parameters = parse([words[0], *option, *words[1:]]) if words == ["demo"] else None
-    assert parameters is None or parameters["live"] == address
-
-
-def test_live_before_another_option_or_an_argument_takes_the_default_address():
-    assert parse(["demo", "--live", "--seconds", "5"])["live"] == "127.0.0.1:8001"
-    parameters = parse(["serve", "replay", "--live", "touch.rec"])
-    assert parameters["live"] == "127.0.0.1:8001"
-    assert parameters["file"].name == "touch.rec"
+def test_live_takes_an_address_or_none(option, address):
+    for words in (["demo"], ["serve", "stream", "three-25um-biaxial", "--port", "film"], ["serve", "replay", "x.rec"]):
+        assert parse([*words, *option])["live"] == address
+    assert parse(["demo", *option, "--seconds", "5"])["live"] == address
+    assert parse(["serve", "replay", *option, "touch.rec"])["live"] == address

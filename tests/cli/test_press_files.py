@@ -37,17 +37,6 @@ def test_a_file_in_utf_16(refuses, name):
     refuses(name, data, "p.csv, line 1: the byte 0xff is not text in UTF-8")
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "predict"])
-def test_a_misspelt_force(refuses, name):
-    data = f"x_mm,y_mm,force [N],A,B,C,D\n{PRESS}".encode()
-    refuses(name, data, "rename 'force [N]' to 'force_N'")
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_file_that_is_named_as_parquet_and_is_none(refuses, name):
-    refuses(name, f"x_mm,y_mm,force_N,A,B,C,D\n{PRESS}".encode(), "p.parquet: not a Parquet file", suffix="parquet")
-
-
 def test_presses_of_a_parquet_file_are_named_by_their_rows(command, tmp_path):
     """The check of a film names the presses that do not count by their rows, counted from 1 without a header."""
     contact_columns = {"x_mm": [2.0, 40.0], "y_mm": [0.0, 0.0], "force_N": [0.5, 0.5]}

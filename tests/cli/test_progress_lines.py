@@ -21,10 +21,3 @@ def test_a_long_computation_has_a_line_every_five_seconds(clock, capsys):
             clock[0] += 3.0
     lines = capsys.readouterr().err.splitlines()
     assert lines == ["pressing: 2 of 7", "pressing: 4 of 7", "pressing: 6 of 7"]
-
-
-def test_a_short_computation_has_no_progress_lines(clock, capsys):
-    with terminal.shown_progress():
-        for _ in track(range(7), "pressing"):
-            clock[0] += 0.1
-    assert capsys.readouterr().err == ""

@@ -1,6 +1,5 @@
 """`train press`: the dialogue with a list of events, and the command with a simulated board."""
 
-import itertools
 import os
 import re
 import threading
@@ -10,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from boards import TcpBoard, until
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, SessionEnd
 from isocharge.common.errors import PortLost
 from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_frame, read_presses
@@ -174,8 +172,8 @@ def places(problem):
     return np.array([press.contact for press in next_presses(problem, kept(solve_even, problem), 3)])
 
 
-def board_rows(film, places, seed=0) -> Iterator[tuple[float, ...]]:
-    """Return the charges that an amplifier measures while a machine presses each position for 1.2 s, pC."""
+def board(film, places, seed=0) -> Iterator[bytes]:
+    """Return the frames that a board sends while a machine presses each position for 1.2 s."""
     t = np.arange(round(1.2 * RATE_HZ)) / RATE_HZ
     rise = np.clip(np.minimum(t, 1.2 - t) / 0.1, 0.0, 1.0)[:, None] ** (2 / 3)
     pause = np.zeros((round(0.8 * RATE_HZ), 4))
@@ -183,14 +181,8 @@ def board_rows(film, places, seed=0) -> Iterator[tuple[float, ...]]:
     for charge in film.charges(places):
         pieces += [rise * charge, pause]
     measure = load_amplifier("reference").start(4, RATE_HZ, np.random.default_rng(seed))
-    for row in measure(np.concatenate(pieces)):
-        yield tuple(row + 12.0)
-
-
-def board(film, places, seed=0) -> Iterator[bytes]:
-    """Return the frames of a board while the machine presses."""
-    for number, row in enumerate(board_rows(film, places, seed)):
-        yield encode_frame(Frame(number, round(1e6 * number / RATE_HZ), row))
+    for number, row in enumerate(measure(np.concatenate(pieces))):
+        yield encode_frame(Frame(number, round(1e6 * number / RATE_HZ), tuple(row + 12.0)))
 
 
 @pytest.fixture
@@ -253,27 +245,6 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk
     std = np.hypot(1.0, 0.002 * clean) * np.sqrt(1 / 90 + 1 / 50)
     assert (np.abs(presses.charge_pC - clean) < 5 * std).all()
     np.testing.assert_array_equal(presses.contact, places)
-
-
-@pytest.mark.slow  # in `make test`, a session continues after the end of its port, and its open file is read
-def test_a_killed_session_leaves_whole_lines_and_continues(start_command, command, desk, film, places):
-    """The process is killed by SIGKILL after two presses."""
-    path = desk / "presses.csv"
-
-    def rows():
-        yield from board_rows(film, places[:2])
-        rest = itertools.repeat((12.0,) * 4)
-        yield from until(rest, lambda: path.exists() and len(read_presses(path)) == 2)
-        process.kill()
-        yield from itertools.islice(rest, 1000)
-
-    with TcpBoard(rows(), RATE_HZ) as port:
-        process = start_command(*PRESS, "--port", port.url, "--press-list", "list.csv")
-        process.wait(timeout=120)
-    assert path.read_text("utf-8").endswith("\n")
-    code, _, err = command(*PRESS, "--port", "rest.bin", "--press-list", "list.csv")
-    assert code == 0, err
-    np.testing.assert_array_equal(read_presses(path, NAMES).contact, places)
 
 
 def test_a_file_with_further_columns_is_not_overwritten(refused, desk):

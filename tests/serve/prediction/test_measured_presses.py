@@ -29,13 +29,6 @@ def read(tmp_path):
     return read
 
 
-def test_all_columns_of_a_press_file_are_read(read):
-    presses = read(f"{HEADER},position_std_mm,force_std\n1,-2,0.5,10,20,30,0.05,0.003\n")
-    assert (presses.contact.tolist(), presses.charge_pC.tolist()) == ([[1.0, -2.0, 0.5]], [[10.0, 20.0, 30.0]])
-    assert (presses.position_std_mm.tolist(), presses.force_std.tolist()) == ([0.05], [0.003])
-    assert (presses.electrodes, presses.lines, presses.ignored, len(presses)) == (NAMES, (2,), (), 1)
-
-
 @pytest.mark.parametrize(
     "text",
     [

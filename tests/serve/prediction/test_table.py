@@ -104,48 +104,27 @@ def test_wrong_charge_tables_are_refused(text, message):
         read(text)
 
 
-def test_contacts_as_csv_with_flags(film, predictor):
+def test_rows_of_a_table_become_csv_and_records(film, predictor):
+    """The last row does not exceed the noise: it has the force 0, and no position."""
+    charge_pC = film.charge_pC([1.0, 9.0, 9.0, 0.0], [0.5, 0.0, 0.0, 0.0], [1.0, 0.25, 99.0, 0.0])
+    expected = np.column_stack(predictor.predict_batch(charge_pC)).tolist()
     out = io.StringIO()
-    charge_pC = film.charge_pC([1.0, 9.0, 9.0], [0.5, 0.0, 0.0], [1.0, 0.25, 99.0])
-    contacts = predictor.predict_batch(charge_pC)
     write_contacts(charge_pC, predictor, out)
     header, *rows = (line.split(",") for line in out.getvalue().splitlines())
     assert header == [*Contacts._fields[:7], "flags"]
-    assert [row[-1] for row in rows] == ["", "outside", "outside beyond"]
-    assert [float(value) for value in rows[0][:3]] == pytest.approx([1.0, 0.5, 1.0], abs=2e-6)
-    assert [row[:-1] for row in rows] == [[f"{value:.6f}" for value in row] for row in np.column_stack(contacts[:7])]
+    assert [row[-1] for row in rows] == ["", "outside", "outside beyond", ""]
+    assert [row[:-1] for row in rows[:3]] == [[f"{value:.6f}" for value in row[:7]] for row in expected[:3]]
+    assert rows[3] == ["", "", "0.000000", "", "", "", "", ""]
 
-
-def test_table_records_of_charges(film, predictor):
-    charges = film.charge_pC([1.0, 9.0], [0.5, 0.0], [1.0, 0.25])
-    first, second = (json.loads(record.to_json()) for record in table_records(charges, predictor))
-    assert (first["x_mm"], first["contact"], first["flags"]) == (pytest.approx(1.0, abs=2e-6), True, [])
-    assert second["flags"] == ["outside"]
-    assert first["charge_pC"] == pytest.approx(dict(zip("ABC", charges[0], strict=True)), abs=1e-6)
-    assert {key for key, value in first.items() if value is None} == {
-        "timestamp",
-        "t_device_us",
-        "seq",
-        "charge_raw_pC",
-        "tare_pC",
-        "latency_us",
-    }
-
-
-@pytest.mark.parametrize("charges", [[0.0, 0.0, 0.0], [4.9, -4.9, 0.0]], ids=["zero", "noise"])
-def test_charges_within_the_noise_get_no_position(charges):
-    predictor = Predictor("three-25um-biaxial")
-    rows = np.array([charges, [848.0, 848.0, 848.0]])
-
-    empty, press = (json.loads(record.to_json()) for record in table_records(rows, predictor))
-    assert (empty["contact"], empty["force_N"], empty["flags"]) == (False, 0.0, [])
-    assert [empty[name] for name in ("x_mm", "y_mm", "x_std_mm", "y_std_mm", "force_std_N", "misfit")] == [None] * 6
-    assert press["contact"]
-    assert press["force_N"] == pytest.approx(1.0, rel=0.02)
-
-    out = io.StringIO()
-    write_contacts(rows, predictor, out)
-    assert out.getvalue().splitlines()[1] == ",,0.000000,,,,,"
+    records = [json.loads(record.to_json()) for record in table_records(charge_pC, predictor)]
+    assert [record["contact"] for record in records] == [True, True, True, False]
+    assert [" ".join(record["flags"]) for record in records] == [row[-1] for row in rows]
+    assert records[1]["charge_pC"] == pytest.approx(dict(zip("ABC", charge_pC[1], strict=True)), abs=1e-6)
+    assert [records[1][name] for name in Contacts._fields] == pytest.approx(expected[1], abs=1e-6)
+    absent = {"timestamp", "t_device_us", "seq", "charge_raw_pC", "tare_pC", "latency_us"}
+    assert {name for name, value in records[0].items() if value is None} == absent
+    assert {name for name, value in records[3].items() if value is None} == absent | {*Contacts._fields} - {"force_N"}
+    assert records[3]["force_N"] == 0.0
 
 
 def test_noise_may_differ_between_electrodes():
@@ -181,13 +160,12 @@ def test_flags_outside_beyond_misfit_and_stress(film, changes, flags):
     assert Validity.of(film.metadata()).flags(GOOD._replace(**changes)) == flags
 
 
-def test_a_press_that_dents_the_film_is_flagged(film):
-    """One by one and in a batch, beside what else is to be said; a model that does not say from where says nothing."""
-    yields = Validity.of(film.metadata(yield_force_N=0.8))
+def test_flag_stress_above_the_force_at_which_the_film_yields(film):
+    validity = Validity.of(film.metadata(yield_force_N=0.8))
     contacts = [GOOD._replace(force_N=force_N) for force_N in (0.8, 0.81, 2.5)]
-    assert [yields.flags(contact) for contact in contacts] == [(), ("stress",), ("outside", "stress")]
-    assert yields.batch_flags(Contacts(*np.float32(contacts).T)) == [(), ("stress",), ("outside", "stress")]
-    assert Validity.of(film.metadata()).flags(contacts[1]) == ()
+    expected = [(), ("stress",), ("outside", "stress")]
+    assert [validity.flags(contact) for contact in contacts] == expected
+    assert validity.batch_flags(Contacts(*np.float32(contacts).T)) == expected
 
 
 @pytest.mark.parametrize("name", ["three-25um-biaxial", "four-25um-uniaxial"])

@@ -41,19 +41,6 @@ def test_records_that_a_slow_browser_misses_are_counted(client, record):
     assert (answer["missed"], record_count(client, answer)) == (250, LIVE_SAMPLES)
 
 
-def test_position_in_a_recording_limits_the_samples(start_page, record):
-    client = start_page(is_recording=True)
-    put(client, record, 4000)
-    answer = client.ask("read", until_s=12.0)
-    times = [sample[0] for sample in answer["samples"]]
-    start_s, end_s = answer["state"]["span"]
-    assert times[-1] == pytest.approx(start_s + 12.0, abs=0.0051)
-    assert times[0] == pytest.approx(start_s + 2.0, abs=0.1)
-    rest = client.ask("read", first=answer["first"], until_s=1e9)
-    assert record_count(client, rest) == 4000 - answer["first"]
-    assert rest["samples"][-1][0] == end_s
-
-
 def test_state_is_sent_if_it_has_changed(client):
     client.page.update(counters={"frames": 7}, recording="x.rec")
     client.page.add_marker(1.0, "")
