@@ -41,6 +41,15 @@ def test_records_that_a_slow_browser_misses_are_counted(client, record):
     assert (answer["missed"], record_count(client, answer)) == (250, LIVE_SAMPLES)
 
 
+def test_position_in_a_recording_limits_the_samples(start_page, record):
+    client = start_page(is_recording=True)
+    put(client, record, 4000)
+    answer = client.ask("read", until_s=12.0)
+    start_s, _ = answer["state"]["span"]
+    first, *_, last = answer["samples"]
+    assert (first[0] - start_s, last[0] - start_s) == pytest.approx((2.0, 12.0), abs=0.1)
+
+
 def test_state_is_sent_if_it_has_changed(client):
     client.page.update(counters={"frames": 7}, recording="x.rec")
     client.page.add_marker(1.0, "")
