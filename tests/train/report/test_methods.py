@@ -7,7 +7,7 @@ from isocharge.serve import Predictor, find_model
 from isocharge.simulate import noise_model
 from isocharge.train import LabelledPresses
 from isocharge.train.data.contact_errors import position_error, rms
-from isocharge.train.report.methods import METHOD_BUILDERS, FittingTask, model_method
+from isocharge.train.report.evaluation import METHOD_BUILDERS, FittingTask, model_method
 
 LARGEST_ERRORS = {
     "triangulation": (0.02, 2e-3),
