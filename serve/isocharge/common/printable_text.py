@@ -6,6 +6,8 @@ and characters without width. Such characters are replaced by the escape sequenc
 text in JSON therefore remains valid JSON.
 """
 
+import json
+
 IGNORABLE_RANGES = (
     (0x034F, 0x034F),
     (0x115F, 0x1160),
@@ -24,9 +26,6 @@ letters or marks, and `str.isprintable` accepts all letters and marks.
 
 INVISIBLE = frozenset(chr(code) for first, last in IGNORABLE_RANGES for code in range(first, last + 1))
 """The characters in `IGNORABLE_RANGES`."""
-
-SHORT_ESCAPES = {"\n": r"\n", "\r": r"\r", "\t": r"\t"}
-"""Escape sequences of the usual white space."""
 
 
 def is_printable(text: str) -> bool:
@@ -61,8 +60,5 @@ def _escape(character: str) -> str:
 
     JSON escapes the code units of UTF-16. A character beyond U+FFFF has two code units, and therefore two sequences.
     """
-    if character in SHORT_ESCAPES:
-        return SHORT_ESCAPES[character]
-    utf16_bytes = character.encode("utf-16-be", "surrogatepass")  # a single surrogate is accepted, too
-    code_units = (utf16_bytes[offset : offset + 2] for offset in range(0, len(utf16_bytes), 2))  # two bytes each
-    return "".join(f"\\u{code_unit.hex()}" for code_unit in code_units)
+    escaped = json.dumps(character)[1:-1]  # without the quotation marks
+    return f"\\u{ord(character):04x}" if escaped == character else escaped  # JSON does not escape U+007F

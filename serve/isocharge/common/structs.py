@@ -229,7 +229,7 @@ def _describe_mistake(content: object, target_type: Any, error: msgspec.Validati
             expected_type = _key_types(value, members)[name]
         elif index.isdigit():
             (expected_type,) = (get_args(member)[0] for member in members if get_origin(member) in (list, tuple))
-            key = int(index)
+            key = int(index)  # all items of a list have the same type
         else:
             (expected_type,) = (get_args(member)[1] for member in members if get_origin(member) is dict)
             key = next(key for key, item in value.items() if not _has_type(item, expected_type))

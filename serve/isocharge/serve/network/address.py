@@ -212,7 +212,7 @@ class Token:
     """
 
     def __init__(self, token: str) -> None:
-        """Check that the token contains only valid characters, and store the header value that clients must send.
+        """Check that the token contains only valid characters, and store the token.
 
         Args:
             token: The secret text.
@@ -227,7 +227,7 @@ class Token:
                 "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
                 "meaning in the address of a page; choose another one"
             )
-        self._expected_header = b"Bearer " + token.encode()
+        self._token = token.encode()
 
     def check(self, authorization: bytes) -> None:
         """Check the value of an Authorization header.
@@ -240,11 +240,9 @@ class Token:
             TokenError: If the header does not contain the token.
         """
         scheme, _, token = authorization.partition(b" ")
-        normalised_header = authorization
-        if scheme.lower() == b"bearer":
-            normalised_header = b"Bearer " + token.lstrip(b" ")
         # The time that compare_digest takes does not depend on the number of correct characters.
-        if not hmac.compare_digest(normalised_header, self._expected_header):
+        is_correct = hmac.compare_digest(token.lstrip(b" "), self._token)
+        if scheme.lower() != b"bearer" or not is_correct:
             received = "a wrong one" if authorization else "none"
             raise TokenError(
                 f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {received}"

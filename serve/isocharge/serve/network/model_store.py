@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import TypeVar
 
 from isocharge.common.errors import ModelError, ModelNotFound
@@ -259,11 +258,7 @@ def _find_model_folders(roots: Sequence[Path]) -> Mapping[str, Path]:
         roots: Folders of the repositories. If several repositories contain a model, its folder in the first of them is
             returned.
     """
-    folder_of_model: dict[str, Path] = {}
-    for root in roots:
-        for name in model_names(root):
-            folder_of_model.setdefault(name, root / name)
-    return MappingProxyType(folder_of_model)
+    return {name: root / name for root in reversed(roots) for name in model_names(root)}
 
 
 def _refusal_reason(folder: Path, error: Exception) -> str:

@@ -31,7 +31,6 @@ from isocharge.serve.network.http import Application, HttpServer
 from isocharge.serve.network.metrics import Client
 from isocharge.serve.network.protocol.handler import Headers
 from isocharge.serve.network.protocol.response import (
-    PAGE_HEADERS,
     Response,
     error_response,
     json_response,
@@ -274,11 +273,19 @@ CONTENT_TYPES = {
 }
 """Content type by the suffix of a file name."""
 
-CONTENT_SECURITY_POLICY = (
-    b"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
-    b"base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
-"""Content security policy of the page. With this policy, a browser loads only files of this server."""
+PAGE_HEADERS = [
+    (
+        b"content-security-policy",
+        b"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
+        b"base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    ),
+    (b"cache-control", b"no-cache"),
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+]
+"""Headers of every file of the page. With the content security policy, a browser loads only files of this server."""
 
 
 def _page_files() -> dict[str, Response]:
@@ -288,8 +295,7 @@ def _page_files() -> dict[str, Response]:
     for path in folder.rglob("*"):
         if path.is_file():
             response = response_of(200, CONTENT_TYPES[path.suffix], path.read_bytes())
-            policy = [(b"content-security-policy", CONTENT_SECURITY_POLICY), (b"cache-control", b"no-cache")]
-            response.headers.extend([*policy, *PAGE_HEADERS])
+            response.headers.extend(PAGE_HEADERS)
             responses[f"/{path.relative_to(folder).as_posix()}"] = response
     responses["/"] = responses["/index.html"]
     return responses

@@ -108,14 +108,6 @@ def error_response(error: Exception) -> Response:
     return response
 
 
-PAGE_HEADERS = [
-    (b"x-content-type-options", b"nosniff"),
-    (b"x-frame-options", b"DENY"),
-    (b"referrer-policy", b"no-referrer"),
-    (b"cross-origin-resource-policy", b"same-origin"),
-]
-"""Headers of every page, in addition to its content security policy."""
-
 _WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
 """Argument `wbits` of zlib for each encoding. The encoding `deflate` of HTTP is the zlib format."""
 
