@@ -74,27 +74,19 @@ def test_temperature_drift_is_smooth_and_equal_on_all_electrodes():
     assert rate_of_change.std() == pytest.approx(0.05 * 270.0 / 10.0, rel=0.1)  # rms / sqrt(20 s * 5 s): lag behind lag
 
 
-def test_temperature_step_gives_its_pyroelectric_charge():
-    """The temperature rises by 0.5 K within 5 ms. A film of 25 um follows with the time constant 2.67 s.
+def test_temperature_step_gives_the_pyroelectric_charge_of_each_electrode():
+    """The temperature rises by 0.5 K within 5 ms, and falls again after 10 s.
 
-    The time constant is rho c h / (2 U). The charge of the temperature is negative, while that of a press is positive.
+    A film of 25 um follows with the time constant rho c h / (2 U) = 2.67 s. The charge of the temperature is negative,
+    while that of a press is positive.
     """
-    part = Amplifier(noise=CLEAN, step=0.5, step_at=2.0, step_time=0.005)
-    readings, _ = measure(part, np.zeros((5000, 3)))
-    time = np.arange(5000) / RATE - 2.0
-    expected = -135.0 * (1.0 - np.exp(-np.maximum(time, 0.0) / 2.67))
-    np.testing.assert_allclose(readings, expected[:, None] * np.ones(3), atol=0.3)
-
-
-def test_temperature_step_ends_and_pyro_mismatch_differs_between_electrodes():
-    part = Amplifier(noise=CLEAN, step=2.0, step_at=2.0, step_time=0.005, step_for=10.0, pyro_mismatch=0.2)
+    part = Amplifier(noise=CLEAN, step=0.5, step_at=2.0, step_time=0.005, step_for=10.0, pyro_mismatch=0.2)
     readings, process = measure(part, np.zeros((5000, 4)))
-    warmest = 1.0 - np.exp(-10.0 / 2.67)
-    np.testing.assert_allclose(readings[2400], 2.0 * process.pyro_charge_per_K * warmest, rtol=0.01)
-    np.testing.assert_allclose(
-        readings[4999], 2.0 * process.pyro_charge_per_K * warmest * np.exp(-13.0 / 2.67), rtol=0.05
-    )
+    assert part.pyro == -270.0
     assert np.ptp(process.pyro_charge_per_K) > 20.0
+    time = np.arange(5000) / RATE
+    rise, fall = (1.0 - np.exp(-np.maximum(time - start, 0.0) / 2.67) for start in (2.0, 12.0))
+    np.testing.assert_allclose(readings, 0.5 * np.outer(rise - fall, process.pyro_charge_per_K), atol=0.4)
 
 
 def test_converter_clips_and_rounds_to_16_bits():
@@ -127,13 +119,9 @@ def test_amplifier_file_changes_the_given_values(tmp_path):
         ("tau = 1", "unknown key 'tau'; did you mean 'tau_s'"),
         ("tau_s = 0", "tau_s: expected a positive number or inf, got 0"),
         ("hum_pC = -1", "hum_pC: expected"),
-        ("bits = 1.5", "bits: expected"),
         ("bits = 33", "bits: expected a whole number from 0 to 32, got 33"),
         ("bits = 16", r"mine\.toml: bits: a converter of 16 bits needs the largest charge that it reads"),
-        ('like = "bench"\nlimit_pC = inf', "bits: a converter of 16 bits needs"),
         ("white_pC = inf", "white_pC: expected a number from 0, got inf"),
-        ("hum_pC = nan", "hum_pC: expected a number from 0, got nan"),
-        ("hum_pC = true", "hum_pC: expected a number from 0, got True"),
         ('like = "kitchen"', "like: expected one of clean, reference, measured, bench, surgery, got 'kitchen'"),
         ("tau_s", "not a TOML file"),
     ],

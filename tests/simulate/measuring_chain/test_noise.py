@@ -26,11 +26,6 @@ def test_added_noise_is_gaussian_with_sigma(charge):
     assert stats.kstest(drawn, "norm").pvalue > 0.01
 
 
-def test_noise_level_clean_adds_nothing():
-    charge = np.random.default_rng(2).normal(0.0, 1e3, (5, 3))
-    np.testing.assert_array_equal(noise_model("clean").add(charge, np.random.default_rng(3)), charge)
-
-
 @pytest.mark.parametrize("level", AMPLIFIER_LEVELS)
 def test_noise_and_amplifier_levels_have_the_same_noise(level):
     """Single readings for training and limits have the same noise as the time series of the virtual sensor."""

@@ -62,21 +62,6 @@ def test_notation_round_trip(width, height, angle):
         np.testing.assert_allclose(read.outline, probe.outline, rtol=0.0, atol=1e-10 * probe.reach)
 
 
-@pytest.mark.parametrize(
-    ("probe", "notation"),
-    [
-        (Circle(0.3), "circle:0.3"),
-        (Ellipse(4.0, 2.0, 1.0), "ellipse:4.0x2.0"),
-        (Polygon.rectangle(4.0, 2.0, 1.0), "rectangle:4.0x2.0"),
-        (Polygon.triangle(4.0), "triangle:4.0"),
-        (parse_probe("polygon:0,0;3,0;0,3"), "polygon:-1.0,-1.0;2.0,-1.0;-1.0,2.0"),
-    ],
-    ids=["circle", "ellipse", "rectangle", "triangle", "polygon"],
-)
-def test_notation_is_in_mm(probe, notation):
-    assert probe.notation == notation
-
-
 def test_help_text_lists_every_probe_notation():
     for form in ("circle:RADIUS", "ellipse:WIDTHxHEIGHT", "rectangle:WIDTHxHEIGHT", "triangle:SIDE", "finger:RADIUS"):
         assert form in PROBE_HELP
