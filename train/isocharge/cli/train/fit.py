@@ -14,7 +14,7 @@ from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
-from isocharge.serve import MeasuredPresses, ModelMetadata
+from isocharge.serve import ModelMetadata
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import (
     Dataset,
@@ -102,56 +102,52 @@ def fit_command(
 
     Example: isocharge train fit presses.csv -o models/pad
     """
-    notations = probe or [DEFAULT_PROBE]
     if dataset is not None and _is_sensor(dataset):
         if sensor is not None:
             raise InputError(f"expected one sensor, got {dataset} and --sensor {sensor}; leave one of them out")
         sensor = str(dataset)
         dataset = None
-
-    # A path that is no folder is a file, a pipe, or missing.
-    press_file = dataset if dataset is not None and not dataset.is_dir() else None
-    if press_file is not None and not press_file.exists():
-        raise InputError(f"{press_file}: expected a dataset folder or a file of measured presses; there is neither")
-    if press_file is not None and sensor is not None:
+    if dataset is not None and not dataset.exists():
+        raise InputError(f"{dataset}: expected a dataset folder or a file of measured presses; there is neither")
+    if dataset is not None and sensor is not None:
+        if dataset.is_dir():
+            raise InputError("expected either a DATASET folder or --sensor SENSOR, got both; leave one of them out")
         raise InputError(
-            f"{press_file}: measured presses of a sensor with a sensor file calibrate its film; use `isocharge train "
-            f"calibrate {shlex.quote(str(press_file))} --sensor {sensor} -o {shlex.quote(str(output))}`, or leave "
+            f"{dataset}: measured presses of a sensor with a sensor file calibrate its film; use `isocharge train "
+            f"calibrate {shlex.quote(str(dataset))} --sensor {sensor} -o {shlex.quote(str(output))}`, or leave "
             "--sensor out to train a network on the presses alone"
         )
-    if dataset is not None and sensor is not None:
-        raise InputError("expected either a DATASET folder or --sensor SENSOR, got both; leave one of them out")
     if sensor is None:
         _refuse_options(context, ("radius",), "belongs to --sensor; the presses determine the working area")
     else:
         _refuse_options(context, ("position_std_mm", "force_std"), "belongs to a file of measured presses")
-    if dataset is not None and press_file is None:
-        _refuse_options(context, ("probe", "position_std_mm", "force_std"), "is contained in the dataset folder")
-    fit_config = load_config(config) if config else FitConfig()
-    loaded_dataset = read_dataset(dataset) if dataset is not None and press_file is None else None
-    presses: MeasuredPresses | None = None
-    sensor_name = output.resolve().name  # the sensor of a file of presses has no other name than that of the model
-    pressing_probes = set(probe or ["unknown"])
-    if press_file is not None:
-        presses = _read_presses_of_unknown_sensor(press_file, position_std_mm, force_std)
-    elif loaded_dataset is not None and is_measured(loaded_dataset):
-        presses = measured_presses_of(loaded_dataset)
-        sensor_name = loaded_dataset.sensor.name
-        pressing_probes = set(map(str, loaded_dataset.samples.probe))
-    if presses is not None:
-        version_folder = check_target(output, version, presses.electrodes)
-        train = partial(fit_presses, presses, sensor_name, fit_config, probes=tuple(sorted(pressing_probes)))
-        train_and_release(train, version_folder, json=json)
-        return
 
-    # A dataset folder or --sensor alone: train a network on the dataset, or on presses that are simulated here.
+    fit_config = load_config(config) if config else FitConfig()
+    train: Callable[[FitConfig], Fitted]
     if sensor is not None:
-        # Refuse an unsuitable model folder before the simulation, which takes a while.
-        check_target(output, version, load_sensor(sensor).electrode_names)
+        electrodes = load_sensor(sensor).electrode_names
+        train = partial(_fit_simulated_presses, sensor, probe or [DEFAULT_PROBE], radius)
+    elif dataset is None:
+        raise InputError("expected either a DATASET folder or a SENSOR, got neither")
+    elif dataset.is_dir():
+        _refuse_options(context, ("probe", "position_std_mm", "force_std"), "is contained in the dataset folder")
+        loaded_dataset = read_dataset(dataset)
+        electrodes = loaded_dataset.sensor.electrode_names
+        train = partial(_fit_dataset, loaded_dataset)
+    else:  # a file or a pipe
+        presses = read_press_file(dataset, None, position_std_mm, force_std)
+        electrodes = presses.electrodes
+        say(f"{dataset}: {len(presses)} presses of the channels {', '.join(electrodes)}")
+        sensor_name = output.resolve().name  # this sensor has no other name than that of the model
+        train = partial(fit_presses, presses, sensor_name, probes=tuple(sorted(set(probe or ["unknown"]))))
+
+    version_folder = check_target(output, version, electrodes)
     with shown_progress():
-        data = _prepare_data(loaded_dataset, sensor, notations, radius)
-    version_folder = check_target(output, version, data.sensor.electrode_names)
-    train_and_release(partial(fit, data, fit_config), version_folder, json=json)
+        fitted = train(fit_config)
+        released = release(fitted, version_folder.parent, version=int(version_folder.name), command=this_command())
+    if json:
+        show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})
+    say(f"{released.folder}: {_errors_sentence(released.metadata)}")
 
 
 def _refuse_options(context: typer.Context, names: Sequence[str], reason: str) -> None:
@@ -177,61 +173,31 @@ def _is_sensor(argument: Path) -> bool:
     return is_built_in or argument.suffix.lower() == ".toml"
 
 
-def _prepare_data(dataset: Dataset | None, sensor: str | None, notations: list[str], radius: str) -> TrainingData:
-    """Convert a simulated dataset to training data, or simulate training data for a sensor.
+def _fit_simulated_presses(sensor_name: str, notations: Sequence[str], radius: str, config: FitConfig) -> Fitted:
+    """Train a network on presses that are simulated on a sensor.
 
     Args:
-        dataset: The dataset; None to simulate presses.
-        sensor: Name or file of the sensor; None to use the dataset.
-        notations: Notations of the probes of the simulated presses.
-        radius: Largest distance of the simulated presses from the centre: a number of mm, or "auto".
-
-    Raises:
-        InputError: If neither the dataset nor the sensor is given.
+        sensor_name: Name or file of the sensor.
+        notations: Notations of the probes.
+        radius: Largest distance of a press from the centre: a number of mm, or "auto".
+        config: Training settings.
     """
-    if dataset is not None:
-        data = TrainingData.of(dataset)
-        if data.yield_force_N is not None:
-            say(f"caution: PVDF yields beyond {data.yield_force_N:g} N, and a dent stays")
-        return data
-    if sensor is None:
-        raise InputError("expected either a DATASET folder or a SENSOR, got neither")
-    described_sensor = load_sensor(sensor)
+    sensor = load_sensor(sensor_name)
     probes = [parse_probe(notation) for notation in notations]
-    warn_of_stress(described_sensor.film, probes, DEFAULT_FORCE_RANGE[1])
-    radius_mm = sweep_radius(radius, described_sensor, probes, DEFAULT_FORCE_RANGE)
-    return TrainingData.of(simulated_presses(described_sensor, probes, radius_mm, DEFAULT_FORCE_RANGE))
+    warn_of_stress(sensor.film, probes, DEFAULT_FORCE_RANGE[1])
+    radius_mm = sweep_radius(radius, sensor, probes, DEFAULT_FORCE_RANGE)
+    return fit(TrainingData.of(simulated_presses(sensor, probes, radius_mm, DEFAULT_FORCE_RANGE)), config)
 
 
-def _read_presses_of_unknown_sensor(file: Path, position_std_mm: float, force_std: float) -> MeasuredPresses:
-    """Read the measured presses of a sensor without a description, and print which columns are its channels.
-
-    Args:
-        file: CSV file of the presses.
-        position_std_mm: Standard deviation of the positions if the file contains none, mm.
-        force_std: Relative standard deviation of the forces if the file contains none.
-
-    Raises:
-        PressError: If the file cannot be read.
-    """
-    presses = read_press_file(file, None, position_std_mm, force_std)
-    say(f"{file}: {len(presses)} presses of the channels {', '.join(presses.electrodes)}")
-    return presses
-
-
-def train_and_release(train: Callable[[], Fitted], version_folder: Path, *, json: bool) -> None:
-    """Train a network, release it as a version folder, and print its errors.
-
-    Args:
-        train: Function that trains the network.
-        version_folder: Folder to write, as `check_target` returned it.
-        json: Whether to print the folder and the errors as one JSON object, too.
-    """
-    with shown_progress():
-        released = release(train(), version_folder.parent, version=int(version_folder.name), command=this_command())
-    if json:
-        show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})
-    say(f"{released.folder}: {_errors_sentence(released.metadata)}")
+def _fit_dataset(dataset: Dataset, config: FitConfig) -> Fitted:
+    """Train a network on the simulated or the measured presses of a dataset."""
+    if is_measured(dataset):
+        probes = tuple(sorted(set(map(str, dataset.samples.probe))))
+        return fit_presses(measured_presses_of(dataset), dataset.sensor.name, config, probes=probes)
+    data = TrainingData.of(dataset)
+    if data.yield_force_N is not None:
+        say(f"caution: PVDF yields beyond {data.yield_force_N:g} N, and a dent stays")
+    return fit(data, config)
 
 
 def _errors_sentence(metadata: ModelMetadata) -> str:
