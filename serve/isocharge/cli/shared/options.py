@@ -1,6 +1,5 @@
 """Arguments and options that several commands share, and functions that convert their values."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -91,20 +90,6 @@ DeviceOption = Annotated[
 ]
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text. (default: text)")]
-
-
-def refuse(mistakes: Mapping[str, object]) -> None:
-    """Refuse contradictory options before anything is computed.
-
-    Args:
-        mistakes: Whether each mistake was made, by the error message for the mistake.
-
-    Raises:
-        InputError: If a mistake was made. The error has the message of the first mistake.
-    """
-    for message, was_made in mistakes.items():
-        if was_made:
-            raise InputError(message)
 
 
 def worker_count(workers: int | None) -> int:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.forward_maps import ProbeOption
-from isocharge.cli.shared.options import JsonOption, StressLimitOption, refuse, worker_count
+from isocharge.cli.shared.options import JsonOption, StressLimitOption, worker_count
 from isocharge.cli.shared.press_options import (
     ForceStdOption,
     PositionStdOption,
@@ -19,6 +19,7 @@ from isocharge.cli.shared.press_options import (
 )
 from isocharge.cli.shared.terminal import say, show, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
+from isocharge.common.errors import InputError
 from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
 from isocharge.train.calibration.calibrate import solve_even
@@ -146,12 +147,12 @@ def _write(result: CalibrationResult, folder: Path, executor: Executor | None) -
 
 def _check_usage(file: Path | None, output: Path | None, next_count: int) -> None:
     """Raise InputError if neither presses are given nor proposed, or if a model is requested without presses."""
-    refuse(
-        {
+    if file is not None:
+        return
+    if not next_count:
+        raise InputError(
             "expected PRESSES.csv, or --next K for presses to begin with, got neither; `isocharge train press` takes "
-            "presses at a port": file is None and not next_count,
-            "--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out": (
-                file is None and output is not None
-            ),
-        }
-    )
+            "presses at a port"
+        )
+    if output is not None:
+        raise InputError("--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out")

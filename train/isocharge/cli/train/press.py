@@ -1,10 +1,10 @@
 """`isocharge train press`: record presses at a port, and write the file of measured presses."""
 
 import shlex
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from pty import STDIN_FILENO
 from typing import Annotated
 
 import typer
@@ -16,7 +16,7 @@ from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
-from isocharge.common.errors import InputError, OutputError, PressError, error_prefix
+from isocharge.common.errors import OutputError, PressError, error_prefix
 from isocharge.common.files import as_output_errors
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch
@@ -104,7 +104,7 @@ def press_command(
     # unless --yes is given.
     contacts = None if press_list is None else read_press_list(press_list)
     asks_person = contacts is None and not yes
-    keyboard = _keyboard_descriptor() if asks_person else None
+    keyboard = STDIN_FILENO if asks_person else None
     board = load_device(device)
     if board.rule(ThermalRule) is not None:
         say(f"{device}: [common_mode] is not used for these presses, because it needs a model of the film")
@@ -181,18 +181,3 @@ def _save(path: Path, presses: MeasuredPresses) -> None:
         return
     with as_output_errors(path):
         path.unlink(missing_ok=True)
-
-
-def _keyboard_descriptor() -> int:
-    """Return the file descriptor of the standard input.
-
-    Raises:
-        InputError: If the standard input is closed or has no file descriptor.
-    """
-    try:
-        return sys.stdin.fileno()
-    except (OSError, ValueError, AttributeError) as error:
-        raise InputError(
-            "expected a standard input for the answers about presses, got none; give --yes for presses that are made "
-            "where they are proposed, or --press-list FILE for the presses of a machine"
-        ) from error
