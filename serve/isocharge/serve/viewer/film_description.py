@@ -19,20 +19,14 @@ def describe_film(name: str, metadata: ModelMetadata) -> dict[str, Any]:
         metadata: Metadata of the model.
     """
     film = metadata.sensor.get("film")
-    outlines_mm = {}
-    leads_mm = {}
-    for electrode, polygons in _electrode_polygons(metadata.sensor, metadata.electrodes).items():
-        pad, *leads = polygons  # the first polygon is the pad; most electrodes have no leads
-        outlines_mm[electrode] = pad
-        if leads:
-            leads_mm[electrode] = leads
-
+    polygons_mm = _electrode_polygons(metadata.sensor, metadata.electrodes)  # the first one is the pad
+    leads_mm = {name: leads for name, (_, *leads) in polygons_mm.items() if leads}  # most electrodes have none
     description = {
         "name": name,
         "model": metadata.label,
         "sensor": metadata.frame_id,
         "electrodes": list(metadata.electrodes),
-        "outlines_mm": outlines_mm,
+        "outlines_mm": {name: pad for name, (pad, *_) in polygons_mm.items()},
         "film": film,
         "radius_mm": film.get("radius_mm") if isinstance(film, dict) else None,
         "working_area_mm": [[float(x), float(y)] for x, y in metadata.working_area_mm],
