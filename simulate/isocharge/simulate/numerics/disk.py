@@ -6,14 +6,14 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 
-INNER_RADIUS = 1.0 - 1e-9
+ROUNDING = 1e-9
+"""Relative tolerance for points on the edge of a disk, dimensionless."""
+
+INNER_RADIUS = 1.0 - ROUNDING
 """Radius of the disk in which contacts are searched for, divided by the radius of the charge map, dimensionless.
 
 The value is smaller than one, because rounding errors would otherwise move some contacts out of the disk.
 """
-
-ROUNDING = 1e-9
-"""Relative tolerance for points on the edge of a disk, dimensionless."""
 
 
 def onto_disk(position: Array, radius: float) -> Array:

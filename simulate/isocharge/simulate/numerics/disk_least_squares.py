@@ -15,6 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from isocharge.common.arrays import Array, Integers
+from isocharge.simulate.numerics.disk import ROUNDING
 
 ResidualFunction = Callable[[Integers, Array], tuple[Array, Array]]
 """Function that evaluates the residuals of some of the problems.
@@ -25,9 +26,6 @@ residuals r, shape (m, k), and their derivatives dr/du, shape (m, 3, k).
 
 MIN_CHANGE = 1e-7
 """Default value for the change of |r|^2 below which the iteration ends, relative to 1 + |r|^2."""
-
-EDGE_TOLERANCE = 1e-9
-"""Distance from an edge of D below which a point counts as lying on the edge."""
 
 
 def minimise(
@@ -102,8 +100,7 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -
 
     # The equations change only for points on an edge of D.
     edge = np.flatnonzero(
-        (point[:, 0] ** 2 + point[:, 1] ** 2 > (1.0 - EDGE_TOLERANCE) ** 2)
-        | (np.abs(point[:, 2]) > 1.0 - EDGE_TOLERANCE)
+        (point[:, 0] ** 2 + point[:, 1] ** 2 > (1.0 - ROUNDING) ** 2) | (np.abs(point[:, 2]) > 1.0 - ROUNDING)
     )
     if edge.size:
         matrix[edge], gradient[edge] = _along_edges(point[edge], matrix[edge], gradient[edge], trace[edge])
@@ -125,7 +122,7 @@ def _along_edges(point: Array, matrix: Array, gradient: Array, trace: Array) -> 
     # The normals of the circle and of the end of the interval are (x, y, 0) and (0, 0, z), because the coordinates of a
     # point on an edge have these lengths. An edge is active if the negative gradient has an outward component.
     normals = point[:, None] * np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])  # shape (n, 2, 3)
-    is_on_edge = np.linalg.norm(normals, axis=2) > 1.0 - EDGE_TOLERANCE
+    is_on_edge = np.linalg.norm(normals, axis=2) > 1.0 - ROUNDING
     outward = -np.einsum("nbi,ni->nb", normals, gradient) * is_on_edge
     normals = normals * (outward > 0.0)[..., None]
 

@@ -4,11 +4,15 @@ The library shapely (GEOS) computes centroids, overlaps and intersections of pol
 not use shapely, because shapely would replace the disk by a polygon.
 """
 
+from typing import TypeVar
+
 import numpy as np
 import shapely
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.numerics.interpolation import gauss_line
+
+Points = TypeVar("Points", Array, Complexes)
 
 
 def area_of(corners: Array) -> float:
@@ -106,21 +110,22 @@ def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float)
     return np.asarray((triangle_area + sector_area).sum(axis=-1))
 
 
-def bilinear(corners: Complexes, s: Array, t: Array) -> Complexes:
+def bilinear(corners: Points, s: Array, t: Array) -> Points:
     """Map points (s, t) of the unit square into a quadrilateral or a triangle by a bilinear function.
 
     Args:
-        corners: Corners x + iy of a quadrilateral, shape (4,), or of a triangle, shape (3,). The corners of a
-            quadrilateral are the images of (0, 0), (1, 0), (1, 1) and (0, 1). The last corner of a triangle is the
-            image of both (1, 1) and (0, 1).
-        s: First coordinate in the unit square.
+        corners: Corners of a quadrilateral or of a triangle: x + iy, shape (4,) or (3,), or (x, y), shape (4, 2) or
+            (3, 2). The corners of a quadrilateral are the images of (0, 0), (1, 0), (1, 1) and (0, 1). The last corner
+            of a triangle is the image of both (1, 1) and (0, 1).
+        s: First coordinate in the unit square. For corners (x, y), the last axis has the length 1.
         t: Second coordinate in the unit square. The shapes of `s` and `t` can be broadcast.
 
     Returns:
-        Points x + iy, in the common shape of `s` and `t`.
+        Points of the same kind as the corners, in the common shape of `s` and `t`.
     """
     z00, z10, z11, z01 = _four_corners(corners)  # the digits are the coordinates s and t of each corner
-    return np.asarray(z00 + (z10 - z00) * s + (z01 - z00) * t + (z00 - z10 + z11 - z01) * s * t)
+    points: Points = z00 + (z10 - z00) * s + (z01 - z00) * t + (z00 - z10 + z11 - z01) * s * t
+    return points
 
 
 def gauss_quadrilateral(corners: Array, max_count: int, reference_length: float) -> tuple[Array, Array]:
@@ -156,13 +161,13 @@ def gauss_quadrilateral(corners: Array, max_count: int, reference_length: float)
     return to_corners(points.ravel()), weights.ravel()
 
 
-def _four_corners(corners: Complexes) -> Complexes:
+def _four_corners(corners: Points) -> Points:
     """Return four corners for a quadrilateral or a triangle. The last corner of a triangle is returned twice.
 
     Args:
-        corners: Corners x + iy, shape (4,) or (3,).
+        corners: Corners x + iy, shape (4,) or (3,), or corners (x, y), shape (4, 2) or (3, 2).
     """
-    return corners if corners.size == 4 else np.append(corners, corners[-1:])
+    return corners if len(corners) == 4 else np.append(corners, corners[-1:], axis=0)
 
 
 def _gauss_line_for(side: float, max_count: int, reference_length: float) -> tuple[Array, Array]:

@@ -1,6 +1,6 @@
 """Division of a union of polygons into trapezoids for numerical integration, and computation of trace outlines.
 
-A polygon is an array of its corners x + iy in anticlockwise order. The library shapely (GEOS) computes unions and
+A polygon is an array of its corners (x, y) in anticlockwise order. The library shapely (GEOS) computes unions and
 intersections of polygons, but cannot divide a union into trapezoids.
 
 The outline of a trace is computed without shapely. The function `shapely.buffer` silently cuts off sharp bends, and
@@ -13,9 +13,10 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
+from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Complexes
-from isocharge.simulate.numerics.polygon import area_of, bilinear, to_complex, to_corners
+from isocharge.simulate.numerics.polygon import area_of, bilinear
 
 MERGE_DISTANCE = 1e-9
 """Distance below which two corners or two y coordinates of corners are treated as equal, mm."""
@@ -27,7 +28,7 @@ The length of a mitre is proportional to 1 / (1 + cos(angle)). The largest allow
 """
 
 
-def is_simple(corners: Complexes) -> bool:
+def is_simple(corners: Array) -> bool:
     """Return whether the corners of a polygon are in anticlockwise order and the polygon does not cross itself.
 
     The function compares the signed area of the polygon with the area that the polygon covers. The two areas differ if
@@ -35,27 +36,27 @@ def is_simple(corners: Complexes) -> bool:
     an edge counts as simple.
 
     Args:
-        corners: Corners x + iy, shape (n,), mm.
+        corners: Corners (x, y), shape (n, 2), mm.
     """
-    signed_area = area_of(to_corners(corners))
-    perimeter = np.abs(corners - np.roll(corners, 1)).sum()
+    signed_area = area_of(corners)
+    perimeter = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
     difference = _region([corners]).area - signed_area
     return signed_area > 0.0 and bool(abs(difference) < MERGE_DISTANCE * perimeter)
 
 
-def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> list[Complexes]:
+def union_parts(front: Sequence[ArrayLike], back: Sequence[ArrayLike] = ()) -> list[Array]:
     """Divide the union of simple polygons into trapezoids that do not overlap.
 
     Horizontal lines through every corner and through every crossing of two edges divide the plane into strips. Within
     each strip, the union consists of trapezoids. A triangle is represented as a trapezoid with two equal corners.
 
     Args:
-        front: Simple polygons, each of shape (n,), mm.
-        back: Further simple polygons, each of shape (n,), mm. If there are any, the function divides the intersection
+        front: Simple polygons, each of shape (n, 2), mm.
+        back: Further simple polygons, each of shape (n, 2), mm. If there are any, the function divides the intersection
             of the union of `front` and the union of `back`.
 
     Returns:
-        Trapezoids, each of shape (4,), mm. The corners of each trapezoid are in the order lower left, lower right,
+        Trapezoids, each of shape (4, 2), mm. The corners of each trapezoid are in the order lower left, lower right,
         upper right, upper left. The trapezoids are ordered from bottom to top, and from left to right within a strip.
     """
     region = _region(front)
@@ -70,7 +71,7 @@ def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> l
         # Find the edges that cross the strip. The start and the end of such an edge are on different sides of the
         # middle of the strip, because no edge ends within a strip.
         middle = 0.5 * (bottom + top)
-        crosses_strip = (start.imag < middle) != (end.imag < middle)
+        crosses_strip = (start[:, 1] < middle) != (end[:, 1] < middle)
         edge_start = start[crosses_strip]
         edge_end = end[crosses_strip]
 
@@ -82,80 +83,78 @@ def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> l
         # The region begins at the first edge, ends at the second edge, begins again at the third edge, and so on.
         for left in range(0, order.size, 2):
             right = left + 1
-            lower_left = x_bottom[left] + 1j * bottom
-            lower_right = x_bottom[right] + 1j * bottom
-            upper_right = x_top[right] + 1j * top
-            upper_left = x_top[left] + 1j * top
-            trapezoids.append(np.array([lower_left, lower_right, upper_right, upper_left]))
+            lower_corners = [(x_bottom[left], bottom), (x_bottom[right], bottom)]
+            upper_corners = [(x_top[right], top), (x_top[left], top)]
+            trapezoids.append(np.array(lower_corners + upper_corners))
     return trapezoids
 
 
-def _x_at_height(start: Complexes, end: Complexes, y: float) -> Array:
+def _x_at_height(start: Array, end: Array, y: float) -> Array:
     """Compute the x coordinate at which each straight line reaches the height y, shape (n,).
 
     Args:
-        start: Points x + iy at which the lines start, shape (n,).
-        end: Points x + iy at which the lines end, shape (n,).
+        start: Points (x, y) at which the lines start, shape (n, 2).
+        end: Points (x, y) at which the lines end, shape (n, 2).
         y: Height, which must be the same for all lines.
     """
-    slope = (end - start).real / (end - start).imag
-    return np.asarray(start.real + slope * (y - start.imag))
+    x_difference, y_difference = (end - start).T
+    return np.asarray(start[:, 0] + x_difference / y_difference * (y - start[:, 1]))
 
 
-def _region(polygons: Sequence[Complexes]) -> shapely.Geometry:
+def _region(polygons: Sequence[ArrayLike]) -> shapely.Geometry:
     """Compute the union of polygons.
 
     A polygon that touches or crosses itself is first converted into a valid region.
     """
-    valid_regions = shapely.make_valid([shapely.Polygon(to_corners(corners)) for corners in polygons])
+    valid_regions = shapely.make_valid([shapely.Polygon(corners) for corners in polygons])
     return shapely.union_all(valid_regions)
 
 
-def _strip_ends(polygons: Sequence[Complexes]) -> Array:
+def _strip_ends(polygons: Sequence[ArrayLike]) -> Array:
     """Return the y coordinates of all corners and of all crossings of edges in ascending order, shape (n,), mm.
 
     Coordinates that differ by less than `MERGE_DISTANCE` are returned only once.
     """
-    outlines = [shapely.LinearRing(to_corners(corners)) for corners in polygons]
+    outlines = [shapely.LinearRing(corners) for corners in polygons]
     lines = shapely.union_all(outlines)  # includes a point at each crossing of two edges
     y = np.unique(shapely.get_coordinates(lines)[:, 1])
     is_distinct = np.diff(y, prepend=-np.inf) > MERGE_DISTANCE  # from the previous coordinate; true for the first
     return np.asarray(y[is_distinct])
 
 
-def _edges(region: shapely.Geometry) -> tuple[Complexes, Complexes]:
+def _edges(region: shapely.Geometry) -> tuple[Array, Array]:
     """Return the start points and the end points of all edges of a region, including the edges of its holes.
 
     Returns:
-        Start points and end points x + iy, each of shape (n,).
+        Start points and end points (x, y), each of shape (n, 2).
     """
     parts = shapely.get_parts(region)
     polygons = parts[shapely.get_dimensions(parts) == 2]  # removes points and lines at which polygons only touch
-    rings = [to_complex(shapely.get_coordinates(ring)) for ring in shapely.get_rings(polygons)]
+    rings = [shapely.get_coordinates(ring) for ring in shapely.get_rings(polygons)]
     # Each ring is closed, because its last point is the same as its first point.
     start = np.concatenate([ring[:-1] for ring in rings])
     end = np.concatenate([ring[1:] for ring in rings])
     return start, end
 
 
-def subdivide(quadrilateral: Complexes, max_side: float) -> list[Complexes]:
+def subdivide(quadrilateral: Array, max_side: float) -> list[Array]:
     """Cut a quadrilateral into quadrilaterals and triangles whose sides do not exceed a given length.
 
     Args:
-        quadrilateral: Corners of the quadrilateral, shape (4,), mm. Two of the corners may be equal.
+        quadrilateral: Corners of the quadrilateral, shape (4, 2), mm. Two of the corners may be equal.
         max_side: Largest length of a side of the returned polygons, mm.
 
     Returns:
-        Corners of each polygon, shape (4,) for a quadrilateral or (3,) for a triangle, mm.
+        Corners of each polygon, shape (4, 2) for a quadrilateral or (3, 2) for a triangle, mm.
     """
     # The quadrilateral is the bilinear image of the unit square (s, t), which is divided into a grid of cells.
-    side_lengths = np.abs(np.roll(quadrilateral, -1) - quadrilateral)
+    side_lengths = np.linalg.norm(np.roll(quadrilateral, -1, axis=0) - quadrilateral, axis=1)
     first_s_side, first_t_side, second_s_side, second_t_side = side_lengths
     n_s = int(np.ceil(max(first_s_side, second_s_side) / max_side))
     n_t = int(np.ceil(max(first_t_side, second_t_side) / max_side))
     s = np.linspace(0.0, 1.0, n_s + 1)
     t = np.linspace(0.0, 1.0, n_t + 1)
-    grid = bilinear(quadrilateral, s[:, None], t)  # shape (n_s + 1, n_t + 1)
+    grid = bilinear(quadrilateral, s[:, None, None], t[:, None])  # shape (n_s + 1, n_t + 1, 2)
     cells = []
     for i in range(n_s):
         for j in range(n_t):
@@ -163,8 +162,8 @@ def subdivide(quadrilateral: Complexes, max_side: float) -> list[Complexes]:
 
             # Omit corners that coincide with the previous corner. Omit cells with fewer than three distinct corners,
             # because their area is zero.
-            previous_corners = np.roll(corners, 1)
-            is_distinct = np.abs(corners - previous_corners) > MERGE_DISTANCE
+            previous_corners = np.roll(corners, 1, axis=0)
+            is_distinct = np.linalg.norm(corners - previous_corners, axis=1) > MERGE_DISTANCE
             has_area = np.count_nonzero(is_distinct) > 2
             if has_area:
                 cells.append(corners[is_distinct])

@@ -168,9 +168,7 @@ class Electrode:
 
         # Charge is collected where metal on the front overlaps metal on the back. Without polygons on the back, the
         # whole back is metal.
-        front = [to_complex(np.array(polygon)) for polygon in self.front]
-        back = [to_complex(np.array(polygon)) for polygon in self.back]
-        return tuple(to_corners(part) for part in union_parts(front, back))
+        return tuple(union_parts(self.front, self.back))
 
     @cached_property
     def parts(self) -> tuple[Array, ...]:
@@ -181,11 +179,7 @@ class Electrode:
         """
         if self._is_convex:
             return self.collecting_polygons
-        return tuple(
-            to_corners(piece)
-            for polygon in self.collecting_polygons
-            for piece in subdivide(to_complex(polygon), MAX_PART_SIDE)
-        )
+        return tuple(piece for polygon in self.collecting_polygons for piece in subdivide(polygon, MAX_PART_SIDE))
 
     @property
     def _is_convex(self) -> bool:
@@ -468,7 +462,7 @@ def check_polygon(where: str, polygon: Corners) -> None:
     # A convex polygon does not cross itself. This case is tested first, because the test is faster and most polygons
     # are convex.
     is_finite = np.isfinite(corners).all()
-    if not (is_finite and (is_convex(corners) or is_simple(to_complex(corners)))):
+    if not (is_finite and (is_convex(corners) or is_simple(corners))):
         raise SensorError(
             f"{where}: expected a polygon that does not cross itself, with its corners anticlockwise, got "
             f"{shown(corners.tolist())} mm"

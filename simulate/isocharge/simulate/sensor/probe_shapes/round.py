@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
+from isocharge.simulate.numerics.interpolation import gauss_line
 from isocharge.simulate.numerics.polygon import area_in_disk, to_complex
 from isocharge.simulate.sensor.probe_shapes.base import CurvedProbe, check_length
 from isocharge.simulate.sensor.size_check import tidy
@@ -118,12 +119,10 @@ class Finger(RoundProbe):
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
             at: Position of the centroid of the footprint as x + iy, mm.
         """
-        # The Gauss rule is for the interval [-1, 1]. It is mapped to levels t from 0 to 1, and its weights are halved.
-        nodes, weights = np.polynomial.legendre.leggauss(PRESSURE_LEVELS)
-        pressure_fraction = 0.5 * (nodes + 1.0)
+        pressure_fraction, weights = gauss_line(PRESSURE_LEVELS)
         disk_radius = self.radius * np.sqrt(1.0 - pressure_fraction**2)
         points = to_complex(corners)
         common_areas = [float(area_in_disk(points, at, radius)) for radius in disk_radius]  # A(t), mm^2
 
         # For a force of 1, the mean pressure is 1 / area, and the peak pressure is `PEAK_PRESSURE` times as large.
-        return float(PEAK_PRESSURE / self.area * 0.5 * (weights @ common_areas))
+        return float(PEAK_PRESSURE / self.area * (weights @ common_areas))
