@@ -66,7 +66,10 @@ def stress_sum(forward_map, contact, points_mm):
     points = np.stack([points_mm.real.ravel(), points_mm.imag.ravel()], axis=1)
     weights = np.tile([1.0, 1.0, 0.0], (len(points), 1, 1))
     readout = ReadoutPoints(points[:, None], weights, np.ones(len(points), dtype=int))
-    return forward_map.field_charges(np.array([contact]), EVEN_FIELD, rule=readout)[0, :, 0].reshape(points_mm.shape)
+    x, y, force = np.array(contact)[:, None]
+    rules = [(readout, np.ones((1, len(points)), dtype=bool))]
+    charge = forward_map.integrate_fields(x + 1j * y, force, np.zeros(1), EVEN_FIELD, rules)
+    return charge[0, :, 0].reshape(points_mm.shape)
 
 
 def table(values):

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, limits_at, load_sensor, noise_model
-from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
-from isocharge.simulate.identifiability.folds import find_folds
+from isocharge.simulate.identifiability.working_area import find_ambiguous_pairs, find_folds
 from isocharge.simulate.numerics.disk import Rings
 
 CASES = {"eight-25um-biaxial-36mm": (36.0, 40.0), "six-25um-biaxial-30mm": (30.0, 36.0)}

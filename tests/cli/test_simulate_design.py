@@ -9,7 +9,6 @@ from isocharge.simulate import load_sensor
 from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.layout import case as case_module
 from isocharge.simulate.layout import design as design_module
-from isocharge.simulate.layout import search as search_module
 from isocharge.simulate.layout import stress_fields
 
 DESIGN = ("simulate", "design", "three-25um-biaxial", "--electrodes")
@@ -19,9 +18,9 @@ FILES = ["design.json", "design.png", "layout.dxf", "layout.svg", "sensor.toml"]
 @pytest.fixture
 def _rough(monkeypatch):
     """The search is coarse and does not search for folds, because the complete search takes half a minute."""
-    monkeypatch.setattr(case_module, "FINE_GRID_STEPS", 12)
-    monkeypatch.setattr(case_module, "MAX_SEARCH_PRESSES", 50)
-    monkeypatch.setattr(search_module, "STARTS", 2)
+    monkeypatch.setattr(case_module, "FINE_PRESSES", 450)
+    monkeypatch.setattr(case_module, "SEARCH_PRESSES", 50)
+    monkeypatch.setattr(design_module, "STARTS", 2)
     monkeypatch.setattr(stress_fields, "NODE_COUNT", NodeCount(distances=2, forces=1))
     monkeypatch.setattr(design_module, "describe_ambiguities", lambda *_: design_module.UNAMBIGUOUS)
 
@@ -31,7 +30,7 @@ def test_a_design_is_a_folder_that_other_commands_read(command, tmp_path, monkey
     folder = tmp_path / "mine"
     words = (*DESIGN, "3", "--radius", "4", "--keep", "A", "--known", "--workers", "1", "-o", folder)
     with monkeypatch.context() as patch:
-        patch.setattr(search_module.Search, "refine", lambda *_: exec("raise KeyboardInterrupt"))
+        patch.setattr(design_module.Search, "refine", lambda *_: exec("raise KeyboardInterrupt"))
         assert command(*words)[0] == 130
     assert list(tmp_path.iterdir()) == []
     code, out, err = command(*words)

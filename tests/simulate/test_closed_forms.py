@@ -4,13 +4,11 @@ For small forces, the deflection is proportional to the force, and Green's funct
 deflection under a circular probe is an integral of this function.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.integrate import dblquad, solve_bvp
-from scipy.interpolate import CubicSpline
+from scipy.integrate import solve_bvp
 from scipy.special import iv, ivp, kv, kvp
 
 from isocharge.simulate import (
@@ -21,9 +19,7 @@ from isocharge.simulate import (
     SolveSettings,
     Theory,
     deflection,
-    load_sensor,
     press,
-    touch_charge,
     touch_stress,
 )
 
@@ -205,25 +201,6 @@ def test_taut_plate_under_a_centred_disk(tension_MPa):
         np.testing.assert_allclose(deflection(solved, ring(r * film.radius)), expected, atol=2e-5 * centre)
 
 
-def charge_of_a(radius: float, stress: Callable[[float], tuple[float, float]]) -> float:
-    """Return the charge of electrode A of "four-25um-uniaxial", pC, by numerical integration.
-
-    Args:
-        radius: Radius of the film, mm.
-        stress: Function that returns (s_r, s_theta), MPa, at a radius in film radii.
-    """
-
-    def density(y: float, x: float) -> float:
-        r = np.hypot(x, y)
-        cos2 = x**2 / (x**2 + y**2)
-        radial, hoop = stress(r / radius)
-        s11 = radial * cos2 + hoop * (1 - cos2)
-        s22 = radial * (1 - cos2) + hoop * cos2
-        return 20.0 * s11 + 2.0 * s22
-
-    return dblquad(density, 8.5, 11.5, -1.5, 1.5)[0]
-
-
 def axisymmetric(share: float, squared_amplitude: float, poisson: float, tension: float, at: np.ndarray) -> np.ndarray:
     """Return the scaled deflection and the radial and hoop stress of a membrane at radii in film radii, shape (3, n).
 
@@ -323,15 +300,3 @@ def test_hencky():
     expected = 1.7244 / 4.0 * np.cbrt(pressure**2 * film.radius**2 * film.young * film.thickness)
     centre = touch_stress(solved, np.zeros((1, 2)))[0] * film.thickness
     np.testing.assert_allclose(centre[:2], expected, rtol=1e-4)
-
-
-def test_charge_of_a_centred_press_is_the_integral_of_the_boundary_value_problem():
-    """The charge of electrode A is the integral of the stress that scipy computes, without code of isocharge."""
-    sensor = load_sensor("four-25um-uniaxial")
-    force = 1.0
-    squared_amplitude = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
-    solved = press(sensor.film, Circle(1.0), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=REFINED))
-    at = np.linspace(8.4, 11.7, 40) / 45.0
-    _, *stresses = axisymmetric(1.0 / 45.0, squared_amplitude, 0.34, 0.0, at)
-    expected = charge_of_a(45.0, CubicSpline(at, SLACK.young * squared_amplitude * np.stack(stresses, axis=1)))
-    assert touch_charge(sensor, solved)[0] == pytest.approx(expected, rel=1e-5)

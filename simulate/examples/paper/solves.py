@@ -28,7 +28,7 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.execution.workers import in_order
-from isocharge.simulate.numerics.disk import lattice
+from isocharge.simulate.numerics.disk import sunflower
 
 FORCE = 1.0
 """Force of the paper's presses, N."""
@@ -162,14 +162,13 @@ class Solves:
 
 
 def spread(radius: float, most: int) -> Array:
-    """Return positions of a lattice that is rotated away from the lines of symmetry, shape (n, 2), mm.
+    """Return positions that are distributed evenly over a disk, shape (n, 2), mm.
 
     Args:
         radius: Largest distance from the centre, mm.
-        most: Largest number of positions.
+        most: Number of positions.
     """
-    z = radius * lattice(most) * np.exp(0.1j)
-    return np.stack([z.real, z.imag], axis=1)
+    return radius * sunflower(most)
 
 
 def sample(choices: Choices) -> Array:
@@ -260,8 +259,7 @@ def find_eq_4(forward_map: ForwardMap, choices: Choices) -> tuple[tuple[float, f
 
     def charge_at(position: Array) -> Array:
         """Return our charges of a press of 1 N, shape (3,), pC."""
-        charge, _, _ = spline.first_order(position[None], FORCE)
-        return charge[0]
+        return spline.charges(np.array([[*position, FORCE]]))[0]
 
     def log_ratio_residuals(position: Array) -> Array:
         """Return the differences of the logarithms of B / A and C / A between our charges and the paper's."""

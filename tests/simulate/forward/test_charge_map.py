@@ -35,7 +35,7 @@ def contacts(domain: Domain, count: int = 60, share: float = 0.97) -> np.ndarray
     """Evenly over the disk, and over the forces in the logarithm."""
     at = share * sunflower(count)
     unit = np.linspace(-share, share, count)
-    return domain.to_contact(np.stack([at.real, at.imag, unit], axis=1))
+    return domain.to_contact(np.column_stack([at, unit]))
 
 
 @pytest.mark.parametrize("charge_map", [*CHECKED, "within", "function"], indirect=True)

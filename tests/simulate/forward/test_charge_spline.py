@@ -16,7 +16,7 @@ RADIUS = 5.0
 def spread(count: int) -> np.ndarray:
     at = RADIUS * sunflower(count)
     force = 0.3 * (1.0 / 0.3) ** np.linspace(0.02, 0.98, count)
-    return np.stack([at.real, at.imag, force], axis=1)
+    return np.column_stack([at, force])
 
 
 def test_spline_charges_equal_those_of_the_forward_map(near_map, near_spline):
@@ -58,16 +58,6 @@ def test_spline_includes_the_charge_of_contact_pressure(near_map):
     extra = pressed.charges(contact) - near_map.charges(contact)
     assert np.abs(extra).max() > 10.0
     np.testing.assert_allclose(with_d33 - without, extra, atol=0.015 * np.abs(extra).max())
-
-
-def test_first_order_equals_charges_and_derivatives_and_clamps_to_the_edge(near_spline):
-    contact = spread(100)
-    value, slope, by_force = near_spline.first_order(contact[:, :2], contact[:, 2])
-    np.testing.assert_allclose(value, near_spline.charges(contact), rtol=1e-13)
-    np.testing.assert_array_equal(np.dstack([slope, by_force]), near_spline.derivatives(contact))
-    out, edge = (near_spline.first_order(np.array([[0.0, y]]), 1.0) for y in (1.2 * RADIUS, RADIUS))
-    for beyond, expected in zip(out, edge, strict=True):
-        np.testing.assert_allclose(beyond, expected, rtol=1e-13)
 
 
 @pytest.mark.parametrize("radius", [0.0, 5.1, np.nan])

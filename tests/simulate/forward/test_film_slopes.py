@@ -15,7 +15,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.mechanics.film_temperature import warmed
+from isocharge.simulate.mechanics.stress import warmed
 
 PROBE = Circle(1.0)
 

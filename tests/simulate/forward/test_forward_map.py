@@ -133,11 +133,6 @@ def test_forward_map_of_other_films(near_electrodes, film, surface, theory):
     assert errors(forward_map, draw(forward_map, 4, seed=7)[0]).max() < 1e-3
 
 
-def test_forward_map_with_one_force():
-    forward_map = ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(2.0), 4.0, (0.7, 0.7), QUICK_SETTINGS)
-    assert errors(forward_map, np.array([[1.0, 2.0, 0.7], [0.0, -3.0, 0.7]])).max() < 1e-3
-
-
 @pytest.mark.slow
 def test_forward_map_reaches_40_mm_on_a_taut_film_of_45_mm():
     """Near the clamp the fields change over the distance from the press to the clamp."""

@@ -20,8 +20,7 @@ from isocharge.simulate import (
     touch_stress,
 )
 from isocharge.simulate.forward.readout import (
-    COARSE,
-    FINE,
+    GAUSS_RULES,
     ReadoutPoints,
     contact_charge,
     thermal_charge,
@@ -33,7 +32,7 @@ D32 = 2.0
 TRIANGLE = Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0)))
 
 
-def charge_of(sensor: Sensor, stress, per_side: int = FINE) -> np.ndarray:
+def charge_of(sensor: Sensor, stress, per_side: int = 12) -> np.ndarray:
     """Charges under a made-up stress field, a function of x and y that returns (s11, s22, s12)."""
     readout = ReadoutPoints.of(sensor, per_side)
     return readout.charge(np.stack(np.broadcast_arrays(*stress(*np.moveaxis(readout.points, -1, 0))), axis=-1))
@@ -44,7 +43,7 @@ def sensor(request) -> Sensor:
     return replace(load_sensor("four-25um-uniaxial"), readout=request.param)
 
 
-@pytest.mark.parametrize("per_side", [1, COARSE, FINE])
+@pytest.mark.parametrize("per_side", [1, 3, 12])
 def test_linear_stress_is_read_at_the_centre(sensor, per_side):
     """The mean of a linear function over a square or two opposite edges is its value at the centre."""
     charge = charge_of(sensor, lambda x, y: (1.0 + 3.0 * x - 2.0 * y, -4.0 * x + y, x), per_side)
@@ -118,7 +117,7 @@ def test_concave_electrode_equals_the_sum_of_two_rectangles(solved):
         for electrodes in ((dented,), (lying, standing), (replace(lying, more=(standing.corners,)),))
     )
     np.testing.assert_allclose([whole[0], union[0]], parts.sum(), rtol=1e-6)
-    stress = (lambda x, y: (x**2 - y, x * y, 0 * x)), COARSE
+    stress = (lambda x, y: (x**2 - y, x * y, 0 * x)), 4
     whole, parts = (charge_of(replace(sensor, electrodes=e), *stress) for e in ((dented,), (lying, standing)))
     assert whole[0] == pytest.approx(parts.sum(), rel=1e-12)
     whole, parts = (
@@ -147,14 +146,21 @@ def test_pretension_cancels_in_the_touch_charge(film):
     assert np.abs(touch_charge(taut, press(taut.film, Circle(1.0), (3.0, 1.0), 1e-6))).max() < 1e-5
 
 
-def test_fine_and_coarse_rules_agree_away_from_the_probe(solved):
-    """The forward map uses the coarse rule for electrodes more than 3 mm from the probe."""
-    sensor = load_sensor("four-25um-uniaxial")
-    coarse, fine = (
-        rule.charge(touch_stress(solved, rule.points.reshape(-1, 2)).reshape(*rule.points.shape[:2], 3))
-        for rule in (ReadoutPoints.of(sensor, COARSE), ReadoutPoints.of(sensor, 40))
-    )
-    np.testing.assert_allclose(coarse, fine, rtol=3e-5)
+@pytest.mark.parametrize("readout", ["area", "edge"])
+def test_each_rule_is_accurate_from_its_smallest_distance_on(film, readout):
+    """The electrode lies at the smallest distance at which the forward map uses the rule."""
+    electrode = Electrode.of_square("A", (10.0, 0.0), 3.0)
+    sensor = replace(load_sensor("four-25um-uniaxial"), electrodes=(electrode,), readout=readout)
+    reach = 1.0
+    unit = 1.5 * np.sqrt(2.0) + reach
+    for smallest_distance, per_side, tolerance in ((0.0, 12, 2e-4), (1.4, 4, 1e-4), (2.5, 3, 1e-4)):
+        assert per_side in dict(GAUSS_RULES).values()
+        pressed = press(film, Circle(reach), (10.0 - smallest_distance * unit, 0.4), 1.0)
+        charge, exact = (
+            rule.charge(touch_stress(pressed, rule.points.reshape(-1, 2)).reshape(*rule.points.shape[:2], 3))
+            for rule in (ReadoutPoints.of(sensor, count) for count in (per_side, 40))
+        )
+        np.testing.assert_allclose(charge, exact, rtol=tolerance)
 
 
 def test_touch_charge_with_another_film_raises_error(solved):
@@ -215,28 +221,3 @@ def test_thermal_charge():
     sensor = replace(sensor, calibration=Calibration(gain={"T": 0.5}))
     np.testing.assert_allclose(thermal_charge(sensor, 0.1), [-27.0, 0.5 * -24.0], rtol=1e-12)
     np.testing.assert_allclose(thermal_charge(sensor, -0.2), [54.0, 24.0], rtol=1e-12)
-
-
-def test_signs_of_tension_pressure_and_warming_follow_the_thickness():
-    """The coefficients of a film of fixed dipoles follow from the change of its thickness, dQ / Q = -dh / h.
-
-    The polarization is the charge of one face per area. A tension s in both directions reduces the thickness by the
-    factor 2 nu s / E, and a pressure p on one face by p / (2 E). Warming increases the thickness.
-    """
-    polarization = 0.18e6  # pC/mm^2
-    young = 3000.0  # MPa
-    poisson = 0.34
-    expansion = 1.5e-4  # 1/K
-    d31 = polarization * poisson / young
-    d33 = -polarization / young
-    pyro = -polarization * expansion
-    sensor = load_sensor("three-25um-biaxial")
-    sensor = replace(sensor, piezo=Piezo(d31, d31, d33, pyro))
-    assert (round(d31, 1), round(d33), round(pyro)) == (20.4, -60, -27)  # PVDF: 20 to 23, -33, -27 to -30
-    stretched = charge_of(sensor, lambda x, y: (10.0 + 0.0 * x, 10.0 + 0.0 * y, 0.0))
-    np.testing.assert_allclose(stretched, 9.0 * polarization * 2.0 * poisson * 10.0 / young)
-    np.testing.assert_allclose(
-        stretched + thermal_charge(sensor, 2.0 * poisson * 10.0 / young / expansion), 0.0, atol=1e-9
-    )
-    pressed = contact_charge(sensor, Circle(5.0), sensor.electrodes[0].centre, np.pi * 25.0)[0]
-    assert pressed == pytest.approx(9.0 * polarization / (2.0 * young))

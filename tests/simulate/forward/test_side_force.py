@@ -10,7 +10,7 @@ from isocharge.simulate import Circle, Polygon, SolveSettings, Theory, load_sens
 from isocharge.simulate import touch_charge as charge_of
 from isocharge.simulate.forward.derivative_maps import SideForceMap
 from isocharge.simulate.solver.equilibrium import Equilibrium
-from isocharge.simulate.solver.friction import friction_force, holding_force
+from isocharge.simulate.solver.sensitivity import friction_force, holding_force
 
 PROBE = Circle(1.0)
 FULL = SolveSettings(theory=Theory(bending=True))

@@ -19,10 +19,10 @@ from isocharge.simulate import (
     working_area,
 )
 from isocharge.simulate.forward.charge_map import differences, within
-from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
-from isocharge.simulate.identifiability.folds import (
+from isocharge.simulate.identifiability.working_area import (
     FOLD_WIDTH,
+    find_ambiguous_pairs,
     find_folds,
     has_reversed_orientation,
     scaled_derivatives,

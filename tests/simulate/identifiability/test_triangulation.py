@@ -51,18 +51,6 @@ def draw(count: int, seed: int, radius: float = 7.0, forces: tuple[float, float]
     return np.stack([r * np.cos(angle), r * np.sin(angle), np.exp(rng.uniform(*np.log(forces), count))], axis=1)
 
 
-@pytest.mark.parametrize("forces", [FORCES, (1.0, 1.0)])
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_triangulation_of_circular_contours_finds_position_and_force(layout, forces):
-    charge_map = round_map(CENTRES[layout], forces)
-    contact = draw(300, seed=1, forces=forces)
-    fix = Triangulation(charge_map).locate(charge_map.charges(contact))
-    assert fix.found.mean() > 0.95
-    assert np.median(errors(fix, contact)) < 1e-4
-    assert np.median(np.abs(fix.contact[:, 2] / contact[:, 2] - 1.0)[fix.found]) < 1e-5
-    assert np.median(fix.spread[fix.found]) < 1e-4
-
-
 def test_triangulation_agrees_with_least_squares_of_scipy():
     """The four charges are not those of any press. The result is then the minimum that a general solver finds."""
     charge_map = round_map(CENTRES["four"])
@@ -150,7 +138,3 @@ def test_wrong_charges_are_shown_in_the_error(charge, message):
 def test_impossible_triangulation_raises_an_error(count, tolerance, message):
     with pytest.raises(SceneError, match=message):
         Triangulation(round_map(CENTRES["three"][:count]), tolerance=tolerance)
-
-
-def test_triangulation_of_no_presses_is_empty():
-    assert Triangulation(round_map(CENTRES["three"])).locate(np.zeros((0, 3))).contact.shape == (0, 3)

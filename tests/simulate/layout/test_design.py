@@ -11,10 +11,15 @@ from isocharge.common.errors import SolveError
 from isocharge.simulate import Domain, ForwardMap, FunctionMap, limits_at
 from isocharge.simulate.layout import case as case_module
 from isocharge.simulate.layout import design as design_module
-from isocharge.simulate.layout import search as search_module
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase
-from isocharge.simulate.layout.design import NOT_SEARCHED, UNAMBIGUOUS, describe_ambiguities, design
-from isocharge.simulate.layout.search import Search, random_layouts
+from isocharge.simulate.layout.design import (
+    NOT_SEARCHED,
+    UNAMBIGUOUS,
+    Search,
+    describe_ambiguities,
+    design,
+    random_layouts,
+)
 from kept import kept
 
 
@@ -28,10 +33,10 @@ def _rough(fields, sensor):
     build = ForwardMap.build
     with pytest.MonkeyPatch.context() as patch:
         for module, name, value in (
-            (case_module, "FINE_GRID_STEPS", 10),
-            (case_module, "MAX_SEARCH_PRESSES", 60),
-            (search_module, "STARTS", 3),
-            (search_module, "ROUNDS", 2),
+            (case_module, "FINE_PRESSES", 320),
+            (case_module, "SEARCH_PRESSES", 60),
+            (design_module, "STARTS", 3),
+            (design_module, "ROUNDS", 2),
         ):
             patch.setattr(module, name, value)
         patch.setattr(design_module, "solve_fields", lambda sensor, *_: fields[sensor.name])

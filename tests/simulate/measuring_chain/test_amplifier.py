@@ -45,12 +45,6 @@ def test_bias_current_settles_at_current_times_tau():
     np.testing.assert_allclose(readings, np.broadcast_to(process.bias * 2.0, readings.shape), rtol=2e-3)
 
 
-def test_amplifier_level_reference_is_memoryless():
-    readings, _ = measure(load_amplifier("reference"), np.full((20_000, 2), 500.0))
-    np.testing.assert_allclose(readings.std(axis=0), np.hypot(1.0, 1.0), rtol=0.03)
-    np.testing.assert_allclose(readings.mean(axis=0), 500.0, atol=0.05)
-
-
 def test_deterministic_readings_do_not_depend_on_the_block_size():
     part = replace(load_amplifier("bench"), noise=CLEAN, temperature_rms=0.0)
     whole, many = (measure(part, step(), blocks=blocks)[0] for blocks in (1, 37))

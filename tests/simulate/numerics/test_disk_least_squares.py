@@ -3,16 +3,10 @@
 import numpy as np
 from scipy.optimize import minimize
 
-from isocharge.simulate.numerics.disk_least_squares import into_domain, minimise
+from isocharge.simulate.identifiability.nearest_contact import into_domain, minimise
 
 RNG = np.random.default_rng(0)
-TARGETS = np.concatenate([RNG.uniform(-1.0, 1.0, (60, 3)), 30.0 * RNG.normal(size=(60, 3)), [[0.0, 0.0, 5.0]]])
 MATRIX = RNG.normal(size=(4, 3))
-
-
-def distances(rows, unit):
-    """Residuals whose minimum is the point of the domain that is nearest to the target."""
-    return unit - TARGETS[rows], np.broadcast_to(np.eye(3), (len(unit), 3, 3))
 
 
 def sine_residuals(rows, unit):
@@ -20,12 +14,6 @@ def sine_residuals(rows, unit):
     angle = unit @ MATRIX.T + 0.1 * rows[:, None]
     slopes = 2.0 * np.cos(angle)[:, None, :] * MATRIX.T
     return 2.0 * np.sin(angle) - 1.5 - 0.1 * rows[:, None], slopes
-
-
-def test_minimise_finds_the_nearest_point_of_the_domain():
-    unit, residual = minimise(distances, np.zeros_like(TARGETS))
-    np.testing.assert_allclose(unit, into_domain(TARGETS), atol=1e-6)
-    np.testing.assert_allclose(residual, unit - TARGETS, rtol=1e-12, atol=1e-12)
 
 
 def test_minimise_is_not_worse_than_scipy_with_constraints():

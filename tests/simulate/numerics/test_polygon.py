@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from isocharge.simulate.numerics.polygon import area_in_disk, area_of, centroid_of, is_convex, shared_area
+from isocharge.simulate.numerics.polygon import area_in_disk, area_of, is_convex, shared_area
 
 COMMON = settings(derandomize=True, deadline=None, max_examples=40)
 
@@ -60,8 +60,3 @@ def test_polygon_with_a_straight_or_reentrant_or_repeated_corner_is_not_convex(c
 def test_star_polygon_is_not_convex():
     """It turns left at every corner, but it crosses itself."""
     assert not is_convex(corners_of(np.exp(0.8j * np.pi * np.arange(5))))
-
-
-def test_centroid_of_a_triangle_is_the_mean_of_its_corners():
-    corners = np.array([[0.0, 0.0], [6.0, 0.0], [0.0, 3.0]])
-    np.testing.assert_allclose(centroid_of(corners), [2.0, 1.0], atol=1e-15)

@@ -181,12 +181,3 @@ def test_gain_multiplies_the_charge():
 def test_place_rotates_then_shifts():
     placed = Calibration(shift=(0.5, 0.0), rotation=np.pi / 2).place(np.array([[1.0, 0.0], [0.0, 2.0]]))
     np.testing.assert_allclose(placed, [[0.5, 1.0], [-1.5, 0.0]], atol=1e-15)
-
-
-def test_rotation_by_the_symmetry_angle_of_the_layout_permutes_the_charges():
-    """A rotation by 90 degrees moves A to the position of B, and so on."""
-    sensor = load_sensor("four-25um-biaxial")
-    solved = press(sensor.film, Circle(1.0), (3.0, 1.0), 1.0)
-    rotated = replace(sensor, calibration=Calibration(rotation=0.5 * np.pi))
-    expected = np.roll(touch_charge(sensor, solved), -1)
-    np.testing.assert_allclose(touch_charge(rotated, solved), expected, rtol=1e-12)

@@ -165,7 +165,6 @@ def test_error_message_names_the_key_of_the_wrong_type(path):
         (("film", "young_GPa"), [3.0, 0.2], r"film\.young_GPa, E1 / E2: expected 0\.1 to 10, got 15"),
         (("film", "pretension_MPa"), [-11, -11, 0], r"film\.pretension_MPa: expected -10 to 300 MPa, got -11 MPa"),
         (("electrodes", "side_mm"), 0.0, "electrodes.side_mm: expected a number above 0"),
-        (("electrodes", "A"), [8.0, 5.0], "electrodes 'A' and 'B' overlap"),
         (("calibration", "gain"), {"A": 0.0}, "calibration.gain.A: expected a positive number, got 0.0"),
         (("calibration", "gain"), {"Z": 1.0}, "calibration gain: no electrode named"),
         (("surface",), "inside", r"surface: expected one of middle, top, bottom, got 'inside'"),

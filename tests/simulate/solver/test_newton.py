@@ -34,17 +34,6 @@ def test_newton_converges_from_the_flat_film_for_every_force(film, changes, theo
         assert solved.iterations <= 20
 
 
-@pytest.mark.parametrize(
-    ("probe", "at", "force"),
-    [
-        (Circle(1.0), (0.0, 30.0), 5.0),
-        (Circle(40.5), (1.0, 1.0), 1e-4),
-    ],
-)
-def test_presses_near_the_rim_and_of_large_probes_converge(film, probe, at, force):
-    assert press(film, probe, at, force).iterations <= 20
-
-
 @pytest.mark.parametrize("theory", [MEMBRANE, FULL], ids=["membrane", "full"])
 def test_newton_converges_quadratically(film, theory):
     """The last step nearly squares the residual, because the tangent is exact near the solution."""

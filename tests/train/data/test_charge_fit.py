@@ -7,8 +7,7 @@ from scipy.optimize import minimize
 from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.serve.model.charge_file import charge_map_from_bytes
 from isocharge.simulate import Domain, noise_model
-from isocharge.simulate.identifiability.nearest_contact import search
-from isocharge.simulate.numerics.disk_least_squares import into_domain
+from isocharge.simulate.identifiability.nearest_contact import into_domain, search
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, release
 from isocharge.train.data.charge_fit import fit_charge_series, fit_film_series
 from isocharge.train.data.contact_errors import rms

@@ -24,10 +24,10 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.forward.readout import thermal_charge
-from isocharge.simulate.mechanics.film_temperature import warmed
+from isocharge.simulate.mechanics.stress import warmed
 from isocharge.simulate.mechanics.theory import theory_by_name
 from isocharge.simulate.solver.error_estimate import estimated_error, summary
-from isocharge.simulate.solver.friction import check_friction, friction_force
+from isocharge.simulate.solver.sensitivity import check_friction, friction_force
 
 
 def point_command(

@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy  # scipy.interpolate is imported when it is used
+from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
+from scipy.sparse.linalg import splu
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
@@ -22,7 +24,6 @@ from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.numerics.disk import onto_disk, sunflower
 from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
-from isocharge.simulate.numerics.spline_fit import disk_positions, fit_spline, spline_knots
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.sensor import Calibration
 
@@ -44,6 +45,16 @@ EXTRA_FORCE_NODES = 2
 
 The charges that d33 causes are proportional to the force, and not to the squared amplitude. With the additional nodes,
 the relative error of these charges is at most 1e-4.
+"""
+
+
+LOG_FORCE_STEP = 1e-4
+"""Step of the central differences with respect to ln F, where F is the force, dimensionless."""
+
+SMOOTHING = 5e-3
+"""Weight of the third differences of the spline coefficients in the fit, dimensionless.
+
+The third differences determine the coefficients in regions without positions.
 """
 
 
@@ -154,33 +165,15 @@ class ChargeSpline:
             SceneError: If a press lies outside the domain.
         """
         contact = self.domain.check(contact, "table")
-        charge, position_derivative, log_force_derivative = self.first_order(contact[:, :2], contact[:, 2])
-        return charge, np.concatenate([position_derivative, log_force_derivative[..., None]], axis=2)
+        position = onto_disk(contact[:, :2], self.domain.radius)  # the check allows for rounding errors
 
-    def first_order(
-        self, position: Array, force: Array | float, log_force_step: float = 1e-4
-    ) -> tuple[Array, Array, Array]:
-        """Compute the charges of presses, and the derivatives of the charges.
-
-        Positions outside the disk are accepted, because an iterative solver may try such positions.
-
-        Args:
-            position: Positions (x, y), shape (n, 2), mm. Positions outside the disk are moved to its edge.
-            force: Forces, shape (n,) or a number, N.
-            log_force_step: Step of the central difference with respect to ln F, where F is the force, dimensionless.
-
-        Returns:
-            Charges, shape (n, n_electrode), pC. Derivatives with respect to (x, y), shape (n, n_electrode, 2), pC/mm.
-            Derivatives with respect to ln F, shape (n, n_electrode), pC.
-        """
         # Each charge is a weighted sum of the scaled charges at the forces of the splines. Only the weights depend on
         # the force. The derivatives of the weights with respect to ln F are computed by central differences.
-        position = onto_disk(position, self.domain.radius)
-        log_force = np.log(np.broadcast_to(force, len(position)))
+        log_force = np.log(contact[:, 2])
         weights = self.force_weights(log_force)
-        weights_above = self.force_weights(log_force + log_force_step)
-        weights_below = self.force_weights(log_force - log_force_step)
-        weight_slopes = (weights_above - weights_below) / (2.0 * log_force_step)
+        weights_above = self.force_weights(log_force + LOG_FORCE_STEP)
+        weights_below = self.force_weights(log_force - LOG_FORCE_STEP)
+        weight_slopes = (weights_above - weights_below) / (2.0 * LOG_FORCE_STEP)
 
         # Only the scaled charges depend on the position.
         scaled_charge = self.scaled_charges(position)
@@ -190,7 +183,7 @@ class ChargeSpline:
         charge = np.einsum("nk,nke->ne", weights, scaled_charge)
         position_derivative = np.einsum("nk,nkei->nei", weights, scaled_gradient)
         log_force_derivative = np.einsum("nk,nke->ne", weight_slopes, scaled_charge)
-        return charge, position_derivative, log_force_derivative
+        return charge, np.concatenate([position_derivative, log_force_derivative[..., None]], axis=2)
 
     def force_weights(self, log_force: Array) -> Array:
         """Compute the weights that convert the scaled charges at the forces of the splines into a charge.
@@ -304,7 +297,9 @@ class _ScaledCharges:
         scaled_charge = force_weights @ scaled_stress_charge  # shape (n, n_force, n_electrode)
 
         # Add the charge of the contact pressure, which is proportional to the force.
-        pressure_charge_per_force = forward_map.pressure_charges(position)  # shape (n, n_electrode)
+        pressure_charge_per_force = forward_map.pressure_charges(
+            position, np.zeros(len(position))
+        )  # shape (n, n_electrode)
         scaled_force = self.force / amplitude_squared(film, self.force)  # shape (n_force,)
         scaled_pressure_charge = pressure_charge_per_force[:, None] * scaled_force[:, None]
         return np.asarray(scaled_charge + scaled_pressure_charge)
@@ -313,7 +308,9 @@ class _ScaledCharges:
 def _fit_disk(
     samples: _ScaledCharges, radius: float, spacing: float, min_cells: int = 8
 ) -> "scipy.interpolate.NdBSpline":
-    """Fit a spline to the scaled charges of all electrodes over the disk.
+    """Fit a cubic spline to the scaled charges of all electrodes over the disk.
+
+    The fit is by least squares with a penalty on the third differences of the coefficients.
 
     Args:
         samples: Scaled charges to which the spline is fitted.
@@ -324,10 +321,50 @@ def _fit_disk(
     Returns:
         Spline in x and y that returns scaled charges, shape (n_force, n_electrode), pC.
     """
+    # The ends of the interval occur four times among the knots, so that the spline is defined on the whole interval. A
+    # cubic spline has 4 coefficients fewer than knots along each axis.
     cells = int(np.clip(np.ceil(2.0 * radius / spacing), min_cells, MAX_CELLS))
-    knots = spline_knots(-radius, radius, cells)
-    position = radius * disk_positions(cells)
-    return fit_spline(position, samples.charges_at(position), (knots, knots))
+    line_knots = np.concatenate([[-radius] * 3, np.linspace(-radius, radius, cells + 1), [radius] * 3])
+    knots = (line_knots, line_knots)
+    count = line_knots.size - 4
+    position = radius * _fit_positions(cells)
+    values = samples.charges_at(position)
+
+    # The design matrix converts the coefficients into the values of the spline. The matrix of SciPy has no columns for
+    # the last coefficients if they do not affect any position, so it is created again with its full shape.
+    cubic_degree = 3
+    entries = scipy.interpolate.NdBSpline.design_matrix(position, knots, cubic_degree)
+    design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(position), count**2))
+    differences = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
+    identity = eye_array(count)
+    penalty = SMOOTHING * vstack([kron(differences, identity), kron(identity, differences)])
+
+    # Solve the normal equations. Their matrix is positive definite, so the factorisation needs no pivoting.
+    normal_matrix = (design.T @ design + penalty.T @ penalty).tocsc()
+    right_side = np.ascontiguousarray(design.T @ values.reshape(len(position), -1))
+    factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    coefficients = factors.solve(right_side).reshape(count, count, *values.shape[1:])
+    return scipy.interpolate.NdBSpline(knots, coefficients, cubic_degree)
+
+
+def _fit_positions(cells: int, per_cell: float = 1.6, per_edge_cell: float = 2.0) -> Array:
+    """Return the positions in the unit disk and on its edge to which a spline is fitted.
+
+    Args:
+        cells: Number of cells of the spline along the diameter of the disk.
+        per_cell: Number of positions per cell.
+        per_edge_cell: Number of additional positions on the edge of the disk per cell along the edge.
+
+    Returns:
+        Positions (x, y), shape (n, 2), in radii of the disk.
+    """
+    # In units of the side of a cell, the diameter of the disk is `cells`. The constants 16 and 8 ensure that there are
+    # enough positions if there are only a few cells.
+    inner_count = int(per_cell * np.pi * (0.5 * cells) ** 2) + 16
+    edge_count = int(per_edge_cell * np.pi * cells) + 8
+    angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
+    edge_positions = (1.0 - 1e-12) * np.stack([np.cos(angle), np.sin(angle)], axis=1)  # in the disk despite rounding
+    return np.concatenate([sunflower(inner_count), edge_positions])
 
 
 def _largest_error(spline: ChargeSpline, forward_map: ForwardMap, count: int = 400) -> float:
@@ -348,7 +385,7 @@ def _largest_error(spline: ChargeSpline, forward_map: ForwardMap, count: int = 4
     log_force_fraction = np.arange(count) * 0.618 % 1.0
     min_force, max_force = spline.domain.force_range
     force = np.clip(min_force * (max_force / min_force) ** log_force_fraction, min_force, max_force)
-    contact = np.stack([position.real, position.imag, force], axis=1)
+    contact = np.column_stack([position, force])
     true_charge = forward_map.charges(contact)
     error = np.abs(spline.charges(contact) - true_charge).max(axis=1)
     largest_charge = np.abs(true_charge).max(axis=1)

@@ -34,11 +34,10 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.mechanics.film_temperature import tension_change
 from isocharge.simulate.mechanics.scaling import amplitude_squared, side_force_unit
+from isocharge.simulate.mechanics.stress import tension_change
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.solver.equilibrium import Equilibrium
-from isocharge.simulate.solver.friction import check_friction, holding_force, limit_to_friction
 from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.press_chain import Reading
 from isocharge.simulate.solver.sensitivity import (
@@ -46,6 +45,9 @@ from isocharge.simulate.solver.sensitivity import (
     FILM_IS_ODD,
     SIDE_FORCE_FIELDS,
     SIDE_FORCE_IS_ODD,
+    check_friction,
+    holding_force,
+    limit_to_friction,
     stress_changes,
 )
 
@@ -233,7 +235,7 @@ class SideForceMap:
         """Compute the side forces that a probe on a vertical stage exerts on the film by friction.
 
         The friction prevents the film from slipping until the side force reaches its limit. The limit of the side force
-        is the coefficient of friction times the force of the press; see `solver.friction`.
+        is the coefficient of friction times the force of the press; see `solver.sensitivity`.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.

@@ -32,8 +32,14 @@ from isocharge.simulate.forward.family import (
     relative_error,
     spread_check_presses,
 )
-from isocharge.simulate.forward.press_chunk import PressChunk, PressMeshes
-from isocharge.simulate.forward.readout import COARSE, FINE, ReadoutPoints, are_near, contact_charge
+from isocharge.simulate.forward.readout import (
+    PressChunk,
+    PressMeshes,
+    ReadoutPoints,
+    contact_charge,
+    pairs_by_rule,
+    relative_distances,
+)
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.blocks import Resolution
@@ -313,19 +319,6 @@ class ForwardMap:
         charge_by_force = charges.swapaxes(1, 2)  # shape (n, n_force, n_electrode)
         return np.asarray(charge_by_force * unit_ratio[:, None])
 
-    def pressure_charges(self, position: Array) -> Array:
-        """Compute the charges per force that the contact pressure causes.
-
-        Crosstalk is omitted. The probe keeps its own orientation.
-
-        Args:
-            position: Positions (x, y), shape (n, 2), mm.
-
-        Returns:
-            Charges per force, shape (n, n_electrode), pC/N.
-        """
-        return self._pressure_charges(position[:, 0] + 1j * position[:, 1], np.zeros(len(position)))
-
     @cached_property
     def _stacked_forces(self) -> "ForwardMap":
         """Forward map whose table contains the stress under each force of the family as a separate stress field.
@@ -354,9 +347,8 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_electrode), pC.
         """
-        position = contact[:, 0] + 1j * contact[:, 1]
         charge: Array = self.field_charges(contact, EVEN_FIELD, orientation)[..., 0]
-        charge += contact[:, 2:] * self._pressure_charges(position, orientation)
+        charge += contact[:, 2:] * self.pressure_charges(contact[:, :2], orientation)
         return self.sensor.calibration.read(charge)
 
     def field_charges(
@@ -364,7 +356,6 @@ class ForwardMap:
         contact: Array,
         is_odd: Booleans,
         orientation: Array | None = None,
-        rule: ReadoutPoints | None = None,
         chunk_size: int = CHUNK_SIZE,
     ) -> Array:
         """Compute the charges of each stress field in the table.
@@ -379,7 +370,6 @@ class ForwardMap:
                 node.
             orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad; None for no
                 rotation.
-            rule: Integration rule for all electrodes. If None, a rule is selected for each press and electrode.
             chunk_size: Number of presses that are evaluated at once.
 
         Returns:
@@ -388,53 +378,50 @@ class ForwardMap:
         position = contact[:, 0] + 1j * contact[:, 1]
         if orientation is None:
             orientation = np.zeros(len(contact))
-        n_electrode = len(self.electrodes) if rule is None else len(rule.count)
-        charges = np.empty((len(contact), n_electrode, is_odd.size))
+        charges = np.empty((len(contact), len(self.electrodes), is_odd.size))
         with single_threaded_blas():  # faster for the many small matrices of a chunk
             for start in range(0, len(contact), chunk_size):
                 chunk = slice(start, start + chunk_size)
-                if rule is None:
-                    rules = self._select_rules(position[chunk])
-                else:
-                    rules = ((rule, np.ones(charges[chunk].shape[:2], dtype=bool)),)
-                charges[chunk] = self._integrate_fields(
+                distances = relative_distances(self.sensor.part_circles, self.probe.reach, position[chunk])
+                rules = [(ReadoutPoints.of(self.sensor, count), uses) for count, uses in pairs_by_rule(distances)]
+                charges[chunk] = self.integrate_fields(
                     position[chunk], contact[chunk, 2], orientation[chunk], is_odd, rules
                 )
         return charges
 
-    def _pressure_charges(self, position: Complexes, orientation: Array) -> Array:
+    def pressure_charges(self, position: Array, orientation: Array) -> Array:
         """Compute the charges per force that the contact pressure causes.
 
         Crosstalk is omitted.
 
         Args:
-            position: Positions x + iy, shape (n,), mm.
+            position: Positions (x, y), shape (n, 2), mm.
             orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
 
         Returns:
             Charges per force, shape (n, n_electrode), pC/N.
         """
-        charge = np.zeros((position.size, len(self.electrodes)))
+        charge = np.zeros((len(position), len(self.electrodes)))
         if self.sensor.piezo.d33 == 0.0:
             return charge
 
         # The contact pressure acts only on electrodes under the probe. Presses far from all electrodes cause no charge.
-        presses_near_electrodes = np.flatnonzero(are_near(self.sensor, self.probe, position).any(axis=1))
+        complex_position = position @ np.array([1.0, 1j])
+        distances = relative_distances(self.sensor.part_circles, self.probe.reach, complex_position)
+        presses_near_electrodes = np.flatnonzero((distances < 1.0).any(axis=1))
         for press_index in presses_near_electrodes:
             probe = self.probe.rotated(float(orientation[press_index]))
-            press_position = position[press_index]
-            charge[press_index] = contact_charge(
-                self.sensor, probe, (press_position.real, press_position.imag), force=1.0
-            )
+            x, y = position[press_index].tolist()
+            charge[press_index] = contact_charge(self.sensor, probe, (x, y), force=1.0)
         return charge
 
-    def _integrate_fields(
+    def integrate_fields(
         self,
         position: Complexes,
         force: Array,
         orientation: Array,
         is_odd: Booleans,
-        rules: tuple[tuple[ReadoutPoints, Booleans], ...],
+        rules: list[tuple[ReadoutPoints, Booleans]],
     ) -> Array:
         """Interpolate the stress fields of one chunk of presses, and integrate the fields to obtain the charges.
 
@@ -490,28 +477,3 @@ class ForwardMap:
         circular_distance = distance_on_circular_film(film, np.abs(position), direction)
         placement = Placement.of(template, self.probe, circular_distance, film.radius, self.layer, rotation)
         return PressMeshes(template, placement, direction, film_oval(film, direction))
-
-    @cached_property
-    def _fine_rule(self) -> ReadoutPoints:
-        """Integration rule for electrodes near the probe."""
-        return ReadoutPoints.of(self.sensor, FINE)
-
-    @cached_property
-    def _coarse_rule(self) -> ReadoutPoints:
-        """Integration rule for electrodes away from the probe."""
-        return ReadoutPoints.of(self.sensor, COARSE)
-
-    def _select_rules(self, position: Complexes) -> tuple[tuple[ReadoutPoints, Booleans], ...]:
-        """Select an integration rule for each pair of a press and an electrode.
-
-        The stress varies strongly near the probe, so electrodes near the probe need a rule with many points.
-
-        Args:
-            position: Positions x + iy of the presses, shape (n,), mm.
-
-        Returns:
-            The two rules. Each rule is followed by an array, shape (n, n_electrode), that is True where a press and an
-            electrode use this rule.
-        """
-        is_near = are_near(self.sensor, self.probe, position)
-        return (self._fine_rule, is_near), (self._coarse_rule, ~is_near)

@@ -11,6 +11,7 @@ right edges, and the mean of s22 over the lower and upper edges (equation 3 of t
 charge under load minus the charge without load. The charge of a uniform pretension therefore cancels.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -18,7 +19,12 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.errors import SensorError
-from isocharge.simulate.numerics.interpolation import gauss_line
+from isocharge.simulate.mechanics.stress import rotate_stress
+from isocharge.simulate.mesh.placed_mesh import from_oval
+from isocharge.simulate.mesh.placement import Placement
+from isocharge.simulate.mesh.point_location import locate_points
+from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.numerics.interpolation import gauss_line, tensor_values
 from isocharge.simulate.numerics.polygon import gauss_quadrilateral
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import MAX_PART_SIDE, Electrode, Readout, Sensor
@@ -31,20 +37,12 @@ The stress has a kink at the edge of the footprint. Even if this edge crosses an
 charge is only 1e-5.
 """
 
-FINE = 12
-"""Number of Gauss points per side of an electrode near the probe, for many presses.
+GAUSS_RULES = ((1.4, 12), (2.5, 4), (np.inf, 3))
+"""Integration rules of electrodes for many presses, in ascending order of the relative distance from the press.
 
-The relative error of the charge is 8e-5.
-"""
-
-COARSE = 4
-"""Number of Gauss points per side of an electrode away from the probe, for many presses."""
-
-NEAR = 1.0
-"""Distance between the footprint and an electrode below which the fine rule is used, mm.
-
-At larger distances, the relative error of the coarse rule is at most 1e-4 for square electrodes with sides of 1 to
-6 mm.
+Each rule consists of the relative distance below which it is used, and of the number of Gauss points per side of the
+electrode. The function `relative_distances` computes the distances. The kink of the stress at the edge of the footprint
+crosses only electrodes to which the first rule applies. The relative error of a charge is at most 1e-4.
 """
 
 
@@ -152,25 +150,42 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
     return sensor.calibration.read(charge)
 
 
-def are_near(sensor: Sensor, probe: Probe, position: Complexes) -> Booleans:
-    """Return whether each electrode is so near to each press that the fine integration rule is needed.
+def relative_distances(
+    part_circles: Sequence[tuple[Complexes, Array]], probe_reach: float, position: Complexes
+) -> Array:
+    """Compute the distance between each press and each electrode.
 
-    Each part of an electrode is enclosed by a circle. The electrode is near if the distance between the footprint and
-    one of these circles is less than `NEAR`.
+    A distance is measured between the centres of the footprint and of a circle around a part of the electrode. The unit
+    is the sum of the radii of the circles around the footprint and the part. The nearest part of an electrode counts.
 
     Args:
-        sensor: Sensor with the electrodes.
-        probe: Probe that presses the film.
+        part_circles: Centres x + iy and radii of the circles around the parts of each electrode, mm.
+        probe_reach: Radius of the circle around the footprint, mm.
         position: Positions x + iy of the presses, shape (n,), mm.
 
     Returns:
-        Whether each electrode is near, shape (n, n_electrode).
+        Distances, shape (n, n_electrode), dimensionless.
     """
-    smallest_gaps = []
-    for part_centres, part_radii in sensor.part_circles:
-        gap_of_parts = np.abs(position[:, None] - part_centres) - part_radii  # shape (n, n_part)
-        smallest_gaps.append(gap_of_parts.min(axis=1))
-    return np.asarray(np.stack(smallest_gaps, axis=1) < probe.reach + NEAR)
+    distances = np.empty((position.size, len(part_circles)))
+    for index, (centres, radii) in enumerate(part_circles):
+        distances[:, index] = (np.abs(position[:, None] - centres) / (radii + probe_reach)).min(axis=1)
+    return distances
+
+
+def pairs_by_rule(distances: Array) -> Iterator[tuple[int, Booleans]]:
+    """Select one of the `GAUSS_RULES` for each pair of a press and an electrode.
+
+    Args:
+        distances: Relative distances, shape (n, n_electrode).
+
+    Yields:
+        The number of Gauss points per side of each rule, and an array that is True where a press and an electrode use
+        the rule, shape (n, n_electrode).
+    """
+    smallest_distance = 0.0
+    for largest_distance, per_side in GAUSS_RULES:
+        yield per_side, (distances >= smallest_distance) & (distances < largest_distance)
+        smallest_distance = largest_distance
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
@@ -210,7 +225,7 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
     """Compute the pyroelectric charge that a uniform change of the temperature causes.
 
     The clamp is assumed to expand like the film. If the clamp expands differently, the pretension of the film also
-    changes. The module `mechanics.film_temperature` computes the change of the pretension.
+    changes. The module `mechanics.stress` computes the change of the pretension.
 
     Args:
         sensor: Sensor with the electrodes and the pyroelectric coefficient.
@@ -304,3 +319,133 @@ def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
     s22_shares = np.stack([zero, half_shares, zero], axis=1)
     points = np.concatenate([left, right, lower, upper])
     return points, np.concatenate([s11_shares, s11_shares, s22_shares, s22_shares])
+
+
+@dataclass(frozen=True)
+class PressMeshes:
+    """Meshes under several presses.
+
+    Attributes:
+        template: Template of the meshes.
+        placement: Position of the template under each press, after the press has been rotated onto the x axis.
+        direction: Direction from the centre of the film to each press, shape (n,), rad.
+        oval: Shape of an oval clamp, rotated with each press, shape (n,); see `mesh.placed_mesh.PlacedMesh`. Zero for a
+            circular clamp.
+    """
+
+    template: Template
+    placement: Placement
+    direction: Array
+    oval: Complexes
+
+    def locate(self, press_index: Integers, points: Complexes) -> tuple[Integers, Array, Booleans]:
+        """Find the elements that contain integration points, and evaluate the basis functions at the points.
+
+        If only half of the film is meshed, points in the other half are reflected into the meshed half.
+
+        Args:
+            press_index: Index of the press of each pair, shape (n_pair,).
+            points: Integration points x + iy, shape (n_pair, n_point), in film radii.
+
+        Returns:
+            Index of the element, shape (n_pair, n_point). Values of the basis functions, shape (n_pair, n_point,
+            n_local). Whether each point was reflected, shape (n_pair, n_point).
+        """
+        # Rotate the film so that the press lies on the positive x axis.
+        mesh = self.template
+        rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]
+        if self.oval.any():
+            rotated_points = from_oval(rotated_points, self.oval[press_index, None])
+        position, is_mirrored = mesh.into_meshed_half(rotated_points)
+        element, xi, eta = locate_points(self.placement[press_index], mesh, position)
+        basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel())
+        return element, basis_values.reshape(*points.shape, mesh.xi.size), is_mirrored
+
+
+@dataclass(frozen=True)
+class PressChunk:
+    """Stress fields under several presses, interpolated at the nodes of the mesh.
+
+    Attributes:
+        meshes: Meshes under the presses.
+        field: Scaled stresses of all fields at the nodes of every element, shape (n, n_element * n_local * n_field *
+            3), dimensionless. The values of all fields at one node are adjacent.
+        frame_angle: Angle of axis 1 of the stress fields from the x axis, shape (n,), rad.
+    """
+
+    meshes: PressMeshes
+    field: Array
+    frame_angle: Array
+
+    def charges_by_rules(
+        self, rules: list[tuple[ReadoutPoints, Booleans]], film_radius: float, is_odd: Booleans
+    ) -> Array:
+        """Compute the charges of all electrodes under all presses, each with its integration rule.
+
+        Args:
+            rules: Pairs of an integration rule and an array, shape (n, n_electrode), that is True where a press and an
+                electrode use this rule.
+            film_radius: Radius of the film, mm.
+            is_odd: Whether each field is odd, shape (n_field,); see `scaled_charges`.
+
+        Returns:
+            Charges divided by the unit of the scaled stress, shape (n, n_electrode, n_field), pC/MPa.
+        """
+        _, pairs_of_first_rule = rules[0]
+        pairs_shape = pairs_of_first_rule.shape  # (n, n_electrode), the same for all rules
+        scaled_charge = np.zeros((*pairs_shape, is_odd.size))
+        for rule, uses_rule in rules:
+            # Electrodes with the same number of points are integrated together, because their arrays have equal shapes.
+            for n_point in np.unique(rule.count):
+                press_index, electrode = np.nonzero(uses_rule & (rule.count == n_point))
+                points_mm = rule.points[electrode, :n_point] @ np.array([1.0, 1j])  # (x, y) becomes x + iy
+                points = points_mm / film_radius
+                weights = rule.weights[electrode, :n_point]
+                scaled_charge[press_index, electrode] = self.scaled_charges(press_index, points, weights, is_odd)
+        return scaled_charge
+
+    def scaled_charges(self, press_index: Integers, points: Complexes, weights: Array, is_odd: Booleans) -> Array:
+        """Compute the charge of each pair of a press and an electrode, by integration of the stress fields.
+
+        Args:
+            press_index: Index of the press of each pair, shape (n_pair,).
+            points: Integration points x + iy on the electrode of each pair, shape (n_pair, n_point), in film radii.
+            weights: Charge per stress (s11, s22, s12) at each integration point, shape (n_pair, n_point, 3), pC/MPa.
+            is_odd: Whether each field is odd, shape (n_field,). A reflection in the direction of the press leaves an
+                even field unchanged, and changes the sign of an odd field.
+
+        Returns:
+            Charges divided by the unit of the scaled stress, shape (n_pair, n_field), pC/MPa.
+        """
+        stress, is_mirrored = self._interpolated_stress(press_index, points, is_odd.size)
+
+        frame_angle = self.frame_angle[press_index]
+        charge = np.empty((len(stress), is_odd.size))
+        for field_index, is_field_odd in enumerate(is_odd):
+            field_stress = stress[:, :, field_index]  # shape (n_pair, n_point, 3)
+            # At reflected points, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
+            reversed_components = slice(0, 2) if is_field_odd else slice(2, 3)
+            field_stress[is_mirrored, reversed_components] *= -1.0
+            film_stress = rotate_stress(field_stress, frame_angle[:, None])
+            # For each pair (index k), sum over the points (p) and the stress components (c).
+            charge[:, field_index] = np.einsum("kpc,kpc->k", film_stress, weights)
+        return charge
+
+    def _interpolated_stress(self, press_index: Integers, points: Complexes, n_field: int) -> tuple[Array, Booleans]:
+        """Interpolate the stress of all fields from the nodes of the mesh to the integration points.
+
+        Args:
+            press_index: Index of the press of each pair, shape (n_pair,).
+            points: Integration points x + iy, shape (n_pair, n_point), in film radii.
+            n_field: Number of fields.
+
+        Returns:
+            Scaled stress (s11, s22, s12) in the frame of the mesh, shape (n_pair, n_point, n_field, 3), dimensionless.
+            Whether each point was reflected, shape (n_pair, n_point).
+        """
+        element, basis_values, is_mirrored = self.meshes.locate(press_index, points)
+        n_value = 3 * n_field  # number of values at a node
+        field_by_element = self.field.reshape(len(self.field), self.meshes.template.n_element, -1, n_value)
+        nodal_stress = field_by_element[press_index[:, None], element]  # shape (n_pair, n_point, n_local, n_value)
+        stress = basis_values[..., None, :].astype(self.field.dtype) @ nodal_stress
+        return stress.reshape(*points.shape, n_field, 3), is_mirrored

@@ -15,19 +15,6 @@ from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
-MIN_EIGENVALUE = 1e-14
-"""Lower bound of the eigenvalues of the scaled Fisher information, dimensionless.
-
-Smaller eigenvalues are rounding errors and are replaced by the bound. The limits of parameters that the charges do not
-determine are therefore very large instead of infinite.
-"""
-
-MIN_INFORMATION = 1e-60
-"""Lower bound of the Fisher information by which a parameter is scaled: 1/mm^2 for x and y, dimensionless for ln F.
-
-The bound avoids a division by zero if the charges do not depend on a parameter.
-"""
-
 
 @dataclass(frozen=True)
 class CramerRao:
@@ -100,7 +87,9 @@ def _invert(information: Array) -> Array:
     """Invert information matrices, and regularise singular matrices.
 
     Each matrix is first scaled such that its diagonal elements are 1, because the units of the parameters differ. The
-    eigenvalues of the scaled matrix are increased to at least `MIN_EIGENVALUE`.
+    eigenvalues of the scaled matrix are increased to at least the precision of a floating-point number, because smaller
+    eigenvalues are rounding errors. The limits of parameters that the charges do not determine are therefore very large
+    instead of infinite.
 
     Args:
         information: Symmetric matrices, shape (n, p, p).
@@ -109,11 +98,13 @@ def _invert(information: Array) -> Array:
         Inverse matrices, shape (n, p, p).
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
-    # The lower bound avoids a division by zero if there is no information about a parameter.
-    parameter_scale = np.sqrt(np.maximum(diagonal, MIN_INFORMATION))  # shape (n, p)
+    # The lower bound avoids a division by zero if there is no information about a parameter. It is the root of the
+    # smallest number, because the products of two bounds must not underflow.
+    smallest_information = np.sqrt(np.finfo(float).tiny)
+    parameter_scale = np.sqrt(np.maximum(diagonal, smallest_information))  # shape (n, p)
     matrix_scale = parameter_scale[:, :, None] * parameter_scale[:, None, :]
     eigenvalues, eigenvectors = np.linalg.eigh(information / matrix_scale)  # the diagonal elements are 1
-    inverse_eigenvalues = 1.0 / np.maximum(eigenvalues, MIN_EIGENVALUE)
+    inverse_eigenvalues = 1.0 / np.maximum(eigenvalues, np.finfo(float).eps)
 
     # If V contains the eigenvectors, the inverse of each scaled matrix is V diag(1 / eigenvalues) V'.
     scaled_inverse = (eigenvectors * inverse_eigenvalues[:, None, :]) @ eigenvectors.swapaxes(1, 2)

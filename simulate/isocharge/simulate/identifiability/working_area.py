@@ -1,17 +1,262 @@
-"""Computation of the working area: the disk in which the charges determine the contact."""
+"""Computation of the working area: the disk in which the charges determine the contact.
+
+Charges Q determine a contact only where the map from (x, y, ln F) to the charges is one to one. Near a fold, different
+contacts have the same charges. At a fold, the derivative J = d(Q)/d(x, y, ln F) is singular, so that the Cramer-Rao
+limit of the position is infinite, and the map reverses its orientation across the fold. With three electrodes, folds
+are lines at which det J changes its sign. With more electrodes, J is not square and is singular only at isolated points
+(Whitney 1944).
+
+The search refines the maxima of the position error on a grid. A maximum is a fold if the orientation of the map is
+reversed across it. The orientation is reversed between two contacts a and b if det(J(a)' W J(b)) < 0, where the
+diagonal matrix W contains the inverse variances of the charges. For more than three electrodes, the criterion is
+reliable only for contacts that are close to each other: beside an electrode, the directions of the derivatives change
+by more than a right angle within 0.1 mm without a fold.
+
+If all electrodes of an isotropic film lie on one circle, a press and its mirror image in this circle cause nearly the
+same charges. The map therefore has a fold near the circle for any number of electrodes.
+
+Even without folds, two distant contacts may have the same charges. The search for such pairs covers the whole domain of
+the map.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy  # loads each of its subpackages on first use
 
-from isocharge.common.arrays import Array
-from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
-from isocharge.simulate.identifiability.ambiguous_pairs import AmbiguousPairs, find_ambiguous_pairs
+from isocharge.common.arrays import Array, Booleans
+from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count, linearised
 from isocharge.simulate.identifiability.cramer_rao import limits_at
-from isocharge.simulate.identifiability.folds import find_folds
+from isocharge.simulate.identifiability.nearest_contact import explain, starting_contacts
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.numerics.disk import Rings
+from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, onto_disk, sunflower
+
+FOLD_WIDTH = 0.02
+"""Distance between two contacts on both sides of a fold, mm.
+
+Beside an electrode, the orientation may be reversed within 0.1 mm without a fold. At a true fold, such as that on a
+circle of four electrodes, the orientation is reversed within about 0.01 mm.
+"""
+
+
+def has_reversed_orientation(first: Array, second: Array) -> Booleans:
+    """Return whether the charge map reverses its orientation between the two contacts of each pair.
+
+    Args:
+        first: Derivatives of the charges with respect to (x, y, ln F) at the first contact of each pair, divided by the
+            standard deviations of the charges, shape (..., n_electrode, 3).
+        second: Scaled derivatives at the second contact of each pair, shape (..., n_electrode, 3).
+
+    Returns:
+        Whether the orientation is reversed, shape (...).
+    """
+    # Rounding errors could change the sign of the determinant if the columns did not have unit lengths.
+    directions = [
+        jacobian / np.maximum(np.linalg.norm(jacobian, axis=-2, keepdims=True), np.finfo(float).tiny)
+        for jacobian in (first, second)
+    ]
+    products = np.einsum("...ei,...ej->...ij", *directions)  # sums over the electrodes (e)
+    return np.asarray(np.linalg.det(products) < 0.0)
+
+
+def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> Array:
+    """Compute derivatives of charges, and divide the derivatives by the standard deviations of the charges.
+
+    Args:
+        charge_map: Map that computes the charges of contacts.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        noise: Noise of the readings.
+
+    Returns:
+        Scaled derivatives with respect to x (1/mm), y (1/mm) and ln F (dimensionless), shape (n, n_electrode, 3).
+    """
+    charge, jacobian = linearised(charge_map, contact)
+    return np.asarray(jacobian / noise.sigma(charge)[..., None])
+
+
+def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel) -> Array:
+    """Find the folds of a charge map for contacts that all have the same force.
+
+    Args:
+        charge_map: Map that computes the charges of contacts.
+        rings: Positions at which the search starts.
+        force: Force of the contacts, N.
+        noise: Noise of the readings.
+
+    Returns:
+        Positions (x, y) on folds, ordered by the distance from the centre, shape (n, 2), mm. With three electrodes, the
+        positions lie on fold lines. With more electrodes, they are points.
+    """
+    radius = INNER_RADIUS * charge_map.domain.radius
+
+    def contacts(position: Array) -> Array:
+        """Return contacts at positions of shape (..., 2), moved onto the disk of the map, shape (n, 3)."""
+        inside = onto_disk(position.reshape(-1, 2), radius)
+        return np.column_stack([inside, np.full(len(inside), force)])
+
+    def precision(position: Array) -> Array:
+        """Return the inverse of the position error, which is zero at a fold, shape of the positions without (2,)."""
+        return np.asarray(1.0 / limits_at(charge_map, contacts(position), noise).position).reshape(position.shape[:-1])
+
+    # Refine the minima of the precision. In each round, the step is halved, and each position moves to the best of the
+    # 25 neighbours that are up to two steps away along x and y.
+    position, step = _starting_points(rings, precision(rings.position))
+    neighbours = np.stack(np.meshgrid(range(-2, 3), range(-2, 3)), axis=-1).reshape(-1, 2)
+    while len(position) and step.max() > 0.05 * FOLD_WIDTH:
+        step *= 0.5
+        trial = position[:, None] + step[:, None, None] * neighbours
+        trial = onto_disk(trial.reshape(-1, 2), radius).reshape(trial.shape)
+        position = trial[np.arange(len(trial)), precision(trial).argmin(axis=1)]
+
+    # Compare the orientations at opposite points of a circle around each position.
+    angle = np.pi * np.arange(4) / 4.0
+    half_width = 0.5 * FOLD_WIDTH * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    sides = np.stack([position[:, None] + half_width, position[:, None] - half_width])
+    jacobian = scaled_derivatives(charge_map, contacts(sides), noise)
+    is_fold = has_reversed_orientation(*jacobian.reshape(*sides.shape[:3], -1, 3)).any(axis=1)
+    folds = position[is_fold]
+    return np.asarray(folds[np.argsort(np.hypot(*folds.T), kind="stable")])
+
+
+def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
+    """Choose the positions on rings near which a fold may lie.
+
+    Args:
+        rings: Positions, of which the angles are periodic.
+        precision: Inverse of the position error at each position, shape (n_ring, n_angle).
+
+    Returns:
+        Positions (x, y), shape (n, 2), and the distance to the farthest neighbour of each, shape (n,), mm.
+    """
+    # A position is chosen if none of its eight neighbours has a smaller precision. It is also chosen if a line of
+    # neighbours has a kink, as at a fold line: the precision then decreases to zero and increases again.
+    is_chosen = precision == scipy.ndimage.minimum_filter(precision, 3, mode=("nearest", "wrap"))
+    along_ring = np.roll(precision, 1, axis=1) + np.roll(precision, -1, axis=1)
+    is_chosen |= 3.0 * precision <= along_ring
+    is_chosen[1:-1] |= 3.0 * precision[1:-1] <= precision[:-2] + precision[2:]
+    ring, _ = np.nonzero(is_chosen)
+    spacing_on_ring = rings.distance * 2.0 * np.pi / precision.shape[1]
+    return rings.position[is_chosen], np.maximum(rings.distance[0], spacing_on_ring)[ring]
+
+
+INDISTINGUISHABLE_SIGMAS = 3.0
+"""Difference of the charges below which two contacts are indistinguishable, in standard deviations of the noise."""
+
+MIN_DISTANCE = 1.0
+"""Smallest distance between the contacts of an ambiguous pair, mm."""
+
+MIN_DISTANCE_SIGMAS = 6.0
+"""Smallest distance between the contacts of an ambiguous pair, in standard deviations of the position.
+
+If the distance is smaller, the two contacts count as a single contact with a large uncertainty.
+"""
+
+STARTS = 3
+"""Number of searches for a second contact of each first contact. Most often, one of them finds the first contact."""
+
+
+@dataclass(frozen=True)
+class AmbiguousPairs:
+    """Pairs of distant contacts that have the same charges.
+
+    The outer contact of a pair is the contact that is farther from the centre of the film. The pairs are ordered by the
+    distance of the outer contact from the centre.
+
+    Attributes:
+        first: First contact (x, y, F) of each pair, shape (n, 3), mm and N.
+        second: Second contact (x, y, F) of each pair, shape (n, 3), mm and N.
+        distance: Distance between the charges of the two contacts of each pair, shape (n,), in standard deviations of
+            the noise.
+    """
+
+    first: Array
+    second: Array
+    distance: Array
+
+    @classmethod
+    def none(cls) -> "AmbiguousPairs":
+        """Return a result without any pair."""
+        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @property
+    def outer_radius(self) -> Array:
+        """Distance between the centre of the film and the outer contact of each pair, shape (n,), mm."""
+        first_radius = np.hypot(*self.first[:, :2].T)
+        second_radius = np.hypot(*self.second[:, :2].T)
+        return np.asarray(np.maximum(first_radius, second_radius))
+
+    @property
+    def radius(self) -> float:
+        """Radius of the smallest disk around the centre that contains both contacts of a pair, mm.
+
+        The radius is infinite if there are no pairs.
+        """
+        return float(self.outer_radius.min(initial=np.inf))
+
+    @property
+    def summary(self) -> str:
+        """Sentence about the pair whose outer contact is nearest to the centre of the film.
+
+        If there are no pairs, the property is an empty text.
+        """
+        if not len(self):
+            return ""
+        x, y, force = self.first[0]
+        other_x, other_y, other_force = self.second[0]
+        return (
+            f"Contacts far apart can have the same charges: the charges of {force:.3g} N at ({x:.1f}, {y:.1f}) mm and "
+            f"of {other_force:.3g} N at ({other_x:.1f}, {other_y:.1f}) mm differ by {self.distance[0]:.1f} standard "
+            "deviations."
+        )
+
+
+def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
+    """Find pairs of distant contacts whose charges cannot be distinguished because of the noise.
+
+    The first contact of a pair is a press with the given force at one of several positions. For each first
+    contact, the search for the nearest contact starts at distant contacts with similar charges.
+
+    Args:
+        charge_map: Map that computes the charges of contacts.
+        noise: Noise of the readings.
+        force: Force of the first contact of each pair, N. The second contact may have any force of the map.
+        places: Number of positions, which are distributed evenly over the disk.
+
+    Returns:
+        The pairs, ordered by the distance of the outer contact from the centre.
+    """
+    # Choose the first contacts, and compute the distance above which a second contact counts as distant.
+    position = INNER_RADIUS * charge_map.domain.radius * sunflower(places)
+    contact = np.column_stack([position, np.full(len(position), force)])
+    charge = charge_map.charges(contact)
+    position_std = limits_at(charge_map, contact, noise).position
+    min_distance = np.maximum(MIN_DISTANCE, MIN_DISTANCE_SIGMAS * position_std)
+    sigma = noise.sigma(charge)
+    start = starting_contacts(charge_map, charge, sigma, starts=STARTS)
+
+    # Search for the second contacts. A search that finds the first contact again is discarded below. Then select the
+    # pairs whose contacts are still distant, and whose charges agree within the noise.
+    first_index = np.repeat(np.arange(len(charge)), start.shape[1])
+    first_contact = contact[first_index]
+    second_contact, residual = explain(
+        charge_map,
+        charge[first_index],
+        sigma[first_index],
+        start.reshape(-1, 3),
+        min_change=1e-4,  # one digit of the difference of the charges is sufficient
+    )
+    charge_difference = np.linalg.norm(residual, axis=1)
+    x_difference, y_difference, _ = (second_contact - first_contact).T
+    is_distant = np.hypot(x_difference, y_difference) > min_distance[first_index]
+    is_ambiguous = is_distant & (charge_difference < INDISTINGUISHABLE_SIGMAS)
+    pairs = AmbiguousPairs(first_contact[is_ambiguous], second_contact[is_ambiguous], charge_difference[is_ambiguous])
+    order = np.argsort(pairs.outer_radius, kind="stable")
+    return AmbiguousPairs(pairs.first[order], pairs.second[order], pairs.distance[order])
+
 
 DEFAULT_ERROR = 1.0
 """Default value of the largest Cramer-Rao position error in a working area, mm.

@@ -11,7 +11,7 @@ from isocharge.common.errors import InputError
 from isocharge.simulate.forward.family import check_family
 from isocharge.simulate.identifiability.cramer_rao import cramer_rao
 from isocharge.simulate.measuring_chain.noise import NOISE_LEVELS, NoiseModel
-from isocharge.simulate.numerics.disk import lattice, square_grid
+from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor, electrode_index
 from isocharge.simulate.sensor.size_check import check_range
@@ -28,11 +28,11 @@ DEFAULT_SIDE = 3.0
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Names of new electrodes. New electrodes get the first of these names that no kept electrode has."""
 
-MAX_SEARCH_PRESSES = 150
-"""Largest number of presses for which the search evaluates random layouts."""
+SEARCH_PRESSES = 150
+"""Number of presses for which the search evaluates random layouts."""
 
-FINE_GRID_STEPS = 50
-"""Number of steps of the fine grid of presses from the centre to the largest distance of a press."""
+FINE_PRESSES = 8000
+"""Number of presses for which a finished layout is evaluated."""
 
 
 @dataclass(frozen=True)
@@ -186,20 +186,16 @@ class DesignCase:
 
     @property
     def search_presses(self) -> Array:
-        """Positions (x, y) of the presses for which the search evaluates random layouts.
-
-        The shape is (n, 2), and the unit is mm.
-        """
-        complex_positions = self.radius * lattice(MAX_SEARCH_PRESSES)  # x + iy
-        return np.stack([complex_positions.real, complex_positions.imag], axis=1)
+        """Positions (x, y) of the presses for which the search evaluates random layouts, shape (n, 2), mm."""
+        return self.radius * sunflower(SEARCH_PRESSES)
 
     @property
-    def fine_grid(self) -> Array:
-        """Positions (x, y) of presses on a fine grid, shape (n, 2), mm.
+    def fine_presses(self) -> Array:
+        """Positions (x, y) of many presses, shape (n, 2), mm.
 
-        The grid is fine because the largest position error mostly occurs in a small region beside an electrode.
+        The largest position error mostly occurs in a small region beside an electrode.
         """
-        return square_grid(self.radius, self.radius / FINE_GRID_STEPS)
+        return self.radius * sunflower(FINE_PRESSES)
 
     def clearance(self, positions: Array) -> Array:
         """Compute the margin with which each square satisfies the distance rules.

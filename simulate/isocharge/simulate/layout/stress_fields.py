@@ -16,9 +16,9 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.forward.press_chunk import PressMeshes
-from isocharge.simulate.forward.readout import layout_points
+from isocharge.simulate.forward.readout import PressMeshes, layout_points, pairs_by_rule, relative_distances
 from isocharge.simulate.mechanics.stress import rotate_stress
+from isocharge.simulate.numerics.polygon import to_complex
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
@@ -43,14 +43,6 @@ MPa.
 
 NODE_COUNT = NodeCount(distances=8, forces=1)
 """Numbers of distances and directions of the solved presses."""
-
-GAUSS_RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
-"""Integration rules of electrodes in ascending order of the distance between the electrode and the press.
-
-Each rule consists of the largest distance at which it is used, and of the number of Gauss points per side of the
-electrode. The unit of the distances is the sum of the radius of the circle around the electrode and the probe radius.
-The kink of the stress crosses only electrodes to which the first rule applies.
-"""
 
 PRESS_CHUNK = 256
 """Number of presses that are evaluated at once, which limits the required memory to about 100 MB."""
@@ -151,17 +143,12 @@ class PressedFilm:
     def rows(self, electrodes: Sequence[Electrode]) -> Array:
         """Compute the charges of electrodes and their derivatives for all presses; see `rows_of`."""
         rows = np.zeros((len(self.presses), len(electrodes), len(COLUMNS)))
-        corners = [np.concatenate(electrode.parts) @ np.array([1.0, 1j]) for electrode in electrodes]
-        centre = np.array([points.mean() for points in corners])
-        reach = np.array([np.abs(points - points.mean()).max() for points in corners]) + self.probe_radius
-
-        # Each press and electrode use the first rule whose largest distance is not below their distance.
-        limits = [largest_distance for largest_distance, _ in GAUSS_RULES]
-        rule_of_pair = np.searchsorted(limits, np.abs(self.presses[:, None] - centre) / reach)
-        for number, (_, per_side) in enumerate(GAUSS_RULES):
+        circles = [(to_complex(centres), radii) for centres, radii in (one.part_circles for one in electrodes)]
+        distances = relative_distances(circles, self.probe_radius, self.presses)
+        for per_side, uses_rule in pairs_by_rule(distances):
             rule = layout_points(tuple(electrodes), "area", per_side)
             for n_point in np.unique(rule.count):
-                press_index, electrode = np.nonzero((rule_of_pair == number) & (rule.count == n_point))
+                press_index, electrode = np.nonzero(uses_rule & (rule.count == n_point))
                 if not press_index.size:
                     continue
                 points = rule.points[electrode, :n_point] @ np.array([1.0, 1j]) / self.film_radius

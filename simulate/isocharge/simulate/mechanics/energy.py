@@ -130,7 +130,7 @@ class ElasticFilm:
     def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
         """Compute the tangent matrix of each element, without the stiffness of trapped air.
 
-        The stiffness of trapped air couples all nodes of the mesh. Therefore `solver.tangent_factor` adds this
+        The stiffness of trapped air couples all nodes of the mesh. Therefore `solver.assembly` adds this
         stiffness separately.
 
         Args:

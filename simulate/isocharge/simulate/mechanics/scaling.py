@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.mechanics.stress import rotate_stress, stress, stress_rotation
+from isocharge.simulate.mechanics.stress import orthotropic_moduli, rotate_stress, stress, stress_rotation
 from isocharge.simulate.sensor.film import Film
 
 MEMBRANE_STIFFNESS = 1.6
@@ -223,31 +223,6 @@ def _anisotropy(film: Film, squared_amplitude: float, angle: float) -> Anisotrop
     rotated_deviator = rotate_stress(deviator, -angle)
     tension_unit = film.young * squared_amplitude
     return Anisotropy(moduli, rotated_deviator / tension_unit)
-
-
-def orthotropic_moduli(film: Film) -> Array:
-    """Compute the difference between the elasticity matrix of a film and that of an isotropic film.
-
-    Both matrices are divided by Young's modulus E, and refer to the axes of the film. The moduli along the two axes are
-    E1 = E r and E2 = E / r, where r is the square root of E1 / E2.
-
-    Args:
-        film: The film.
-
-    Returns:
-        Difference for the strain components (E11, E22, 2 E12), shape (3, 3), dimensionless.
-    """
-    plane_modulus = 1.0 / (1.0 - film.poisson**2)
-    root_of_ratio = np.sqrt(film.young_ratio)  # r
-    difference_11 = plane_modulus * (root_of_ratio - 1.0)
-    difference_22 = plane_modulus * (1.0 / root_of_ratio - 1.0)
-
-    # If no shear modulus is given, the film has the shear modulus of an isotropic film.
-    difference_12 = 0.0
-    if film.shear is not None:
-        isotropic_shear = 0.5 / (1.0 + film.poisson)
-        difference_12 = film.shear / film.young - isotropic_shear
-    return np.diag([difference_11, difference_22, difference_12])
 
 
 def side_force_unit(film: Film, squared_amplitude: Array | float) -> Any:

@@ -1,8 +1,23 @@
-"""Functions that compute the strain, the stress and the principal stresses of a film, and that rotate stresses."""
+"""Strain, stress and principal stresses of a film, rotation of stresses, and change of the pretension by temperature.
+
+A film that is clamped in a ring cannot expand freely. If the film becomes warmer by dT and the ring by dR, the elastic
+strain along axis i of the film changes by
+
+    strain_i = ring_expansion * dR - expansion_i * dT.
+
+The pretension changes by the stress that this change of the strain causes. The stress follows from the plane-stress
+stiffness of the film. A drawn film expands more across the drawn direction than along the drawn direction. The tension
+of a drawn film therefore becomes uneven. The temperature of a thin film follows the temperature of the air within
+seconds. The ring needs many minutes to reach the temperature of the air.
+"""
+
+from dataclasses import replace
 
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.sensor import Sensor
 
 
 def principal_stresses(stresses: Array) -> tuple[float, float]:
@@ -110,3 +125,84 @@ def rotate_stress(rotated_frame_stress: Array, angle: float | Array) -> Array:
     new_half_difference = half_difference * cosine - s12 * sine
     new_s12 = half_difference * sine + s12 * cosine
     return np.stack([mean + new_half_difference, mean - new_half_difference, new_s12], axis=-1)
+
+
+def orthotropic_moduli(film: Film) -> Array:
+    """Compute the difference between the elasticity matrix of a film and that of an isotropic film.
+
+    Both matrices are divided by Young's modulus E, and refer to the axes of the film. The moduli along the two axes are
+    E1 = E r and E2 = E / r, where r is the square root of E1 / E2.
+
+    Args:
+        film: The film.
+
+    Returns:
+        Difference for the strain components (E11, E22, 2 E12), shape (3, 3), dimensionless.
+    """
+    plane_modulus = 1.0 / (1.0 - film.poisson**2)
+    root_of_ratio = np.sqrt(film.young_ratio)  # r
+    difference_11 = plane_modulus * (root_of_ratio - 1.0)
+    difference_22 = plane_modulus * (1.0 / root_of_ratio - 1.0)
+
+    # If no shear modulus is given, the film has the shear modulus of an isotropic film.
+    difference_12 = 0.0
+    if film.shear is not None:
+        isotropic_shear = 0.5 / (1.0 + film.poisson)
+        difference_12 = film.shear / film.young - isotropic_shear
+    return np.diag([difference_11, difference_22, difference_12])
+
+
+def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> Array:
+    """Compute by how much the pretension changes if the temperatures of the film and of its ring change.
+
+    The elastic strain of the clamped film is the expansion of the ring minus the free expansion of the film. The change
+    of the pretension is the stress that corresponds to the elastic strain.
+
+    Args:
+        film: The film. If the film has no expansion coefficients, the result is zero.
+        film_warming_K: Increase of the temperature of the film, K.
+        ring_warming_K: Increase of the temperature of the ring, K.
+
+    Returns:
+        Change of the pretension (T11, T22, T12) in the axes x and y, shape (3,), MPa.
+    """
+    if film.expansion is None:
+        return np.zeros(3)
+    expansion_1, expansion_2 = film.expansion  # along the axes 1 and 2 of the film, 1/K
+    ring_strain = film.ring_expansion * ring_warming_K
+    strain_1 = ring_strain - expansion_1 * film_warming_K
+    strain_2 = ring_strain - expansion_2 * film_warming_K
+    elastic_strain = np.array([strain_1, strain_2, 0.0])
+    change_in_film_axes = film.young * stress(elastic_strain, film.poisson, orthotropic_moduli(film))
+    return rotate_stress(change_in_film_axes, film.axis)
+
+
+def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -> Sensor:
+    """Return a copy of a sensor whose pretension is the pretension at other temperatures of the film and its ring.
+
+    Args:
+        sensor: The sensor at the temperatures for which it is described.
+        film_warming_K: Temperature of the film minus the temperature for which the film is described, K.
+        ring_warming_K: Temperature of the ring minus the temperature for which the ring is described, K.
+
+    Returns:
+        The copy. If the film has no expansion coefficients, the sensor itself is returned.
+
+    Raises:
+        SensorError: If the film becomes so slack that it is outside the range of the simulator.
+    """
+    film = sensor.film
+    if film.expansion is None:
+        return sensor
+    change_11, change_22, change_12 = tension_change(film, film_warming_K, ring_warming_K).tolist()
+    mean_pretension = film.pretension + 0.5 * (change_11 + change_22)
+    if film.expands_evenly:  # only the mean of the pretension changes
+        return replace(sensor, film=replace(film, pretension=mean_pretension))
+
+    # The deviator of the pretension consists of half of the difference between the pretensions along x and y, and of
+    # the shear.
+    half_difference, shear = film.deviator
+    warm_half_difference = half_difference + 0.5 * (change_11 - change_22)
+    warm_shear = shear + change_12
+    deviator = (warm_half_difference, warm_shear)
+    return replace(sensor, film=replace(film, pretension=mean_pretension, deviator=deviator))

@@ -126,19 +126,6 @@ class Blocks:
         return slice(0, self.n_quad)
 
     @property
-    def first_layer(self) -> slice:
-        """Indices of the elements of the layer next to the core polygon."""
-        return slice(self.n_quad, self.n_quad + self.n_sector)
-
-    @property
-    def last_layer(self) -> slice:
-        """Indices of the elements of the layer next to the innermost circle.
-
-        If there is only one layer, the last layer is the same as the first layer.
-        """
-        return slice(self.n_inner - self.n_sector, self.n_inner)
-
-    @property
     def copies(self) -> int:
         """Number of copies of the mesh that cover the whole film."""
         return 2 if self.half else 1
@@ -179,8 +166,8 @@ class Blocks:
 
         The shape is (n_inner, 4, n_corner + 1). The four corners of an element are the first and the last corner of its
         inner side, and the first and the last corner of its outer side. Each corner is a weighted sum of the corners
-        and the centroid of the core polygon. The weights of a corner on a curved side are zero, because `Placement`
-        adds the curved sides.
+        and the centroid of the core polygon. The weights of a corner on a curved side are zero, because
+        `Placement.sides` computes the curved sides.
 
         The elements are those of the core polygon, followed by one or two layers of elements that surround the core
         polygon up to the innermost circle.

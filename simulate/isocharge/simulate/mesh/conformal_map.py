@@ -182,13 +182,14 @@ def _intersections_with_circle(origin: Complexes, ray: Complexes, radius: Array)
 def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array, max_turn: float = 0.2) -> Array:
     """Compute the directions of the rays that extend from the centroid of the footprint to the sides of the sectors.
 
-    The last layer of elements inside the innermost circle connects the circle to an inner boundary. Some of the rays
-    belong to given points on the inner boundary. The other rays lie between them.
+    The last layer of elements inside the innermost circle connects the circle to an inner boundary. Each of the given
+    points on the inner boundary has a ray. The direction of the ray is the direction of the point, rotated by a limited
+    angle towards evenly spaced directions. All other rays divide the angle between two such rays into equal parts.
 
     Args:
         blocks: The elements.
-        inner_points: Points x + iy on the inner boundary, relative to the centroid, shape (..., n_point). They belong
-            to the corners of the core polygon and to the points half-way between the corners.
+        inner_points: Points x + iy on the inner boundary, relative to the centroid, shape (..., n_point): one point for
+            each corner of the core polygon, and one point half-way between each two corners.
         radius_ratio: Radius of the innermost circle divided by the largest distance of the inner boundary from the
             centre of the circle, shape (...).
         max_turn: Largest angle between the side of a sector and the ray through its corner, rad. With larger angles,

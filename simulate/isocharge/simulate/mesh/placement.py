@@ -204,9 +204,7 @@ class Placement:
     def _inner_element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of the elements inside the innermost circle.
 
-        The points of an element are interpolated linearly between its inner side and its outer side. The weights
-        `Blocks.inner_corner_weights` describe the corners on straight sides, and are zero for corners on curved sides.
-        Therefore the contributions of the curved sides are added separately.
+        The points of an element are interpolated linearly between its inner side and its outer side.
 
         Args:
             blocks: The elements.
@@ -214,28 +212,48 @@ class Placement:
         Returns:
             Film points x + iy, shape (n_inner, (order + 1)^2), in film radii.
         """
-        # Contributions of the straight sides. The coordinates of the nodes have the shape (n_local,).
         radial, angular = _unit_coordinates(blocks)
-        corners = blocks.inner_corner_weights @ self.corners  # shape (n_inner, 4)
-        inner_first, inner_last, outer_first, outer_last = corners.T[:, :, None]  # each of shape (n_inner, 1)
-        inner_side = inner_first + angular * (inner_last - inner_first)
-        outer_side = outer_first + angular * (outer_last - outer_first)
-        points = (1.0 - radial) * inner_side + radial * outer_side
+        placement_of_element = self.batch()[np.zeros(blocks.n_inner, dtype=np.intp)]
+        inner, outer = placement_of_element.sides(blocks, np.arange(blocks.n_inner), angular[None])
+        return np.asarray((1.0 - radial) * inner + radial * outer)
 
-        # Contribution of the innermost circle, which is the outer side of the last layer
-        node_directions = np.exp(1j * self._node_circle_angles(blocks))  # shape (n_sector, n_local)
-        circle = self.to_film(self.template_radius * node_directions)
-        points[blocks.last_layer] += radial * circle
+    def sides(self, blocks: Blocks, element: Integers, angular: Array) -> tuple[Complexes, Complexes]:
+        """Compute points of the inner and the outer side of elements inside the innermost circle.
 
-        # Contribution of the boundary of the footprint, which separates the layers if there are two
+        The object contains n placements, one for each element.
+
+        Args:
+            blocks: The elements.
+            element: Index of each element, shape (n,).
+            angular: Angular coordinates of the points from 0 to 1, shape (n, k) or (1, k).
+
+        Returns:
+            Points x + iy of the inner sides and of the outer sides, each of shape (n, k), in film radii.
+        """
+        # Straight sides. The weights of the corners of curved sides are zero.
+        corners = np.einsum("nkc,nc->kn", blocks.inner_corner_weights[element], self.corners)
+        inner_first, inner_last, outer_first, outer_last = corners[:, :, None]  # each of shape (n, 1)
+        inner = inner_first + angular * (inner_last - inner_first)
+        outer = outer_first + angular * (outer_last - outer_first)
+
+        # The outer sides of the last layer lie on the innermost circle.
+        in_last_layer = element >= blocks.n_inner - blocks.n_sector
+        sector = (element - blocks.n_quad) % blocks.n_sector  # not used for elements of the core polygon
+        first_angle = np.take_along_axis(self.circle_angles, sector[:, None], axis=1)
+        last_angle = np.take_along_axis(self.circle_angles, sector[:, None] + 1, axis=1)
+        circle_angle = first_angle + angular * (last_angle - first_angle)
+        circle = self.to_film(self.template_radius[:, None] * np.exp(1j * circle_angle))
+        outer[in_last_layer] = circle[in_last_layer]
+
+        # If there are two layers, the boundary of the footprint separates them.
         if blocks.n_layer == 2:
-            sector = np.arange(blocks.n_sector)[:, None]
-            first_parameter = blocks.boundary_parameter[sector]
-            last_parameter = blocks.boundary_parameter[sector + 1]
+            in_first_layer = (element >= blocks.n_quad) & ~in_last_layer
+            first_parameter = blocks.boundary_parameter[sector, None]
+            last_parameter = blocks.boundary_parameter[sector + 1, None]
             boundary = self.boundary(first_parameter + angular * (last_parameter - first_parameter))
-            points[blocks.first_layer] += radial * boundary
-            points[blocks.last_layer] += (1.0 - radial) * boundary
-        return np.asarray(points)
+            outer[in_first_layer] = boundary[in_first_layer]
+            inner[in_last_layer] = boundary[in_last_layer]
+        return np.asarray(inner), np.asarray(outer)
 
     def _ring_element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of the elements between the innermost circle and the rim.

@@ -139,7 +139,10 @@ def _locate_inside(
     Returns:
         Index of the element, and radial and angular coordinate in the element from 0 to 1, each of shape (n,).
     """
-    corners = _inner_corners(placement, blocks)
+    # Compute the corners of all elements for each point. They are the ends of the inner and the outer sides.
+    point_index, inner_element = np.divmod(np.arange(points.size * blocks.n_inner), blocks.n_inner)
+    ends = placement[point_index].sides(blocks, inner_element, np.array([[0.0, 1.0]]))
+    corners = np.concatenate(ends, axis=1).reshape(points.size, blocks.n_inner, 4)
     inner_first, inner_last, outer_first, outer_last = np.moveaxis(corners, -1, 0)
     sides = ((inner_first, outer_first), (outer_last, inner_last), (inner_last, inner_first), (outer_first, outer_last))
     distances = [_distance_to_left(start, end, points[:, None]) for start, end in sides]
@@ -154,9 +157,7 @@ def _locate_inside(
         if selected.size == 0:
             break
         tried = candidate[selected]
-        new_radial, new_angular = _local_coordinates(
-            placement[selected], blocks, points[selected], tried, corners[selected, tried]
-        )
+        new_radial, new_angular = _local_coordinates(placement[selected], blocks, points[selected], tried)
         is_better = _overshoot(new_radial, new_angular) < _overshoot(radial[selected], angular[selected])
         improved = selected[is_better]
         element[improved] = tried[is_better]
@@ -165,44 +166,11 @@ def _locate_inside(
     return element, radial, angular
 
 
-def _inner_corners(placement: Placement, blocks: Blocks) -> Complexes:
-    """Compute the corners of all elements inside the innermost circle.
-
-    Corners on straight sides are weighted sums of the corners and the centroid of the core polygon. All other corners
-    lie on the innermost circle or on the boundary of the footprint.
-
-    Args:
-        placement: One or several placements.
-        blocks: The elements.
-
-    Returns:
-        Corners x + iy of each element, shape (n_placement, n_inner, 4), in film radii. They are the first and the last
-        corner of the inner side, and the first and the last corner of the outer side.
-    """
-    # Sum over the corners n of the core polygon, for each element e, its corner k and each placement p.
-    corners = np.einsum("ekn,pn->pek", blocks.inner_corner_weights, placement.corners)
-    inner_sides = corners[:, :, :2]
-    outer_sides = corners[:, :, 2:]
-
-    # Replace the corners of the last layer on the innermost circle.
-    circle = placement.to_film(placement.template_radius[:, None] * np.exp(1j * placement.circle_angles))
-    outer_sides[:, blocks.last_layer] = np.stack([circle[:, :-1], circle[:, 1:]], axis=-1)
-
-    # Replace the corners on the boundary of the footprint, which separates the layers if there are two.
-    if blocks.n_layer == 2:
-        boundary = placement.boundary(blocks.boundary_parameter)
-        boundary_sides = np.stack([boundary[:, :-1], boundary[:, 1:]], axis=-1)
-        outer_sides[:, blocks.first_layer] = boundary_sides
-        inner_sides[:, blocks.last_layer] = boundary_sides
-    return np.asarray(corners)
-
-
 def _local_coordinates(
     placement: Placement,
     blocks: Blocks,
     points: Complexes,
     element: Integers,
-    corners: Complexes,
     max_steps: int = 20,
     negligible_step: float = 1e-13,
     max_overshoot: float = 0.1,
@@ -210,15 +178,14 @@ def _local_coordinates(
 ) -> tuple[Array, Array]:
     """Compute the local coordinates of points in given elements inside the innermost circle by Newton's method.
 
-    The film point with the coordinates (radial, angular) is (1 - radial) * inner(angular) + radial * outer(angular).
-    The functions inner and outer return the points of the inner and the outer side at a given angular coordinate.
+    A point with the radial coordinate r lies on the straight line between two points with the same angular coordinate:
+    the point I of the inner side and the point O of the outer side. Its position is (1 - r) I + r O.
 
     Args:
         placement: n placements, one for each point.
         blocks: The elements.
         points: Film points x + iy, shape (n,), in film radii.
         element: Index of the element that contains each point, shape (n,).
-        corners: Corners of these elements, shape (n, 4); see `_inner_corners`.
         max_steps: Largest number of Newton steps with which a point inside the innermost circle is located.
         negligible_step: Change of the local coordinates below which Newton's method ends, dimensionless.
         max_overshoot: Largest distance of the local coordinates of a point from the range from 0 to 1 in Newton's
@@ -235,7 +202,7 @@ def _local_coordinates(
     for _ in range(max_steps):
         # Evaluate the sides at the angular coordinate, and before and after it for the central differences.
         shifted_angular = angular[:, None] + np.array([0.0, -difference_step, difference_step])
-        inner, outer = _side_points(placement, blocks, element, corners, shifted_angular)
+        inner, outer = placement.sides(blocks, element, shifted_angular)
         shifted_points = inner + radial[:, None] * (outer - inner)
         current, before, after = shifted_points.T
         residual = current - points
@@ -255,45 +222,6 @@ def _local_coordinates(
         if largest_step < negligible_step:
             break
     return radial, angular
-
-
-def _side_points(
-    placement: Placement, blocks: Blocks, element: Integers, corners: Complexes, angular: Array
-) -> tuple[Complexes, Complexes]:
-    """Compute points of the inner and the outer side of elements at given angular coordinates.
-
-    Args:
-        placement: n placements, one for each element.
-        blocks: The elements.
-        element: Index of each element, shape (n,).
-        corners: Corners of these elements, shape (n, 4); see `_inner_corners`.
-        angular: Angular coordinates from 0 to 1, shape (n, k).
-
-    Returns:
-        Points x + iy of the inner sides and of the outer sides, each of shape (n, k), in film radii.
-    """
-    inner_first, inner_last, outer_first, outer_last = corners.T[:, :, None]  # each of shape (n, 1)
-    inner = inner_first + angular * (inner_last - inner_first)
-    outer = outer_first + angular * (outer_last - outer_first)
-
-    # Replace the outer sides on the innermost circle.
-    in_last_layer = element >= blocks.last_layer.start
-    sector = (element - blocks.n_quad) % blocks.n_sector  # not used for elements of the core polygon
-    first_angle = np.take_along_axis(placement.circle_angles, sector[:, None], axis=1)
-    last_angle = np.take_along_axis(placement.circle_angles, sector[:, None] + 1, axis=1)
-    circle_angle = first_angle + angular * (last_angle - first_angle)
-    circle = placement.to_film(placement.template_radius[:, None] * np.exp(1j * circle_angle))
-    outer[in_last_layer] = circle[in_last_layer]
-
-    # If there are two layers, the boundary of the footprint separates them.
-    if blocks.n_layer == 2:
-        in_first_layer = (element >= blocks.n_quad) & ~in_last_layer
-        first_parameter = blocks.boundary_parameter[sector, None]
-        last_parameter = blocks.boundary_parameter[sector + 1, None]
-        boundary = placement.boundary(first_parameter + angular * (last_parameter - first_parameter))
-        outer[in_first_layer] = boundary[in_first_layer]
-        inner[in_last_layer] = boundary[in_last_layer]
-    return np.asarray(inner), np.asarray(outer)
 
 
 def _overshoot(radial: Array, angular: Array) -> Array:

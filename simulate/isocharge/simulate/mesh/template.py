@@ -3,16 +3,17 @@
 A template is the same for all positions of a probe.
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Self
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Complexes, Integers
+from isocharge.common.arrays import Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.probe import Circle, Polygon, Probe
-from isocharge.simulate.sensor.probe_shapes.base import CurvedProbe, FootprintTopology
+from isocharge.simulate.sensor.probe_shapes.base import FootprintTopology
+from isocharge.simulate.sensor.probe_shapes.round import RoundProbe
 
 SAMPLE_REACH = 0.1
 """Reach of the footprint of the sample press, in film radii.
@@ -62,38 +63,23 @@ class Template(Blocks):
         self.on_axis = (np.abs(node_points.imag) < 1e-9) & self.half
 
 
-class SampleCurve(CurvedProbe):
-    """Circular footprint that replaces another curved footprint in the sample press. It has the same topology."""
+@dataclass(frozen=True)
+class SampleCurve(RoundProbe):
+    """Circular footprint that replaces another curved footprint in the sample press.
 
-    angle = 0.0
+    Attributes:
+        radius: Radius of the circle, mm.
+        other_topology: Topology of the other footprint.
+    """
+
+    other_topology: FootprintTopology
     notation = "sample"
-    area = np.pi * SAMPLE_REACH**2
-    reach = SAMPLE_REACH
     period = 2.0 * np.pi
-
-    def __init__(self, topology: FootprintTopology) -> None:
-        self._topology = topology
 
     @property
     def topology(self) -> FootprintTopology:
         """Topology of the other footprint."""
-        return self._topology
-
-    def boundary(self, parameter: Array) -> Complexes:
-        """Return the points of the circle at given angles.
-
-        Args:
-            parameter: Angles, any shape, rad.
-
-        Returns:
-            Points x + iy, same shape, mm.
-        """
-        return np.asarray(SAMPLE_REACH * np.exp(1j * parameter))
-
-    def rotated(self, angle: float) -> Self:
-        """Return the footprint itself, because a rotation does not change a circle."""
-        del angle
-        return self
+        return self.other_topology
 
 
 def sample_points(blocks: Blocks) -> Complexes:
@@ -122,7 +108,7 @@ def _sample_probe(topology: FootprintTopology) -> Probe:
     if topology.fills_circle:
         return Circle(SAMPLE_REACH)
     if topology.is_curved:
-        return SampleCurve(topology)
+        return SampleCurve(SAMPLE_REACH, topology)
     angle = np.linspace(0.0, 2.0 * np.pi, topology.n_corner, endpoint=False)
     return Polygon.of(SAMPLE_REACH * np.stack([np.cos(angle), np.sin(angle)], axis=1))
 

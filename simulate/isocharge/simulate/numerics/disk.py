@@ -1,10 +1,10 @@
-"""Regular patterns of points in a disk, and projection of points outside a disk onto its edge."""
+"""Patterns of points in a disk, and projection of points outside a disk onto its edge."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Complexes
+from isocharge.common.arrays import Array
 
 ROUNDING = 1e-9
 """Relative tolerance for points on the edge of a disk, dimensionless."""
@@ -82,65 +82,8 @@ class Rings:
         return values.reshape(*self.position.shape[:2], *values.shape[1:])
 
 
-def lattice(max_count: int) -> Complexes:
-    """Return the points of a square lattice within the unit disk as complex numbers x + iy.
-
-    The lattice has as many points as possible, but not more than `max_count`. One of the points is the centre of the
-    disk. The outermost points lie on the unit circle.
-
-    Args:
-        max_count: Largest allowed number of points. A number below 1 counts as 1.
-
-    Returns:
-        Points, sorted by their distance from the centre, shape (n,).
-    """
-    # Integer coordinates of a square that contains a disk with `max_count` points. Such a disk has about the area
-    # `max_count`, because there is one point per unit area. The 2 is a margin.
-    max_count = max(max_count, 1)
-    half_side = int(np.sqrt(max_count / np.pi)) + 2
-    coordinates = np.arange(-half_side, half_side + 1)
-    x_grid, y_grid = np.meshgrid(coordinates, coordinates)
-    squared_distance = x_grid**2 + y_grid**2
-
-    # Find the largest radius within which the lattice has at most `max_count` points.
-    squared_radii, point_counts = np.unique(squared_distance, return_counts=True)
-    n_allowed_radii = np.searchsorted(np.cumsum(point_counts), max_count, side="right")
-    squared_radius = squared_radii[n_allowed_radii - 1]
-
-    # Sort the points by the distance from the centre, and by x and y if the distances are equal.
-    is_inside = squared_distance <= squared_radius
-    x = x_grid[is_inside]
-    y = y_grid[is_inside]
-    order = np.lexsort((y, x, squared_distance[is_inside]))
-
-    # Scale the lattice such that the outermost points have the distance 1 from the centre.
-    radius = max(np.sqrt(squared_radius), 1.0)  # the radius is 0 if the centre is the only point
-    rounding_margin = 1.0 - 1e-15  # keeps the outermost points within the unit circle despite rounding errors
-    return np.asarray((x[order] + 1j * y[order]) / radius * rounding_margin)
-
-
-def square_grid(radius: float, spacing: float) -> Array:
-    """Return the points of a square grid that lie within a disk. One of the points is the centre of the disk.
-
-    Args:
-        radius: Radius of the disk, whose centre is the origin.
-        spacing: Distance between neighbouring points, in the unit of the radius.
-
-    Returns:
-        Points (x, y), shape (n, 2), including points on the edge of the disk.
-    """
-    # The tolerance keeps points on the edge of the disk, whose distance may exceed the radius by a rounding error.
-    radius_with_tolerance = radius * (1.0 + ROUNDING)
-    intervals_to_edge = int(radius / spacing * (1.0 + ROUNDING))
-    coordinates = spacing * np.arange(-intervals_to_edge, intervals_to_edge + 1)
-    x_grid, y_grid = np.meshgrid(coordinates, coordinates)
-    points = np.stack([x_grid.ravel(), y_grid.ravel()], axis=1)
-    distance_from_centre = np.hypot(points[:, 0], points[:, 1])
-    return np.asarray(points[distance_from_centre <= radius_with_tolerance])
-
-
-def sunflower(count: int) -> Complexes:
-    """Return points x + iy that are distributed evenly over the unit disk.
+def sunflower(count: int) -> Array:
+    """Return points that are distributed evenly over the unit disk.
 
     The points are arranged like the seeds of a sunflower (Vogel 1979).
 
@@ -148,8 +91,9 @@ def sunflower(count: int) -> Complexes:
         count: Number of points.
 
     Returns:
-        Points, sorted by their distance from the centre of the disk, shape (count,).
+        Points (x, y), sorted by their distance from the centre of the disk, shape (count, 2).
     """
     number = np.arange(count)
     golden_angle = np.pi * (3.0 - np.sqrt(5.0))
-    return np.asarray(np.sqrt((number + 0.5) / count) * np.exp(1j * golden_angle * number))
+    distance = np.sqrt((number + 0.5) / count)
+    return np.stack([distance * np.cos(golden_angle * number), distance * np.sin(golden_angle * number)], axis=1)

@@ -112,19 +112,22 @@ class Electrode:
         return cls(name, _as_tuples(corners.tolist()))
 
     def with_trace(self, path: Corners, width: float) -> "Electrode":
-        """Return a copy of the electrode with an additional trace on the front.
+        """Return a copy of the electrode whose metal on the front includes a trace.
+
+        A trace is a strip of metal with a constant width. The copy contains the outline of the trace as the last
+        polygon of `more`.
 
         Args:
-            path: Successive points (x, y) of the centre line of the trace, mm.
+            path: Points (x, y) that the centre line of the trace connects by straight lines, mm.
             width: Width of the trace, mm.
 
         Raises:
             SensorError: If the path has fewer than two points or repeats a point, or if the trace crosses itself.
         """
         outline = to_corners(trace_outline(to_complex(np.array(path)), width))
-        polygon = _as_tuples(outline.tolist())
-        check_polygon(f"trace of electrode {self.name!r}", polygon)
-        return replace(self, more=(*self.more, polygon))
+        trace = _as_tuples(outline.tolist())
+        check_polygon(f"trace of electrode {self.name!r}", trace)
+        return replace(self, more=(*self.more, trace))
 
     @cached_property
     def side(self) -> float | None:
@@ -180,6 +183,13 @@ class Electrode:
         if self._is_convex:
             return self.collecting_polygons
         return tuple(piece for polygon in self.collecting_polygons for piece in subdivide(polygon, MAX_PART_SIDE))
+
+    @cached_property
+    def part_circles(self) -> tuple[Array, Array]:
+        """Centres (x, y) of circles that enclose the parts, shape (n_part, 2), and their radii, shape (n_part,), mm."""
+        centres = np.array([part.mean(axis=0) for part in self.parts])
+        distances = [np.linalg.norm(part - centre, axis=1) for part, centre in zip(self.parts, centres, strict=True)]
+        return centres, np.array([distance.max() for distance in distances])
 
     @property
     def _is_convex(self) -> bool:
@@ -332,15 +342,8 @@ class Sensor:
         Returns:
             For each electrode, the centres x + iy and the radii of the circles, each of shape (n_part,), mm.
         """
-        circles = []
-        for electrode in self.electrodes:
-            parts = [self.calibration.place(part) for part in electrode.parts]
-            centres = np.array([part.mean(axis=0) for part in parts])
-            radii = []
-            for part, centre in zip(parts, centres, strict=True):
-                radii.append(np.linalg.norm(part - centre, axis=1).max())
-            circles.append((to_complex(centres), np.array(radii)))
-        return tuple(circles)
+        circles = [electrode.part_circles for electrode in self.electrodes]
+        return tuple((to_complex(self.calibration.place(centres)), radii) for centres, radii in circles)
 
     @property
     def gains(self) -> Array:

@@ -19,8 +19,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Complexes
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.solver.assembly import Assembly
-from isocharge.simulate.solver.tangent_factor import TangentFactor, factor_tangent
+from isocharge.simulate.solver.assembly import Assembly, TangentFactor, factor_tangent
 
 STABILISING_TENSION = 0.4
 """Stabilising tension at a relative residual of one.

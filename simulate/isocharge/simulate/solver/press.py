@@ -68,8 +68,8 @@ def press(
         force: Force, N, positive in the direction of the push.
         settings: Accuracy, theory and mesh.
         side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N. It is distributed over the
-            footprint like the pressure, and its direction does not change. `solver.friction.friction_force` computes
-            the side force of a probe with friction.
+            footprint like the pressure, and its direction does not change. `solver.sensitivity.friction_force`
+            computes the side force of a probe with friction.
         start: Equilibrium of a similar press on the same mesh, whose field is the first iterate; None if there is no
             such equilibrium.
         throw: Whether to raise an error if the solve fails. Otherwise the `status` of the result is "failed".

@@ -189,7 +189,7 @@ def spread_contacts(domain: Domain, count: int) -> Array:
     point = sunflower(count) * domain.radius
     shares = np.random.default_rng(0).permutation((np.arange(count) + 0.5) / count)
     low, high = np.log(domain.force_range)
-    return np.column_stack([point.real, point.imag, np.exp(low + shares * (high - low))])
+    return np.column_stack([point, np.exp(low + shares * (high - low))])
 
 
 def _candidates(problem: CalibrationProblem) -> Array:
