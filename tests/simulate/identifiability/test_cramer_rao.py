@@ -9,7 +9,6 @@ from scipy.stats import norm
 
 from isocharge.simulate import ChargeSpline, Domain, Electrode, FunctionMap, NoiseModel, limits_at, noise_model
 from isocharge.simulate.identifiability.cramer_rao import cramer_rao
-from isocharge.simulate.numerics.disk import sunflower
 
 REFERENCE = noise_model("reference")
 AT = np.array([[8.0, 0.0], [0.0, 8.0], [-8.0, 0.0], [0.0, -8.0]])
@@ -94,7 +93,9 @@ def test_limits_of_layouts_agree_with_an_independent_search(three_map, places, w
     """
     electrodes = tuple(Electrode.of_square(name, place, 3.0) for name, place in zip("ABCD", places, strict=False))
     charges = ChargeSpline.of(replace(three_map, sensor=replace(three_map.sensor, electrodes=electrodes)), spacing=0.3)
-    at = 8.0 * sunflower(2200)
+    steps = 0.3 * np.arange(-26, 27)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    at = grid[np.hypot(*grid.T) <= 8.0]
     position = limits_at(charges, np.column_stack([at, np.ones(len(at))]), REFERENCE).position
     assert position.max() == pytest.approx(worst, rel=0.04)
     assert np.sqrt(np.mean(position**2)) == pytest.approx(rms, rel=0.015)

@@ -33,9 +33,11 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
     is_inside = np.abs(template_points) <= placement.template_radius[:, None]
     if np.any(is_inside):
         placement_index, _ = np.nonzero(is_inside)
+        used_index, point_index = np.unique(placement_index, return_inverse=True)
+        corners = _inner_corners(placement[used_index], blocks)[point_index]
         placement_of_point = placement[placement_index]  # one placement for each point inside the circle
         element[is_inside], radial[is_inside], angular[is_inside] = _locate_inside(
-            placement_of_point, blocks, points[is_inside]
+            placement_of_point, blocks, points[is_inside], corners
         )
 
     # Convert the coordinates from the range from 0 to 1 to the range from -1 to 1.
@@ -120,7 +122,7 @@ def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
 
 
 def _locate_inside(
-    placement: Placement, blocks: Blocks, points: Complexes, tolerance: float = 1e-9
+    placement: Placement, blocks: Blocks, points: Complexes, corners: Complexes, tolerance: float = 1e-9
 ) -> tuple[Integers, Array, Array]:
     """Find the elements that contain points inside the innermost circle.
 
@@ -134,15 +136,12 @@ def _locate_inside(
         placement: n placements, one for each point.
         blocks: The elements.
         points: Film points x + iy, shape (n,), in film radii.
+        corners: Corners of all elements for each point, shape (n, n_inner, 4); see `_inner_corners`.
         tolerance: Distance of a local coordinate from the range from 0 to 1 above which another element is tried.
 
     Returns:
         Index of the element, and radial and angular coordinate in the element from 0 to 1, each of shape (n,).
     """
-    # Compute the corners of all elements for each point. They are the ends of the inner and the outer sides.
-    point_index, inner_element = np.divmod(np.arange(points.size * blocks.n_inner), blocks.n_inner)
-    ends = placement[point_index].sides(blocks, inner_element, np.array([[0.0, 1.0]]))
-    corners = np.concatenate(ends, axis=1).reshape(points.size, blocks.n_inner, 4)
     inner_first, inner_last, outer_first, outer_last = np.moveaxis(corners, -1, 0)
     sides = ((inner_first, outer_first), (outer_last, inner_last), (inner_last, inner_first), (outer_first, outer_last))
     distances = [_distance_to_left(start, end, points[:, None]) for start, end in sides]
@@ -164,6 +163,23 @@ def _locate_inside(
         radial[improved] = new_radial[is_better]
         angular[improved] = new_angular[is_better]
     return element, radial, angular
+
+
+def _inner_corners(placement: Placement, blocks: Blocks) -> Complexes:
+    """Return the corners of all elements inside the innermost circle.
+
+    Args:
+        placement: n placements.
+        blocks: The elements.
+
+    Returns:
+        Corners x + iy, shape (n, n_inner, 4), in film radii. They are the first and the last corner of the inner side,
+        and the first and the last corner of the outer side of each element.
+    """
+    n_placement = len(placement.template_radius)
+    index, element = np.divmod(np.arange(n_placement * blocks.n_inner), blocks.n_inner)
+    sides = placement[index].sides(blocks, element, np.array([[0.0, 1.0]]))
+    return np.concatenate(sides, axis=1).reshape(n_placement, blocks.n_inner, 4)
 
 
 def _local_coordinates(
