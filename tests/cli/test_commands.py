@@ -299,11 +299,7 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     card = ("position_median_mm", "position_p95_mm") * 2 + ("force_median_percent", "force_rms_percent")
     ratios = errors / [model.metadata.errors[key] for key in card]
     assert np.all(np.abs(np.log(ratios)) < [1e-3, 1e-3, 1.1, 1.1, 1e-3, 1e-3])  # live, there is one press only
-    size, seconds = (
-        re.search(r"size_KiB +([0-9.]+)", table)[1],
-        re.findall(r"(?:simulate|train|serve|show) ([0-9.]+)", table),
-    )
-    assert (model.folder / "model.onnx").stat().st_size == pytest.approx(1024 * float(size), rel=1e-3)
+    seconds = re.findall(r"(?:simulate|train|serve|show) ([0-9.]+)", table)
     assert 2.0 <= sum(map(float, seconds)) < 60.0
     pressed, felt = figures[0].axes[2].lines[:2]
     assert (pressed.get_label(), felt.get_label(), (out / "presses").is_dir()) == ("pressed", "estimated", True)

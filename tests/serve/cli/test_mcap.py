@@ -68,17 +68,6 @@ def figures(monkeypatch):
     return figures
 
 
-def records_in(path):
-    records = map(json.loads, path.read_text().splitlines())
-    return [record for record in records if "timestamp" in record]
-
-
-def lines_of(figure):
-    """Times and values of the lines with a label, shape (n, 2), by label."""
-    lines = (line for axes in figure.axes for line in axes.lines)
-    return {line.get_label(): line.get_xydata() for line in lines if line.get_label()[0] != "_"}
-
-
 def test_plot_draws_a_recording(command, recorded, tmp_path, figures):
     picture, (path, _) = tmp_path / "touch.png", recorded
     code, out, err = command("serve", "plot", path, "-o", picture)
@@ -87,22 +76,22 @@ def test_plot_draws_a_recording(command, recorded, tmp_path, figures):
     assert pixels.shape[0] > 900
     assert pixels.std() > 0.1
 
-    records, lines = records_in(path), lines_of(figures[0])
+    records = [json.loads(line) for line in path.read_text().splitlines() if line.startswith('{"timestamp"')]
+    lines = {line.get_label(): line.get_ydata() for axes in figures[0].axes for line in axes.lines}
     expected = {name: [record[key] for record in records] for name, key in (("x", "x_mm"), ("force", "force_N"))}
     expected["C"] = [(record["charge_pC"] or {"C": None})["C"] for record in records]
     for name, values in expected.items():
-        np.testing.assert_array_equal(lines[name][:, 1], np.array(values, dtype=float))
+        np.testing.assert_array_equal(lines[name], np.array(values, dtype=float))
     position_lines = next(axes for axes in figures[0].axes if axes.get_ylabel().startswith("position")).lines
     upper_limit = [np.nan if r["x_mm"] is None else r["x_mm"] + 2.0 * r["x_std_mm"] for r in records]
     np.testing.assert_allclose(position_lines[2].get_ydata(), upper_limit)
 
     flag_axes = next(axes for axes in figures[0].axes if axes.get_xlabel().startswith("time since"))
-    start = records[0]["timestamp"]
-    for word, marks in zip(flag_axes.get_yticklabels(), flag_axes.lines, strict=True):
-        row = word.get_position()[1]
-        flagged = [(record["timestamp"] - start, row) for record in records if word.get_text() in record["flags"]]
-        np.testing.assert_allclose(marks.get_xydata(), flagged)
-    assert {word.get_text() for word in flag_axes.get_yticklabels()} == {f for r in records for f in r["flags"]}
+    words = [label.get_text() for label in flag_axes.get_yticklabels()]
+    for flag, marks in zip(words, flag_axes.lines, strict=True):
+        times_s = [record["timestamp"] - records[0]["timestamp"] for record in records if flag in record["flags"]]
+        np.testing.assert_allclose(marks.get_xdata(), times_s)
+    assert set(words) == {flag for record in records for flag in record["flags"]}
 
 
 @pytest.mark.parametrize(

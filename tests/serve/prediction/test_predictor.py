@@ -61,14 +61,6 @@ def test_predict_takes_any_kind_of_numbers(predictor, kind):
     assert predictor.predict(kind([100, 100, 100])) == predictor.predict([100.0, 100.0, 100.0])
 
 
-def test_predict_batch_equals_predict_of_each_row(film, predictor):
-    charges = film.golden_pC()
-    batch = predictor.predict_batch(charges)
-    for row, charge_pC in enumerate(charges):
-        assert predictor.predict(charge_pC) == pytest.approx([column[row] for column in batch], rel=1e-6, nan_ok=True)
-    assert [column.shape for column in predictor.predict_batch(charges[:0])] == [(0,)] * 10
-
-
 @pytest.mark.parametrize(
     ("charge_pC", "message"),
     [
