@@ -23,7 +23,7 @@ from isocharge.cli.shared.live_page import (
     TokenOption,
     live_page,
 )
-from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption, WaitOption
+from isocharge.cli.shared.options import BaudOption, DeviceOption, ModelArgument, ModelsOption, WaitOption
 from isocharge.cli.shared.port_hints import no_frames_advice_added, no_frames_hint
 from isocharge.cli.shared.terminal import (
     on_signal,
@@ -194,9 +194,7 @@ def stream_command(
         int | None, typer.Option("--count", min=1, help="Number of records after which to stop. (default: at Ctrl-C)")
     ] = None,
     wait: WaitOption = 0.0,
-    baud: Annotated[
-        int, typer.Option("--baud", min=1, help="Speed of the port, bits per second; USB ports ignore it.")
-    ] = 115200,
+    baud: BaudOption = 115200,
     track: Annotated[
         bool,
         typer.Option(

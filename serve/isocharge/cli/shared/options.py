@@ -89,6 +89,10 @@ DeviceOption = Annotated[
     ),
 ]
 
+BaudOption = Annotated[
+    int, typer.Option("--baud", min=1, help="Speed of the port, bits per second; USB ports ignore it.")
+]
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text. (default: text)")]
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.forward_maps import ProbeOption
-from isocharge.cli.shared.options import DeviceOption, StressLimitOption, worker_count
+from isocharge.cli.shared.options import BaudOption, DeviceOption, StressLimitOption, worker_count
 from isocharge.cli.shared.port_hints import no_frames_advice_added
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, RadiusOption, SensorOption
 from isocharge.cli.shared.terminal import say
@@ -46,9 +46,7 @@ def press_command(
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
     device: DeviceOption = None,
-    baud: Annotated[
-        int, typer.Option("--baud", min=1, help="Speed of the port, bits per second; USB ports ignore it.")
-    ] = 115200,
+    baud: BaudOption = 115200,
     yes: Annotated[
         bool,
         typer.Option("--yes", help="Take each press as made where it was proposed, without asking. (default: ask)"),
