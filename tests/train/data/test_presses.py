@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.train.measured import measured_presses
 
 from isocharge.common.errors import DatasetError, PressError
-from isocharge.serve import MeasuredPresses
-from isocharge.simulate import Circle, Domain, Samples, parse_probe
+from isocharge.simulate import Circle, Domain, parse_probe
 from isocharge.train.data.presses import (
     LabelledPresses,
     dataset_of,
@@ -49,16 +49,13 @@ def with_one_charge(dataset, value):
     return with_samples(dataset, charge_pC=charge)
 
 
-def first_hundred(dataset):
-    """Return a dataset with the first hundred samples of another one."""
-    columns = {name: column[:100] for name, column in dataset.samples.columns().items()}
-    return replace(dataset, samples=Samples(**columns))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (first_hundred, "expected at least 500 presses at 50 positions, got 100 at 100"),
+        (
+            lambda d: replace(d, samples=d.samples[np.arange(100)]),
+            "expected at least 500 presses at 50 positions, got 100 at 100",
+        ),
         (lambda d: with_samples(d, x_mm=0.0 * d.samples.x_mm, y_mm=0.0 * d.samples.y_mm), "got 6000 at 1"),
         (lambda d: with_samples(d, charge_pC=d.samples.charge_pC[:, :2]), "at least three electrodes"),
         (lambda d: with_samples(d, force_N=-d.samples.force_N), "sample 0: expected a positive force, got -"),
@@ -84,19 +81,6 @@ def random_contacts(count: int, seed: int) -> np.ndarray:
     """Return random contacts (x, y, F), shape (count, 3), mm and N."""
     rng = np.random.default_rng(seed)
     return np.column_stack([rng.uniform(-6, 6, (count, 2)), rng.uniform(0.05, 2.0, count)])
-
-
-def measured_presses(contact: np.ndarray, charge: np.ndarray) -> MeasuredPresses:
-    """Return measured presses with standard deviations of 0.1 mm and 1 % of the force."""
-    count = len(contact)
-    return MeasuredPresses(
-        contact=contact,
-        charge_pC=charge,
-        position_std_mm=np.full(count, 0.1),
-        force_std=np.full(count, 0.01),
-        electrodes=("A", "B", "C"),
-        lines=tuple(range(2, count + 2)),
-    )
 
 
 @given(count=st.integers(50, 300), seed=st.integers(0, 999), forces=st.integers(1, 5))

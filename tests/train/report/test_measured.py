@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.train.measured import measured_presses
 
 from isocharge.common.errors import ModelError, PressError
-from isocharge.serve import MeasuredPresses, Predictor, check_presses, find_model
+from isocharge.serve import Predictor, check_presses, find_model
 from isocharge.simulate import (
     Circle,
     Domain,
@@ -21,15 +22,6 @@ from isocharge.train.report import QUICK, write_report
 NAME = "three-25um-biaxial"
 PROBE = Circle(1.0)
 PRESS_COUNT = 300
-ELECTRODES = ("A", "B", "C")
-
-
-def measured_presses(contact, charge):
-    """Return measured presses with standard deviations of 0.05 mm and 0.5 % of the force."""
-    position_std_mm = np.full(PRESS_COUNT, 0.05)
-    force_std = np.full(PRESS_COUNT, 0.005)
-    lines = tuple(range(2, PRESS_COUNT + 2))
-    return MeasuredPresses(contact, charge, position_std_mm, force_std, ELECTRODES, lines)
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.train.measured import measured_presses
 
 from isocharge.cli.train import fit as fit_command
 from isocharge.common.errors import PressError, SceneError
-from isocharge.serve import Contact, MeasuredPresses, Predictor, read_presses
+from isocharge.serve import Contact, Predictor, read_presses
 from isocharge.serve.prediction.press_check import check_presses
 from isocharge.serve.presses.measured_presses import write_presses
 from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit_presses
@@ -36,6 +37,8 @@ negative."""
 
 NOISE_pC = np.array([0.3, 0.2, 0.3, 0.4])
 """Standard deviation of the white noise of each channel, pC."""
+
+CHANNELS = ("Q1", "Q2", "Q3", "Q4")
 
 FORCES_N = (0.2, 5.0)
 """Smallest and largest force of the presses, N."""
@@ -70,23 +73,10 @@ def charges_on_l(contact, seed):
     return linear_charges(contact, [20.0, -5.0]) + noise
 
 
-def measured_presses(contact, charge, names=("Q1", "Q2", "Q3", "Q4")):
-    """Return measured presses with standard deviations of 0.05 mm and 0.5 % of the force."""
-    count = len(contact)
-    return MeasuredPresses(
-        contact=contact,
-        charge_pC=charge,
-        position_std_mm=np.full(count, 0.05),
-        force_std=np.full(count, 0.005),
-        electrodes=names,
-        lines=tuple(range(2, count + 2)),
-    )
-
-
 def presses_on_l():
     """Return the presses on the L with which the network is trained."""
     contact = contacts_on_l(1_200, 0)
-    return measured_presses(contact, charges_on_l(contact, 1))
+    return measured_presses(contact, charges_on_l(contact, 1), CHANNELS)
 
 
 def fit_to_l():
@@ -161,7 +151,7 @@ def test_fit_command_releases_a_model_of_measured_presses(fitted_pad, fresh, rel
     predictor = Predictor(released_pad)
     expected_contact, _, _ = fitted_pad.predict(fresh.charge[:1])
     np.testing.assert_allclose(predictor.predict(fresh.charge[0])[:3], expected_contact[0], rtol=1e-3)
-    assert check_presses(predictor, measured_presses(fresh.contact[:200], fresh.charge[:200])).fits
+    assert check_presses(predictor, measured_presses(fresh.contact[:200], fresh.charge[:200], CHANNELS)).fits
     assert predictor.metadata.sensor == {"name": "pad", "electrodes": ["Q1", "Q2", "Q3", "Q4"]}
     assert read_presses(released_pad / "presses.csv") == presses_on_l()
 
@@ -236,7 +226,7 @@ def with_channel(channel, new_charge):
     presses = presses_on_l()
     charge = presses.charge_pC.copy()
     charge[:, channel] = new_charge(charge)
-    return measured_presses(presses.contact, charge)
+    return measured_presses(presses.contact, charge, CHANNELS)
 
 
 def with_contact(column, new_values):
@@ -249,7 +239,7 @@ def with_contact(column, new_values):
     presses = presses_on_l()
     contact = presses.contact.copy()
     contact[:, column] = new_values(contact)
-    return measured_presses(contact, presses.charge_pC)
+    return measured_presses(contact, presses.charge_pC, CHANNELS)
 
 
 def in_eighth_press(value, column):
@@ -362,9 +352,9 @@ def test_intact_presses_are_accepted():
     usable_presses(read_presses(ROOT / "tests" / "data" / "tactile_fsi.csv"))
     presses = presses_on_l()
     for unit in (1e-12, 1e12):
-        usable_presses(measured_presses(presses.contact, unit * presses.charge_pC))
+        usable_presses(measured_presses(presses.contact, unit * presses.charge_pC, CHANNELS))
     is_zero = np.random.default_rng(7).random((1_200, 4)) < 0.9
-    usable_presses(measured_presses(presses.contact, np.where(is_zero, 0.0, presses.charge_pC)))
+    usable_presses(measured_presses(presses.contact, np.where(is_zero, 0.0, presses.charge_pC), CHANNELS))
     usable_presses(with_channel(1, lambda charge: charge[:, 0] * (1.0 + 0.01 * JITTER)))
 
 
