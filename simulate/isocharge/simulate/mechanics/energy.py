@@ -32,6 +32,9 @@ from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_str
 from isocharge.simulate.mechanics.stress import strain
 from isocharge.simulate.mesh.placed_mesh import Geometry
 
+EQUAL_TENSION = np.array([1.0, 1.0, 0.0])
+"""Stress (T11, T22, T12) of a tension of one in all directions."""
+
 SHIFT = 5.0
 """Shift s of the linear solves with bending; see `Bending`.
 
@@ -141,7 +144,7 @@ class ElasticFilm:
             Element matrices, shape (n_element, n_local, n_unknown, n_local, n_unknown), where
             n_unknown is `unknowns_per_node`.
         """
-        tangent = Membrane(self.geometry, self.groups.stiffened(added_tension)).tangent(field)
+        tangent = self.membrane.tangent(field, added_tension)
         if self.bending is None:
             return tangent
         return self.bending.extend(tangent)
@@ -174,7 +177,7 @@ class Membrane:
         # Weights of the squared slopes of U1, U2 and W in the strain, shape (3,)
         self._slope_weights = np.array([groups.squared_amplitude, groups.squared_amplitude, 1.0])
         # Pretension in units of E_young A^2, as stress (T11, T22, T12) and as a symmetric matrix
-        self._pretension = groups.tension * np.array([1.0, 1.0, 0.0]) + groups.anisotropy.tension
+        self._pretension = groups.tension * EQUAL_TENSION + groups.anisotropy.tension
         self._pretension_matrix = _symmetric_matrix(self._pretension)
 
     def _slopes(self, field: Array) -> Array:
@@ -254,11 +257,12 @@ class Membrane:
         transposed_gradient = geometry.stacked.transpose(0, 2, 1)  # shape (n_element, n_local, n_point * 2)
         return np.asarray(transposed_gradient @ stacked_traction)
 
-    def tangent(self, field: Array) -> Array:
+    def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
         """Compute the second derivatives of the stretching energy of each element.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
+            added_tension: Tension that is added to the pretension, in units of E_young A^2.
 
         Returns:
             Second derivatives, shape (n_element, n_local, 3, n_local, 3). The second and third axes are the node and
@@ -273,7 +277,8 @@ class Membrane:
         # The total stress (S11, S22, S12) is the sum of the elastic stress and the pretension. It is multiplied by the
         # integration weights.
         elastic_stress = scaled_stress(strain(slopes, self.groups.squared_amplitude), self.groups)
-        weighted_stress = _symmetric_matrix((elastic_stress + self._pretension) * geometry.weights[..., None])
+        total_stress = elastic_stress + self._pretension + added_tension * EQUAL_TENSION
+        weighted_stress = _symmetric_matrix(total_stress * geometry.weights[..., None])
         weighted_stiffness = self._material_stiffness(deformation) * geometry.weights[..., None, None, None, None]
 
         # Compute one block for each pair (i, j) of displacement components. A block consists of the material part and,

@@ -176,14 +176,6 @@ class DimensionlessGroups:
         height = float(_root(linear_factor / cubic_factor, abs(self.static_pressure) / cubic_factor))
         return float(np.copysign(height, self.static_pressure))
 
-    def stiffened(self, added_tension: float) -> "DimensionlessGroups":
-        """Return a copy of the groups in which a tension is added to the pretension.
-
-        Args:
-            added_tension: The additional tension, in units of E A^2.
-        """
-        return replace(self, tension=self.tension + added_tension)
-
 
 def scaled_stress(scaled_strain: Array, groups: DimensionlessGroups) -> Array:
     """Compute the scaled stress that belongs to a scaled strain, with the elasticity of the film.

@@ -29,9 +29,7 @@ def principal_stresses(stresses: Array) -> tuple[float, float]:
     Returns:
         Smallest and largest principal stress of all stresses, in the unit of the stresses.
     """
-    s11 = stresses[..., 0]
-    s22 = stresses[..., 1]
-    s12 = stresses[..., 2]
+    s11, s22, s12 = np.moveaxis(stresses, -1, 0)
 
     # The principal stresses are the ends of the horizontal diameter of Mohr's circle.
     centre = 0.5 * (s11 + s22)
@@ -112,9 +110,7 @@ def rotate_stress(rotated_frame_stress: Array, angle: float | Array) -> Array:
     Returns:
         Stress (s11, s22, s12) in the unrotated frame, shape (..., 3).
     """
-    s11 = rotated_frame_stress[..., 0]
-    s22 = rotated_frame_stress[..., 1]
-    s12 = rotated_frame_stress[..., 2]
+    s11, s22, s12 = np.moveaxis(rotated_frame_stress, -1, 0)
 
     # In Mohr's circle, the mean of s11 and s22 does not change. The vector of half of their difference and the shear
     # stress is rotated by twice the angle.

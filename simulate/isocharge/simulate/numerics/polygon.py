@@ -58,19 +58,8 @@ def to_corners(z: Complexes) -> Array:
     return np.stack([z.real, z.imag], axis=1)
 
 
-def shared_area(first: Complexes, second: Complexes) -> float:
-    """Compute the area of the intersection of two polygons.
-
-    Args:
-        first: Corners x + iy, shape (n,).
-        second: Corners x + iy, shape (m,).
-    """
-    intersection = shapely.intersection(shapely.Polygon(to_corners(first)), shapely.Polygon(to_corners(second)))
-    return float(intersection.area)
-
-
-def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float) -> Array:
-    """Compute the area that a polygon has in common with each of several disks.
+def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> Array:
+    """Compute the area that a polygon has in common with each of several concentric disks.
 
     Each edge of the polygon forms a triangle with the centre of the disk. The signed areas that the triangles and the
     disk have in common add up to the common area of the polygon and the disk. The part of an edge inside the circle
@@ -79,16 +68,16 @@ def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float)
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
-        centre: Centres of the disks, x + iy, any shape.
-        radius: Radius of all disks.
+        centre: Centre of the disks, x + iy.
+        radius: Radii of the disks, any shape.
 
     Returns:
-        Common area for each disk, in the shape of `centre`.
+        Common area for each disk, in the shape of `radius`.
     """
     # Start and end point of each edge relative to the centre, and their coordinates along the edge and across it. The
-    # coordinate across the edge is the same for both points. All arrays have the shape (..., n).
-    start = corners - np.asarray(centre)[..., None]
-    end = np.roll(start, -1, axis=-1)
+    # coordinate across the edge is the same for both points. The shape of these arrays is (n,).
+    start = corners - centre
+    end = np.roll(start, -1)
     direction = (end - start) / np.abs(end - start)  # unit vector x + iy
     start_along = (start * np.conj(direction)).real
     end_along = (end * np.conj(direction)).real
@@ -96,7 +85,8 @@ def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float)
 
     # The chord is the part of the edge within the circle. If the edge does not meet the circle, the length of the chord
     # is zero.
-    half_chord = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
+    squared_radius = np.asarray(radius)[..., None] ** 2  # shape (..., 1)
+    half_chord = np.sqrt(np.maximum(squared_radius - across**2, 0.0))
     chord_start_along = np.clip(start_along, -half_chord, half_chord)
     chord_end_along = np.clip(end_along, -half_chord, half_chord)
     chord_start = (chord_start_along + 1j * across) * direction
@@ -106,7 +96,7 @@ def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float)
     triangle_area = -0.5 * across * (chord_end_along - chord_start_along)
     angle_before_chord = np.angle(chord_start * np.conj(start))
     angle_after_chord = np.angle(end * np.conj(chord_end))
-    sector_area = 0.5 * radius**2 * (angle_before_chord + angle_after_chord)
+    sector_area = 0.5 * squared_radius * (angle_before_chord + angle_after_chord)
     return np.asarray((triangle_area + sector_area).sum(axis=-1))
 
 

@@ -1,5 +1,6 @@
 """Mechanical properties and piezoelectric coefficients of the film."""
 
+import cmath
 import math
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, Self
@@ -143,11 +144,14 @@ class Film:
         """
         if self.is_axisymmetric:
             return self
-        half_difference, shear = self.deviator
-        cosine = math.cos(2.0 * angle)
-        sine = math.sin(2.0 * angle)
-        deviator = (half_difference * cosine - shear * sine, half_difference * sine + shear * cosine)
-        return replace(self, deviator=deviator, axis=self.axis + angle, oval_axis=self.oval_axis + angle)
+        # As a complex number, the deviator is rotated by twice the angle.
+        deviator = complex(*self.deviator) * cmath.rect(1.0, 2.0 * angle)
+        return replace(
+            self,
+            deviator=(deviator.real, deviator.imag),
+            axis=self.axis + angle,
+            oval_axis=self.oval_axis + angle,
+        )
 
     def __post_init__(self) -> None:
         """Check the properties of the film.

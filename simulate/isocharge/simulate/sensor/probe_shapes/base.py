@@ -16,10 +16,11 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+import shapely
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
-from isocharge.simulate.numerics.polygon import area_of, shared_area, to_complex, to_corners
+from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.sensor.size_check import check_range
 
 NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
@@ -217,8 +218,8 @@ class Probe(ABC):
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
             at: Position of the centroid of the footprint as x + iy, mm.
         """
-        area_in_polygon = shared_area(to_complex(corners), at + self.outline)
-        return area_in_polygon / area_of(to_corners(self.outline))
+        outline = shapely.Polygon(to_corners(at + self.outline))
+        return float(shapely.intersection(shapely.Polygon(corners), outline).area / outline.area)
 
     @property
     def is_axisymmetric(self) -> bool:

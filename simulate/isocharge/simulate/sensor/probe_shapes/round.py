@@ -121,8 +121,7 @@ class Finger(RoundProbe):
         """
         pressure_fraction, weights = gauss_line(PRESSURE_LEVELS)
         disk_radius = self.radius * np.sqrt(1.0 - pressure_fraction**2)
-        points = to_complex(corners)
-        common_areas = [float(area_in_disk(points, at, radius)) for radius in disk_radius]  # A(t), mm^2
+        common_areas = area_in_disk(to_complex(corners), at, disk_radius)  # A(t), mm^2
 
         # For a force of 1, the mean pressure is 1 / area, and the peak pressure is `PEAK_PRESSURE` times as large.
         return float(PEAK_PRESSURE / self.area * (weights @ common_areas))
