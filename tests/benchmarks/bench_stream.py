@@ -9,6 +9,7 @@ byte. The charges are those of a made-up linear film: nothing here depends on wh
 
 import multiprocessing
 import time
+from dataclasses import asdict
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -77,7 +78,7 @@ def play(predictor: Predictor, seconds: float, rate_Hz: float, seed: int) -> dic
 def summary(latencies: np.ndarray, path: TouchStream, played: dict[str, int]) -> dict[str, Any]:
     """Counters and percentiles; latencies has the columns last byte to record (us), contact."""
     touched = latencies[latencies[:, 1] == 1.0]
-    return path.totals()._asdict() | {
+    return asdict(path.totals()) | {
         "board": played,
         "in_contact": len(touched),
         "last_byte_to_record_us": percentiles(latencies[:, 0], SHARES),

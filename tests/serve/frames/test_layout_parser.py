@@ -207,6 +207,9 @@ def test_datagrams_contain_whole_frames():
     assert parser.feed(first[:3]) == []
     assert [frame.values for frame in parser.feed(first_with_another_sync + second)] == [(1.0,)]
     assert (parser.counts.malformed, parser.counts.bytes_dropped) == (1, 9)
+    assert parser.sequence_flags(1) == ()
+    parser.feed(first + second)
+    assert parser.sequence_flags(4) == ("gap",)
 
 
 def test_constant_bytes_are_checked():

@@ -14,7 +14,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from isocharge.serve import AutoParser, BinaryParser, Frame, device_from_table, encode_frame
-from isocharge.serve.frames.frame import Parser, SequenceGaps
+from isocharge.serve.frames.frame import Parser
 from isocharge.serve.frames.text import TextParser
 from layout_encoder import TEXT_ENCODERS, encode_layout
 
@@ -149,15 +149,22 @@ def test_bytes_between_two_frames_damage_no_frame(name, data):
 @pytest.mark.parametrize(
     ("numbers", "modulus", "counts", "flags"),
     [
-        ((65534, 65535, 0, 1), (), (0, 0, 0), [()] * 4),
-        ((65530, 65533, 2, 2, 3, 0, 1), (), (2 + 4, 1, 1), [(), ("gap",), ("gap",), ("repeat",), (), ("restart",), ()]),
-        ((254, 255, 0, 3), (256,), (2, 0, 0), [(), (), (), ("gap",)]),
-        ((None, 5, None, 8), (), (2, 0, 0), [(), (), (), ("gap",)]),
+        ((65534, 65535, 0, 1), 65536, (0, 0, 0), [()] * 4),
+        (
+            (65530, 65533, 2, 2, 3, 0, 1),
+            65536,
+            (2 + 4, 1, 1),
+            [(), ("gap",), ("gap",), ("repeat",), (), ("restart",), ()],
+        ),
+        ((254, 255, 0, 3), 256, (2, 0, 0), [(), (), (), ("gap",)]),
+        ((None, 5, None, 8), 65536, (2, 0, 0), [(), (), (), ("gap",)]),
     ],
     ids=["wrap", "gaps, a repeat and a restart", "one byte", "some without a number"],
 )
 def test_sequence_gaps_repeats_and_restarts(numbers, modulus, counts, flags):
-    """Without a modulus, the frame numbers have two bytes."""
-    gaps = SequenceGaps()
-    assert [gaps.update(seq, *modulus) for seq in numbers] == flags
-    assert (gaps.lost, gaps.repeated, gaps.restarts) == counts
+    parser = BinaryParser()
+    parser.seq_modulus = modulus
+    assert [parser.sequence_flags(seq) for seq in numbers] == flags
+    assert (parser.counts.lost, parser.counts.repeated, parser.counts.restarts) == counts
+    parser.reset()
+    assert parser.sequence_flags(100) == ()

@@ -125,8 +125,10 @@ def test_overlong_piece_is_counted_once_and_the_next_frame_is_found(size, step):
     data = b"\x01" * size + b"\0"  # valid stuffing of zeros, so that only the length is wrong
     parser = BinaryParser()
     frame = Frame(7, 8, (9.0,))
+    parser.sequence_flags(5)
     for start in range(0, len(data), step):
         assert parser.feed(data[start : start + step]) == []
     counts = parser.counts
     assert (counts.malformed, counts.crc_errors, counts.bytes_dropped) == (1, 0, len(data))
     assert parser.feed(encode_frame(frame)) == [frame]
+    assert parser.sequence_flags(7) == ("gap",)  # the piece was frame 6

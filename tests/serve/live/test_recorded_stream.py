@@ -191,6 +191,7 @@ def test_recording_that_begins_later_restarts_the_stream(film, predictor, tmp_pa
     assert len(lines) > 20
     # The totals continue in spite of the restart. The restart and the outage each cut one of the 80 frames in two.
     assert stream.totals().frames == 80 - 2
+    assert stream.totals().reconnects == 1
 
     markers = []
     new_stream = TouchStream(predictor, device)

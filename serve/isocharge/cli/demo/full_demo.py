@@ -18,7 +18,7 @@ from isocharge.common.files import new_folder
 from isocharge.common.progress import track
 from isocharge.serve import Port, Predictor, TouchStream, find_model, load_model
 from isocharge.serve.benchmark import in_process_contenders, press_charges, take_turns
-from isocharge.serve.live.stream import StreamTotals
+from isocharge.serve.frames.frame import FrameCounts
 from isocharge.simulate import Circle, Equilibrium, ForwardMap, Sweep, load_sensor, press, read_dataset
 from isocharge.simulate.dataset.sweep import solve_maps, write_sweep
 from isocharge.simulate.plots.figure import FELT, PRESSED, new_figure, save_picture
@@ -99,7 +99,7 @@ def _demo_step(name: str, description: str, durations_s: dict[str, float]) -> It
     durations_s[name] = time.perf_counter() - start_s
 
 
-def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, StreamTotals]:
+def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, FrameCounts]:
     """Play a virtual sensor, read its port, and print the estimated and the true contact at regular intervals.
 
     Args:

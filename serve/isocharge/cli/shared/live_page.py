@@ -5,6 +5,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlsplit
@@ -234,7 +235,7 @@ class PageFeed:
             return
         recorder = self._stream.recorder if self._stream else None
         self._page.update(
-            counters=self._touch.totals()._asdict(),
+            counters=asdict(self._touch.totals()),
             rate_Hz=self._page.tape.rate_Hz(),
             model=record.model,
             film=None if record.film is None else structs.asdict(record.film),

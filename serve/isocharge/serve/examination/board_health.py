@@ -152,8 +152,8 @@ def transmission_sentences(capture: Capture, url: str) -> Iterator[str]:
                 "value; if the line is damaged"
             )
         yield f"{damaged}: {advice}"
-    if capture.gaps.lost:
-        yield f"{capture.gaps.lost} frames were lost: send fewer frames per second, or use a faster link"
+    if capture.parser.counts.lost:
+        yield f"{capture.parser.counts.lost} frames were lost: send fewer frames per second, or use a faster link"
 
 
 def channel_count_sentences(

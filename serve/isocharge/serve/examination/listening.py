@@ -11,7 +11,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PortLost
 from isocharge.serve.frames.device_clock import DeviceClock
-from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
+from isocharge.serve.frames.frame import Frame, Parser
 from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.port.serial_line import UDP_SCHEME, Request
 from isocharge.serve.port.source import Port, has_speed
@@ -146,14 +146,12 @@ class Capture:
         parser: The parser, with its counters.
         frames: Good frames.
         times_s: Time of each frame, s, by the clock of the device if the frames contain a time.
-        gaps: Counters of the frame numbers.
         bytes_seen: Number of bytes that were received.
     """
 
     parser: Parser
     frames: list[Frame] = field(default_factory=list)
     times_s: list[float] = field(default_factory=list)
-    gaps: SequenceGaps = field(default_factory=SequenceGaps)
     bytes_seen: int = 0
 
     @property
@@ -210,5 +208,5 @@ def read_frames(received: ReceivedData, device: Device) -> Capture:
         capture.frames += frames
         capture.times_s += [frame.clock_s for frame in frames]
         for frame in frames:
-            capture.gaps.update(frame.seq, capture.parser.seq_modulus)
+            capture.parser.sequence_flags(frame.seq)
     return capture

@@ -224,8 +224,8 @@ def examine_received(
     is_numbered = first_frame.seq is not None
     return replace(
         examination,
-        lost=capture.gaps.lost if is_numbered else None,
-        repeated=capture.gaps.repeated if is_numbered else None,
+        lost=counts.lost if is_numbered else None,
+        repeated=counts.repeated if is_numbered else None,
         device_clock=first_frame.t_us is not None,
         unit=unit,
         channels=channels,

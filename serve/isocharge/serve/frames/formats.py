@@ -58,6 +58,7 @@ class AutoParser(Parser):
 
         A format that was recognised stays recognised.
         """
+        super().reset()
         for candidate in self._candidates:
             candidate.reset()
 

@@ -8,7 +8,8 @@ it never finds a frame.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
+from operator import add
 from typing import Any, TypeVar
 
 from isocharge.common.arrays import Array
@@ -40,59 +41,6 @@ OTHER_CHARGE_UNITS = ("fC", "nC", "µC", "μC", "uC", "C", "V", "mV")
 
 Raw = TypeVar("Raw")
 """Type of the data from which a frame is decoded: bytes, or the numbers of a row."""
-
-
-class SequenceGaps:
-    """Detector of missing frames, repeated frames and restarts of the board. It compares successive frame counters.
-
-    Attributes:
-        lost: Number of frames that are missing between received frames.
-        repeated: Number of frames with the same counter as the previous frame.
-        restarts: Number of times that the counter decreased without a wrap, for example after a reset of the device.
-            Frames that were lost during a restart are not counted.
-    """
-
-    def __init__(self) -> None:
-        """Begin without a frame."""
-        self.lost = 0
-        self.repeated = 0
-        self.restarts = 0
-        self._last_seq: int | None = None
-
-    def reset(self) -> None:
-        """Treat the next frame as the first frame of a new connection, so that no gap is counted before this frame.
-
-        The counts of lost frames, repeated frames and restarts are not reset.
-        """
-        self._last_seq = None
-
-    def update(self, seq: int | None, modulus: int = SEQ_MODULUS) -> tuple[str, ...]:
-        """Compare the counter of the next frame with the counter of the previous frame, and update the counts.
-
-        Args:
-            seq: Counter of the next frame; None if the format has no counter.
-            modulus: Value at which the counter wraps to 0.
-
-        Returns:
-            Flags of the frame: empty, or one of `gap`, `repeat` and `restart` (see `isocharge.serve.flags`).
-        """
-        if seq is None:
-            return ()
-        last_seq = self._last_seq
-        self._last_seq = seq
-        if last_seq is None:  # this is the first frame of a connection
-            return ()
-        increase = (seq - last_seq) % modulus  # from 0 to modulus - 1, also if the counter has wrapped
-        if increase == 1:
-            return ()
-        if increase == 0:
-            self.repeated += 1
-            return (REPEAT,)
-        if increase >= modulus // 2:  # modulo `modulus`, a decrease is the same as a large increase
-            self.restarts += 1
-            return (RESTART,)
-        self.lost += increase - 1
-        return (GAP,)
 
 
 @dataclass(slots=True)
@@ -175,15 +123,28 @@ class FrameCounts:
 
     Attributes:
         frames: Number of intact frames.
+        lost: Number of frames that are missing between received frames.
+        repeated: Number of frames with the same counter as the previous frame.
+        restarts: Number of times that the counter decreased without a wrap, for example after a reset of the device.
+            Frames that were lost during a restart are not counted.
         crc_errors: Number of pieces with a wrong checksum.
         malformed: Number of pieces that were rejected for another reason, such as a wrong length.
         bytes_dropped: Number of bytes in the rejected pieces, including their delimiters.
+        reconnects: Number of outages of the port after which the stream has continued.
     """
 
     frames: int = 0
+    lost: int = 0
+    repeated: int = 0
+    restarts: int = 0
     crc_errors: int = 0
     malformed: int = 0
     bytes_dropped: int = 0
+    reconnects: int = 0
+
+    def __add__(self, other: "FrameCounts") -> "FrameCounts":
+        """Return the sum of each counter."""
+        return FrameCounts(*map(add, astuple(self), astuple(other)))
 
     def count_rejected(self, size: int, *, wrong_checksum: bool = False) -> None:
         """Count bytes that the parser expected to be one frame, but has rejected.
@@ -290,15 +251,51 @@ class Parser(ABC):
         self.counts = FrameCounts()
         self.unread_line = ""
         self._tail = b""  # bytes of an unfinished frame
+        self._previous_seq: int | None = None  # counter of the latest frame of the connection
 
     @abstractmethod
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`. Bytes of an unfinished frame are stored for the next call."""
 
     def reset(self) -> None:
-        """Drop the stored bytes of an unfinished frame, because the next bytes come from another connection."""
+        """Drop the bytes of an unfinished frame, because the next bytes come from another connection.
+
+        No frame is counted as lost before the first frame of the next connection.
+        """
+        self._drop_tail()
+        self._previous_seq = None
+
+    def _drop_tail(self) -> None:
+        """Drop the stored bytes of an unfinished frame."""
         self.counts.bytes_dropped += len(self._tail)
         self._tail = b""
+
+    def sequence_flags(self, seq: int | None) -> tuple[str, ...]:
+        """Compare the counter of the next frame with the counter of the previous frame, and update the counts.
+
+        Args:
+            seq: Counter of the next frame; None if the format has no counter.
+
+        Returns:
+            Flags of the frame: empty, or one of `gap`, `repeat` and `restart` (see `isocharge.serve.flags`).
+        """
+        if seq is None:
+            return ()
+        previous_seq = self._previous_seq
+        self._previous_seq = seq
+        if previous_seq is None:  # this is the first frame of a connection
+            return ()
+        increase = (seq - previous_seq) % self.seq_modulus  # from 0, also if the counter has wrapped
+        if increase == 1:
+            return ()
+        if increase == 0:
+            self.counts.repeated += 1
+            return (REPEAT,)
+        if increase >= self.seq_modulus // 2:  # modulo `seq_modulus`, a decrease is the same as a large increase
+            self.counts.restarts += 1
+            return (RESTART,)
+        self.counts.lost += increase - 1
+        return (GAP,)
 
     def _try_decode(self, decode: Callable[[Raw], Frame], raw: Raw, dropped_size: int) -> list[Frame]:
         """Try to decode one frame, and count either an intact frame or rejected bytes.
@@ -360,7 +357,7 @@ class DelimitedParser(Parser):
         self._tail = tail
         if self._beginning_was_dropped or len(tail) > self._max_length:
             self._beginning_was_dropped = True
-            super().reset()  # drops the tail; `self.reset` would also set `_beginning_was_dropped` to False
+            self._drop_tail()
         return frames
 
     def reset(self) -> None:

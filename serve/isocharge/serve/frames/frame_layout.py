@@ -399,5 +399,5 @@ class DatagramParser(SyncParser):
             self.counts.count_rejected(len(data))
             return []
         frames = super().feed(data)
-        self.reset()
+        self._drop_tail()
         return frames

@@ -8,13 +8,12 @@ on a model of the film, unless warming is estimated.
 import math
 import time
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, NoFramesError, shown
 from isocharge.serve.flags import RECONNECTED, in_order
 from isocharge.serve.frames.device_clock import DeviceClock
-from isocharge.serve.frames.frame import Frame, SequenceGaps
+from isocharge.serve.frames.frame import Frame, FrameCounts
 from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
@@ -22,23 +21,6 @@ from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, 
 from isocharge.serve.signal_chain.stage import Device, Setup, Stage
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule
-
-
-class StreamTotals(NamedTuple):
-    """Counts of a stream since it began, including the counts before its latest restart.
-
-    The classes `FrameCounts` and `SequenceGaps` describe the meaning of each count except `reconnects`, which is the
-    number of outages of the port after which the stream has continued.
-    """
-
-    frames: int = 0
-    lost: int = 0
-    repeated: int = 0
-    restarts: int = 0
-    crc_errors: int = 0
-    malformed: int = 0
-    bytes_dropped: int = 0
-    reconnects: int = 0
 
 
 def stream(chunks: Iterable[Chunk], predictor: Predictor, device: Device = ANY_BOARD) -> Iterator[PredictionRecord]:
@@ -69,7 +51,6 @@ class ReadingStream:
 
     Attributes:
         parser: Parser that finds the frames in the bytes and counts them.
-        gaps: Counter of missing frame numbers.
         clock: Clock of the device.
     """
 
@@ -98,16 +79,14 @@ class ReadingStream:
         self._setup = Setup(electrodes, device, predictor, reader)
         has_film = predictor is None or "film" in predictor.metadata.sensor  # false for a model of presses alone
         self._setup.has_any_sign |= has_any_sign or not has_film
-        self._before_restart = StreamTotals()  # counts of the time before the latest `restart`
+        self._before_restart = FrameCounts()  # counts of the time before the latest `restart`
         self._begin()
 
     def _begin(self) -> None:
         """Begin without any byte."""
         self.parser = self._device.parser()
-        self.gaps = SequenceGaps()
         self.clock = DeviceClock()
         self._charge_stages: list[Stage] = create_stages(self._setup)
-        self._reconnects = 0
         self._pending_flags: list[str] = []  # flags that the next frame gets
 
     def tare(self) -> None:
@@ -123,20 +102,9 @@ class ReadingStream:
         self._before_restart = self.totals()  # `totals` adds these counts to the counts of the new parser
         self._begin()
 
-    def totals(self) -> StreamTotals:
+    def totals(self) -> FrameCounts:
         """Return the counts of the stream since it began, including the counts before its latest restart."""
-        counts = self.parser.counts
-        since_restart = StreamTotals(
-            frames=counts.frames,
-            lost=self.gaps.lost,
-            repeated=self.gaps.repeated,
-            restarts=self.gaps.restarts,
-            crc_errors=counts.crc_errors,
-            malformed=counts.malformed,
-            bytes_dropped=counts.bytes_dropped,
-            reconnects=self._reconnects,
-        )
-        return StreamTotals(*map(sum, zip(self._before_restart, since_restart, strict=True)))
+        return self._before_restart + self.parser.counts
 
     def frames(self, chunk: Chunk) -> Iterator[Frame]:
         """Process a chunk, and yield each frame whose last byte is in the chunk, with its touch charges.
@@ -155,7 +123,7 @@ class ReadingStream:
         self._check_recognised()
         self.clock.stamp(chunk, frames, parser.t_us_modulus)
         for frame in frames:
-            frame.flags = [*self._pending_flags, *self.gaps.update(frame.seq, parser.seq_modulus)]
+            frame.flags = [*self._pending_flags, *parser.sequence_flags(frame.seq)]
             self._pending_flags = []
             for stage in self._charge_stages:
                 stage.step(frame)
@@ -185,14 +153,13 @@ class ReadingStream:
         )
 
     def _reconnect(self) -> None:
-        """Discard the state of the parser, the gap counter, the clock and the tare after an outage of the port.
+        """Discard the state of the parser, the clock and the tare after an outage of the port.
 
         The state before the outage is no longer valid, because frames are missing and the film may have been touched
         during the outage. The next frame gets the flag `reconnected`.
         """
-        self._reconnects += 1
+        self.parser.counts.reconnects += 1
         self.parser.reset()
-        self.gaps.reset()
         self.clock.reset()
         self.tare()
         self._pending_flags = [RECONNECTED]
