@@ -228,8 +228,10 @@ def _describe_mistake(content: object, target_type: Any, error: msgspec.Validati
         if name:
             expected_type = _key_types(value, members)[name]
         elif index.isdigit():
-            (expected_type,) = (get_args(member)[0] for member in members if get_origin(member) in (list, tuple))
-            key = int(index)  # all items of a list have the same type
+            (item_types,) = (get_args(member) for member in members if get_origin(member) in (list, tuple))
+            is_uniform = len(item_types) == 1 or Ellipsis in item_types
+            key = int(index)
+            expected_type = item_types[0 if is_uniform else key]
         else:
             (expected_type,) = (get_args(member)[1] for member in members if get_origin(member) is dict)
             key = next(key for key, item in value.items() if not _has_type(item, expected_type))
