@@ -17,7 +17,7 @@ module `measuring_chain.noise` describes this noise.
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
@@ -114,31 +114,9 @@ class Amplifier:
         Returns:
             The measurement, with the drawn properties of each channel.
         """
-        # Do not change the order of the statements, because it determines which random numbers each property gets.
-        leak_time = self.tau * (1.0 + self.tau_mismatch * rng.standard_normal(electrodes))
-        gain = 1.0 + self.gain_mismatch * rng.standard_normal(electrodes)
-        bias = self.bias * rng.choice([-1.0, 1.0], electrodes)
-        offset = self.offset * rng.standard_normal(electrodes)
-        hum_phase = rng.uniform(0.0, 2.0 * np.pi, electrodes)
-
-        # Without a mismatch of the pyroelectric charges, no random numbers are drawn for them.
-        pyro_charge_per_K = np.full(electrodes, self.pyro)
-        if self.pyro_mismatch:
-            pyro_charge_per_K = self.pyro * (1.0 + self.pyro_mismatch * rng.standard_normal(electrodes))
-        return Measurement(
-            amplifier=self,
-            rate=rate,
-            rng=rng,
-            leak_time=leak_time,
-            gain=gain,
-            bias=bias,
-            offset=offset,
-            hum_phase=hum_phase,
-            pyro_charge_per_K=pyro_charge_per_K,
-        )
+        return Measurement(self, electrodes, rate, rng)
 
 
-@dataclass
 class Measurement:
     """Running measurement that converts successive blocks of touch charges into readings.
 
@@ -154,30 +132,30 @@ class Measurement:
         pyro_charge_per_K: Pyroelectric charge of each electrode per temperature change, shape (electrodes,), pC/K.
     """
 
-    amplifier: Amplifier
-    rate: float
-    rng: np.random.Generator
-    leak_time: Array
-    gain: Array
-    bias: Array
-    offset: Array
-    hum_phase: Array
-    pyro_charge_per_K: Array
-    _readings: int = 0
-    _film_charge: Array = field(init=False)
-    _output: Array = field(init=False)
-    _air_temperature: float = field(init=False)
-    _film_temperature: float = field(init=False)
+    def __init__(self, amplifier: Amplifier, electrodes: int, rate: float, rng: np.random.Generator) -> None:
+        """Draw the properties and the initial temperatures, and set all charges to their stationary values."""
+        self.amplifier = amplifier
+        self.rate = rate
+        self.rng = rng
+        self._readings = 0
 
-    def __post_init__(self) -> None:
-        """Draw the initial temperatures, and set all charges to their stationary values at these temperatures."""
-        amplifier = self.amplifier
+        # Do not change the order of the statements, because it determines which random numbers each property gets.
+        self.leak_time = amplifier.tau * (1.0 + amplifier.tau_mismatch * rng.standard_normal(electrodes))
+        self.gain = 1.0 + amplifier.gain_mismatch * rng.standard_normal(electrodes)
+        self.bias = amplifier.bias * rng.choice([-1.0, 1.0], electrodes)
+        self.offset = amplifier.offset * rng.standard_normal(electrodes)
+        self.hum_phase = rng.uniform(0.0, 2.0 * np.pi, electrodes)
+
+        # Without a mismatch of the pyroelectric charges, no random numbers are drawn for them.
+        self.pyro_charge_per_K = np.full(electrodes, amplifier.pyro)
+        if amplifier.pyro_mismatch:
+            self.pyro_charge_per_K *= 1.0 + amplifier.pyro_mismatch * rng.standard_normal(electrodes)
 
         # Draw correlated temperatures of the air and the film. The film follows the air as a low-pass filter, so the
         # standard deviation of the film is smaller than that of the air. The ratio of both standard deviations is also
         # the correlation of both temperatures. The film must have the standard deviation `temperature_rms`, so the air
         # has the standard deviation `temperature_rms / correlation`.
-        common_draw, independent_draw = amplifier.temperature_rms * self.rng.standard_normal(2)
+        common_draw, independent_draw = amplifier.temperature_rms * rng.standard_normal(2)
         variance_ratio = self._variance_ratio  # variance of the film divided by the variance of the air
         correlation = math.sqrt(variance_ratio)
         self._air_temperature = common_draw / correlation
@@ -189,10 +167,9 @@ class Measurement:
         # The stationary output satisfies output = decay * output + bias / rate for each channel. Without a leak, there
         # is no stationary output, and the output starts at zero.
         self._output = np.zeros_like(self.gain)
-        has_leak = math.isfinite(amplifier.tau)
-        if has_leak:
-            decay = np.exp(-1.0 / (self.rate * self.leak_time))  # factor of the output from one reading to the next
-            self._output = self.bias / (1.0 - decay) / self.rate
+        if math.isfinite(amplifier.tau):
+            decay = np.exp(-1.0 / (rate * self.leak_time))  # factor of the output from one reading to the next
+            self._output = self.bias / (1.0 - decay) / rate
 
     def __call__(self, charge: Array) -> Array:
         """Simulate the readings of the next block of touch charges.

@@ -155,18 +155,14 @@ def subdivide(quadrilateral: Array, max_side: float) -> list[Array]:
     s = np.linspace(0.0, 1.0, n_s + 1)
     t = np.linspace(0.0, 1.0, n_t + 1)
     grid = bilinear(quadrilateral, s[:, None, None], t[:, None])  # shape (n_s + 1, n_t + 1, 2)
+    corner_grids = [grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]]
     cells = []
-    for i in range(n_s):
-        for j in range(n_t):
-            corners = np.array([grid[i, j], grid[i + 1, j], grid[i + 1, j + 1], grid[i, j + 1]])
-
-            # Omit corners that coincide with the previous corner. Omit cells with fewer than three distinct corners,
-            # because their area is zero.
-            previous_corners = np.roll(corners, 1, axis=0)
-            is_distinct = np.linalg.norm(corners - previous_corners, axis=1) > MERGE_DISTANCE
-            has_area = np.count_nonzero(is_distinct) > 2
-            if has_area:
-                cells.append(corners[is_distinct])
+    for corners in np.stack(corner_grids, axis=2).reshape(-1, 4, 2):
+        # Omit corners that coincide with the previous corner. Omit cells with fewer than three distinct corners,
+        # because their area is zero.
+        is_distinct = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) > MERGE_DISTANCE
+        if np.count_nonzero(is_distinct) > 2:
+            cells.append(corners[is_distinct])
     return cells
 
 
