@@ -459,7 +459,7 @@ def check_polygon(where: str, polygon: Corners) -> None:
             that is not finite.
     """
     corners = np.array(polygon)
-    if corners.ndim != 2 or not 3 <= len(corners) <= MAX_CORNERS or corners.shape[1] != 2:
+    if corners.shape[1:] != (2,) or not 3 <= len(corners) <= MAX_CORNERS:
         raise SensorError(f"{where}: expected 3 to {MAX_CORNERS} corners (x, y), got {shown(corners.tolist())}")
 
     # A convex polygon does not cross itself. This case is tested first, because the test is faster and most polygons

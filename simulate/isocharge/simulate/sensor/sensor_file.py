@@ -269,12 +269,10 @@ def film_to_dict(film: Film) -> dict[str, Any]:
         elif value is not None:
             table[number.key] = tidy(value * number.factor)
 
-    # The pretension is always written, and the expansion of the ring for a film that expands.
-    always = {"pretension_MPa"} if film.expansion is None else {"pretension_MPa", "ring_expansion_ppm_per_K"}
+    default_of_key = {field.name: field.default for field in msgspec.structs.fields(FilmTable)}
+    del default_of_key["pretension_MPa"]  # the pretension is always written
     return {
-        field.name: table[field.name]
-        for field in msgspec.structs.fields(FilmTable)
-        if field.name in table and (field.name in always or table[field.name] != field.default)
+        key: table[key] for key in FilmTable.__struct_fields__ if key in table and table[key] != default_of_key.get(key)
     }
 
 

@@ -25,12 +25,12 @@ class Polygon(Probe):
     Attributes:
         corners: Corners (x, y) before the rotation, anticlockwise, mm. They are stored relative to the centroid.
         angle: Rotation about the centroid, anticlockwise, rad.
-        name: Kind of polygon in the notation: "rectangle", "triangle" or "polygon".
+        shape: Notation of a rectangle or a triangle without its rotation; empty for another polygon.
     """
 
     corners: tuple[tuple[float, float], ...]
     angle: float = 0.0
-    name: str = "polygon"
+    shape: str = ""
 
     def __post_init__(self) -> None:
         """Check that the corners form a convex polygon, and shift them such that its centroid becomes the origin.
@@ -39,9 +39,7 @@ class Polygon(Probe):
             SceneError: If the corners do not form such a polygon, or if the polygon is too small.
         """
         corners = np.array(self.corners, dtype=float)
-        has_two_columns = corners.ndim == 2 and corners.shape[1:] == (2,)
-        is_list_of_points = has_two_columns and 3 <= len(corners) <= MAX_CORNERS and np.isfinite(corners).all()
-        if not is_list_of_points:
+        if corners.shape[1:] != (2,) or not (3 <= len(corners) <= MAX_CORNERS and np.isfinite(corners).all()):
             raise SceneError(f"probe: expected 3 to {MAX_CORNERS} corners (x, y), got {cut(str(self.corners))}")
         check_angle(self.angle)
         if not is_convex(corners):
@@ -55,18 +53,18 @@ class Polygon(Probe):
         check_length("probe reach", self.reach)
 
     @classmethod
-    def of(cls, corners: Array, angle: float = 0.0, name: str = "polygon") -> "Polygon":
+    def of(cls, corners: Array, angle: float = 0.0, shape: str = "") -> "Polygon":
         """Create a polygon from an array of corners.
 
         Args:
             corners: Corners (x, y) relative to any point, anticlockwise, shape (n, 2), mm.
             angle: Rotation about the centroid, anticlockwise, rad.
-            name: Kind of polygon in the notation: "rectangle", "triangle" or "polygon".
+            shape: Notation of a rectangle or a triangle without its rotation; empty for another polygon.
 
         Raises:
             SceneError: If the corners do not form a convex polygon, or if the polygon is too small.
         """
-        return cls(_as_tuples(corners), angle, name)
+        return cls(_as_tuples(corners), angle, shape)
 
     @classmethod
     def rectangle(cls, width: float, height: float, angle: float = 0.0) -> "Polygon":
@@ -81,7 +79,7 @@ class Polygon(Probe):
         check_length("probe height", height)
         x = 0.5 * width
         y = 0.5 * height
-        return cls(((x, y), (-x, y), (-x, -y), (x, -y)), angle, "rectangle")
+        return cls(((x, y), (-x, y), (-x, -y), (x, -y)), angle, f"rectangle:{tidy(width)}x{tidy(height)}")
 
     @classmethod
     def triangle(cls, side: float, angle: float = 0.0) -> "Polygon":
@@ -94,20 +92,13 @@ class Polygon(Probe):
         check_length("probe side", side)
         circumradius = side / np.sqrt(3.0)
         corner_angles = 0.5 * np.pi + 2.0 * np.pi / 3.0 * np.arange(3)
-        return cls.of(to_corners(np.exp(1j * corner_angles) * circumradius), angle, "triangle")
+        return cls.of(to_corners(np.exp(1j * corner_angles) * circumradius), angle, f"triangle:{tidy(side)}")
 
     @property
     def notation(self) -> str:
         """Notation of this probe without its rotation, which `parse_probe` converts back into the probe."""
-        corners = np.array(self.corners)
-        first_corner, second_corner, *_ = corners
-        if self.name == "rectangle":  # the first corner lies at (width / 2, height / 2)
-            half_width, half_height = first_corner
-            return f"rectangle:{tidy(2.0 * half_width)}x{tidy(2.0 * half_height)}"
-        if self.name == "triangle":
-            side = float(np.linalg.norm(second_corner - first_corner))
-            return f"triangle:{tidy(side)}"
-        return "polygon:" + ";".join(f"{tidy(x)},{tidy(y)}" for x, y in corners)
+        corners = ";".join(f"{tidy(x)},{tidy(y)}" for x, y in self.corners)
+        return self.shape or f"polygon:{corners}"
 
     @property
     def area(self) -> float:
