@@ -17,8 +17,8 @@ import pytest
 
 from isocharge.cli.demo.full_demo import run_demo
 from isocharge.cli.demo.live_film import played_radius_mm
-from isocharge.cli.shared.terminal import shown_progress
-from isocharge.common.progress import report
+from isocharge.cli.shared import terminal
+from isocharge.common.progress import report, track
 from isocharge.common.toml_text import to_toml
 from isocharge.serve import find_model, load_model
 from isocharge.simulate import load_sensor
@@ -115,7 +115,7 @@ def test_a_progress_bar_says_how_far_and_how_long(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     monkeypatch.setenv("COLUMNS", "160")
     monkeypatch.setenv("TERM", "xterm")
-    with shown_progress():
+    with terminal.shown_progress():
         for done in range(1, 4):
             report("solving", done, 3)
         for done in range(0, 60, 10):
@@ -124,6 +124,16 @@ def test_a_progress_bar_says_how_far_and_how_long(monkeypatch):
     shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", sys.stderr.getvalue())
     assert "solving" in shown
     assert re.search(r"pressing .*50/100 .*0:00:0.*slowly", shown)
+
+
+def test_a_long_computation_has_a_line_every_five_seconds(monkeypatch, capsys):
+    """Each step takes 3 s."""
+    now_s = [0.0]
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now_s[0])
+    with terminal.shown_progress():
+        for _ in track(range(7), "pressing"):
+            now_s[0] += 3.0
+    assert capsys.readouterr().err.splitlines() == ["pressing: 2 of 7", "pressing: 4 of 7", "pressing: 6 of 7"]
 
 
 def test_a_thick_film(command, tmp_path):

@@ -2,7 +2,8 @@
 
 The standard deviations of the model are 50 mm pC / (sum of the charges) for the position and 7e-4 N for the force. The
 contacts are moved by noise of this size, so that chi-squared, its distribution and each part of the errors are known.
-The chi-squared distribution is compared with SciPy.
+The chi-squared distribution is compared with SciPy. The guarantee of the factor for standard deviations is tested on
+presses whose errors do not follow the model.
 """
 
 import math
@@ -15,7 +16,13 @@ from scipy import stats
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, Predictor, check_presses
-from isocharge.serve.prediction.press_errors import binomial_distribution, chi_squared_survival, common_error
+from isocharge.serve.prediction.press_errors import (
+    REGION_QUANTILES,
+    StdFactor,
+    binomial_distribution,
+    chi_squared_survival,
+    common_error,
+)
 
 RIG_STD_MM = 0.05
 RIG_FORCE_STD = 0.004
@@ -204,3 +211,40 @@ def test_chi_squared_survival_is_near_scipy(degrees, tolerance):
 def test_binomial_distribution_is_that_of_scipy():
     expected = stats.binom.cdf(np.arange(2001), 2000, 0.01)
     np.testing.assert_allclose(binomial_distribution(2000, 0.01), expected, atol=1e-10)
+
+
+# Factor for standard deviations
+
+
+def draw(rng, count, scale, degrees_of_freedom):
+    """Return errors with heavy tails and stated standard deviations that are wrong by a factor, both (count, 3)."""
+    std = rng.uniform(0.5, 2.0, (count, 3))
+    return scale * std * rng.standard_t(degrees_of_freedom, (count, 3)), std
+
+
+def coverage(factor, error, std):
+    return np.mean(np.sum((error / (factor * std)) ** 2, axis=1) <= stats.chi2.ppf(0.95, 3))
+
+
+@pytest.mark.parametrize("count", [22, 30, 100])
+def test_regions_hold_for_at_least_ninety_percent_of_contacts_on_ninety_percent_of_films(count):
+    rng = np.random.default_rng(count)
+    holds = []
+    for _ in range(1000):
+        scale, degrees_of_freedom = rng.uniform(0.3, 4.0), rng.integers(3, 30)
+        factor = StdFactor.from_errors(*draw(rng, count, scale, degrees_of_freedom)).factor
+        holds.append(coverage(factor, *draw(rng, 2000, scale, degrees_of_freedom)) >= 0.9)
+    assert 0.88 < np.mean(holds) < 0.98
+
+
+def test_too_few_presses_have_no_guarantee():
+    assert StdFactor.from_errors(*draw(np.random.default_rng(0), 21, 1.0, 30)) is None
+    assert StdFactor.from_errors(np.full((30, 3), np.nan), np.ones((30, 3))) is None
+
+
+def test_unknown_values_do_not_count():
+    np.testing.assert_allclose(REGION_QUANTILES, stats.chi2.ppf(0.95, [1, 2, 3]), atol=1e-3)
+    error = np.full((30, 3), np.nan)
+    error[:, 2] = 2.0 * np.sqrt(REGION_QUANTILES[0])
+    assert StdFactor.from_errors(error, np.ones((30, 3))).factor == pytest.approx(2.0)
+    assert "multiply the standard deviations by 2; the 95 %" in StdFactor(2.0, 30).statement
