@@ -353,20 +353,19 @@ def _progress_bars() -> Iterator[Listener]:
         MofNCompleteColumn,
         Progress,
         TaskID,
-        TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
 
     columns = (
-        TextColumn("{task.description}", markup=False),
+        "{task.description}",
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
+        "{task.fields[note]}",
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+    with Progress(*columns, console=Console(stderr=True, markup=False, emoji=False), transient=True) as bars:
         bar_of_title: dict[str, TaskID] = {}
 
         def update_bar(title: str, done: int, total: int, note: str) -> None:

@@ -41,9 +41,6 @@ VALUE_COLUMNS = slice(0, 3)
 STD_COLUMNS = slice(3, 6)
 """Columns of the standard deviations of x, y and the force in an array of contacts."""
 
-MISFIT_COLUMN = Contacts._fields.index("misfit")
-"""Column of the misfit in an array of contacts."""
-
 
 @dataclass(frozen=True)
 class PressErrors:
@@ -145,7 +142,8 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     rig_std = np.column_stack([position_std_mm, position_std_mm, model_presses.force_std])
     is_unknown = np.isnan(measured)
     is_complete = np.asarray(np.isfinite(predicted[:, VALUE_COLUMNS]).all(axis=1))
-    flags = Validity.of(metadata).batch_flags(Contacts(*predicted.astype(np.float32).T))
+    contacts = Contacts(*predicted.astype(np.float32).T)
+    flags = Validity.of(metadata).batch_flags(contacts)
     return PressErrors(
         lines=model_presses.lines,
         row_noun=model_presses.row_noun,
@@ -154,7 +152,7 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
         noise_std=np.where(is_unknown, np.nan, predicted[:, STD_COLUMNS] / divisor),
         rig_std=np.where(is_unknown, np.nan, rig_std),
         flags=tuple(words if is_known else () for words, is_known in zip(flags, is_complete, strict=True)),
-        has_misfit=np.asarray(predicted[:, MISFIT_COLUMN] > misfit_limit(metadata)),
+        has_misfit=contacts.misfit > misfit_limit(metadata),
         exclusion_reasons=_exclusion_reasons(metadata, model_presses),
     )
 
