@@ -164,11 +164,8 @@ def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> 
     """
     if film.expansion is None:
         return np.zeros(3)
-    expansion_1, expansion_2 = film.expansion  # along the axes 1 and 2 of the film, 1/K
-    ring_strain = film.ring_expansion * ring_warming_K
-    strain_1 = ring_strain - expansion_1 * film_warming_K
-    strain_2 = ring_strain - expansion_2 * film_warming_K
-    elastic_strain = np.array([strain_1, strain_2, 0.0])
+    free_strain = np.array(film.expansion) * film_warming_K  # along the axes 1 and 2 of the film
+    elastic_strain = np.append(film.ring_expansion * ring_warming_K - free_strain, 0.0)
     change_in_film_axes = film.young * stress(elastic_strain, film.poisson, orthotropic_moduli(film))
     return rotate_stress(change_in_film_axes, film.axis)
 
@@ -191,14 +188,11 @@ def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -
     if film.expansion is None:
         return sensor
     change_11, change_22, change_12 = tension_change(film, film_warming_K, ring_warming_K).tolist()
-    mean_pretension = film.pretension + 0.5 * (change_11 + change_22)
-    if film.expands_evenly:  # only the mean of the pretension changes
-        return replace(sensor, film=replace(film, pretension=mean_pretension))
-
-    # The deviator of the pretension consists of half of the difference between the pretensions along x and y, and of
-    # the shear.
-    half_difference, shear = film.deviator
-    warm_half_difference = half_difference + 0.5 * (change_11 - change_22)
-    warm_shear = shear + change_12
-    deviator = (warm_half_difference, warm_shear)
-    return replace(sensor, film=replace(film, pretension=mean_pretension, deviator=deviator))
+    warm_film = replace(film, pretension=film.pretension + 0.5 * (change_11 + change_22))
+    if not film.expands_evenly:  # otherwise only the mean of the pretension changes
+        # The deviator of the pretension consists of half of the difference between the pretensions along x and y, and
+        # of the shear.
+        half_difference, shear = film.deviator
+        deviator = (half_difference + 0.5 * (change_11 - change_22), shear + change_12)
+        warm_film = replace(warm_film, deviator=deviator)
+    return replace(sensor, film=warm_film)

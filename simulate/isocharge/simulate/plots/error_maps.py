@@ -106,8 +106,7 @@ def error_maps_picture(design: Design) -> Figure:
     for axes, (sensor, errors) in zip(all_axes, layouts, strict=True):
         position_error = errors.with_nuisances  # shape (n_press,), mm
         coloured_area = _draw_errors(axes, sensor, errors.presses, position_error, norm)
-        worst_x, worst_y = errors.presses[np.argmax(position_error)]
-        axes.plot(worst_x, worst_y, "x", color=FELT, ms=9, mew=2)
+        axes.plot(*errors.presses[np.argmax(position_error)], "x", color=FELT, ms=9, mew=2)
         draw_working_area(axes, case.radius)
         rms = np.sqrt(np.mean(position_error**2))
         axes.set_title(f"{sensor.name}\nworst {position_error.max():.3g} mm (cross), rms {rms:.3g} mm")
@@ -159,13 +158,11 @@ def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
     # Compute the corners of the cells, shape (n_ring + 1, n_sector + 1). A cell is the part of a ring in one sector.
     n_sector = mirror.share.shape[1]
     edge_angle = 2.0 * np.pi * np.arange(n_sector + 1) / n_sector
-    corner_x = np.outer(mirror.edges, np.cos(edge_angle))
-    corner_y = np.outer(mirror.edges, np.sin(edge_angle))
-    shades = axes.pcolormesh(corner_x, corner_y, mirror.share, vmin=0.0, vmax=1.0, cmap="Reds")
+    corners = np.outer(mirror.edges, np.exp(1j * edge_angle))
+    shades = axes.pcolormesh(corners.real, corners.imag, mirror.share, vmin=0.0, vmax=1.0, cmap="Reds")
     figure.colorbar(shades, ax=axes, label="share of the forces that cannot be noticed", shrink=0.85)
 
-    film_radius = sensor.film.radius
-    draw_circle(axes, film_radius, color=INK, lw=2.0)
+    draw_circle(axes, sensor.film.radius, color=INK, lw=2.0)
     draw_circle(axes, mirror.inner, color=INK, ls="--", lw=1.6)
     draw_electrodes(axes, sensor)
     title = (

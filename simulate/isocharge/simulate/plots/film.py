@@ -72,9 +72,8 @@ def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> Non
     """
     # Find the distance of the outermost corner of an electrode from the centre of the film.
     polygons = [polygon for electrode in sensor.electrodes for polygon in electrode.front]
-    nominal_corners = np.concatenate(polygons)
-    corner_x, corner_y = sensor.calibration.place(nominal_corners).T  # calibrated positions
-    outermost = float(np.hypot(corner_x, corner_y).max())
+    calibrated_corners = sensor.calibration.place(np.concatenate(polygons))
+    outermost = float(np.linalg.norm(calibrated_corners, axis=1).max())
     margin_mm = 0.7
     half_width = max(radius, outermost) + margin_mm
     limits = (-half_width, half_width)
@@ -177,4 +176,5 @@ def _polar_grid(radius: float, rings: int, angles: int) -> tuple[Array, Array]:
     """
     distance = radius * np.sqrt(np.linspace(0.0, 1.0, rings))
     angle = np.linspace(0.0, 2.0 * np.pi, angles)
-    return np.outer(distance, np.cos(angle)), np.outer(distance, np.sin(angle))
+    points = np.outer(distance, np.exp(1j * angle))
+    return points.real, points.imag
