@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.path import Path
 
-from isocharge.simulate.numerics.polygon import area_of, to_corners
-from isocharge.simulate.numerics.polygon_union import is_simple, trace_outline, union_parts
+from isocharge.simulate.numerics.polygon import area_of, is_simple, to_corners, trace_outline, union_parts
 
 SQUARE = np.array([0, 4, 4 + 4j, 4j])
 SQUARE_WITH_HOLE = np.array([0, 4, 4 + 4j, 4j, 0, 1 + 1j, 1 + 3j, 3 + 3j, 3 + 1j, 1 + 1j])

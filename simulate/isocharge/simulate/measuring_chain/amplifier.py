@@ -395,11 +395,12 @@ def load_amplifier(level: str) -> Amplifier:
 
     # Remove the level and the parameters of the noise, because the remaining keys must be attributes of the amplifier.
     similar_amplifier = AMPLIFIER_LEVELS[changes.pop("like")]
-    white = changes.pop("white_pC", similar_amplifier.noise.white)
-    gain = changes.pop("proportional", similar_amplifier.noise.gain)
-    name = Path(level).stem
+    noise = NoiseModel(
+        Path(level).stem,
+        changes.pop("white_pC", similar_amplifier.noise.white),
+        changes.pop("proportional", similar_amplifier.noise.gain),
+    )
     with error_prefix(f"{level}: ", InputError):
-        noise = NoiseModel(name, white, gain)
         return replace(similar_amplifier, noise=noise, **changes)
 
 

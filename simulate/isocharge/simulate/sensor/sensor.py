@@ -16,8 +16,16 @@ import shapely
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SensorError, cut, shown
 from isocharge.common.printable_text import is_printable
-from isocharge.simulate.numerics.polygon import area_of, is_convex, to_complex, to_corners
-from isocharge.simulate.numerics.polygon_union import is_simple, subdivide, trace_outline, union_parts
+from isocharge.simulate.numerics.polygon import (
+    area_of,
+    is_convex,
+    is_simple,
+    subdivide,
+    to_complex,
+    to_corners,
+    trace_outline,
+    union_parts,
+)
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.size_check import check_range
 
@@ -315,10 +323,8 @@ class Sensor:
             _check_name(name)
         if not all(np.isfinite(gain) and gain > 0.0 for gain in gains.values()):
             raise SensorError(f"calibration gain: expected positive numbers, got {shown(gains)}")
-        if not abs(self.calibration.crosstalk) <= MAX_CROSSTALK:
-            raise SensorError(
-                f"calibration crosstalk: expected a share up to {MAX_CROSSTALK:g}, got {self.calibration.crosstalk}"
-            )
+        limits = (-MAX_CROSSTALK, MAX_CROSSTALK)
+        check_range("calibration crosstalk", self.calibration.crosstalk, limits, "", SensorError)
         if not set(gains) <= set(names):
             unknown = sorted(set(gains) - set(names))
             raise SensorError(f"calibration gain: no electrode named {shown(unknown)}, have {cut(str(names))}")
