@@ -22,7 +22,7 @@ from isocharge.simulate.numerics.polygon import to_complex
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
-from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
+from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress, touch_stress
 from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.press import press
 from isocharge.simulate.solver.sensitivity import change_by_node_shift
@@ -196,10 +196,10 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
         stress = stress_unit * rotate_stress(nodal_stress(equilibrium, surface), angle)
         return stress, equilibrium.mesh.points * np.exp(1j * angle)
 
-    def changed(column: str, change: float) -> tuple[Array, Complexes]:
-        """Return the stress and the nodes if the quantity of one column changes."""
+    def changed(column: str, change: float) -> Equilibrium:
+        """Return the equilibrium if the quantity of one column changes."""
         changes = dict.fromkeys(STEPS, 0.0) | {column: change}
-        changed_press = press(
+        return press(
             replace(film, pretension=film.pretension + changes["pretension"]),
             Circle(radius + changes["probe radius"]),
             (distance + changes["x"], changes["y"]),
@@ -207,17 +207,27 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
             settings,
             start=solved,
         )
-        return stress_of(changed_press)
 
     stress, _ = stress_of(solved)
+    points = film.radius * (1.0 - 1e-12) * mesh.points.ravel()  # on the film despite rounding errors
+    nodes = np.stack([points.real, points.imag], axis=1)
     columns = [stress]
     for column, relative_step in STEPS.items():
         step = relative_step if column in ("ln force", "pretension") else relative_step * radius
-        last_stress, last_points = changed(column, step)
+        last = changed(column, step)
         if column == "pretension":  # the pretension may be zero and must not become negative
+            last_stress, _ = stress_of(last)
             columns.append((last_stress - stress) / step)
             continue
-        first_stress, first_points = changed(column, -step)
+        first = changed(column, -step)
+        if (
+            column == "y"
+        ):  # the mesh turns by a large angle if the press is near the centre, but the nodes must not move
+            difference = touch_stress(last, nodes, surface) - touch_stress(first, nodes, surface)
+            columns.append(difference.reshape(stress.shape) / (2.0 * step))
+            continue
+        last_stress, last_points = stress_of(last)
+        first_stress, first_points = stress_of(first)
         # The nodes move with the press. Subtract the change of the stress that their movement causes.
         change = last_stress - first_stress - change_by_node_shift(mesh, stress, last_points - first_points)
         columns.append(change / (2.0 * step))
