@@ -31,7 +31,6 @@ def report(dataset, tmp_path_factory):
     folder = tmp_path_factory.mktemp("report") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(benchmark, "ROUNDS", 2)
-        patch.setattr(benchmark, "MIN_CALLS", 1)
         record = write_report(folder, [(dataset, find_model(NAME))], SMALL)
     return folder, record, (folder / "report.md").read_text("utf-8")
 
