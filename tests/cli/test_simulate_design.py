@@ -20,7 +20,7 @@ def _rough(monkeypatch):
     """The search is coarse and does not search for folds, because the complete search takes half a minute."""
     monkeypatch.setattr(case_module, "FINE_PRESSES", 450)
     monkeypatch.setattr(case_module, "SEARCH_PRESSES", 50)
-    monkeypatch.setattr(design_module, "STARTS", 2)
+    monkeypatch.setattr(design_module, "STARTS", 1)
     monkeypatch.setattr(stress_fields, "NODE_COUNT", NodeCount(distances=2, forces=1))
     monkeypatch.setattr(design_module, "describe_ambiguities", lambda *_: design_module.UNAMBIGUOUS)
 
