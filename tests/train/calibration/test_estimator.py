@@ -164,6 +164,7 @@ def test_noise_is_estimated_and_noisy_presses_are_not_bad(problem, synthetic, ga
         assert not found.is_bad.any()
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("ratio", [3.0, 8.0])
 def test_positions_worse_than_stated_are_not_taken_for_noise(problem, synthetic, ratio):
     for seed in range(3):
