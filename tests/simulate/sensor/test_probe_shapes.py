@@ -70,6 +70,7 @@ def grid_in(probe: Probe, count: int = 801) -> np.ndarray:
     line = 1.01 * probe.reach * np.linspace(-1.0, 1.0, count)
     points = (line[:, None] + 1j * line).ravel()
     footprint = shapely.Polygon(to_corners(boundary_points(probe, 4000)))
+    shapely.prepare(footprint)  # old versions of shapely are very slow otherwise
     return points[shapely.contains_xy(footprint, points.real, points.imag)]
 
 
