@@ -37,7 +37,7 @@ The stress has a kink at the edge of the footprint. Even if this edge crosses an
 charge is only 1e-5.
 """
 
-GAUSS_RULES = ((1.4, 12), (2.5, 4), (np.inf, 3))
+GAUSS_RULES = ((1.4, 12), (np.inf, 4))
 """Integration rules of electrodes for many presses, in ascending order of the relative distance from the press.
 
 Each rule consists of the relative distance below which it is used, and of the number of Gauss points per side of the
