@@ -278,8 +278,8 @@ def _has_type(value: object, expected_type: Any) -> bool:
 def _key_types(table: Mapping[str, Any], members: Iterable[Any]) -> dict[str, Any]:
     """Return the types of the keys that a table may have.
 
-    A struct is a class that declares the keys of a table. If a table may belong to one of several structs, one of its
-    keys selects the struct, and the value of this key is the tag.
+    A struct is a class that declares the keys of a table. If several structs are possible, the table has a key that
+    states which of them applies. The value of this key is called the tag.
 
     Args:
         table: Table from TOML or JSON.

@@ -43,7 +43,7 @@ CHUNK_SIZE = 4096
 class Series:
     """Sum of products of Chebyshev polynomials in three coordinates: x, y and the logarithm of the force.
 
-    Each coordinate is scaled to the range from -1 to 1. The sum has one value for each electrode. Products whose total
+    Each coordinate is scaled to the range from -1 to 1. Each electrode has its own coefficients. Products whose total
     degree in x and y exceeds `degree` are omitted.
 
     Attributes:

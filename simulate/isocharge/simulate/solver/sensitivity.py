@@ -193,7 +193,7 @@ SIDE_FORCE_IS_ODD = np.array([field.odd for field in SIDE_FORCE_FIELDS])
 def stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: Surface = "middle") -> Array:
     """Compute how the scaled stress at the nodes changes, for example by `FILM_FIELDS` or `SIDE_FORCE_FIELDS`.
 
-    The changes refer to fixed points of the film, after the press has been rotated onto the x axis. The unit of a
+    The press is rotated onto the x axis. The changes are those at fixed points of the rotated film. The unit of a
     tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is the amplitude of the press.
     The function `scaling.side_force_unit` returns the unit of a side force.
 

@@ -56,7 +56,7 @@ def terms(contact: Array, domain: Domain) -> Array:
 
 @cache
 def _degrees() -> Integers:
-    """Return the degrees in x, y and ln F of each term, shape (n_term, 3)."""
+    """Return the degrees of each term as a polynomial in x, y and ln F, shape (n_term, 3)."""
     all_degrees = np.indices((DEGREE + 1, DEGREE + 1, FORCE_DEGREE + 1)).reshape(3, -1).T
     return np.asarray(all_degrees[all_degrees.sum(axis=1) <= DEGREE])
 

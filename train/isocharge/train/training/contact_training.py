@@ -68,7 +68,7 @@ def fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor
 
 
 def contact_loss(posterior: Posterior, target: Tensor, error: Tensor) -> Tensor:
-    """Compute the loss of the contact perceptron: that of the mean plus that of the covariance.
+    """Compute the loss of the contact perceptron, which is the sum of the losses of its mean and of its covariance.
 
     The two losses have separate gradients. The first loss does not change the outputs for the covariance, and the
     second loss does not change the mean.
@@ -100,7 +100,7 @@ def mean_loss(posterior: Posterior, target: Tensor) -> Tensor:
 
 
 def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
-    """Compute the loss of the standard deviations plus that of the correlations of each press, shape (n,).
+    """Compute the sum of the losses of the standard deviations and of the correlations for each press, shape (n,).
 
     Both are negative logarithms of likelihoods, without constants. The standard deviations are fitted to the errors,
     and the correlations to the errors divided by the standard deviations. The likelihoods are Gaussian for errors up to
@@ -187,8 +187,8 @@ class LinearTargets:
         charge: Charges without noise, shape (n, n_electrode), pC.
         contact: Contacts in unit coordinates, shape (n, 3).
         noise_response: Matrices, shape (n, 3, n_electrode), 1/pC. The matrix of a press times the vector of its noise
-            is the change of its estimated contact.
-            The matrix is zero if the estimated contact of a press is not linear in the noise.
+            is the change of its estimated contact. The matrix is zero if the estimated contact of a press is not linear
+            in the noise.
         noise_factor: Factor by which the noise of each press is enlarged, shape (n, 1).
         noise: Noise of the charges.
     """
