@@ -42,7 +42,7 @@ def read(tmp_path):
     ids=["spreadsheet", "comments", "order and blanks", "quotes", "empty columns", "another column"],
 )
 def test_the_same_press_from_every_kind_of_file(read, text):
-    assert read(text) == read(f"{HEADER}\n1,2,0.5,10,20,30\n")
+    np.testing.assert_equal(read(text).columns, read(f"{HEADER}\n1,2,0.5,10,20,30\n").columns)
 
 
 def test_a_quoted_cell_may_hold_a_line_that_begins_with_a_hash(read):
@@ -205,8 +205,9 @@ def test_written_presses_are_read_back(suffix, presses, tmp_path_factory):
     """With the names of the electrodes, and with every other column as an electrode."""
     path = tmp_path_factory.getbasetemp() / f"written.{suffix}"
     write_presses(path, presses)
-    assert read_presses(path, presses.electrodes) == presses
-    assert read_presses(path) == presses
+    for read in (read_presses(path, presses.electrodes), read_presses(path)):
+        assert read.electrodes == presses.electrodes
+        np.testing.assert_equal(read.columns, presses.columns)
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])

@@ -66,7 +66,7 @@ def test_numbers_of_every_type_are_exact(write, column):
 
 def test_ignored_columns_may_have_any_type(write, expected):
     presses = read_presses(write({"more": pyarrow.array([{"A": 1, "B": None}, None, {}])}), NAMES)
-    assert presses == expected
+    np.testing.assert_equal(presses.columns, expected.columns)
     assert (presses.ignored, presses.lines, presses.row_noun) == (("more",), (1, 2, 3), "row")
 
 

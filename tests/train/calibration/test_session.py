@@ -68,7 +68,7 @@ def test_session_reports_its_errors_and_continues_with_saved_presses(problem, sy
     assert [presses.lines for presses in rig.saved] == [(1,), (1, 2), (1, 2, 3)]
     assert not session.enough
     continued = PressSession(problem, save=rig.saved.append, presses=rig.saved[2], until=10.0)
-    assert continued.presses == session.presses
+    np.testing.assert_equal(continued.presses.columns, session.presses.columns)
     assert continued.summary == session.summary
     assert continued.proposed == session.proposed
     assert continued.enough

@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.live_page import LiveOption
-from isocharge.cli.shared.options import ConfigOption
 from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError
 from isocharge.common.extras import require
@@ -41,7 +40,6 @@ def demo_command(
             "three-25um-biaxial)",
         ),
     ] = None,
-    config: ConfigOption = None,
     live: LiveOption = None,
     playground: Annotated[
         Path | None,
@@ -63,7 +61,7 @@ def demo_command(
     Example: isocharge demo -o first-light
     """
     if playground is not None:
-        other_options = (output, seconds, sensor, config, live)
+        other_options = (output, seconds, sensor, live)
         if any(option is not None for option in other_options):
             raise InputError("expected --playground without another option, got another option with it")
         _write_playground(playground)
@@ -73,7 +71,7 @@ def demo_command(
     if live is None:
         with require("train"):
             from isocharge.cli.demo.full_demo import run_demo
-        run_demo(output, seconds, config, sensor)
+        run_demo(output, seconds, sensor)
         return
     with require("simulate", "http"):
         from isocharge.cli.demo.live_film import show_live_film

@@ -16,9 +16,9 @@ from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.arrays import Array
 from isocharge.common.files import new_folder
 from isocharge.common.progress import track
-from isocharge.serve import Port, Predictor, TouchStream, find_model, load_model
-from isocharge.serve.benchmark import in_process_contenders, press_charges, take_turns
+from isocharge.serve import Port, Predictor, TouchStream
 from isocharge.serve.frames.frame import FrameCounts
+from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.simulate import Circle, Equilibrium, ForwardMap, Sweep, load_sensor, press, read_dataset
 from isocharge.simulate.dataset.sweep import solve_maps, write_sweep
 from isocharge.simulate.plots.figure import FELT, PRESSED, new_figure, save_picture
@@ -29,26 +29,21 @@ from isocharge.simulate.plots.film import (
     draw_layout,
     draw_section,
 )
-from isocharge.train import fit, load_config, release
+from isocharge.train import fit, release
 from isocharge.train.data.contact_errors import position_error
 
 LIVE_S = 10.0
 """Duration of the live part, s."""
 
-PRINT_INTERVAL_S = 0.5
-"""Time between two printed lines of the live part, s."""
 
-
-def run_demo(output: Path | None, seconds: float | None, config: Path | None, sensor_name: str | None = None) -> None:
+def run_demo(output: Path | None, seconds: float | None, sensor_name: str | None = None) -> None:
     """Run the demo, print a table of its results, and write the dataset, the model and a picture into a new folder.
 
     Args:
         output: The folder; None for demo-output.
         seconds: Duration of the live part, s; None for `LIVE_S`.
-        config: Training settings, TOML; None for those of the released models.
         sensor_name: Name of the simulated sensor and of the model that is trained; None for `DEFAULT_SENSOR`.
     """
-    settings = load_config(config) if config else None
     folder = output or Path("demo-output")
     sensor = load_sensor(sensor_name or DEFAULT_SENSOR)
     probe = Circle(1.0)
@@ -66,7 +61,7 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
                 f"{forward_map.error:.1e}"
             )
         with _demo_step("train", "a small network on noisy charges, exported to ONNX", durations_s):
-            model = release(fit(dataset, settings), draft / "models" / sensor.name, command=this_command())
+            model = release(fit(dataset), draft / "models" / sensor.name, command=this_command())
             predictor = Predictor(model.folder)
         with _demo_step(
             "serve",
@@ -79,7 +74,7 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
             equilibrium = press(sensor.film, probe, (3.0, -2.0), 1.0)  # a press inside every working area
             draw_page(forward_map, equilibrium, followed, draft / "demo.png")
     say(f"   {folder / 'demo.png'}")
-    show_result(_results(followed, durations_s, folder / "models" / sensor.name), json=False)
+    show_result(_results(predictor.metadata, followed, durations_s, folder), json=False)
 
 
 @contextmanager
@@ -100,7 +95,7 @@ def _demo_step(name: str, description: str, durations_s: dict[str, float]) -> It
 
 
 def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, FrameCounts]:
-    """Play a virtual sensor, read its port, and print the estimated and the true contact at regular intervals.
+    """Play a virtual sensor, and estimate its contacts from the frames at its port.
 
     Args:
         forward_map: Charges of the presses of the virtual sensor.
@@ -114,60 +109,39 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
     """
     touch = TouchStream(predictor)
     followed = []
-    say("   estimated: x mm, y mm, N   true: x mm, y mm, N")
     with virtual_sensor(forward_map, "reference", seed=0) as sensor, Port(sensor.url) as port:
         rate_Hz = sensor.script.rate_Hz
         frame_count = round(seconds * rate_Hz)
-        print_interval = round(PRINT_INTERVAL_S * rate_Hz)
         all_records = (record for chunk in port for record in touch.feed(chunk))
         records = islice(all_records, frame_count)
         script = np.column_stack([sensor.script.x_mm, sensor.script.y_mm, sensor.script.force_N])
-        for frame_number, record in enumerate(track(records, "following", frame_count), start=1):
+        for record in track(records, "following", frame_count):
             # The script that the virtual sensor repeats contains the true press of this frame.
             row = round(1e-6 * (record.t_device_us or 0) * rate_Hz) % len(script)
-            true_contact = script[row] if sensor.script.touching[row] else None
-            contact = np.array([record.x_mm, record.y_mm, record.force_N], float) if record.contact else None
-            if true_contact is not None and contact is not None:
-                followed.append((true_contact, contact))
-            if frame_number % print_interval == 0:
-                say(f"   {_contact_columns(contact)}     {_contact_columns(true_contact)}")
-    return np.array(followed), touch.totals()
+            if record.contact and sensor.script.touching[row]:
+                followed.append((script[row], (record.x_mm, record.y_mm, record.force_N)))
+    return np.array(followed, float), touch.totals()
 
 
-def _contact_columns(contact: Array | None) -> str:
-    """Format a contact (x, y, F), mm and N, for the table of the live part. If it is None, say that there is none."""
-    if contact is None:
-        return f"{'no contact':>22}"
-    x_mm, y_mm, force_N = contact
-    return f"{x_mm:7.2f} {y_mm:7.2f} {force_N:6.3f}"
-
-
-def _results(followed: Array, durations_s: dict[str, float], model_folder: Path) -> dict[str, Any]:
-    """Measure the latency of a prediction, and return the results of the demo, with units in their names.
+def _results(metadata: ModelMetadata, followed: Array, durations_s: dict[str, float], folder: Path) -> dict[str, Any]:
+    """Return the results of the demo, with units in their names.
 
     Args:
+        metadata: Metadata of the trained model.
         followed: True and estimated contacts of the live part, shape (n, 2, 3), mm and N.
         durations_s: Duration of each step by its name, s.
-        model_folder: Folder of the model, which is `models/NAME` in the folder of the results.
+        folder: Folder of the results.
     """
-    model = load_model(find_model(str(model_folder)))
-    predictor = Predictor(model.folder)
-    # The second kind of call is the prediction of a single press from a list of charges.
-    press_from_list = in_process_contenders(predictor, press_charges(predictor, model.golden.charge_pC))[1]
-    (latency,) = take_turns([press_from_list], seconds=0.5)
-
-    errors = model.metadata.errors
+    errors = metadata.errors
     live_errors_mm = position_error(followed[:, 1], followed[:, 0])
     live_median_mm, live_p95_mm = np.percentile(live_errors_mm, (50, 95))
     return {
-        "model": model.metadata.label,
-        "size_KiB": (model.folder / "model.onnx").stat().st_size / 1024,
+        "model": metadata.label,
         "position_error_mm": {"median": errors["position_median_mm"], "p95": errors["position_p95_mm"]},
         "live_position_error_mm": {"median": live_median_mm, "p95": live_p95_mm},
         "force_error_percent": {"median": errors["force_median_percent"], "rms": errors["force_rms_percent"]},
-        "prediction_us": {"p50": latency.p50_us, "p99": latency.p99_us},
         "step_s": durations_s,
-        "folder": str(model_folder.parent.parent),
+        "folder": str(folder),
     }
 
 

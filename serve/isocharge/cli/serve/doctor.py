@@ -74,9 +74,6 @@ def doctor_command(
             help=r"What the board has to be asked, as in '?\n' or '\x01\x04'. (default: nothing)",
         ),
     ] = None,
-    request_Hz: Annotated[
-        float, typer.Option("--request-hz", min=0.1, max=1e5, help="Rate of the requests, at most, Hz.")
-    ] = 100.0,
     check_wiring: Annotated[
         bool,
         typer.Option(
@@ -117,7 +114,7 @@ def doctor_command(
         device=load_device(device),
         electrodes=electrodes,
         gain=gain,
-        request=_parse_request(request, request_Hz),
+        request=_parse_request(request),
         wait=wait,
     )
     if not json:
@@ -217,13 +214,12 @@ def _parse_gain(text: str) -> Any:
         ) from error
 
 
-def _parse_request(text: str | None, rate_Hz: float) -> Request | None:
+def _parse_request(text: str | None) -> Request | None:
     r"""Convert the text of `--request` to the bytes that are sent to the board as a request for each frame.
 
     Args:
         text: Value of the option; None if the option is not given. Each escape sequence, such as `\n` or `\x01`, stands
             for one byte.
-        rate_Hz: Number of requests per second, Hz.
 
     Raises:
         InputError: If the text is empty, or an escape sequence is wrong.
@@ -235,7 +231,7 @@ def _parse_request(text: str | None, rate_Hz: float) -> Request | None:
         # sequences themselves. The last step refuses them, because they do not fit into one byte.
         data = text.encode("latin-1", "backslashreplace").decode("unicode_escape").encode("latin-1")
         if data:
-            return Request(data, rate_Hz)
+            return Request(data)
     except (UnicodeDecodeError, UnicodeEncodeError):
         pass
     raise InputError(rf"--request: expected a text like '?\n' or '\x01\x04', got {text!r}")

@@ -29,7 +29,6 @@ def recognised_frames(received: ReceivedData) -> dict[str, Any]:
         return {}
     if received.request is not None:
         frames["request"] = received.request.data.hex(" ").upper()  # bytes as hexadecimal numbers, such as "3F 0A"
-        frames["request_Hz"] = received.request.rate_Hz
     return frames
 
 

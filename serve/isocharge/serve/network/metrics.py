@@ -148,7 +148,7 @@ class Exchange(NamedTuple):
         status: HTTP status, or name of the gRPC status.
         model: Label `name/version` of the requested model, or None if no loaded model was requested.
         error: Name of the type of the error, or None if no error occurred.
-        ns: Time from the complete request to the complete response, ns; 0 if the time is unknown.
+        duration_us: Time from the complete request to the complete response, us; 0 if the time is unknown.
         bytes_in: Size of the body of the request, bytes.
         bytes_out: Size of the body of the response, bytes.
         client: Address and port of the client, or a text that contains both.
@@ -159,7 +159,7 @@ class Exchange(NamedTuple):
     status: int | str
     model: str | None
     error: str | None
-    ns: int
+    duration_us: float
     bytes_in: int
     bytes_out: int
     client: Client | str = None
@@ -185,14 +185,7 @@ class RequestLog(logging.Handler):
             "time": datetime.now(UTC),
             "level": "error" if is_internal_error else "info",
             "event": "request",
-            "transport": exchange.transport,
-            "route": exchange.route,
-            "status": exchange.status,
-            "model": exchange.model,
-            "error": exchange.error,
-            "duration_us": exchange.ns / 1000,
-            "bytes_in": exchange.bytes_in,
-            "bytes_out": exchange.bytes_out,
+            **exchange._asdict(),
             "client": "%s:%d" % client if isinstance(client, tuple) else client,  # noqa: UP031 - twice as fast
         }
         self._write(orjson.dumps(line).decode())

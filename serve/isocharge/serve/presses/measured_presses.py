@@ -64,9 +64,6 @@ MAX_ELECTRODES = MAX_COLUMNS - len(PRESS_RULES)
 class MeasuredPresses:
     """Charges, positions and forces of n measured presses.
 
-    Two objects are equal if their values and the names of their electrodes are equal. The attribute `lines` is not
-    compared.
-
     Attributes:
         contact: Position and force (x_mm, y_mm, force_N) of each press, shape (n, 3); NaN if unknown. Either both x and
             y are known, or neither.
@@ -121,17 +118,6 @@ class MeasuredPresses:
     def placed(self) -> Booleans:
         """Mask of the presses whose position and force are both known, shape (n,)."""
         return np.asarray(np.isfinite(self.contact).all(axis=1))
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether the values and the names of the columns are equal. The numbers of the lines are ignored."""
-        if not isinstance(other, MeasuredPresses):
-            return NotImplemented
-        own_columns = self.columns
-        other_columns = other.columns
-        have_same_names = list(own_columns) == list(other_columns)
-        return have_same_names and all(
-            np.array_equal(column, other_columns[name], equal_nan=True) for name, column in own_columns.items()
-        )
 
     def of_electrodes(self, electrodes: Sequence[str], owner: str) -> "MeasuredPresses":
         """Return the same presses with only the charges of the given electrodes, in the given order.

@@ -132,7 +132,7 @@ class Service:
                     status=status,
                     model=call.model,
                     error=error_type,
-                    ns=time.perf_counter_ns() - start_ns,
+                    duration_us=(time.perf_counter_ns() - start_ns) / 1000,
                     bytes_in=call.bytes_in,
                     bytes_out=call.bytes_out,
                     client=context.peer() if self._traffic.log else None,  # only the log needs the client

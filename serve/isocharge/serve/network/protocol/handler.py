@@ -114,7 +114,7 @@ class Handler:
                 status=response.status,
                 model=self.store.label(model, version),
                 error=response.error,
-                ns=time.perf_counter_ns() - start_ns,
+                duration_us=(time.perf_counter_ns() - start_ns) / 1000,
                 bytes_in=len(body),
                 bytes_out=len(response.body),
                 client=client,
