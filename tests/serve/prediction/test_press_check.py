@@ -16,13 +16,8 @@ from scipy import stats
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, Predictor, check_presses
-from isocharge.serve.prediction.press_errors import (
-    REGION_QUANTILES,
-    StdFactor,
-    binomial_distribution,
-    chi_squared_survival,
-    common_error,
-)
+from isocharge.serve.prediction.press_errors import chi_squared_survival, common_error
+from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, REGION_QUANTILES, StdFactor, binomial_distribution
 
 RIG_STD_MM = 0.05
 RIG_FORCE_STD = 0.004
@@ -237,9 +232,14 @@ def test_regions_hold_for_at_least_ninety_percent_of_contacts_on_ninety_percent_
     assert 0.88 < np.mean(holds) < 0.98
 
 
-def test_too_few_presses_have_no_guarantee():
-    assert StdFactor.from_errors(*draw(np.random.default_rng(0), 21, 1.0, 30)) is None
-    assert StdFactor.from_errors(np.full((30, 3), np.nan), np.ones((30, 3))) is None
+def test_fewest_presses_are_those_of_the_binomial_distribution():
+    assert stats.binom.cdf(FEWEST_HELD_OUT - 1, FEWEST_HELD_OUT, 0.9) >= 0.9
+    assert stats.binom.cdf(FEWEST_HELD_OUT - 2, FEWEST_HELD_OUT - 1, 0.9) < 0.9
+
+
+def test_check_states_a_factor_from_the_fewest_presses(predictor, measure):
+    assert check_presses(predictor, measure(FEWEST_HELD_OUT - 1)).std_factor is None
+    assert check_presses(predictor, measure(FEWEST_HELD_OUT)).std_factor.presses == FEWEST_HELD_OUT
 
 
 def test_unknown_values_do_not_count():
@@ -247,4 +247,4 @@ def test_unknown_values_do_not_count():
     error = np.full((30, 3), np.nan)
     error[:, 2] = 2.0 * np.sqrt(REGION_QUANTILES[0])
     assert StdFactor.from_errors(error, np.ones((30, 3))).factor == pytest.approx(2.0)
-    assert "multiply the standard deviations by 2; the 95 %" in StdFactor(2.0, 30).statement
+    assert "standard deviations that are 2 times as large, the 95 % regions" in StdFactor(2.0, 30).statement

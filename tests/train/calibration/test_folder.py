@@ -66,7 +66,7 @@ def test_folder_contains_the_presses_the_sensor_and_the_estimate(written, proble
         assert (written.path / name).read_bytes() == (version / name).read_bytes()
 
 
-def test_next_calibration_is_the_next_version_and_stale_files_are_mended(written, problem, tmp_path):
+def test_stale_files_are_mended(written, problem, tmp_path):
     path = tmp_path / "film"
     shutil.copytree(written.path, path)
     (path / "card.md").write_text("stale")
@@ -76,8 +76,6 @@ def test_next_calibration_is_the_next_version_and_stale_files_are_mended(written
             pass
         assert (path / "card.md").read_bytes() == (path / "1" / "card.md").read_bytes()
         assert not (path / ".2.draft").exists()
-        assert write_calibration(written.result, path, config=QUICK).name == "2"
-    assert (path / "card.md").read_bytes() == (path / "2" / "card.md").read_bytes()
 
 
 def test_network_is_trained_with_the_noise_of_the_presses(written, tmp_path):
@@ -88,6 +86,33 @@ def test_network_is_trained_with_the_noise_of_the_presses(written, tmp_path):
     assert noisy.metadata.noise.gain == 0.016
     charge_pC = written.result.presses.charge_pC[0]
     assert noisy.predict(charge_pC).force_std_N > 1.5 * quiet.predict(charge_pC).force_std_N
+
+
+def test_next_version_has_wider_regions_that_hold_for_held_out_presses(written, problem, synthetic, tmp_path):
+    _, contact, presses = rig(problem, synthetic, 130, seed=33, values=written.values)
+    # The rig is twenty times as inaccurate as the model.
+    moved = contact + np.random.default_rng(34).normal(0.0, [2.0, 2.0, 0.0], contact.shape)
+    inaccurate = replace(presses, contact=moved)[~problem.domain.is_outside(moved)]
+    held_out, others = inaccurate[:30], inaccurate[30:]
+    plain = Predictor(written.path)
+    path = tmp_path / "film"
+    shutil.copytree(written.path, path)
+    assert write_calibration(written.result, path, held_out=held_out, config=QUICK) == path / "2"
+    wide = Predictor(path)
+
+    factor = wide.metadata.made_with["std_factor"]["factor"]
+    assert wide.metadata.made_with["std_factor"]["presses"] == 30
+    answers, plain_answers = (np.array(one.predict_batch(others.charge_pC)).T for one in (wide, plain))
+    np.testing.assert_allclose(answers[:3], plain_answers[:3], atol=1e-3)
+    np.testing.assert_allclose(answers[3:6], factor * plain_answers[3:6], rtol=1e-4)
+    error = ((answers[:3] - others.contact.T) / answers[3:6]) ** 2
+    assert np.mean(error.sum(axis=0) < 7.815) >= 0.85
+    assert (path / "card.md").read_bytes() == (path / "2" / "card.md").read_bytes()
+    assert f"{factor:.3g} times as large" in (path / "card.md").read_text()
+    moved_presses = replace(held_out, contact=np.where(np.arange(30)[:, None] < 2, 9.0, held_out.contact))
+    with pytest.raises(PressError, match=r"at least 22 held-out presses within 8 mm.*got 21 of 23"):
+        write_calibration(written.result, tmp_path / "few", held_out=moved_presses[:23], config=QUICK)
+    assert not (tmp_path / "few").exists()
 
 
 def test_unsuitable_folders_are_refused_and_left_as_they_are(written, problem, tmp_path):

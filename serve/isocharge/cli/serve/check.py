@@ -52,7 +52,8 @@ def check_command(
             {check.errors.row_noun: row["line"]} | {name: row[name] for name in SHOWN} for row in _worst_presses(check)
         ]
         result = {"each": presses, "errors": errors} | result
-        result["std_factor"] = check.std_factor and check.std_factor.statement
+        if check.std_factor is not None:
+            result["std_factor"] = f"{check.std_factor.statement}, if they were not used for the model"
     show_result(result, json=json)
     raise typer.Exit(0 if check.fits else 1)
 

@@ -28,13 +28,12 @@ from isocharge.serve.prediction.press_errors import (
     TEST_SIGNIFICANCE,
     Agreement,
     PressErrors,
-    StdFactor,
-    binomial_distribution,
     chi_squared_deviate,
     misfit_limit,
     press_errors,
 )
 from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
+from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor, binomial_distribution
 
 MIN_PRESSES = 3
 """Smallest number of presses for a verdict. With fewer presses, a single bad press cannot be recognised."""
@@ -195,6 +194,11 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     if selected_count >= MIN_PRESSES:
         fits = agreement.acceptable and not misfit_text
 
+    std_factor = None  # remains None if too few presses are compared for a guarantee
+    is_compared = errors.is_compared  # a guarantee needs all presses, also the bad ones
+    if np.count_nonzero(is_compared) >= FEWEST_HELD_OUT:
+        std_factor = StdFactor.from_errors(errors.error[is_compared], errors.noise_std[is_compared])
+
     # Collect the explanations for the user.
     notes: list[str] = []
     if fits is False:
@@ -215,8 +219,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
         verdict=_verdict(fits, selected_count, position, force, misfit_text),
         notes=tuple(notes),
         errors=errors,
-        # A guarantee needs all presses, also the bad ones.
-        std_factor=StdFactor.from_errors(errors.error[errors.is_compared], errors.noise_std[errors.is_compared]),
+        std_factor=std_factor,
     )
 
 

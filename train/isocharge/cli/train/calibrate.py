@@ -20,6 +20,9 @@ from isocharge.cli.shared.press_options import (
 from isocharge.cli.shared.terminal import say, show, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
+from isocharge.serve.model.model_folder import load_model
+from isocharge.serve.presses.measured_presses import MeasuredPresses
+from isocharge.serve.presses.std_factor import StdFactor
 from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
 from isocharge.train.calibration.calibrate import solve_even
@@ -70,6 +73,15 @@ def calibrate_command(
             help="Start from the calibration in this folder, allowing for drift since then. (default: the sensor file)",
         ),
     ] = None,
+    held_out: Annotated[
+        Path | None,
+        typer.Option(
+            "--held-out",
+            metavar="PRESSES.csv",
+            help="22 or more presses that are not used for the calibration. The standard deviations of the model are "
+            "multiplied by a factor with which its 95 % regions hold for such presses. (default: no factor)",
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Calibrate a film: estimate its properties from measured presses, and write a model of this film.
@@ -83,18 +95,20 @@ def calibrate_command(
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
-    _check_usage(file, output, next_count)
+    _check_usage(file, output, next_count, held_out)
     problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius=radius, stress_limit=stress_limit)
     result: CalibrationResult | None = None  # None if only presses are proposed
+    std_factor: StdFactor | None = None  # None without held-out presses
     proposed_presses: list[ProposedPress] = []
     with (
         calibration_folder(output, problem) if output is not None else nullcontext(),
         shown_progress(),
         local_workers(worker_count(None)) as executor,
     ):
-        presses = None
-        if file is not None:
-            presses = read_press_file(file, problem.electrodes, position_std_mm, force_std)
+        presses, held_out_presses = (
+            None if path is None else read_press_file(path, problem.electrodes, position_std_mm, force_std)
+            for path in (file, held_out)
+        )
         if earlier is not None:
             problem = replace(problem, earlier=read_earlier(earlier, problem))
         if presses is not None:
@@ -103,7 +117,7 @@ def calibrate_command(
             for caution in result.cautions:
                 say(f"caution: {caution}")
         if result is not None and output is not None:
-            _write(result, output, executor)
+            std_factor = _write(result, output, held_out_presses, executor)
         if next_count:
             # The next presses are chosen for the calibrated film, or for the mean film if nothing was calibrated.
             charges = solve_even(problem, executor) if result is None else result.charges
@@ -111,26 +125,37 @@ def calibrate_command(
             proposed_presses = next_presses(
                 problem, charges, next_count, film, position_std_mm=position_std_mm, force_std=force_std
             )
-    _print_result(result, proposed_presses, json=json)
+    _print_result(result, std_factor, proposed_presses, json=json)
 
 
-def _print_result(result: CalibrationResult | None, proposed_presses: list[ProposedPress], *, json: bool) -> None:
+def _print_result(
+    result: CalibrationResult | None,
+    std_factor: StdFactor | None,
+    proposed_presses: list[ProposedPress],
+    *,
+    json: bool,
+) -> None:
     """Print the result of a calibration, if there is one, and the proposed presses.
 
     For each proposed press, the function prints the errors of position and force that would remain after this press.
 
     Args:
         result: Result of the calibration; None if only presses are proposed.
+        std_factor: Factor of the standard deviations of the model; None without held-out presses.
         proposed_presses: Presses that should be made next.
         json: Whether to print JSON instead of sentences.
     """
     if json:
         result_fields = {} if result is None else result_table(result)
+        if std_factor is not None:
+            result_fields["std_factor"] = std_factor.factor
         show_json(result_fields | {"next": [vars(press) for press in proposed_presses]})
         return
     if result is not None:
         for sentence in result.summary:
             show(sentence)
+    if std_factor is not None:
+        show(f"Held-out presses: {std_factor.statement}.")
     for press in proposed_presses:
         show(
             f"press {press.force_N:.2f} N at ({press.x_mm:.1f}, {press.y_mm:.1f}) mm: "
@@ -138,15 +163,20 @@ def _print_result(result: CalibrationResult | None, proposed_presses: list[Propo
         )
 
 
-def _write(result: CalibrationResult, folder: Path, executor: Executor | None) -> None:
-    """Write the model of a calibrated film, and print the name of its version folder."""
+def _write(
+    result: CalibrationResult, folder: Path, held_out: MeasuredPresses | None, executor: Executor | None
+) -> StdFactor | None:
+    """Write the model of a calibrated film, print the name of its version folder, and return its factor, if any."""
     say("training the network of this film")
-    version = write_calibration(result, folder, this_command(), executor=executor)
+    version = write_calibration(result, folder, this_command(), held_out=held_out, executor=executor)
     say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
+    return None if held_out is None else StdFactor(**load_model(version).metadata.made_with["std_factor"])
 
 
-def _check_usage(file: Path | None, output: Path | None, next_count: int) -> None:
-    """Raise InputError if neither presses are given nor proposed, or if a model is requested without presses."""
+def _check_usage(file: Path | None, output: Path | None, next_count: int, held_out: Path | None) -> None:
+    """Raise InputError if neither presses are given nor proposed, or if a model is needed that is not trained."""
+    if held_out is not None and output is None:
+        raise InputError("--held-out: expected --output FOLDER for the model whose standard deviations it changes")
     if file is not None:
         return
     if not next_count:

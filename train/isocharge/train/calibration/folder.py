@@ -42,8 +42,9 @@ from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target
 from isocharge.serve.model.model_search import version_folders
-from isocharge.serve.presses.measured_presses import presses_text
-from isocharge.simulate import NoiseModel
+from isocharge.serve.presses.measured_presses import MeasuredPresses, presses_text
+from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor
+from isocharge.simulate import Domain, NoiseModel
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.film_network import compact_charges, training_data
@@ -51,7 +52,7 @@ from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.model_release.release import release
 from isocharge.train.training.config import FitConfig
-from isocharge.train.training.fit import fit
+from isocharge.train.training.fit import Fitted, fit
 
 FORMAT_VERSION = 5
 """Version of the file format that this module writes and reads."""
@@ -297,6 +298,7 @@ def write_calibration(
     folder: Path,
     command: str = "",
     *,
+    held_out: MeasuredPresses | None = None,
     config: FitConfig | None = None,
     executor: Executor | None = None,
 ) -> Path:
@@ -308,6 +310,8 @@ def write_calibration(
         result: Result of the calibration.
         folder: A new folder, or the folder of an earlier calibration.
         command: Command that repeats this calibration, for the card.
+        held_out: Presses that were not used for the calibration. The standard deviations of the model are multiplied by
+            a factor with which its 95 % regions hold for contacts like these presses (`StdFactor`). None for no factor.
         config: Sizes and steps of the training; None for the defaults.
         executor: Executor that runs solves; None for this process.
 
@@ -317,6 +321,7 @@ def write_calibration(
     Raises:
         ModelError: If the folder cannot be used for a calibration because of its name or content.
         OutputError: If the folder cannot be written.
+        PressError: If too few presses are held out.
     """
     # These modules are imported late, because they import matplotlib, whose import is slow.
     from isocharge.simulate.plots.figure import picture_bytes
@@ -324,12 +329,16 @@ def write_calibration(
 
     check_calibration_folder(folder, result.problem.electrodes)
     problem, film = result.problem, result.film
+    if held_out is not None:
+        held_out = usable_held_out(held_out, problem.domain)
     noisy_problem = replace(problem, noise=film.noise)
     series = compact_charges(noisy_problem, result.charges, film, executor)
     settings = config or FitConfig()
     if film.noise != problem.noise:
         settings = FitConfig(settings.network, replace_setting(settings.training, noise=film.noise))
     fitted = fit(training_data(result.charges, film, series, executor), settings)
+    if held_out is not None:
+        fitted = with_guarantee(fitted, held_out)
 
     sensor, _ = result.sensor_and_probe
     is_folded = CHARGES in fitted.files
@@ -349,6 +358,46 @@ def write_calibration(
     )
     _copy_last_version(folder)
     return released_model.folder
+
+
+def usable_held_out(held_out: MeasuredPresses, domain: Domain) -> MeasuredPresses:
+    """Return the held-out presses inside a domain with all charges and a known position or force.
+
+    Args:
+        held_out: Presses that were not used for the calibration.
+        domain: Contacts that the model will answer.
+
+    Raises:
+        PressError: If these are fewer than the 22 presses from which a factor for standard deviations follows.
+    """
+    is_known = np.isfinite(held_out.charge_pC).all(axis=1) & np.isfinite(held_out.contact).any(axis=1)
+    usable = held_out[is_known & ~domain.is_outside(held_out.contact)]
+    if len(usable) < FEWEST_HELD_OUT:
+        low, high = domain.force_range
+        raise PressError(
+            f"expected at least {FEWEST_HELD_OUT} held-out presses within {domain.radius:g} mm of the centre, of "
+            f"{low:g} to {high:g} N, with all charges and a known place or force, got {len(usable)} of "
+            f"{len(held_out)}; measure more, or calibrate without held-out presses"
+        )
+    return usable
+
+
+def with_guarantee(fitted: Fitted, held_out: MeasuredPresses) -> Fitted:
+    """Multiply the standard deviations of a network by the factor that follows from held-out presses.
+
+    The metadata of the model contain the factor and the number of presses as `std_factor`.
+
+    Args:
+        fitted: The network.
+        held_out: Presses that `usable_held_out` returned.
+    """
+    contact, std, _ = fitted.network.predict(held_out.charge_pC)
+    std_factor = StdFactor.from_errors(contact - held_out.contact, std)
+    return replace(
+        fitted,
+        network=fitted.network.with_scaled_std(std_factor.factor, std_factor.factor),
+        made_with={**fitted.made_with, "std_factor": std_factor._asdict()},
+    )
 
 
 def result_table(result: CalibrationResult) -> dict[str, Any]:
@@ -382,6 +431,8 @@ def _card(result: CalibrationResult, about: ModelMetadata, radius: float) -> str
     problem = result.problem
     min_force, max_force = about.force_range_N
     sentences = (*result.summary, *(f"Caution: {caution}." for caution in result.cautions))
+    if "std_factor" in about.made_with:
+        sentences = (*sentences, f"Held-out presses: {StdFactor(**about.made_with['std_factor']).statement}.")
     summary_list = "\n".join(f"- {sentence}" for sentence in sentences)
     property_rows = "\n".join(
         f"| `{name}` | {one.meaning} | {one.value:.4g} | {one.std:.2g} | {one.before_std:.2g} | "

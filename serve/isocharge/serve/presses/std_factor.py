@@ -1,0 +1,83 @@
+"""Factor for the standard deviations of a model with a guarantee that held-out presses provide.
+
+The factor is an order statistic of the presses (split conformal prediction, Vovk 2012, proposition 2a). For n presses
+that were not used for the training or the calibration, the share of contacts that the k-th smallest score covers has
+the distribution Beta(k, n + 1 - k), whatever the distribution of the errors.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+
+COVERAGE = 0.9
+"""Share of contacts that the 95 % regions contain at least, after the factor is applied."""
+
+CONFIDENCE = 0.9
+"""Probability that the statement about the coverage is true."""
+
+FEWEST_HELD_OUT = 22
+"""Smallest number of presses from which a factor follows: with fewer, 1 - COVERAGE**n is below CONFIDENCE."""
+
+REGION_QUANTILES = (3.841, 5.991, 7.815)
+"""Quantiles 95 % of chi-squared with one, two and three degrees of freedom."""
+
+
+class StdFactor(NamedTuple):
+    """Factor by which the standard deviations of a model must be multiplied on this film.
+
+    Attributes:
+        factor: The factor, dimensionless. It may be smaller than 1.
+        presses: Number of presses from which the factor was computed.
+    """
+
+    factor: float
+    presses: int
+
+    @property
+    def statement(self) -> str:
+        """Statement about the contacts of a model whose standard deviations were multiplied by the factor."""
+        return (
+            f"with standard deviations that are {self.factor:.3g} times as large, the 95 % regions hold for at least "
+            f"{100.0 * COVERAGE:.0f} % of contacts like these {self.presses} presses, with probability {CONFIDENCE:g}"
+        )
+
+    @classmethod
+    def from_errors(cls, error: Array, std: Array) -> "StdFactor":
+        """Compute the factor from the errors of held-out presses.
+
+        The score of a press is the factor with which its 95 % region just contains the measured values.
+
+        Args:
+            error: Errors of x, y and the force, shape (n, 3); NaN if unknown. At least one value of
+                `FEWEST_HELD_OUT` rows must be known.
+            std: Standard deviations that the model states, in the units of `error`, shape (n, 3).
+
+        Returns:
+            The factor.
+        """
+        is_known = np.isfinite(error)
+        degrees = is_known.sum(axis=1)
+        squared_size = np.sum(np.where(is_known, error / std, 0.0) ** 2, axis=1)[degrees > 0]
+        scores = np.sort(np.sqrt(squared_size / np.take(REGION_QUANTILES, degrees[degrees > 0] - 1)))
+        # The k-th smallest score covers at least the share p of all contacts if at most k - 1 of n independent scores
+        # lie below the quantile p.
+        rank = np.argmax(binomial_distribution(len(scores), COVERAGE) >= CONFIDENCE)
+        return cls(float(scores[rank]), len(scores))
+
+
+def binomial_distribution(count: int, probability: float) -> Array:
+    """Compute the probabilities that at most 0, 1, ... `count` of `count` trials succeed, shape (count + 1,).
+
+    The terms are computed from their logarithms, because the binomial coefficients would overflow.
+
+    Args:
+        count: Number of trials.
+        probability: Probability that a trial succeeds.
+    """
+    successes = np.arange(1, count + 1)
+    log_ratios = np.log((count + 1 - successes) / successes * (probability / (1.0 - probability)))
+    log_terms = count * math.log1p(-probability) + np.append(0.0, np.cumsum(log_ratios))
+    return np.cumsum(np.exp(log_terms))
