@@ -20,7 +20,7 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from boards import TcpBoard, interrupt, taps
 from isocharge.common.errors import InputError
-from isocharge.serve import Predictor, Recording, Script, VirtualSensor, load_device
+from isocharge.serve import Recording, Script, VirtualSensor, load_device
 from isocharge.serve.signal_chain.gain import GainRule
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
 
@@ -211,17 +211,6 @@ def test_doctor_as_json_waits_for_its_port(resting, run, tmp_path):
         plugging.join()
     assert found["rate_Hz"] == pytest.approx(500.0, rel=0.05)
     assert [round(channel["offset_pC"], 3) for channel in found["channels"]] == [5.0, -6.0, 7.0]
-
-
-def test_doctor_states_the_share_of_presses_outside_the_working_area_without_a_flag(resting, command):
-    words = ("--seconds", 0.5, "--model", "three-25um-biaxial")
-    with resting() as sensor:
-        _, out, _ = command("serve", "doctor", "--port", sensor.url, *words)
-    with resting() as sensor:
-        _, json_out, _ = command("serve", "doctor", "--port", sensor.url, *words, "--json")
-    summary = Predictor("three-25um-biaxial").metadata.unnoticed.summary
-    assert f"three-25um-biaxial/1: {summary}" in " ".join(out.split())
-    assert json.loads(json_out)["unnoticed_share"] == pytest.approx(0.79, abs=0.02)
 
 
 def test_doctor_exit_code_if_no_frames_are_recognised(command, monkeypatch):

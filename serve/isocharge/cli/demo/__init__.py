@@ -1,1 +1,4 @@
-"""The command `isocharge demo`: simulation, training, live service and pictures in one run."""
+"""The command `isocharge demo`: simulation, training, live service and pictures in one run.
+
+May import: serve, shared.
+"""

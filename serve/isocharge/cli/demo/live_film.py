@@ -1,22 +1,14 @@
 """Demo of the live page with a virtual sensor and a released model, and the area in which the presses of a demo lie."""
 
-from contextlib import ExitStack, closing
-from functools import partial
-from typing import TYPE_CHECKING, cast
-
 import numpy as np
 
-from isocharge.cli.shared.live_page import PageFeed, live_page
+from isocharge.cli.serve.stream import stream_command
 from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import ModelError
-from isocharge.serve import Port, Predictor, Recorder, TouchStream, find_model, load_model
-from isocharge.serve.live.recorded_stream import RecordedStream
+from isocharge.serve import find_model, load_model
 from isocharge.simulate import Circle, ForwardMap, load_sensor
-
-if TYPE_CHECKING:
-    from isocharge.serve.viewer.live_page import LivePage
 
 DEFAULT_SENSOR = "three-25um-biaxial"
 """Name of the sensor of the demo, and of its released model."""
@@ -53,28 +45,11 @@ def show_live_film(live: str, seconds: float | None, sensor_name: str | None = N
         InputError: If the address has another form than PORT or HOST:PORT.
     """
     sensor = sensor_name or DEFAULT_SENSOR
-    predictor = Predictor(sensor)
-    touch = TouchStream(predictor)
-    stream = RecordedStream(touch)
-    with ExitStack() as stack:
-        stack.enter_context(until_stopped())
-
-        # The page starts before the film is solved, so that the user can open it meanwhile.
-        page = cast("LivePage", stack.enter_context(live_page(live, sensor, predictor.metadata)))  # `live` is given
+    find_model(sensor)  # an unknown model is refused before the film is solved
+    with until_stopped():
         with shown_progress():
             radius_mm = played_radius_mm(sensor)
             forward_map = ForwardMap.build(load_sensor(sensor), Circle(1.0), radius_mm, DEFAULT_PLAYED_FORCE_RANGE)
-
-        board = stack.enter_context(virtual_sensor(forward_map, "reference", seed=0))
-        port = stack.enter_context(Port(board.url))
-
-        # A recording that the page begins has every frame, and neither a device file nor a name of the film.
-        new_recorder = partial(Recorder, device={})
-        feed = PageFeed(page, touch, stream, new_recorder)
-
-        say("Ctrl-C stops")
-        records = stack.enter_context(closing(stream.follow(port)))
-        for count, record in enumerate(records, start=1):
-            feed.write(record)
-            if seconds is not None and count > seconds * board.script.rate_Hz:
-                break
+        with virtual_sensor(forward_map, "reference", seed=0) as board:
+            say("Ctrl-C stops")
+            stream_command(sensor, board.url, output=["none"], live=live, seconds=seconds)

@@ -97,9 +97,7 @@ def doctor_command(
         return
     if write is not None:
         refuse_existing(write)
-    metadata = Predictor(model, models=models).metadata if model else None
-    electrodes = metadata.electrodes if metadata else ()  # empty for any model
-    unnoticed = metadata.unnoticed if metadata else None  # presses outside the working area that the model misses
+    electrodes = Predictor(model, models=models).metadata.electrodes if model else ()  # empty for any model
     gain = None if pC_per_unit is None else {"pC_per_unit": _parse_gain(pC_per_unit)}
     if gain is not None and device is not None:
         raise InputError(
@@ -119,8 +117,6 @@ def doctor_command(
     )
     if not json:
         show_result(brief_report(examination), json=False)
-    if metadata and unnoticed and examination.good and not json:
-        show(f"{metadata.label}: {unnoticed.summary}")
     is_unit_missing = write is not None and device is None and examination.unit != "pC"
     found_channels = None
     if check_wiring and examination.good and not examination.touch and not is_unit_missing:
@@ -130,8 +126,7 @@ def doctor_command(
         if not json:
             show("\n".join(wiring.sentences))
     if json:
-        unnoticed_share = unnoticed.total_share if unnoticed else None
-        show_json(asdict(examination) | {"found_channels": found_channels, "unnoticed_share": unnoticed_share})
+        show_json(asdict(examination) | {"found_channels": found_channels})
     if not examination.good:
         raise typer.Exit(1)
     if examination.touch:

@@ -3,7 +3,7 @@
 The values are replaced by their medians over blocks of 0.1 s, because hum averages out in a block. A single damaged
 value does not change the median of a block. A press begins with a large change within half a second. Warming, creep and
 the slow noise of amplifiers cause slower changes. One function, `find_press`, finds the touches of a film that should
-be at rest, the press that is held during the port check, and the press near each electrode.
+be at rest, and the press that is held during the port check.
 
 A press that is held with a constant force during the whole time does not change the values. It cannot be distinguished
 from an amplifier with another rest level.
@@ -40,12 +40,10 @@ class Press(NamedTuple):
     Attributes:
         begin: Number of the first block of the press.
         end: Number of the first block after the press; None if the press has not ended.
-        change: Change of each channel in the block with the largest change, shape (channels,).
     """
 
     begin: int
     end: int | None
-    change: Array
 
 
 def find_press(levels: Array, noise: Array, sigmas: float = 20.0, release_share: float = 0.3) -> Press | None:
@@ -82,7 +80,7 @@ def find_press(levels: Array, noise: Array, sigmas: float = 20.0, release_share:
     is_released = (is_low & is_falling) | is_gone
     is_released[: peak + 1] = False
     end = int(np.argmax(is_released)) if is_released.any() else None
-    return Press(begin, end, changes[peak])
+    return Press(begin, end)
 
 
 class TouchFound(NamedTuple):
