@@ -105,9 +105,6 @@ def test_stream_writes_a_record_for_each_frame_of_a_port(board, models, run):
     assert "tared: A " in result.stderr
     last = result.stderr.splitlines()[-1]
     assert "0 lost, 0 repeated, 0 restarts; 0 CRC errors, 0 malformed" in last
-    p50, p99 = map(float, re.search(r"p50 (\d+) us, p99 (\d+) us", last).groups())
-    latencies = [record["latency_us"] for record in records]
-    assert (p50, p99) == pytest.approx(np.percentile(latencies, (50, 99)), abs=1.0)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -2,7 +2,6 @@
 
 import signal
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
@@ -11,7 +10,6 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from isocharge.cli.shared.live_page import (
@@ -71,22 +69,16 @@ OutputOption = Annotated[
 DEFAULT_TARGETS = ("json",)
 """Targets of the output if the option `--output` is not given."""
 
-LATENCIES = 100_000
-"""Number of the latest records from whose latencies the summary computes percentiles."""
-
 RecordWriter = Callable[[PredictionRecord], object]
 """Function that is called with each record."""
 
 
-def write_records(
-    records: Iterable[PredictionRecord], writers: Iterable[RecordWriter], latencies: deque[float]
-) -> None:
-    """Pass each record to all writers, print each new tare, and collect the latencies.
+def write_records(records: Iterable[PredictionRecord], writers: Iterable[RecordWriter]) -> None:
+    """Pass each record to all writers, and print each new tare.
 
     Args:
         records: The records.
         writers: Functions that write a record, which are called in their order.
-        latencies: Queue to which the latency of each record is added, us.
     """
     is_tare_new = True
     for record in records:
@@ -98,8 +90,6 @@ def write_records(
             is_tare_new = False
             tare_text = ", ".join(f"{electrode} {charge:.2f} pC" for electrode, charge in record.tare_pC.items())
             say(f"tared: {tare_text}")
-        if record.latency_us is not None:
-            latencies.append(record.latency_us)
 
 
 def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_live: bool) -> Outputs:
@@ -138,23 +128,14 @@ def say_missing_records(outputs: Outputs) -> None:
             say(f"{target}: incomplete")
 
 
-def summary(touch: TouchStream, latencies: deque[float]) -> str:
-    """Return the summary of a stream: the numbers of frames and faults, and percentiles of the latency.
-
-    Args:
-        touch: The stream.
-        latencies: Latencies of the latest records, us.
-    """
+def summary(touch: TouchStream) -> str:
+    """Return the numbers of frames and faults of a stream."""
     totals = touch.totals()
-    frames_text = (
+    return (
         f"{totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated, {totals.restarts} restarts; "
         f"{totals.crc_errors} CRC errors, {totals.malformed} malformed, {totals.bytes_dropped} bytes dropped; "
         f"{totals.reconnects} reconnects"
     )
-    if not latencies:
-        return frames_text
-    p50, p99 = np.percentile(latencies, (50, 99))
-    return f"{frames_text}; last byte to record p50 {p50:.0f} us, p99 {p99:.0f} us"
 
 
 def stream_command(
@@ -237,7 +218,6 @@ def stream_command(
     if follow:
         board = with_settings(board, "follow", on=True)
     touch = TouchStream(predictor, board, frame_id=name)
-    latencies: deque[float] = deque(maxlen=LATENCIES)
     recorder = Recorder(record, predictor.metadata.label, board.table, name) if record else None
     stream = RecordedStream(touch, recorder)
     has_expired = Event()
@@ -274,11 +254,11 @@ def stream_command(
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
             with no_frames_advice_added(port, device):
-                write_records(islice(records, count), writers, latencies)
+                write_records(islice(records, count), writers)
         finally:
             if source.is_live:
                 outputs.close()
-            say(summary(touch, latencies))
+            say(summary(touch))
     if outputs is None:
         say(f"{port}: the command was stopped before the port was open")
         raise typer.Exit(int(has_expired.is_set()))
@@ -346,7 +326,6 @@ def replay_command(
     load = None if model else partial(_load_labelled, models=models)
     play = partial(replay, recording, touch, real_time=real_time, load=load)
 
-    latencies: deque[float] = deque(maxlen=LATENCIES)
     outputs = command_outputs(output, touch, is_live=False)
     page_context = live_page(
         live,
@@ -360,10 +339,10 @@ def replay_command(
     )
     with until_stopped(), page_context as page, outputs:
         if page is None:
-            write_records(play(), [outputs.write], latencies)
+            write_records(play(), [outputs.write])
         else:
-            _play_on_page(play, page, PageFeed(page, touch), outputs, latencies)
-    say(summary(touch, latencies))
+            _play_on_page(play, page, PageFeed(page, touch), outputs)
+    say(summary(touch))
     if outputs.has_incomplete_file:
         incomplete = ", ".join(outputs.not_written)
         say(f"{incomplete}: not written, because the replay was stopped before its end")
@@ -375,7 +354,6 @@ def _play_on_page(
     page: "LivePage",
     feed: PageFeed,
     outputs: Outputs,
-    latencies: deque[float],
 ) -> None:
     """Write the records of a recording to the outputs and to the replay page, and keep the page open until Ctrl-C.
 
@@ -384,10 +362,9 @@ def _play_on_page(
         page: The page.
         feed: Writer that passes the records to the page.
         outputs: The outputs, which are closed at the end of the recording.
-        latencies: Queue to which the latency of each record is added, us.
     """
     records = play(on_marker=lambda marker: page.add_marker(*marker))
-    write_records(records, [outputs.write, feed.write], latencies)
+    write_records(records, [outputs.write, feed.write])
     outputs.close()  # now, because the page stays open until Ctrl-C, which would discard files that are not closed
     feed.update_state()  # with the counters of the whole recording
     page.update(is_complete=True)
