@@ -165,25 +165,6 @@ def test_charges_of_no_contact_are_not_tracked_and_saturated_frames_are_ignored(
     assert track_frame(tracker, MODEL_CONTACT, 0.2, ("saturated",), np.full(3, 1e5)) == (last_tracked, None)
 
 
-@pytest.mark.parametrize("set_back_s", [0.002, 50.0])
-def test_contact_is_found_again_at_once_if_the_clock_is_set_back(set_back_s: float):
-    """After the clock was set back, the results are those of a new mixture."""
-    rows = noisy_charges(np.full(60, -4.0))
-    mixture = ContactMixture(folded_series(), NOISE)
-    for number, charge_pC in enumerate(rows[:30]):
-        mixture.update(charge_pC, 100.0 + number / 1000.0)
-
-    new_mixture = ContactMixture(folded_series(), NOISE)
-    for number, charge_pC in enumerate(rows[30:]):
-        t_s = 100.029 - set_back_s + number / 1000.0
-        hypotheses = mixture.update(charge_pC, t_s)
-        expected_hypotheses = new_mixture.update(charge_pC, t_s)
-        assert len(hypotheses) > 0
-        for hypothesis, expected in zip(hypotheses, expected_hypotheses, strict=True):
-            np.testing.assert_array_equal(hypothesis.mean, expected.mean)
-            np.testing.assert_array_equal(hypothesis.covariance, expected.covariance)
-
-
 @pytest.fixture
 def model(models, tmp_path):
     """A model with the file `charges.npz` of its film."""

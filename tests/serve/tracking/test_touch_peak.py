@@ -3,7 +3,7 @@
 import numpy as np
 
 from isocharge.serve.model.contact import Contact
-from isocharge.serve.tracking.film_follower import MAX_AVERAGED_FRAMES, TouchPeak
+from isocharge.serve.tracking.film_follower import TouchPeak
 
 
 def contact(force_N, x_mm=1.0):
@@ -24,11 +24,3 @@ def test_only_the_frames_near_the_largest_force_are_averaged():
     charges = [[100.0 * force_N, 50.0 * force_N] for force_N in forces_N]
     peak = peak_of([contact(force_N) for force_N in forces_N], charges)
     np.testing.assert_allclose(peak.mean_charge_pC, [100.0, 50.0])
-
-
-def test_long_touch_is_averaged_over_the_first_frames_only():
-    steady = [[100.0]] * MAX_AVERAGED_FRAMES
-    changed = [[200.0]] * 10
-    charges = steady + changed
-    peak = peak_of([contact(1.0)] * len(charges), charges)
-    np.testing.assert_allclose(peak.mean_charge_pC, [100.0])

@@ -220,8 +220,7 @@ def test_event_tap_of_a_short_press_and_event_release_of_a_short_slide():
 def test_long_touch_without_hold_or_slide_is_no_tap(duration_s, event):
     """It is uncertain whether the contact moves or rests."""
     tracked = TrackedContact(0.0, 0.0, 1.0, STD, STD, 0.003, 0.0, 0.0, moving=0.7)
-    events = TouchEvents()
-    events.begin(tracked, 10.0)
+    events = TouchEvents(tracked, 10.0)
     assert events.step(tracked, 10.0 + duration_s) is None
     assert events.end(10.0 + duration_s) == event
 

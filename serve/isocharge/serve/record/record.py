@@ -152,10 +152,6 @@ class Tracking(Struct, frozen=True):
     ] = None
 
 
-NO_TRACKING = Tracking()
-"""Tracking while nothing touches."""
-
-
 class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     """One reading of a sensor and the contact that a model computed from the reading.
 

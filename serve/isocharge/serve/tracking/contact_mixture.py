@@ -31,6 +31,7 @@ from isocharge.serve.tracking.motion_filter import (
     INITIAL_RATE_STD,
     POSITION,
     RATES,
+    SQUARED_GATE,
     VALUES,
     VELOCITY,
     MAX_GAP_s,
@@ -262,9 +263,6 @@ SLOW_NOISE_STD = 0.003
 SEARCH_INTERVAL_s = 0.05
 """Shortest time between two searches over the whole film, s. Each search takes milliseconds."""
 
-MAX_SQUARED_DISTANCE = 60.0
-"""Largest squared distance of a component that explains the charges, dimensionless."""
-
 MAX_RELATIVE_RADIUS = 1.1
 """Distance from the centre, relative to the radius of the film, beyond which components are removed."""
 
@@ -326,20 +324,16 @@ class ContactMixture:
     def update(self, charge_pC: Array, t_s: float) -> list[ContactHypothesis]:
         """Process the next frame, and return the contacts that explain the charges.
 
-        The mixture is updated only once in each step, with the mean charges of the frames of the step. If the clock was
-        set back, the contact and all earlier frames are discarded. The whole film is then searched at once.
+        The mixture is updated only once in each step, with the mean charges of the frames of the step.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
-            t_s: Time of the frame on any clock, s.
+            t_s: Time of the frame on a clock that is never set back, s.
 
         Returns:
             The contacts that explain the charges at `time_s`, in descending order of their probability. The list is
             empty if no contact explains the charges.
         """
-        latest_frame_s = self._frames[-1][1] if self._frames else self._step_begin_s
-        if t_s < latest_frame_s:
-            self.reset()
         self._frames.append((charge_pC, t_s))
         if t_s - self._step_begin_s < NOISE_INTERVAL_s:
             return self._hypotheses
@@ -396,7 +390,7 @@ class ContactMixture:
         is_outside = distance_mm > MAX_RELATIVE_RADIUS * self.charges.domain.radius
         log_weight = np.where(is_outside, -np.inf, components.log_weight)
         best = int(log_weight.argmax())
-        if is_outside[best] or updated.squared_distance[best] > MAX_SQUARED_DISTANCE:
+        if is_outside[best] or updated.squared_distance[best] > SQUARED_GATE:
             return
         components = prune_components(components._replace(log_weight=log_weight))  # the most probable is now the first
         count = len(components.mean)

@@ -27,6 +27,7 @@ if its frames have flags that make the charges unreliable.
 """
 
 import math
+from datetime import timedelta
 from typing import NamedTuple
 
 import numpy as np
@@ -41,14 +42,6 @@ from isocharge.serve.model.robust_estimate import ModelValues, Prior, robust_est
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.stage import Rule, Setting
 from isocharge.serve.tracking.contact_mixture import GAIN_STD
-
-MAX_AVERAGED_FRAMES = 64
-"""Largest number of frames that are averaged.
-
-The average of 64 frames has an eighth of the noise of a frame. Longer averages would gain little, and slow changes of
-the charges, such as creep, would affect them more.
-"""
-
 
 UNUSED_FRAME_FLAGS = frozenset({OUTSIDE, BEYOND, STRESS, GAP, REPEAT})
 """Flags of frames that are not used, although the other frames of the same touch may be used.
@@ -75,13 +68,14 @@ class TouchPeak:
     def __init__(self) -> None:
         """Start without a frame."""
         self._reference_contact: Contact | None = None
-        self._averaged_charges_pC: list[Array] = []
+        self._averaged_count = 0
+        self._charge_sum_pC: Array = np.zeros(())
         self._is_reliable = True  # whether all flags so far are harmless
 
     @property
     def is_usable(self) -> bool:
         """Whether at least one frame was averaged, and all flags of the touch are harmless."""
-        return self._is_reliable and bool(self._averaged_charges_pC)
+        return self._is_reliable and self._averaged_count > 0
 
     def add_frame(self, contact: Contact, charge_pC: Array, flags: tuple[str, ...] = ()) -> None:
         """Process the next frame of the touch.
@@ -100,16 +94,17 @@ class TouchPeak:
             return
         reference = self._reference_contact
         if is_close(contact, reference):
-            if len(self._averaged_charges_pC) < MAX_AVERAGED_FRAMES:
-                self._averaged_charges_pC.append(charge_pC)
+            self._averaged_count += 1
+            self._charge_sum_pC = self._charge_sum_pC + charge_pC
         elif reference is None or contact.force_N > reference.force_N:
             self._reference_contact = contact
-            self._averaged_charges_pC = [charge_pC]
+            self._averaged_count = 1
+            self._charge_sum_pC = charge_pC
 
     @property
     def mean_charge_pC(self) -> Array:
         """Average of the touch charges, shape (n_electrode,), pC."""
-        return np.asarray(np.mean(self._averaged_charges_pC, axis=0))
+        return self._charge_sum_pC / self._averaged_count
 
 
 RELATIVE_OFFSET_STD = 0.1
@@ -136,8 +131,6 @@ MEMORY_TOUCHES = 16
 
 CONVERSIONS = 3
 """Number of repetitions of the conversion of charges and of the computation of the contact."""
-
-SECONDS_PER_HOUR = 3600.0
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):
@@ -292,7 +285,7 @@ class FilmFollower:
             charge_pC: Average touch charges near the largest force, shape (n_electrode,), pC.
             clock_s: Time of the touch, s.
         """
-        elapsed_hours = max(clock_s - self._latest_touch_s, 0.0) / SECONDS_PER_HOUR
+        elapsed_hours = timedelta(seconds=max(clock_s - self._latest_touch_s, 0.0)) / timedelta(hours=1)
         self._latest_touch_s = clock_s
         self._covariance[0, 0] += self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
         self._covariance += (np.diag(self._initial_std**2) - self._covariance) / FADING_TOUCHES

@@ -74,7 +74,7 @@ FORCE_ACCELERATION_DENSITY = 1e3
 """Spectral density of the second derivative of a changing ln F, 1/s^3."""
 
 SQUARED_GATE = 30.0
-"""Squared Mahalanobis distance of the innovation above which a frame does not belong to the contact."""
+"""Squared Mahalanobis distance of a frame above which it does not belong to a contact."""
 
 MAX_GAP_s = 1.0
 """Time without a frame after which the tracked contact is discarded, s."""
@@ -87,12 +87,6 @@ WEAK_VARIANCE_FACTOR = 100.0
 
 NOISE_INTERVAL_s = 0.0045
 """Time after which the noise of two frames is independent, s. Boards filter their charges over shorter times."""
-
-NOISE_FRAMES = 100
-"""Number of frames over which the estimate of the noise is averaged.
-
-At first, the noise that the model states has the weight of one frame.
-"""
 
 
 def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float) -> Array:
@@ -142,12 +136,12 @@ class NoiseEstimate:
     def __init__(self) -> None:
         """Start with the noise that the model states."""
         self.relative_variance = 1.0
-        self._frames = 1
+        self._frames = 1  # the noise that the model states has the weight of one frame
         self._latest: list[Array] = []  # the latest values, at most three
         self._latest_s = -math.inf
 
     def update(self, measured: Array, covariance: Array, t_s: float) -> None:
-        """Update the estimate with the second difference of the latest three values.
+        """Update the estimate, a mean over all frames, with the second difference of the latest three values.
 
         Args:
             measured: Measured x, y and ln F, shape (3,).
@@ -163,7 +157,7 @@ class NoiseEstimate:
         (difference,) = np.diff(self._latest, n=2, axis=0)
         variance_factor = 6.0 * difference.size  # 1 + 2^2 + 1 for each of the values
         relative_square = float(difference @ np.linalg.solve(covariance, difference)) / variance_factor
-        self._frames = min(self._frames + 1, NOISE_FRAMES)
+        self._frames += 1
         self.relative_variance += (relative_square - self.relative_variance) / self._frames
 
 
@@ -274,16 +268,16 @@ class ContactFilter:
         The standard deviations of the smoothed contact include the constant errors.
 
         A frame that does not belong to the contact is ignored once. A second such frame in succession begins a new
-        contact. A new contact also begins if the time since the latest frame is longer than `MAX_GAP_s`, or if the
-        clock was set back. Frames may have the same time, for example because they were received together.
+        contact. A new contact also begins if the time since the latest frame is longer than `MAX_GAP_s`. Frames may
+        have the same time, for example because they were received together.
 
         Args:
             contact: Contact predicted by the model.
-            t_s: Time of the frame on any clock, s.
+            t_s: Time of the frame on a clock that is never set back, s.
             flags: Flags of the frame. Frames with flags in `WEAK_FLAGS` have a small weight.
         """
         dt_s = t_s - self._latest_time_s
-        if not 0.0 <= dt_s <= MAX_GAP_s:
+        if dt_s > MAX_GAP_s:
             self.reset()
         self._latest_time_s = t_s
         measured, stated_covariance = _measured_values(contact)

@@ -5,21 +5,21 @@ fold, a model predicts only the contacts on one side of the fold. On such a film
 contact directly from the charges.
 """
 
+import math
 from dataclasses import replace
 
 from isocharge.serve.flags import SATURATED
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import read_charge_map
 from isocharge.serve.model.contact import Contact
-from isocharge.serve.record.record import NO_TRACKING, OtherContact, TrackedContact, Tracking
+from isocharge.serve.record.record import OtherContact, TrackedContact, Tracking
 from isocharge.serve.signal_chain.stage import Rule, Setup, Share, Stage
 from isocharge.serve.tracking.contact_mixture import ContactHypothesis, ContactMixture
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.motion_filter import VELOCITY, ContactFilter
 
 CERTAIN_PROBABILITY = 0.97
-"""Probability of a contact above which no other contact is reported."""
-
+"""Probability above which a statement counts as certain: that there is no other contact, or that the contact moves."""
 
 HOLD_TIME_s = 0.2
 """Time at rest after which a hold begins, and longest duration of a tap, s."""
@@ -27,42 +27,24 @@ HOLD_TIME_s = 0.2
 SLIDE_DISTANCE_mm = 0.3
 """Distance from the position at which the contact last rested, above which a moving contact slides, mm."""
 
-SLIDE_PROBABILITY = 0.95
-"""Probability that the contact moves, above which it may slide."""
-
 REST_PROBABILITY = 0.5
 """Probability that the contact moves, below which it is at rest."""
 
 
 class TouchEvents:
-    """Detector that derives the events of a touch from the tracked contacts of its frames.
+    """Detector that derives the events of one touch from the tracked contacts of its frames."""
 
-    The durations of a touch and of a rest are measured with the times of the frames. If the clock is set back during a
-    touch, the time between the two frames is unknown and is not counted.
-    """
-
-    def __init__(self) -> None:
-        """Start without a touch."""
-        # `begin` sets these values when a touch begins.
-        self._press_s = 0.0  # time at which the touch began
-        self._rest_position = 0j  # position x + iy at which the contact last rested, mm
-        self._rest_begin_s = 0.0  # time at which the contact began to rest at this position
-        self._latest_frame_s = 0.0
-        self._latest_event = ""
-
-    def begin(self, tracked: TrackedContact, t_s: float) -> str:
-        """Begin a new touch, and return its first event, which is always `press`.
+    def __init__(self, tracked: TrackedContact, t_s: float) -> None:
+        """Begin a touch, whose first event is always `press`.
 
         Args:
             tracked: Tracked contact of the first frame of the touch.
             t_s: Time of the frame, s.
         """
         self._press_s = t_s
-        self._rest_position = complex(tracked.x_mm, tracked.y_mm)
-        self._rest_begin_s = t_s
-        self._latest_frame_s = t_s
+        self._rest_position = complex(tracked.x_mm, tracked.y_mm)  # where the contact last rested, mm
+        self._rest_begin_s = t_s  # time at which the contact began to rest at this position
         self._latest_event = "press"
-        return "press"
 
     def step(self, tracked: TrackedContact, t_s: float) -> str | None:
         """Return the event that begins with the next frame of a touch, or None if no event begins.
@@ -75,10 +57,9 @@ class TouchEvents:
             tracked: Tracked contact of the frame. Its attribute `moving` is the probability that the contact moves.
             t_s: Time of the frame, s.
         """
-        self._correct_for_clock(t_s)
         position = complex(tracked.x_mm, tracked.y_mm)
         is_away = abs(position - self._rest_position) > SLIDE_DISTANCE_mm
-        if tracked.moving > SLIDE_PROBABILITY:
+        if tracked.moving > CERTAIN_PROBABILITY:
             if is_away and self._latest_event != "slide":
                 self._latest_event = "slide"
                 return "slide"
@@ -92,29 +73,17 @@ class TouchEvents:
         return None
 
     def end(self, t_s: float) -> str:
-        """Return the event with which a touch ends: `tap` or `release`.
+        """Return the event with which the touch ends: `tap` or `release`.
 
         A touch ends with a tap if the touch was short, and no other event has followed the press.
 
         Args:
             t_s: Time of the first frame without a contact, s.
         """
-        self._correct_for_clock(t_s)
         is_short = t_s - self._press_s <= HOLD_TIME_s
         if self._latest_event == "press" and is_short:
             return "tap"
         return "release"
-
-    def _correct_for_clock(self, t_s: float) -> None:
-        """Store the time of the next frame. If the clock was set back, set the stored times back by the same amount.
-
-        Args:
-            t_s: Time of the frame, s.
-        """
-        set_back_s = max(self._latest_frame_s - t_s, 0.0)
-        self._press_s -= set_back_s
-        self._rest_begin_s -= set_back_s
-        self._latest_frame_s = t_s
 
 
 class TrackRule(Rule, frozen=True, kw_only=True):
@@ -159,14 +128,16 @@ class Tracker(Stage):
                 self._mixture = ContactMixture(charges, predictor.metadata.noise)
                 # A contact of the mixture is valid in the whole area for which the file describes the charges.
                 self._mixture_validity = replace(predictor.validity, corners_mm=charges.corners_mm)
+        self._time_s = 0.0  # time of the latest frame on a clock that is never set back
+        self._latest_clock_s = math.inf
         self.reset()
 
     def reset(self) -> None:
-        """Discard the tracked contact, for example after an outage or a new tare."""
-        self._other: OtherContact | None = None  # another contact that also explains the charges
+        """Discard the touch, for example after an outage or a new tare."""
+        self._events: TouchEvents | None = None  # None without a touch
         self._tracked: TrackedContact | None = None
+        self._other: OtherContact | None = None  # another contact that also explains the charges
         self._filter.reset()
-        self._events = TouchEvents()
         if self._mixture is not None:
             self._mixture.reset()
 
@@ -176,36 +147,35 @@ class Tracker(Stage):
         The previous tracked contact is used again if the frame is invalid, if its charges are saturated and there is a
         mixture, or if no contact explains the charges.
 
-        If the clock was set back, the filter or the mixture begins again with the frame, but the touch continues. The
-        time between the two frames is then not counted for the events.
+        If the clock was set back, the touch continues. The time between the two frames is unknown and is not counted.
         """
+        self._time_s += max(frame.clock_s - self._latest_clock_s, 0.0)
+        self._latest_clock_s = frame.clock_s
         event = None
-        tracked = self._tracked
         if frame.contact is not None:
-            event, tracked = self._follow(frame, frame.contact)
+            event = self._follow(frame, frame.contact)
         elif frame.is_valid:  # an invalid frame does not show whether the touch has ended
-            event = self._end_touch(frame.clock_s)
-            tracked = None
-        frame.tracking = NO_TRACKING
-        if tracked is not None or event is not None or self._other is not None:
-            frame.tracking = Tracking(tracked, event, self._other)
+            if self._events is not None:
+                event = self._events.end(self._time_s)
+            self.reset()
+        frame.tracking = Tracking(self._tracked, event, self._other)
 
-    def _follow(self, frame: Frame, contact: Contact) -> tuple[str | None, TrackedContact | None]:
-        """Update the tracked contact with a frame in contact, and return the event that begins and the tracked contact.
+    def _follow(self, frame: Frame, contact: Contact) -> str | None:
+        """Update the tracked contact with a frame in contact, and return the event that begins.
 
         Args:
             frame: The frame. A contact of the mixture replaces its contact.
             contact: Contact predicted by the model.
         """
-        t_s = frame.clock_s
+        t_s = self._time_s
         if self._mixture is None:
             tracked = self._filter.step(contact, t_s, (*frame.flags, *frame.contact_flags))
         else:
             hypotheses: list[ContactHypothesis] = []  # possible contacts, the most probable first
             if SATURATED not in frame.flags and frame.charge_pC is not None:  # saturated charges are wrong
                 hypotheses = self._mixture.update(frame.charge_pC, t_s)
-            if not hypotheses:  # the frame contains no information, so the previous contact is returned again
-                return None, self._tracked
+            if not hypotheses:  # the frame contains no information
+                return None
             contact, *others = [hypothesis.contact(t_s - self._mixture.time_s) for hypothesis in hypotheses]
             frame.set_contact(contact, self._mixture_validity)
             self._other = None
@@ -214,26 +184,8 @@ class Tracker(Stage):
             vx_mm_s, vy_mm_s = hypotheses[0].mean[VELOCITY].tolist()
             tracked = TrackedContact(*contact[:6], vx_mm_s, vy_mm_s, hypotheses[0].moving_probability)
 
-        is_new_touch = self._tracked is None
         self._tracked = tracked
-        if is_new_touch:
-            return self._events.begin(tracked, t_s), tracked
-        return self._events.step(tracked, t_s), tracked
-
-    def _end_touch(self, t_s: float) -> str | None:
-        """Discard the tracked contact, and return the event with which its touch ends.
-
-        Args:
-            t_s: Time of the first frame without a contact, s.
-
-        Returns:
-            The event `tap` or `release`; None if there was no touch.
-        """
-        if self._tracked is None:
-            # The mixture may have received charges that no contact explains. Discard them before the next touch.
-            if self._mixture is not None:
-                self._mixture.reset()
-            return None
-        event = self._events.end(t_s)
-        self.reset()  # only now, because `reset` also discards the events of the touch
-        return event
+        if self._events is None:
+            self._events = TouchEvents(tracked, t_s)
+            return "press"
+        return self._events.step(tracked, t_s)
