@@ -98,7 +98,8 @@ def test_estimate_minimises_the_sum_of_squares_of_all_unknowns_and_contacts(prob
             ]
         )
 
-    start = np.concatenate([(found.film.values - prior.mean)[is_free], data.contact.ravel()])
+    log_contact = np.column_stack([found.contact[:, :2], np.log(found.contact[:, 2])])
+    start = np.concatenate([(found.film.values - prior.mean)[is_free], log_contact.ravel()])
     solution = least_squares(residuals, start, x_scale="jac", xtol=1e-10, ftol=1e-12)
     values, contact = unpacked(solution.x)
     std = np.sqrt(np.diag(found.film.covariance))

@@ -172,7 +172,7 @@ def next_presses(
     for _ in range(count):
         # A press with the rows H reduces the covariance C by C H' (1 + H C H')^-1 H C.
         spread_rows = information_root @ covariance  # H C, shape (n, n_row, n_unknown)
-        innovation = np.eye(data.charge.shape[1] + 3) + spread_rows @ information_root.swapaxes(1, 2)
+        innovation = np.eye(information_root.shape[1]) + spread_rows @ information_root.swapaxes(1, 2)
         effect = spread_rows @ gain.T  # shape (n, n_row, n_error)
         reduction = (effect * np.linalg.solve(innovation, effect)).sum(axis=(1, 2))
         best = int(reduction.argmax())

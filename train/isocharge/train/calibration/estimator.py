@@ -13,12 +13,13 @@ evidence.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc, chdtri, softmax
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, RobustEstimate, robust_estimate
@@ -34,9 +35,6 @@ from isocharge.train.calibration.press_data import (
     linearise,
     model_values,
 )
-
-UNKNOWN_CHARGE_STD = 1e9
-"""Standard deviation of a charge that was not measured, pC."""
 
 BAD_PROBABILITY = 1e-5
 """Probability of residuals as large as those of a press, below which the press is left out."""
@@ -65,14 +63,8 @@ POSITION_RATIOS = ((1.0, 0.8), (3.0, 0.1), (8.0, 0.1))
 NOISE_RATIOS = ((1.0, 0.6), (2.0, 0.1), (4.0, 0.1), (8.0, 0.1), (16.0, 0.1))
 """Noise that is proportional to the charge, relative to that of a good amplifier, with its prior probabilities."""
 
-LARGER_POSITION_RATIO = 3.0
-"""Error of the positions relative to the stated one, with which the search is repeated if a press seems bad.
-
-A press at a wrong place is still recognised.
-"""
-
 MIN_WEIGHT = 1e-6
-"""Weight of a hypothesis below which its covariance is neglected."""
+"""Weight of a hypothesis below which its estimate is neglected."""
 
 MAX_SEARCHES = 5
 """Largest number of searches with other errors than the stated ones."""
@@ -97,9 +89,9 @@ class Hypothesis:
     probability: float
 
     @property
-    def sizes(self) -> tuple[float, float, tuple[float, ...]]:
-        """Sizes from which the prior distribution of the unknowns follows."""
-        return self.imperfections, self.discrepancy, self.session_std
+    def variances(self) -> Array:
+        """Factors of the parts of the prior covariance, shape (3 + n_session,); see `Prior.parts`."""
+        return np.array([1.0, self.imperfections, self.discrepancy, *self.session_std]) ** 2
 
 
 def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
@@ -147,27 +139,35 @@ class Prior:
         mean[self.layout.film] = self.layout.prior.mean
         return mean
 
-    def covariance(self, hypothesis: Hypothesis) -> Array:
-        """Return the covariance of the unknowns, shape (n_unknown, n_unknown).
+    @cached_property
+    def parts(self) -> Array:
+        """Parts of the covariance of the unknowns, shape (3 + n_session, n_unknown, n_unknown).
 
-        After an earlier calibration, only the unknowns of the session depend on the hypothesis, and the discrepancy
-        grows by its size.
+        The parts are the covariance that is the same under all hypotheses, and the covariances of the imperfections, of
+        the discrepancy, and of each unknown of the session, all of the size 1. After an earlier calibration, its
+        covariance contains the imperfections, and the discrepancy grows.
         """
         layout = self.layout
-        n_electrode = len(layout.prior.sensor.electrode_names)
-        discrepancy = hypothesis.discrepancy**2 * unit_covariance(n_electrode)
-        session = np.array(hypothesis.session_std) ** 2
+        parts = np.zeros((3 + len(SESSION), *(layout.coefficients.stop,) * 2))
+        fixed, imperfections, discrepancy, *session = parts
+        discrepancy[layout.coefficients, layout.coefficients] = unit_covariance(
+            len(layout.prior.sensor.electrode_names)
+        )
+        for index, matrix in enumerate(session, layout.session.start):
+            matrix[index, index] = 1.0
         if self.earlier is not None:
-            covariance = self.earlier.covariance.copy()
-            covariance[layout.session, layout.session] = np.diag(session)
-            covariance[layout.coefficients, layout.coefficients] += REMAINING_DISCREPANCY**2 * discrepancy
-            return covariance
-        covariance = np.zeros((layout.coefficients.stop,) * 2)
-        scale = np.where(layout.prior.is_imperfection, hypothesis.imperfections, 1.0)
-        covariance[layout.film, layout.film] = np.diag((scale * layout.prior.std) ** 2)
-        covariance[layout.session, layout.session] = np.diag(session)
-        covariance[layout.coefficients, layout.coefficients] = discrepancy
-        return covariance
+            fixed += self.earlier.covariance
+            discrepancy *= REMAINING_DISCREPANCY**2
+            return parts
+        variance = layout.prior.std**2
+        is_imperfection = layout.prior.is_imperfection
+        fixed[layout.film, layout.film] = np.diag(np.where(is_imperfection, 0.0, variance))
+        imperfections[layout.film, layout.film] = np.diag(np.where(is_imperfection, variance, 0.0))
+        return parts
+
+    def covariance(self, hypothesis: Hypothesis) -> Array:
+        """Return the covariance of the unknowns, shape (n_unknown, n_unknown)."""
+        return np.asarray(np.tensordot(hypothesis.variances, self.parts, 1))
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,9 @@ def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Esti
     estimation = _estimate_with_errors(charges, data, assumed, prior, all_hypotheses, previous)
     probable = estimation.hypothesis.errors
     if estimation.is_bad.any():
-        probable = PressErrors(all_hypotheses[-1].errors.noise, LARGER_POSITION_RATIO)
+        # With larger errors of the positions, a press at a wrong place would not be recognised.
+        middle_ratio, _ = POSITION_RATIOS[len(POSITION_RATIOS) // 2]
+        probable = PressErrors(all_hypotheses[-1].errors.noise, middle_ratio)
     for _ in range(MAX_SEARCHES):
         if probable == assumed:
             break
@@ -269,35 +271,32 @@ def _estimate_with_errors(
 
     # The estimate of each hypothesis follows from the linearised problem at the most probable unknowns so far.
     used_data, used_contact = data[is_used], log_contact[is_used]
-    hypothesis_of_sizes = {one.sizes: one for one in all_hypotheses}
-    precisions = {sizes: _Precision.of(prior.covariance(one)) for sizes, one in hypothesis_of_sizes.items()}
     for _ in range(2):
         model = model_values(charges, layout, used_data, unknowns, used_contact)
         evidence = {
-            errors: _Evidence.of(model, stated[is_used].with_errors(errors), used_contact, unknowns - prior.mean)
+            errors: _Evidence.of(model, stated[is_used].with_errors(errors), used_contact, unknowns, prior)
             for errors in {one.errors for one in all_hypotheses}
         }
-        estimates = [
-            evidence[one.errors].posterior(precisions[one.sizes], prior.mean, one.probability) for one in all_hypotheses
-        ]
-        log_evidence = np.array([one.log_evidence for one in estimates])
-        weight = np.exp(log_evidence - log_evidence.max())
-        weight /= weight.sum()
-        means = np.array([one.mean for one in estimates])
-        mean = weight @ means
-        best = estimates[int(weight.argmax())]
+        fits = [evidence[one.errors].fit(one) for one in all_hypotheses]
+        weight = softmax([one.log_evidence for one in fits])
+        weight[weight < MIN_WEIGHT] = 0.0
+        means = np.tile(prior.mean, (len(fits), 1))
+        covariance = np.zeros((len(unknowns),) * 2)
+        for row in np.flatnonzero(weight):
+            hypothesis = all_hypotheses[row]
+            means[row], one_covariance = evidence[hypothesis.errors].posterior(hypothesis, fits[row])
+            covariance += weight[row] / weight.sum() * one_covariance
+        mean = np.average(means, axis=0, weights=weight)
+        covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)
         used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
         unknowns = _bounded(mean, layout)
-    deviation = means - mean
-    covariance = (weight[:, None] * deviation).T @ deviation
-    for index in np.flatnonzero(weight > MIN_WEIGHT):
-        covariance += weight[index] * cho_solve(estimates[index].factor, np.eye(len(mean)))
 
+    best = int(weight.argmax())
     log_contact[is_used] = used_contact
     final = linearise(charges, layout, data, unknowns, log_contact)
     final_residual, _ = final.eliminated()
     final_chi2 = (final_residual**2).sum(axis=1)
-    best_hypothesis = all_hypotheses[int(weight.argmax())]
+    best_hypothesis = all_hypotheses[best]
     film = FilmEstimate(layout, unknowns, covariance, best_hypothesis.errors.noise)
     return Estimation(
         charges=charges,
@@ -305,7 +304,7 @@ def _estimate_with_errors(
         contact=in_domain(log_contact, charges),
         is_bad=is_bad,
         press_chi2=np.divide(final_chi2, redundancy, out=np.full(len(data), np.nan), where=redundancy > 0),
-        chi2=best.chi2,
+        chi2=fits[best].chi2,
         redundancy=float(redundancy[is_used].sum()),
         hypothesis=best_hypothesis,
     )
@@ -324,7 +323,7 @@ def _search(charges: FilmCharges, data: PressData, prior: Prior, unknowns: Array
     layout = prior.layout
     low, high = np.full((2, len(unknowns)), np.inf) * [[-1.0], [1.0]]
     low[layout.film], high[layout.film] = layout.prior.bounds
-    variance = np.minimum(data.charge_std, UNKNOWN_CHARGE_STD) ** 2
+    variance = np.nan_to_num(data.charge_std**2)  # the largest number for a charge that was not measured
     return robust_estimate(
         lambda contacts, state: model_values(charges, layout, data, state, contacts),
         data.charge,
@@ -337,35 +336,18 @@ def _search(charges: FilmCharges, data: PressData, prior: Prior, unknowns: Array
     )
 
 
-class _Precision(NamedTuple):
-    """Prior distribution under one hypothesis.
+class _Fit(NamedTuple):
+    """Residuals at the prior means, compared with their covariance under one hypothesis.
 
     Attributes:
-        matrix: Inverse covariance of the unknowns, shape (n_unknown, n_unknown).
-        log_determinant: Logarithm of the determinant of this matrix.
-    """
-
-    matrix: Array
-    log_determinant: float
-
-    @classmethod
-    def of(cls, covariance: Array) -> "_Precision":
-        """Invert the covariance of the unknowns, shape (n_unknown, n_unknown)."""
-        return cls(np.asarray(np.linalg.inv(covariance)), -float(np.linalg.slogdet(covariance)[1]))
-
-
-class _Posterior(NamedTuple):
-    """Estimate under one hypothesis.
-
-    Attributes:
-        mean: Most probable unknowns, shape (n_unknown,).
-        factor: Cholesky factor of the inverse covariance, as `cho_factor` returns it.
+        factor: Cholesky factor of the covariance S of the residuals, as `cho_factor` returns it.
+        weighted: S^-1 r, shape (m,).
         log_evidence: Logarithm of the evidence.
-        chi2: Sum of the squared residuals of the presses and of the prior distribution.
+        chi2: Sum of the squared residuals of the presses and of the prior distribution after the fit.
     """
 
-    mean: Array
     factor: tuple[Array, bool]
+    weighted: Array
     log_evidence: float
     chi2: float
 
@@ -374,59 +356,69 @@ class _Posterior(NamedTuple):
 class _Evidence:
     """What presses with given errors state about the unknowns, in the linearised problem.
 
-    With the residuals r at the prior means, from which the contacts are eliminated, and with their derivatives J:
+    The residuals r at the prior means, without the effect of the contacts, have the covariance S = 1 + J P J', where
+    J contains their derivatives, and P is the prior covariance of the unknowns.
 
     Attributes:
-        information: J^T J, shape (n_unknown, n_unknown).
-        gradient: J^T r, shape (n_unknown,).
-        chi2: r^T r.
+        prior: Prior distribution of the unknowns.
+        residual: Residuals r, shape (m,), in a basis of all residuals that the unknowns change.
+        jacobian: Derivatives J, shape (m, n_unknown).
+        parts: J P J' for each part of the prior covariance, shape (n_part, m, m).
+        other_chi2: Sum of the squared residuals that the unknowns do not change.
         log_volume: Logarithm of the density of the measurements, and of the volume of the possible contacts.
     """
 
-    information: Array
-    gradient: Array
-    chi2: float
+    prior: Prior
+    residual: Array
+    jacobian: Array
+    parts: Array
+    other_chi2: float
     log_volume: float
 
     @classmethod
-    def of(cls, model: ModelValues, data: PressData, contact: Array, from_mean: Array) -> "_Evidence":
+    def of(cls, model: ModelValues, data: PressData, contact: Array, unknowns: Array, prior: Prior) -> "_Evidence":
         """Eliminate the contacts.
 
         Args:
-            model: Charges, as `model_values` returns them.
+            model: Charges at the unknowns, as `model_values` returns them.
             data: The presses with the given errors.
             contact: Contacts (x, y, ln F), shape (n, 3).
-            from_mean: Differences of the unknowns from their prior means, shape (n_unknown,).
+            unknowns: The unknowns, shape (n_unknown,).
+            prior: Prior distribution of the unknowns.
         """
         linearised = Linearised.of(model, data, contact)
-        residual, jacobian = linearised.eliminated()
-        jacobian = jacobian.reshape(residual.size, -1)
-        at_mean = residual.ravel() - jacobian @ from_mean
+        eliminated, eliminated_jacobian = linearised.eliminated()
+        is_changed = eliminated_jacobian.any(axis=2)  # False for a coordinate that was not measured
+        basis, jacobian = np.linalg.qr(eliminated_jacobian[is_changed])
+        residual = basis.T @ eliminated[is_changed]
         by_contact = linearised.contact_jacobian
         log_contact_volume = -0.5 * np.linalg.slogdet(by_contact.swapaxes(1, 2) @ by_contact)[1].sum()
         measured_std = np.column_stack([data.charge_std, data.contact_std])
         log_density = -np.log(measured_std[np.isfinite(measured_std)]).sum()
         return cls(
-            information=jacobian.T @ jacobian,
-            gradient=jacobian.T @ at_mean,
-            chi2=float(at_mean @ at_mean),
+            prior=prior,
+            residual=residual - jacobian @ (unknowns - prior.mean),
+            jacobian=jacobian,
+            parts=jacobian @ prior.parts @ jacobian.T,
+            other_chi2=float((eliminated**2).sum() - residual @ residual),
             log_volume=float(log_contact_volume + log_density),
         )
 
-    def posterior(self, precision: _Precision, mean: Array, probability: float) -> _Posterior:
-        """Compute the estimate and the evidence of a hypothesis.
+    def fit(self, hypothesis: Hypothesis) -> _Fit:
+        """Compute the evidence of a hypothesis."""
+        covariance = np.eye(self.residual.size) + np.tensordot(hypothesis.variances, self.parts, 1)
+        factor = cho_factor(covariance, lower=True, check_finite=False)
+        weighted = cho_solve(factor, self.residual, check_finite=False)
+        chi2 = self.other_chi2 + float(self.residual @ weighted)
+        log_determinant = 2.0 * np.log(np.diag(factor[0])).sum()
+        log_evidence = self.log_volume - 0.5 * (chi2 + log_determinant) + np.log(hypothesis.probability)
+        return _Fit(factor, weighted, float(log_evidence), chi2)
 
-        Args:
-            precision: Prior distribution under the hypothesis.
-            mean: Prior means of the unknowns, shape (n_unknown,).
-            probability: Prior probability of the hypothesis.
-        """
-        factor = cho_factor(precision.matrix + self.information, lower=True)
-        change = -cho_solve(factor, self.gradient)
-        chi2 = self.chi2 + float(self.gradient @ change)
-        log_determinant = 2.0 * np.log(np.diag(factor[0])).sum() - precision.log_determinant
-        log_evidence = self.log_volume - 0.5 * (chi2 + log_determinant) + np.log(probability)
-        return _Posterior(mean + change, factor, float(log_evidence), chi2)
+    def posterior(self, hypothesis: Hypothesis, fit: _Fit) -> tuple[Array, Array]:
+        """Return the mean, shape (n_unknown,), and the covariance of the unknowns under a hypothesis with its fit."""
+        prior_covariance = self.prior.covariance(hypothesis)
+        gain = self.jacobian @ prior_covariance
+        return self.prior.mean - gain.T @ fit.weighted, prior_covariance - gain.T @ cho_solve(fit.factor, gain)
 
 
 def _redundancy(data: PressData) -> Array:

@@ -60,9 +60,6 @@ FORMAT_VERSION = 5
 DIGITS = 6
 """Number of decimal digits of a correlation."""
 
-EIGENVALUE_TOLERANCE = 1e-4
-"""Largest magnitude of a negative eigenvalue of a correlation matrix that counts as a rounding error."""
-
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Std = Annotated[float, Meta(ge=0.0, le=1e6)]
 Correlation = Annotated[float, Meta(ge=-1.0, le=1.0)]
@@ -189,7 +186,8 @@ def _correlations(path: Path, rows: list[list[float]], count: int) -> Array:
         matrix[index, :index] = row
         matrix[:index, index] = row
     eigenvalues, vectors = np.linalg.eigh(matrix)
-    if eigenvalues[0] < -EIGENVALUE_TOLERANCE:
+    largest_rounding_error = count * 10.0**-DIGITS  # of an eigenvalue, if each correlation was rounded
+    if eigenvalues[0] < -largest_rounding_error:
         raise PressError(
             f"{path}: correlations: expected a positive semidefinite matrix, got one with the eigenvalue "
             f"{eigenvalues[0]:.3g}: no unknowns have these correlations together; calibrate again"

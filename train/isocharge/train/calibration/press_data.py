@@ -131,13 +131,12 @@ class Linearised:
         """Return the residuals and their derivatives after the best change of each contact.
 
         Returns:
-            Residuals, shape (n, n_electrode + 3), and derivatives, shape (n, n_electrode + 3, n_unknown), both
-            projected onto the space in which the contacts have no effect.
+            Residuals, shape (n, n_electrode), and derivatives, shape (n, n_electrode, n_unknown), in an orthonormal
+            basis of the space in which the contacts have no effect.
         """
-        basis, _ = np.linalg.qr(self.contact_jacobian)  # shape (n, n_electrode + 3, 3)
-        transposed = basis.swapaxes(1, 2)
-        residual = self.residual - (basis @ (transposed @ self.residual[:, :, None]))[:, :, 0]
-        return residual, self.jacobian - basis @ (transposed @ self.jacobian)
+        basis, _ = np.linalg.qr(self.contact_jacobian, mode="complete")
+        transposed = basis[:, :, 3:].swapaxes(1, 2)
+        return (transposed @ self.residual[:, :, None])[:, :, 0], transposed @ self.jacobian
 
     def contact_change(self, change: Array) -> Array:
         """Return the best changes of the contacts (x, y, ln F), shape (n, 3), after a change of the unknowns."""
