@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from headless_chromium import start_chromium
 from isocharge.common.errors import InputError, OriginError
 from isocharge.serve.network.address import Token
-from isocharge.serve.network.browser_check import BrowserCheck, host_name
+from isocharge.serve.network.browser_check import AccessCheck, host_name
 from isocharge.serve.network.protocol import Handler
 
 CHROMIUM_ARGUMENTS = (
@@ -59,14 +59,14 @@ REFUSED = {
 
 @pytest.mark.parametrize("headers", SERVED.values(), ids=SERVED)
 def test_clients_and_own_pages_are_served(headers):
-    BrowserCheck().check("POST", headers_of(**headers))
+    AccessCheck().check("POST", headers_of(**headers))
 
 
 @pytest.mark.parametrize(("headers", "header"), REFUSED.values(), ids=REFUSED)
 def test_pages_of_other_sites_are_refused(headers, header):
     for method in ("GET", "POST"):
         with pytest.raises(OriginError, match=f"^{header}: expected"):
-            BrowserCheck().check(method, headers_of(**headers))
+            AccessCheck().check(method, headers_of(**headers))
 
 
 def test_repeated_host_is_refused_and_other_repeated_headers_are_joined(handler):
@@ -82,15 +82,15 @@ def test_link_on_another_site_is_accepted():
     link = headers_of(
         host="127.0.0.1:8000", sec_fetch_site="cross-site", sec_fetch_mode="navigate", sec_fetch_dest="document"
     )
-    BrowserCheck().check("GET", link)
+    AccessCheck().check("GET", link)
     with pytest.raises(OriginError, match="Sec-Fetch-Site"):
-        BrowserCheck().check("POST", link)
+        AccessCheck().check("POST", link)
     with pytest.raises(OriginError, match="Sec-Fetch-Site"):
-        BrowserCheck().check("GET", link | {b"sec-fetch-dest": b"iframe"})
+        AccessCheck().check("GET", link | {b"sec-fetch-dest": b"iframe"})
 
 
 def test_allow_host_names_a_proxy():
-    check = BrowserCheck("0.0.0.0", ["Robot.Example"])
+    check = AccessCheck("0.0.0.0", ["Robot.Example"])
     check.check("POST", headers_of(host="robot.example", origin="https://robot.example"))
     check.check("POST", headers_of(host="127.0.0.1:8000", origin="https://robot.example:8443"))
     with pytest.raises(OriginError, match=r"one of 0\.0\.0\.0, localhost, robot\.example"):
@@ -107,11 +107,11 @@ def test_allow_host_expects_a_plain_name(name):
 def test_no_name_but_localhost_is_served(name):
     if name.partition(":")[0] != "localhost":
         with pytest.raises(OriginError, match="Host"):
-            BrowserCheck().check("GET", {b"host": name.encode()})
+            AccessCheck().check("GET", {b"host": name.encode()})
 
 
 def test_with_a_token_any_host_name_is_served(store):
-    handler = Handler(store, token=Token("sesame"))
+    handler = Handler(store, access=AccessCheck(token=Token("sesame")))
     headers = [(b"host", b"inference.cluster.local"), (b"authorization", b"Bearer sesame")]
     assert handler.answer("GET", "/v2", headers, b"").status == 200
     assert handler.answer("GET", "/v2", [*headers, (b"origin", b"http://evil.example")], b"").status == 403
@@ -204,7 +204,7 @@ def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_
 
 def test_page_on_another_port_of_an_allowed_host_is_refused():
     """The page belongs to another server. Behind a proxy that replaces the `Host`, the page is accepted."""
-    check = BrowserCheck("127.0.0.1", ["film.example.org"])
+    check = AccessCheck("127.0.0.1", ["film.example.org"])
     page = {b"origin": b"http://film.example.org:3000"}
     with pytest.raises(OriginError, match="Origin: expected a page of this server"):
         check.check("POST", {b"host": b"film.example.org:8000"} | page)

@@ -9,6 +9,7 @@ import pytest
 
 from headless_chromium import start_chromium
 from isocharge.serve.network.address import Address, Token
+from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.viewer.film_description import describe_film
 from isocharge.serve.viewer.live_page import LivePage, serve_page
 
@@ -56,7 +57,8 @@ def start_page(film):
 
         def start(token=None, **settings):
             secret = None if token is None else Token(token)
-            page = LivePage(describe_film("a film", film.metadata()), token=secret, **settings)
+            access = AccessCheck(token=secret)
+            page = LivePage(describe_film("a film", film.metadata()), access=access, **settings)
             return Client(page, stack.enter_context(serve_page(page, Address())))
 
         yield start

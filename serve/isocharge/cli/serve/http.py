@@ -23,7 +23,7 @@ from isocharge.cli.shared.terminal import announce, on_signal, say, unless_hung_
 from isocharge.common.errors import IsochargeError
 from isocharge.common.extras import require
 from isocharge.serve.network.address import Address, Tls, check_exposure
-from isocharge.serve.network.browser_check import BrowserCheck
+from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.http import Application, HttpServer
 from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import ModelStore, open_model_store
@@ -81,15 +81,15 @@ def http_command(
     most_exposed_address = address if grpc_port is None else Address(host)
     check_exposure(most_exposed_address, has_token=secret is not None)
     tls = given_tls(tls_cert, tls_key)
-    # Pages of other sites can neither send the token nor reach a Unix socket, so every host name is then accepted.
-    browser_check = BrowserCheck(host, allow_host or (), any_host=secret is not None or uds is not None)
+    # Pages of other sites cannot reach a Unix socket, so every host name is then accepted.
+    access = AccessCheck(host, allow_host or (), token=secret, any_host=uds is not None)
 
     # Load the models, and serve them until Ctrl-C.
     with suppress(KeyboardInterrupt), _traffic(log) as traffic:
         store = open_model_store(models)
         for reason in store.refusals():
             _report(traffic, "warning", "refused", reason)
-        handler = Handler(store, traffic=traffic, token=secret, browser_check=browser_check)
+        handler = Handler(store, traffic=traffic, access=access)
         server = HttpServer(Application(handler), address, handler.limits, traffic, tls=tls)
         with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:  # empty without gRPC
             _report(traffic, "info", "serving", _labels(store))

@@ -21,7 +21,7 @@ from isocharge.serve import PredictionRecord, Recorder, TouchStream
 from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.network.address import Address, Tls, Token, check_exposure
-from isocharge.serve.network.browser_check import BrowserCheck
+from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.port import recording
 from isocharge.serve.viewer.film_description import describe_film
 
@@ -175,9 +175,8 @@ def live_page(
     with require("http"):
         from isocharge.serve.viewer.live_page import LivePage, serve_page
 
-    browser_check = BrowserCheck(address.host, allow_host or (), any_host=secret is not None)
-    description = describe_film(name, metadata)
-    page = LivePage(description, is_recording=is_recording, token=secret, browser_check=browser_check)
+    access = AccessCheck(address.host, allow_host or (), token=secret)
+    page = LivePage(describe_film(name, metadata), is_recording=is_recording, access=access)
     handler = logging.Handler()
     handler.emit = lambda record: page.update(  # type: ignore[method-assign]
         note={"text": record.getMessage(), "at": time.time()}

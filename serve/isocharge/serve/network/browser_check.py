@@ -24,7 +24,7 @@ from functools import lru_cache
 from urllib.parse import urlsplit
 
 from isocharge.common.errors import InputError, OriginError, RequestError
-from isocharge.serve.network.address import ip_address
+from isocharge.serve.network.address import Token, ip_address
 
 TRUSTED_FETCH_SITES = (b"same-origin", b"none")
 """Values of the header `Sec-Fetch-Site` that are accepted.
@@ -33,33 +33,55 @@ Browsers send `same-origin` if a page of this server sends the request, and `non
 """
 
 
-class BrowserCheck:
-    """Filter that refuses requests from web pages of other sites.
+class AccessCheck:
+    """Filter that refuses requests from web pages of other sites, and requests without the token of the server.
 
     Args:
         host: Host name or address on which the server listens.
         allowed_hosts: Further host names of the server, for example the name of a reverse proxy. Pages of these hosts
             may also send requests.
-        any_host: Whether to accept every value of the header `Host`. DNS rebinding is harmless if requests must contain
-            a token, because a page of another site does not have the token. It is also harmless if the server listens
-            on a Unix socket.
+        token: Token that requests must contain; None if requests need no token. With a token, every value of the header
+            `Host` is accepted. DNS rebinding is then harmless, because a page of another site does not have the token.
+        any_host: Whether to accept every value of the header `Host` even without a token. This is harmless if the
+            server listens on a Unix socket.
     """
 
-    def __init__(self, host: str = "localhost", allowed_hosts: Iterable[str] = (), *, any_host: bool = False) -> None:
+    def __init__(
+        self,
+        host: str = "localhost",
+        allowed_hosts: Iterable[str] = (),
+        *,
+        token: Token | None = None,
+        any_host: bool = False,
+    ) -> None:
         self._allowed_names = frozenset(map(host_name, allowed_hosts))
         self._host_names = self._allowed_names | {"localhost", host.lower()}
-        self._any_host = any_host
+        self._token = token
+        self._any_host = any_host or token is not None
 
-    def check(self, method: str, headers: Mapping[bytes, bytes]) -> None:
+    def check(self, method: str, headers: Mapping[bytes, bytes], *, needs_token: bool = True) -> None:
         """Check the headers of a request, and raise an error if the request is refused.
 
         Args:
             method: Method in capitals.
             headers: Value of each header by the name of the header in lower case.
+            needs_token: Whether the request must contain the token, if the server has one.
 
         Raises:
             OriginError: If a page of another site has sent the request, or if `Host` is not a name of this server.
+            TokenError: If the token is missing or wrong.
         """
+        self._check_site(method, headers)
+        if needs_token:
+            self.check_token(headers.get(b"authorization", b""))
+
+    def check_token(self, authorization: bytes) -> None:
+        """Check the value of an Authorization header; see `Token.check`. Without a token, every value is accepted."""
+        if self._token is not None:
+            self._token.check(authorization)
+
+    def _check_site(self, method: str, headers: Mapping[bytes, bytes]) -> None:
+        """Raise an error if a page of another site has sent a request."""
         host = headers.get(b"host", b"")
         if not (self._any_host or self._is_served(host)):
             raise OriginError(

@@ -25,8 +25,8 @@ from isocharge.common.errors import RequestError, UnknownPath, WrongMethod
 from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, WrongKey, parse_json
 from isocharge.serve.flags import MEANINGS
-from isocharge.serve.network.address import Address, ServerLimits, Tls, Token
-from isocharge.serve.network.browser_check import BrowserCheck, header_values
+from isocharge.serve.network.address import Address, ServerLimits, Tls
+from isocharge.serve.network.browser_check import AccessCheck, header_values
 from isocharge.serve.network.http import Application, HttpServer
 from isocharge.serve.network.metrics import Client
 from isocharge.serve.network.protocol.handler import Headers
@@ -130,8 +130,7 @@ class LivePage:
         description: dict[str, Any],
         *,
         is_recording: bool = False,
-        token: Token | None = None,
-        browser_check: BrowserCheck | None = None,
+        access: AccessCheck | None = None,
     ) -> None:
         """Create a page without samples.
 
@@ -141,16 +140,14 @@ class LivePage:
         Args:
             description: Description of the film, as `describe_film` returns it.
             is_recording: Whether the stream is a recording.
-            token: Token that requests must contain, or None if requests need no token.
-            browser_check: Check that refuses requests from web pages of other sites. By default, it accepts requests
-                for IP addresses and for `localhost`.
+            access: Check of the token, and of the web page that has sent a request. By default, requests need no token,
+                and only requests for IP addresses and for `localhost` are accepted.
         """
         self._electrodes = tuple(description["electrodes"])
         dtype = sample_type(self._electrodes)
         self.tape: Tape = RecordedTape(dtype) if is_recording else Tape(dtype)
         self.act: Callable[[Action], None] | None = None
-        self._token = token
-        self._browser_check = browser_check or BrowserCheck(any_host=token is not None)
+        self._access = access or AccessCheck()
         self._markers: deque[tuple[float, str]] = deque(maxlen=MAX_MARKERS)
         self._state: dict[str, Any] = {}
         self._state_lock = Lock()  # the thread of the stream and the thread of the server change the state
@@ -198,9 +195,7 @@ class LivePage:
         """
         if path in self._files:
             return self._files[path]
-        self._browser_check.check(method, headers)
-        if self._token is not None:
-            self._token.check(headers.get(b"authorization", b""))
+        self._access.check(method, headers)
         if path == SESSION_PATH:
             return json_response(self._session)
         if path != REQUEST_PATH:

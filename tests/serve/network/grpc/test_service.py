@@ -20,6 +20,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from isocharge.common.errors import InputError
 from isocharge.serve.model.session import OUTPUTS
 from isocharge.serve.network.address import ServerLimits, Tls, Token
+from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.grpc import grpc_server, server
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE
 from isocharge.serve.network.grpc.service import Service
@@ -34,7 +35,7 @@ def serve(store):
     with ExitStack() as stack:
 
         def start(token=None, **limits):
-            handler = Handler(store, ServerLimits(**limits), token=token)
+            handler = Handler(store, ServerLimits(**limits), access=AccessCheck(token=token))
             url = stack.enter_context(grpc_server(handler, "127.0.0.1", 0)).removeprefix("grpc://")
             # Each channel has its own connection.
             own = ("grpc.use_local_subchannel_pool", 1)
@@ -234,6 +235,7 @@ def test_keepalive_pings_do_not_close_a_connection(serve, silent_call, monkeypat
 def test_end_of_a_connection_is_not_logged_as_an_error(store, caplog):
     """If a client ends a call whose responses it does not read, the pending response cannot be sent."""
     context = Mock(read=AsyncMock(return_value=b""), write=AsyncMock(side_effect=grpc.aio.InternalError))
+    context.invocation_metadata.return_value = ()
     service = Service(Handler(store))
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(service._handle("ModelStreamInfer", None, context))

@@ -64,7 +64,7 @@ class Service:
         self._store = handler.store
         self._limits = handler.limits
         self._traffic = handler.traffic
-        self._token = handler.token
+        self._access = handler.access
         self._open_count = 0
         # Timeouts of the calls that wait for a message, in the order in which they began to wait. A dictionary without
         # values is used as an ordered set.
@@ -158,8 +158,8 @@ class Service:
             IsochargeError: If the call is refused.
         """
         with self._count_open_call():
-            if self._token is not None and name not in METHODS_WITHOUT_TOKEN:
-                self._token.check(_authorization(context))
+            if name not in METHODS_WITHOUT_TOKEN:
+                self._access.check_token(_authorization(context))
             timeout_s = self._limits.header_seconds
             while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
                 if name in SLOW_METHODS:

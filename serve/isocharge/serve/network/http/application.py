@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from isocharge.serve.network.address import ServerLimits, Token
-from isocharge.serve.network.browser_check import BrowserCheck
+from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.metrics import Client
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
@@ -97,8 +97,8 @@ def asgi_app(models: Path | None = None, *, token: str | None = None, allowed_ho
         >>> app = Starlette(routes=[Mount("/touch", asgi_app(token="s3cret"))])  # doctest: +SKIP
     """
     secret = None if token is None else Token(token)
-    browser_check = BrowserCheck(allowed_hosts=allowed_hosts, any_host=secret is not None)
-    return Application(Handler(open_model_store(models), token=secret, browser_check=browser_check))
+    access = AccessCheck(allowed_hosts=allowed_hosts, token=secret)
+    return Application(Handler(open_model_store(models), access=access))
 
 
 async def _read_body(receive: Receive, max_bytes: int) -> bytes | None:

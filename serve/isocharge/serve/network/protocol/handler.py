@@ -13,8 +13,8 @@ from collections.abc import Iterable
 from functools import lru_cache
 
 from isocharge.common.errors import UnknownPath, WrongMethod
-from isocharge.serve.network.address import ServerLimits, Token
-from isocharge.serve.network.browser_check import BrowserCheck, header_values
+from isocharge.serve.network.address import ServerLimits
+from isocharge.serve.network.browser_check import AccessCheck, header_values
 from isocharge.serve.network.metrics import Client, Exchange, Traffic
 from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.response import Response, decompress, error_response, json_response
@@ -54,8 +54,7 @@ class Handler:
         store: ModelStore,
         limits: ServerLimits | None = None,
         traffic: Traffic | None = None,
-        token: Token | None = None,
-        browser_check: BrowserCheck | None = None,
+        access: AccessCheck | None = None,
     ) -> None:
         """Create a handler for the models of a store.
 
@@ -64,16 +63,12 @@ class Handler:
             limits: Limits of the server. The handler applies the limits of the body and of the batch. The server itself
                 applies the limits of the connections.
             traffic: Counters and log of the requests. By default, the requests are counted, but not logged.
-            token: Token that requests must contain, or None if requests need no token.
-            browser_check: Check that refuses requests from web pages of other sites. By default, the check only accepts
-                requests for IP addresses and for `localhost`. If there is a token, it accepts requests for any host
-                name.
+            access: Check of the token, and of the web page that has sent a request. By default, requests need no token,
+                and only requests for IP addresses and for `localhost` are accepted.
         """
         self.store = store
-        self.token = token
+        self.access = access or AccessCheck()
         self.limits = limits or ServerLimits()
-        has_token = token is not None
-        self._browser_check = browser_check or BrowserCheck(any_host=has_token)
         self.traffic = traffic or Traffic()
 
     def may_block(self, path: str) -> bool:
@@ -135,11 +130,9 @@ class Handler:
             IsochargeError: If the request is refused.
         """
         headers = request.headers
-        self._browser_check.check(method, headers)
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
         # which paths exist.
-        if self.token is not None and (route is None or route.needs_token):
-            self.token.check(headers.get(b"authorization", b""))
+        self.access.check(method, headers, needs_token=route is None or route.needs_token)
         if route is None:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
         # A HEAD request is answered like a GET request. The server then sends the response without its body.
