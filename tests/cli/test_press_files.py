@@ -1,40 +1,10 @@
-"""All commands that read a file of presses give the same error messages for the same faults."""
+"""Commands that read a file of presses: names of rows and columns in messages, and long files."""
 
 import pyarrow
-import pytest
 from pyarrow.parquet import write_table
 
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.serve import Predictor
-
-COMMANDS = {
-    "predict": ("serve", "predict", "four-25um-biaxial"),
-    "check": ("serve", "check", "four-25um-biaxial"),
-    "calibrate": ("train", "calibrate", "--sensor", "four-25um-biaxial", "-o", "film"),
-    "fit alone": ("train", "fit", "-o", "models/pad"),
-}
-"""Words of the commands, to which the file is appended."""
-
-PRESS = "1,2,0.5,100,200,300,400\n"
-
-
-@pytest.fixture
-def refuses(refused, tmp_path, monkeypatch):
-    """Check that a command refuses a file, and that nothing but the file is left."""
-    monkeypatch.chdir(tmp_path)
-
-    def check(name, data, message, suffix="csv"):
-        (tmp_path / f"p.{suffix}").write_bytes(data)
-        refused(*COMMANDS[name], f"p.{suffix}", message=message)
-        assert [path.name for path in tmp_path.iterdir()] == [f"p.{suffix}"]
-
-    return check
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_file_in_utf_16(refuses, name):
-    data = f"x_mm,y_mm,force_N,A,B,C,D\n{PRESS}".encode("utf-16")
-    refuses(name, data, "p.csv, line 1: the byte 0xff is not text in UTF-8")
 
 
 def test_presses_of_a_parquet_file_are_named_by_their_rows(command, tmp_path):
@@ -48,8 +18,11 @@ def test_presses_of_a_parquet_file_are_named_by_their_rows(command, tmp_path):
     assert "(row 2)" in out
 
 
-def test_a_missing_column_of_a_training_is_named(refuses):
-    refuses("fit alone", b"force_N,A,B,C,D\n1,100,200,300,400\n", "add the column 'x_mm', 'y_mm'")
+def test_a_missing_column_of_a_training_is_named(refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "p.csv").write_text("force_N,A,B,C,D\n1,100,200,300,400\n")
+    refused("train", "fit", "p.csv", "-o", "models/pad", message="add the column 'x_mm', 'y_mm'")
+    assert [path.name for path in tmp_path.iterdir()] == ["p.csv"]
 
 
 def test_a_long_table_is_predicted_in_pieces(command, tmp_path, monkeypatch):
@@ -65,8 +38,9 @@ def test_a_long_table_is_predicted_in_pieces(command, tmp_path, monkeypatch):
     header = "A,B,C,D\n"
     (tmp_path / "p.csv").write_text(header + "500,500,500,500\n" * (MAX_BATCH + 1))
     (tmp_path / "empty.csv").write_text(header)
-    _, out, _ = command(*COMMANDS["predict"], tmp_path / "p.csv")
-    _, out_of_empty, _ = command(*COMMANDS["predict"], tmp_path / "empty.csv")
+    predict = ("serve", "predict", "four-25um-biaxial")
+    _, out, _ = command(*predict, tmp_path / "p.csv")
+    _, out_of_empty, _ = command(*predict, tmp_path / "empty.csv")
     assert sizes == [MAX_BATCH, 1, 0]
     names, *rows = out.splitlines()
     assert out_of_empty.splitlines() == [names]

@@ -213,11 +213,9 @@ def test_doctor_as_json_waits_for_its_port(resting, run, tmp_path):
 def test_doctor_exit_code_if_no_frames_are_recognised(command, monkeypatch):
     monkeypatch.setattr("isocharge.serve.port.source.START_UP_s", 0.5)
     silent = PseudoPort()
-    words = ("--seconds", 0.5, "--model", "three-25um-biaxial")
-    code, out, err = command("serve", "doctor", "--port", silent.url, *words)
+    code, out, err = command("serve", "doctor", "--port", silent.url, "--seconds", 0.5)
     silent.close()
     assert (code, "no bytes were received" in out, "listening for 0.5 s" in err) == (1, True, True)
-    assert "answered wrongly" not in out
     assert "held presses" not in out
 
 

@@ -51,15 +51,6 @@ def test_replay_converts_an_old_recording(command, recorded, models, tmp_path, n
     assert path.read_bytes() == before
 
 
-def test_a_live_stream_that_is_stopped_ends_its_file(board_until, models, run, tmp_path):
-    path = tmp_path / "touch.mcap"
-    with board_until(400) as board:
-        out = run(
-            "stream", "linear", "--port", board.url, "--models", models, "--output", "json", "--output", path
-        ).stdout
-    assert lines_in(path) == out.splitlines() != []
-
-
 @pytest.fixture
 def figures(monkeypatch):
     """The figures that are drawn from now on."""

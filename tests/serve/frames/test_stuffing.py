@@ -16,24 +16,6 @@ from isocharge.serve import BinaryParser, Frame, encode_frame
 from isocharge.serve.frames.binary import MAX_STUFFED_LENGTH
 from isocharge.serve.frames.transmission import CHECKSUMS, STUFFINGS
 
-EXAMPLES = [
-    ("slip", "C0", "DB DC"),
-    ("slip", "DB", "DB DD"),
-    ("slip", "DB DC", "DB DD DC"),
-    ("slip", "01 C0 DB 02", "01 DB DC DB DD 02"),
-    ("hdlc", "7E", "7D 5E"),
-    ("hdlc", "7D", "7D 5D"),
-    ("hdlc", "31 7D 7E 11", "31 7D 5D 7D 5E 7D 31"),
-    ("cobs", "00", "01 01"),
-    ("cobs", "11 22 00 33", "03 11 22 02 33"),
-]
-"""Name of the stuffing, data, and data with stuffing, from RFC 1055, RFC 1662 (4.2), and Cheshire and Baker."""
-
-
-@pytest.mark.parametrize(("name", "data", "stuffed"), EXAMPLES)
-def test_examples_of_the_documents_are_decoded(name, data, stuffed):
-    assert STUFFINGS[name].decode(bytes.fromhex(stuffed)) == bytes.fromhex(data)
-
 
 @pytest.mark.parametrize(
     ("name", "stuffed", "reason"),

@@ -13,7 +13,6 @@ from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_lines import clean_text, line_values, parse_line, skeleton_pattern
 from isocharge.serve.port.file_source import Chunk
-from layout_encoder import TEXT_ENCODERS
 
 README_OF_TELEPLOT = [
     ("myValue:1234", ("myValue",), (1234.0,)),
@@ -87,12 +86,6 @@ def feed(*lines, parser=None):
     return (parser or TextParser()).feed("".join(f"\n{line}" for line in lines).encode() + b"\n")
 
 
-@pytest.mark.parametrize("line", ['{"A": %s, "B": 1, "C": 2}', "[%s, 1, 2]", "A:%s,B:1,C:2", "%s,1,2"])
-def test_number_of_hundreds_of_digits_is_infinite_in_every_notation(line):
-    _, values = names_and_values(line % ("9" * 400))
-    assert values == (math.inf, 1.0, 2.0)
-
-
 def test_layout_is_recognised_from_the_first_good_lines():
     parser = TextParser()
     assert feed("booting v1.2 ...", "3.3,801.2", "801.0,799.0,803.0", "801.1,799.1,803.1", parser=parser) == []
@@ -108,11 +101,6 @@ def test_header_names_the_columns():
     frames = feed("seq,t_us,A,B,C", *rows)
     assert frames[0] == Frame(0, 0, (1.0, 2.0, 3.0), names=("A", "B", "C"))
     assert [(frame.seq, frame.t_us) for frame in frames] == [(0, 0), (1, 1000), (2, 2000), (3, 3000)]
-
-
-def test_columns_are_named_by_the_device_file():
-    frames = feed("7,12.5,801", "8,13.5,801", "9,14.5,801", parser=TextParser(("seq", "t_ms", "A")))
-    assert frames[1] == Frame(8, 13500, (801.0,), names=("A",))
 
 
 NOTATIONS = {
@@ -278,26 +266,6 @@ def test_line_of_another_layout_is_dropped_and_counted():
     frames = feed("1,2,3", "1,2,3", "1,2,3", "1,2", "A:1", "1,2,3", parser=parser)
     assert len(frames) == 4
     assert parser.counts.malformed == 2
-
-
-FRAMES = st.builds(
-    Frame,
-    seq=st.integers(0, 2**16 - 1),
-    t_us=st.integers(0, 2**32 - 1),
-    values=st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 3),
-)
-
-
-@settings(derandomize=True)
-@given(FRAMES, st.sampled_from(sorted(TEXT_ENCODERS)))
-def test_text_lines_round_trip_in_every_notation(frame, notation):
-    parsed = TextParser().feed(b"\n" + TEXT_ENCODERS[notation](frame) * 3)
-    assert len(parsed) == 3
-    latest = parsed[-1]
-    assert latest.values == pytest.approx(frame.values, rel=1e-6)
-    if notation != "csv":
-        assert latest.names == ("A", "B", "C")
-        assert (latest.seq, latest.t_us) == (frame.seq, frame.t_us)
 
 
 def test_unrecognised_lines_use_bounded_memory():

@@ -19,7 +19,7 @@ from isocharge.serve import (
 from isocharge.serve.frames.formats import Frames
 from isocharge.serve.frames.frame_layout import SyncParser
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.live.device import ANY_BOARD, create_stages
+from isocharge.serve.live.device import ANY_BOARD
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain, SaturationRule
 from isocharge.serve.signal_chain.hum import HumRule
@@ -155,19 +155,6 @@ WRONG = [
 def test_device_file_that_is_refused(device, text, message):
     with pytest.raises(DeviceError, match=rf"device\.toml: .*{message}"):
         device(text)
-
-
-def test_device_file_that_does_not_exist(tmp_path):
-    with pytest.raises(DeviceError, match=r"none\.toml: cannot be read"):
-        load_device(tmp_path / "none.toml")
-
-
-def test_setting_for_other_electrodes_is_refused(device):
-    board = device("[gain]\npC_per_unit = {A = 1.0, B = 1.0}\n")
-    with pytest.raises(
-        DeviceError, match=r"one for each of the electrodes \('A', 'B', 'C'\), got \{'A': 1.0, 'B': 1.0\}"
-    ):
-        create_stages(Setup(ELECTRODES, board))
 
 
 @pytest.mark.parametrize(

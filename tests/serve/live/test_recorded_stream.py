@@ -8,7 +8,6 @@ from itertools import count
 import numpy as np
 import pytest
 
-from isocharge.common.errors import RecordingError
 from isocharge.serve import (
     Chunk,
     Frame,
@@ -136,23 +135,6 @@ def test_recording_on_a_full_disk_remains_readable(tmp_path, film, predictor, fi
     assert replayed == lines[: len(replayed)]
 
 
-@pytest.mark.parametrize("real_time", [False, True])
-def test_replay_in_real_time_waits_between_chunks(tmp_path, film, predictor, monkeypatch, real_time):
-    path = tmp_path / "touch.rec"
-    record_presses(path, film, predictor)
-    recording = Recording(path)
-    slept_s = []
-    monkeypatch.setattr(time, "monotonic", lambda: sum(slept_s))
-    monkeypatch.setattr(time, "sleep", slept_s.append)
-    stream = TouchStream(predictor, device_from_table(recording.device, "recording"))
-    records = list(replay(recording, stream, real_time=real_time))
-    assert len(records) > 60
-
-    chunk_count = sum(event.chunk is not None for event in recording.events())
-    expected_s = CHUNK_INTERVAL_S * (chunk_count - 1) if real_time else 0.0
-    assert sum(slept_s) == pytest.approx(expected_s, abs=1e-5)
-
-
 def test_replay_in_real_time_ignores_a_step_of_the_wall_clock(tmp_path, predictor, monkeypatch):
     """A step by 8e10 s is longer than `time.sleep` accepts."""
     path = tmp_path / "touch.rec"
@@ -200,12 +182,3 @@ def test_recording_that_begins_later_restarts_the_stream(film, predictor, tmp_pa
     assert markers == [Marker(1e9, "now")]
     assert [event.use for event in Recording(path).events() if event.use] == model_changes
     assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.parametrize("marker", ['["x", "y"]', "[1.0]", "[1.0, 2]", '[1e300, "y"]', "1", f'[1.0, "{"x" * 2000}"]'])
-def test_damaged_marker_raises_an_error_with_the_reason(film, predictor, tmp_path, marker):
-    path = tmp_path / "touch.rec"
-    record_presses(path, film, predictor)
-    path.write_text(path.read_text() + f'{{"marker": {marker}}}\n')
-    with pytest.raises(RecordingError, match="marker"):
-        list(Recording(path).events())

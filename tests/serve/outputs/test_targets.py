@@ -8,7 +8,7 @@ import pytest
 from boards import interrupt
 from isocharge.common.errors import InputError, OutputError, OutputExists
 from isocharge.serve.outputs.output import OutputContext, OutputKind
-from isocharge.serve.outputs.targets import OUTPUT_KINDS, Outputs, output_kind, target_forms
+from isocharge.serve.outputs.targets import Outputs, output_kind
 
 ELECTRODES = ("A", "B")
 
@@ -50,10 +50,6 @@ def test_two_outputs_on_standard_output_are_refused():
 def test_repeated_target_is_refused():
     with pytest.raises(InputError, match="expected targets that differ"):
         Outputs(["a.csv", "a.csv"], context())
-
-
-def test_help_lists_the_forms_of_all_kinds():
-    assert all(kind.form in target_forms() for kind in OUTPUT_KINDS)
 
 
 @pytest.mark.parametrize("is_live", [True, False], ids=["live", "replay"])

@@ -113,6 +113,7 @@ def test_recording_of_another_version_is_refused(tmp_path):
         '{"timestamp": 1.0, "latency_us": "soon"}',
         '{"timestamp": 1, "latency_us": 1e300}',
         '{"chunk": [1.0, 2]}',
+        '{"marker": [1e300, "y"]}',
         '{"chunk": ["no base64!", 1.0, 2, 0.0]}',
         '{"chunk": ["YWJj", 1e300, 5, 0.0]}',
         '{"chunk": ["YWJj", 1e9, 11111111111111111111111, 0.0]}',

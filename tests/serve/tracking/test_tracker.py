@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from isocharge.serve import Chunk, Contact, Device, Frame, TouchStream, encode_frame
+from isocharge.serve import Chunk, Contact, Frame, TouchStream, encode_frame
 from isocharge.serve.flags import INVALID
 from isocharge.serve.live.device import device_from_table, with_settings
 from isocharge.serve.record.record import TrackedContact
@@ -18,7 +18,7 @@ from isocharge.serve.tracking.motion_filter import (
     SPEED_CHANGE_RATE,
     MotionFilter,
 )
-from isocharge.serve.tracking.tracker import TouchEvents, TrackRule
+from isocharge.serve.tracking.tracker import TouchEvents
 from stage_runner import new_tracker, track
 
 STD = 0.06
@@ -288,7 +288,5 @@ def test_records_with_track_only_add_fields_and_are_repeated_bit_for_bit(film, p
         assert other is None
 
 
-def test_device_file_section_track_switches_tracking_on():
-    assert Device().rule(TrackRule) is None
-    assert device_from_table({"track": {"lasting": 0.9}}, "b").rule(TrackRule) == TrackRule(lasting=0.9)
+def test_option_track_adds_a_section_to_the_device_file():
     assert with_settings(device_from_table({}, "b"), "track", on=True).table == {"track": {"on": True}}

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from isocharge.serve import flags
 from isocharge.serve.record.record import OtherContact, TrackedContact, Tracking
 from isocharge.serve.viewer.tape import (
     FLAG_BITS,
@@ -43,12 +42,6 @@ def test_sample_contains_the_tracked_contact(record):
     sample = sample_of(record(x_mm=1.0, misfit=0.5, xy_correlation=0.25, tracking=tracking))
     assert (sample["x_mm"], sample["misfit"], sample["xy_correlation"], sample["x_std_mm"]) == (2.0, 0.5, 0.25, 0.01)
     assert (sample["other_x_mm"], sample["other_y_mm"]) == (5.0, -1.0)
-
-
-def test_every_flag_has_its_own_bit():
-    words = {value for name, value in vars(flags).items() if name.isupper() and isinstance(value, str)}
-    assert set(FLAG_BITS) == words
-    assert len(set(FLAG_BITS.values())) == len(words)
 
 
 def samples(times_s, force_N=0.0, bits=0):

@@ -115,16 +115,6 @@ def test_frames_are_sent_on_time(film):
     assert drift_s < 0.02  # 0.05 if it slept for the time between two frames
 
 
-def test_script_is_replaced_at_the_next_block(film):
-    sensor = VirtualSensor(film.charges, steady(rate_Hz=1000.0, force_N=1.0), offset_pC=[0.0] * 3)
-    encoded = sensor.frames()
-    values = [next(iter(BinaryParser().feed(next(encoded)))).values for _ in range(10)]
-    sensor.use(film.charges, steady(rate_Hz=1000.0, force_N=2.0))
-    values += [next(iter(BinaryParser().feed(next(encoded)))).values for _ in range(991)]
-    expected = film.charge_pC([0.0, 0.0], [0.0, 0.0], [1.0, 2.0])
-    np.testing.assert_allclose([values[499], values[500]], expected, rtol=1e-6)  # a block is half a second
-
-
 def test_frames_after_a_stall_of_the_process_are_postponed_and_not_sent_in_a_burst(film):
     """The stall is as long as 200 frames. Without a pause, these frames would be sent within a few milliseconds."""
     encode = TimedEncoder(stall_s=0.4)

@@ -25,8 +25,7 @@ from schemathesis.specs.openapi.checks import (
 )
 
 from isocharge.common.errors import InputError
-from isocharge.serve.network.address import ServerLimits
-from isocharge.serve.network.protocol import Handler, routes
+from isocharge.serve.network.protocol import routes
 from isocharge.serve.network.protocol.response import decompress
 
 INFER = "/v2/models/linear/infer"
@@ -286,10 +285,6 @@ def test_wrong_content_encoding_is_refused(ask, way, body, status, message):
     got, error = refusal(ask("POST", INFER, body, content_encoding=way))
     assert got == status
     assert message in error
-
-
-def test_body_above_the_limit_is_refused(store):
-    assert Handler(store, ServerLimits(body_bytes=100)).answer("POST", INFER, [], bytes(101)).status == 413
 
 
 def test_internal_errors_are_logged_and_not_sent(ask, store, monkeypatch, caplog):
