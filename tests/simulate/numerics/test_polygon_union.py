@@ -1,10 +1,17 @@
-"""Union, intersection, validity and trapezoids of polygons, compared with point-in-polygon tests by matplotlib."""
+"""Union, intersection, validity and triangles of polygons, compared with point-in-polygon tests by matplotlib."""
 
 import numpy as np
 import pytest
 from matplotlib.path import Path
 
-from isocharge.simulate.numerics.polygon import area_of, is_simple, to_corners, trace_outline, union_parts
+from isocharge.simulate.numerics.polygon import (
+    area_of,
+    is_simple,
+    subdivide,
+    to_corners,
+    trace_outline,
+    union_triangles,
+)
 
 SQUARE = np.array([0, 4, 4 + 4j, 4j])
 SQUARE_WITH_HOLE = np.array([0, 4, 4 + 4j, 4j, 0, 1 + 1j, 1 + 3j, 3 + 3j, 3 + 1j, 1 + 1j])
@@ -17,7 +24,7 @@ def area(z: np.ndarray) -> float:
 
 def total_area(front, back=()) -> float:
     """Area of the parts of a union of polygons x + iy."""
-    parts = union_parts(*([to_corners(z) for z in polygons] for polygons in (front, back)))
+    parts = union_triangles(*([to_corners(z) for z in polygons] for polygons in (front, back)))
     return sum(area_of(part) for part in parts)
 
 
@@ -59,6 +66,14 @@ def test_union_area_in_closed_form(polygons, expected):
 def test_intersection_of_polygons_that_only_touch_is_empty():
     assert total_area([SQUARE], [SQUARE + 4.0]) == 0.0
     assert total_area([SQUARE], [SQUARE + 10.0]) == 0.0
+
+
+@pytest.mark.parametrize("corners", [[0, 9, 4 + 7j], [0, 0.3, 20 + 5j], [0, 12 + 1j, 0.1j], [0, 1, 1j]])
+def test_pieces_of_a_triangle_cover_it_and_have_short_sides(corners):
+    pieces = subdivide(to_corners(np.array(corners)), 3.0)
+    assert sum(area_of(piece) for piece in pieces) == pytest.approx(area(np.array(corners)), rel=1e-12)
+    assert all(area_of(piece) > 0.0 for piece in pieces)
+    assert max(np.linalg.norm(piece - np.roll(piece, 1, axis=0), axis=1).max() for piece in pieces) <= 3.0 + 1e-9
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,8 @@
 """Areas of polygons, Gauss quadrature rules for polygons, unions of polygons, and outlines of traces.
 
-A polygon is an array of its corners in anticlockwise order. The library shapely (GEOS) computes centroids, unions and
-intersections of polygons, but cannot divide a union into trapezoids for numerical integration. The function
-`area_in_disk` does not use shapely, because shapely would replace the disk by a polygon.
+A polygon is an array of its corners in anticlockwise order. The library shapely (GEOS) computes centroids, unions,
+intersections and triangles of polygons. The function `area_in_disk` does not use shapely, because shapely would replace
+the disk by a polygon.
 
 The outline of a trace is computed without shapely. The function `shapely.buffer` silently cuts off sharp bends, and
 converts a trace that crosses itself into a ring. The result of the function `trace_outline` allows callers to detect
@@ -11,7 +11,6 @@ sharp bends and crossings.
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
 import shapely
@@ -28,8 +27,6 @@ MIN_BEND = 0.1
 
 The length of a mitre is proportional to 1 / (1 + cos(angle)). The largest allowed bend is 154 degrees.
 """
-
-Points = TypeVar("Points", Array, Complexes)
 
 
 def area_of(corners: Array) -> float:
@@ -117,24 +114,6 @@ def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> 
     return np.asarray((triangle_area + sector_area).sum(axis=-1))
 
 
-def bilinear(corners: Points, s: Array, t: Array) -> Points:
-    """Map points (s, t) of the unit square into a quadrilateral or a triangle by a bilinear function.
-
-    Args:
-        corners: Corners of a quadrilateral or of a triangle: x + iy, shape (4,) or (3,), or (x, y), shape (4, 2) or
-            (3, 2). The corners of a quadrilateral are the images of (0, 0), (1, 0), (1, 1) and (0, 1). The last corner
-            of a triangle is the image of both (1, 1) and (0, 1).
-        s: First coordinate in the unit square. For corners (x, y), the last axis has the length 1.
-        t: Second coordinate in the unit square. The shapes of `s` and `t` can be broadcast.
-
-    Returns:
-        Points of the same kind as the corners, in the common shape of `s` and `t`.
-    """
-    z00, z10, z11, z01 = _four_corners(corners)  # the digits are the coordinates s and t of each corner
-    points: Points = z00 + (z10 - z00) * s + (z01 - z00) * t + (z00 - z10 + z11 - z01) * s * t
-    return points
-
-
 def gauss_quadrilateral(corners: Array, max_count: int, reference_length: float) -> tuple[Array, Array]:
     """Compute the points and weights of a Gauss rule for a quadrilateral or a triangle.
 
@@ -150,31 +129,21 @@ def gauss_quadrilateral(corners: Array, max_count: int, reference_length: float)
         Points (x, y), shape (n, 2), and weights, shape (n,). The weights add up to the area of the polygon.
     """
     # The polygon is the image of the unit square with the coordinates s and t. The digits in the name of a corner are
-    # the values of s and t at this corner.
-    complex_corners = to_complex(corners)
-    z00, z10, z11, z01 = _four_corners(complex_corners)
+    # the values of s and t at this corner. The last corner of a triangle is the image of both corners with t = 1.
+    z00, z10, z11, z01 = to_complex(corners[[0, 1, 2, -1]])
     s_side = max(abs(z10 - z00), abs(z11 - z01))  # length of the longer side in the direction of s
     t_side = max(abs(z01 - z00), abs(z11 - z10))
     s_points, s_weights = _gauss_line_for(s_side, max_count, reference_length)
     t, t_weights = _gauss_line_for(t_side, max_count, reference_length)
     s = s_points[:, None]  # shape (n_s, 1), to be combined with each t
 
-    points = bilinear(complex_corners, s, t)  # shape (n_s, n_t)
+    points = z00 + (z10 - z00) * s + (z01 - z00) * t + (z00 - z10 + z11 - z01) * s * t  # shape (n_s, n_t)
     # The determinant of the Jacobian is the cross product of the derivatives of the points.
     s_derivative = (z10 - z00) * (1.0 - t) + (z11 - z01) * t
     t_derivative = (z01 - z00) * (1.0 - s) + (z11 - z10) * s
     determinant = (np.conj(s_derivative) * t_derivative).imag
     weights = np.outer(s_weights, t_weights) * determinant
     return to_corners(points.ravel()), weights.ravel()
-
-
-def _four_corners(corners: Points) -> Points:
-    """Return four corners for a quadrilateral or a triangle. The last corner of a triangle is returned twice.
-
-    Args:
-        corners: Corners x + iy, shape (4,) or (3,), or corners (x, y), shape (4, 2) or (3, 2).
-    """
-    return corners if len(corners) == 4 else np.append(corners, corners[-1:], axis=0)
 
 
 def _gauss_line_for(side: float, max_count: int, reference_length: float) -> tuple[Array, Array]:
@@ -204,15 +173,12 @@ def is_simple(corners: Array) -> bool:
     """
     signed_area = area_of(corners)
     perimeter = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
-    difference = _region([corners]).area - signed_area
+    difference = region_of([corners]).area - signed_area
     return signed_area > 0.0 and bool(abs(difference) < MERGE_DISTANCE * perimeter)
 
 
-def union_parts(front: Sequence[ArrayLike], back: Sequence[ArrayLike] = ()) -> list[Array]:
-    """Divide the union of simple polygons into trapezoids that do not overlap.
-
-    Horizontal lines through every corner and through every crossing of two edges divide the plane into strips. Within
-    each strip, the union consists of trapezoids. A triangle is represented as a trapezoid with two equal corners.
+def union_triangles(front: Sequence[ArrayLike], back: Sequence[ArrayLike] = ()) -> list[Array]:
+    """Divide the union of simple polygons into triangles that do not overlap.
 
     Args:
         front: Simple polygons, each of shape (n, 2), mm.
@@ -220,52 +186,19 @@ def union_parts(front: Sequence[ArrayLike], back: Sequence[ArrayLike] = ()) -> l
             of the union of `front` and the union of `back`.
 
     Returns:
-        Trapezoids, each of shape (4, 2), mm. The corners of each trapezoid are in the order lower left, lower right,
-        upper right, upper left. The trapezoids are ordered from bottom to top, and from left to right within a strip.
+        Triangles with anticlockwise corners, each of shape (3, 2), mm.
     """
-    region = _region(front)
+    region = region_of(front)
     if back:
-        region = shapely.intersection(region, _region(back))
-    if region.area == 0.0:
-        return []
-
-    start, end = _edges(region)
-    trapezoids = []
-    for bottom, top in pairwise(_strip_ends([*front, *back])):
-        # Find the edges that cross the strip. The start and the end of such an edge are on different sides of the
-        # middle of the strip, because no edge ends within a strip.
-        middle = 0.5 * (bottom + top)
-        crosses_strip = (start[:, 1] < middle) != (end[:, 1] < middle)
-        edge_start = start[crosses_strip]
-        edge_end = end[crosses_strip]
-
-        # Sort the edges from left to right. Edges do not cross each other within a strip.
-        order = np.argsort(_x_at_height(edge_start, edge_end, middle))
-        x_bottom = _x_at_height(edge_start, edge_end, bottom)[order]
-        x_top = _x_at_height(edge_start, edge_end, top)[order]
-
-        # The region begins at the first edge, ends at the second edge, begins again at the third edge, and so on.
-        for left in range(0, order.size, 2):
-            right = left + 1
-            lower_corners = [(x_bottom[left], bottom), (x_bottom[right], bottom)]
-            upper_corners = [(x_top[right], top), (x_top[left], top)]
-            trapezoids.append(np.array(lower_corners + upper_corners))
-    return trapezoids
+        region = shapely.intersection(region, region_of(back))
+    # The polygons of the region, without points and lines at which polygons only touch
+    parts = shapely.get_parts(region)
+    polygons = shapely.multipolygons(parts[shapely.get_dimensions(parts) == 2])
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygons))
+    return [shapely.get_coordinates(triangle)[:3] for triangle in shapely.orient_polygons(triangles)]
 
 
-def _x_at_height(start: Array, end: Array, y: float) -> Array:
-    """Compute the x coordinate at which each straight line reaches the height y, shape (n,).
-
-    Args:
-        start: Points (x, y) at which the lines start, shape (n, 2).
-        end: Points (x, y) at which the lines end, shape (n, 2).
-        y: Height, which must be the same for all lines.
-    """
-    x_difference, y_difference = (end - start).T
-    return np.asarray(start[:, 0] + x_difference / y_difference * (y - start[:, 1]))
-
-
-def _region(polygons: Sequence[ArrayLike]) -> shapely.Geometry:
+def region_of(polygons: Sequence[ArrayLike]) -> shapely.Geometry:
     """Compute the union of polygons.
 
     A polygon that touches or crosses itself is first converted into a valid region.
@@ -274,60 +207,28 @@ def _region(polygons: Sequence[ArrayLike]) -> shapely.Geometry:
     return shapely.union_all(valid_regions)
 
 
-def _strip_ends(polygons: Sequence[ArrayLike]) -> Array:
-    """Return the y coordinates of all corners and of all crossings of edges in ascending order, shape (n,), mm.
-
-    Coordinates that differ by less than `MERGE_DISTANCE` are returned only once.
-    """
-    outlines = [shapely.LinearRing(corners) for corners in polygons]
-    lines = shapely.union_all(outlines)  # includes a point at each crossing of two edges
-    y = np.unique(shapely.get_coordinates(lines)[:, 1])
-    is_distinct = np.diff(y, prepend=-np.inf) > MERGE_DISTANCE  # from the previous coordinate; true for the first
-    return np.asarray(y[is_distinct])
-
-
-def _edges(region: shapely.Geometry) -> tuple[Array, Array]:
-    """Return the start points and the end points of all edges of a region, including the edges of its holes.
-
-    Returns:
-        Start points and end points (x, y), each of shape (n, 2).
-    """
-    parts = shapely.get_parts(region)
-    polygons = parts[shapely.get_dimensions(parts) == 2]  # removes points and lines at which polygons only touch
-    rings = [shapely.get_coordinates(ring) for ring in shapely.get_rings(polygons)]
-    # Each ring is closed, because its last point is the same as its first point.
-    start = np.concatenate([ring[:-1] for ring in rings])
-    end = np.concatenate([ring[1:] for ring in rings])
-    return start, end
-
-
-def subdivide(quadrilateral: Array, max_side: float) -> list[Array]:
-    """Cut a quadrilateral into quadrilaterals and triangles whose sides do not exceed a given length.
+def subdivide(triangle: Array, max_side: float) -> list[Array]:
+    """Cut a triangle into quadrilaterals and triangles whose sides do not exceed a given length.
 
     Args:
-        quadrilateral: Corners of the quadrilateral, shape (4, 2), mm. Two of the corners may be equal.
+        triangle: Corners (x, y), anticlockwise, shape (3, 2), mm.
         max_side: Largest length of a side of the returned polygons, mm.
 
     Returns:
-        Corners of each polygon, shape (4, 2) for a quadrilateral or (3, 2) for a triangle, mm.
+        Corners of each polygon, anticlockwise, shape (4, 2) for a quadrilateral or (3, 2) for a triangle, mm. The
+        triangles share the corner that lies opposite the shortest side of the given triangle.
     """
-    # The quadrilateral is the bilinear image of the unit square (s, t), which is divided into a grid of cells.
-    side_lengths = np.linalg.norm(np.roll(quadrilateral, -1, axis=0) - quadrilateral, axis=1)
-    first_s_side, first_t_side, second_s_side, second_t_side = side_lengths
-    n_s = int(np.ceil(max(first_s_side, second_s_side) / max_side))
-    n_t = int(np.ceil(max(first_t_side, second_t_side) / max_side))
-    s = np.linspace(0.0, 1.0, n_s + 1)
-    t = np.linspace(0.0, 1.0, n_t + 1)
-    grid = bilinear(quadrilateral, s[:, None, None], t[:, None])  # shape (n_s + 1, n_t + 1, 2)
-    corner_grids = [grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]]
-    cells = []
-    for corners in np.stack(corner_grids, axis=2).reshape(-1, 4, 2):
-        # Omit corners that coincide with the previous corner. Omit cells with fewer than three distinct corners,
-        # because their area is zero.
-        is_distinct = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) > MERGE_DISTANCE
-        if np.count_nonzero(is_distinct) > 2:
-            cells.append(corners[is_distinct])
-    return cells
+    sides = np.linalg.norm(np.roll(triangle, -1, axis=0) - triangle, axis=1)
+    first, second, apex = np.roll(triangle, -int(sides.argmin()), axis=0)
+    base = np.linspace(first, second, int(np.ceil(sides.min() / max_side)) + 1)
+    heights = np.linspace(0.0, 1.0, int(np.ceil(sides.max() / max_side)) + 1)[:-1, None, None]
+    grid = base + heights * (apex - base)  # points on lines from the base to the apex, shape (n_height, n_base, 2)
+    quadrilaterals = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=2)
+    last = grid[-1]
+    return [
+        *quadrilaterals.reshape(-1, 4, 2),
+        *(np.array([left, right, apex]) for left, right in pairwise(last)),
+    ]
 
 
 def trace_outline(path: Complexes, width: float) -> Complexes:

@@ -20,11 +20,12 @@ from isocharge.simulate.numerics.polygon import (
     area_of,
     is_convex,
     is_simple,
+    region_of,
     subdivide,
     to_complex,
     to_corners,
     trace_outline,
-    union_parts,
+    union_triangles,
 )
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.size_check import check_range
@@ -160,7 +161,7 @@ class Electrode:
     def collecting_polygons(self) -> tuple[Array, ...]:
         """Polygons that do not overlap and together form the collecting area of the electrode.
 
-        The collecting area consists of one convex polygon or of several trapezoids. The corners (x, y) of a polygon are
+        The collecting area consists of one convex polygon or of several triangles. The corners (x, y) of a polygon are
         an array of shape (n, 2), mm.
 
         Raises:
@@ -179,7 +180,7 @@ class Electrode:
 
         # Charge is collected where metal on the front overlaps metal on the back. Without polygons on the back, the
         # whole back is metal.
-        return tuple(union_parts(self.front, self.back))
+        return tuple(union_triangles(self.front, self.back))
 
     @cached_property
     def parts(self) -> tuple[Array, ...]:
@@ -218,7 +219,7 @@ class Electrode:
     @cached_property
     def region(self) -> shapely.Geometry:
         """Region of the film that the metal on the front covers."""
-        return shapely.union_all([shapely.Polygon(part) for part in self.metal])
+        return region_of(self.front)
 
     @property
     def centre(self) -> tuple[float, float]:
