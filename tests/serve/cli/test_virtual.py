@@ -102,15 +102,12 @@ def test_virtual_option_film_plays_a_random_film_without_printing_it(played, tmp
 
 def test_frames_with_the_faults_of_a_script(played, tmp_path):
     script = tmp_path / "play.toml"
-    script.write_text("[faults]\nlose_share = 0.05\ncorrupt_share = 0.001\nunplug_every_s = 0.5\nunplug_s = 0.2\n")
+    script.write_text("[faults]\nlose_share = 0.05\ncorrupt_share = 0.001\n")
     values, result = played(700, "--script", script)
     assert values.shape == (len(values), 3)
-    lost, damaged, unplugged = map(
-        int, re.search(r"(\d+) lost and (\d+) damaged on purpose, (\d+) times", result.stderr).groups()
-    )
-    assert lost > 100
-    assert 0 < damaged < lost
-    assert unplugged >= 1
+    lost, damaged = map(int, re.search(r"(\d+) lost and (\d+) damaged on purpose", result.stderr).groups())
+    assert lost > 20
+    assert damaged > 0
 
 
 def test_virtual_solves_the_film_only_up_to_the_scripted_distance(tmp_path, run, solved):

@@ -11,7 +11,7 @@ import pytest
 import serial
 
 from isocharge.common.errors import PortError, SceneError
-from isocharge.serve import BinaryParser, Faults, Port, Script, VirtualSensor, encode_frame, encode_text, wander
+from isocharge.serve import BinaryParser, Port, Script, VirtualSensor, encode_frame, wander
 from isocharge.serve.virtual_sensor.script import corrupt
 
 
@@ -64,13 +64,6 @@ def test_frame_number_and_clock_overflow(film):
 def test_forward_map_with_wrong_charges_is_refused(charges):
     with pytest.raises(SceneError, match=r"forward map: expected finite charges of shape \(10, electrodes\)"):
         VirtualSensor(lambda *_: charges, steady())
-
-
-def test_no_frames_are_sent_while_the_port_is_unplugged(film):
-    faults = Faults(unplug_every_s=0.25, unplug_s=0.0625)
-    frames = sent(VirtualSensor(film.charges, steady(rate_Hz=512.0), faults=faults), 300)
-    silent = [number for number, frame in enumerate(frames) if frame is None]
-    assert silent == [*range(128, 160), *range(256, 288)]
 
 
 def test_corrupt_flips_drops_and_adds_bytes():
@@ -153,24 +146,3 @@ def test_bytes_that_a_sensor_ignores_do_not_block_their_sender(film):
     with sensor, serial.Serial(sensor.url, write_timeout=10.0) as line:
         for _ in range(100):
             line.write(b"?" * 2000)
-
-
-def test_unplugged_port_returns_under_the_same_link(film, tmp_path):
-    encode = lambda frame: encode_text(frame, "json")  # noqa: E731
-    faults = Faults(unplug_every_s=0.8, unplug_s=0.3)
-    with VirtualSensor(
-        film.charges, steady(rate_Hz=500.0), faults=faults, encode=encode, link=tmp_path / "film"
-    ) as sensor:
-        with Port(sensor.url, reconnect=True) as port:
-            outages_s = list(islice((chunk.outage_s for chunk in port if chunk.outage_s > 0.0), 2))
-        assert sensor.unplugged >= 2
-        assert sensor.sent < 0.7 * (
-            sensor.sent + sensor.withheld + sensor.lost
-        )  # unplugged for three eighths of the time
-    assert min(outages_s) > 0.1
-
-
-def test_outages_without_a_link_are_refused(film):
-    sensor = VirtualSensor(film.charges, steady(), faults=Faults(unplug_every_s=0.8))
-    with pytest.raises(SceneError, match=r"faults: expected a link \(--link PATH\)"), sensor:
-        pass

@@ -136,7 +136,7 @@ def virtual_command(
         threading.Event().wait(seconds)  # sleeps until Ctrl-C if `seconds` is None
     say(
         f"{player.sent} frames sent, {player.withheld} withheld because no program read them, {player.lost} lost "
-        f"and {player.corrupted} damaged on purpose, {player.unplugged} times unplugged"
+        f"and {player.corrupted} damaged on purpose"
     )
     if player.paused_s > 0.0:
         say(f"the sensor paused for {player.paused_s:.1f} s in all, because this computer was busy")

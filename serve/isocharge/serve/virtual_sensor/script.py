@@ -81,20 +81,10 @@ class Faults(Settings, frozen=True, kw_only=True):
     Attributes:
         lose_share: Fraction of the frames that are not sent, dimensionless.
         corrupt_share: Fraction of the bytes that are changed, dropped or followed by a random byte, dimensionless.
-        unplug_every_s: Interval of the outages of the port, s; 0 for no outages. The first outage begins after one
-            interval.
-        unplug_s: Length of each outage, s.
     """
 
     lose_share: Fraction = 0.0
     corrupt_share: Fraction = 0.0
-    unplug_every_s: NotNegative = 0.0
-    unplug_s: NotNegative = 0.5
-
-    def is_unplugged(self, t_s: float) -> bool:
-        """Return whether a time since the start of the sensor, s, lies in an outage of the port."""
-        period_s = self.unplug_every_s
-        return period_s > 0.0 and t_s >= period_s and t_s % period_s < self.unplug_s
 
 
 class VirtualScript(Settings, frozen=True):

@@ -119,11 +119,10 @@ class VirtualSensor:
 
     Attributes:
         script: The presses that are played.
-        port_path: Path of the pseudo-terminal that was opened first.
+        port_path: Path of the pseudo-terminal.
         withheld: Number of frames that were discarded because they did not fit into the buffer of the port.
         lost: Number of frames that were not sent because of a fault.
         corrupted: Number of frames that were damaged by a fault.
-        unplugged: Number of outages of the port that have ended.
         paused_s: Time by which frames were postponed because the computer was busy, s.
 
     Example:
@@ -175,13 +174,12 @@ class VirtualSensor:
         self.withheld = 0
         self.lost = 0
         self.corrupted = 0
-        self.unplugged = 0
         self.paused_s = 0.0
         self._frame_count = 0
         self._first_frame_of_script = 0  # number of the frame with which the script began
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
-        self._port: PseudoPort | None = None
+        self._port_stack = contextlib.ExitStack()  # closes the port and removes the link
         self.port_path = ""
 
     @property
@@ -262,16 +260,12 @@ class VirtualSensor:
             The bytes that the sensor sends; empty if the frame is lost because of a fault.
         """
         faults = self._faults
-        time_s = frame_number / self.script.rate_Hz
-        is_lost = faults.is_unplugged(time_s)
         # A random number is drawn only if random frames are to be lost. Otherwise, it would change the noise that
         # belongs to the seed.
-        if not is_lost and faults.lose_share > 0.0:
-            is_lost = self._rng.random() < faults.lose_share
-        if is_lost:
+        if faults.lose_share > 0.0 and self._rng.random() < faults.lose_share:
             self.lost += 1
             return b""
-        t_us = round(1e6 * time_s) % T_US_MODULUS
+        t_us = round(1e6 * frame_number / self.script.rate_Hz) % T_US_MODULUS
         data = self._encode(Frame(frame_number % SEQ_MODULUS, t_us, charge_pC))
         if not faults.corrupt_share:
             return data
@@ -285,20 +279,24 @@ class VirtualSensor:
 
         Raises:
             InputError: If the link cannot be created.
-            SceneError: If the faults contain outages, after which the port has another name, and there is no link.
         """
-        if self._faults.unplug_every_s > 0.0 and self._link is None:
-            raise SceneError(
-                "faults: expected a link (--link PATH) for outages of the port, got none; the port has another name "
-                "after each outage"
-            )
         self._frame_count = 0
         self.withheld = 0
-        self.unplugged = 0
         self.paused_s = 0.0
-        self.port_path = self._open_port().url
+        port = PseudoPort()
+        self._port_stack.callback(port.close)
+        if self._link:
+            try:
+                self._link.symlink_to(port.url)
+            except OSError as error:  # for example, a file with the name of the link exists already
+                self._port_stack.close()
+                raise InputError(
+                    f"{self._link}: the link cannot be made ({error.strerror}); choose another path"
+                ) from error
+            self._port_stack.callback(self._link.unlink, missing_ok=True)
+        self.port_path = port.url
         self._stop.clear()
-        self._writer = threading.Thread(target=self._play, name="virtual sensor", daemon=True)
+        self._writer = threading.Thread(target=self._play, args=(port,), name="virtual sensor", daemon=True)
         self._writer.start()
         return self
 
@@ -307,14 +305,13 @@ class VirtualSensor:
         self._stop.set()
         if self._writer is not None:
             self._writer.join()
-        self._close_port()
+        self._port_stack.close()
         self._writer = None
 
-    def _play(self) -> None:
-        """Write each frame when it is due, until the sensor is stopped.
+    def _play(self, port: PseudoPort) -> None:
+        """Write each frame to the port when it is due, until the sensor is stopped.
 
-        A frame that is late by more than `MAX_LATENESS_S` postpones all later frames. During an outage, the port is
-        closed and the frames are discarded.
+        A frame that is late by more than `MAX_LATENESS_S` postpones all later frames.
         """
         start_s = time.perf_counter()
         for frame_number, data in enumerate(self.frames()):
@@ -327,53 +324,10 @@ class VirtualSensor:
                 self.paused_s += lateness_s
 
             self._frame_count = frame_number + 1
-            self._plug_or_unplug(frame_number)
-            if self._port is not None and data:  # otherwise the frame is discarded because of a fault
-                self._port.discard_received()
-                if not self._port.write_whole(data):
+            if data:  # otherwise the frame is lost because of a fault
+                port.discard_received()
+                if not port.write_whole(data):
                     self.withheld += 1
-
-    def _plug_or_unplug(self, frame_number: int) -> None:
-        """Close the port if an outage has begun, or open a new port if an outage has ended.
-
-        Args:
-            frame_number: Number of the frame that is due, which determines whether there is an outage.
-        """
-        if self._faults.is_unplugged(frame_number / self.script.rate_Hz):
-            self._close_port()
-        elif self._port is None:
-            self._open_port()
-            self.unplugged += 1
-
-    def _open_port(self) -> PseudoPort:
-        """Open a new port as the port of the sensor. If the sensor has a link, create the link to the new port.
-
-        Returns:
-            The open port.
-
-        Raises:
-            InputError: If the link cannot be created.
-        """
-        port = PseudoPort()
-        try:
-            if self._link:
-                self._link.symlink_to(port.url)
-        except OSError as error:  # for example, a file with the name of the link exists already
-            port.close()
-            raise InputError(
-                f"{self._link}: the link cannot be made ({error.strerror}); choose another path"
-            ) from error
-        self._port = port
-        return port
-
-    def _close_port(self) -> None:
-        """Remove the link to the port, and close the port. If the port is closed already, do nothing."""
-        if self._port is None:
-            return
-        if self._link:
-            self._link.unlink(missing_ok=True)
-        self._port.close()
-        self._port = None
 
 
 def _clean_charges(forward: Charges, script: Script) -> Array:
