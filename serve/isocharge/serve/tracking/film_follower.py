@@ -27,7 +27,6 @@ if its frames have flags that make the charges unreliable.
 """
 
 import math
-from datetime import timedelta
 from typing import NamedTuple
 
 import numpy as np
@@ -285,7 +284,7 @@ class FilmFollower:
             charge_pC: Average touch charges near the largest force, shape (n_electrode,), pC.
             clock_s: Time of the touch, s.
         """
-        elapsed_hours = timedelta(seconds=max(clock_s - self._latest_touch_s, 0.0)) / timedelta(hours=1)
+        elapsed_hours = max(clock_s - self._latest_touch_s, 0.0) / 3600.0
         self._latest_touch_s = clock_s
         self._covariance[0, 0] += self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
         self._covariance += (np.diag(self._initial_std**2) - self._covariance) / FADING_TOUCHES
