@@ -309,10 +309,6 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             numbers[position] = int.from_bytes(numbers[position], self.byte_order, signed=is_signed)
         return self.columns.frame(numbers)
 
-    def frame_of_zeros(self) -> Frame:
-        """Return a frame in which all numbers are 0."""
-        return self.columns.frame([0] * len(self.fields))
-
     def parser(self) -> Parser:
         """Create a parser for frames with this layout and this framing."""
         if self.framing == SYNC:

@@ -33,12 +33,11 @@ from typing import Any
 
 from msgspec import defstruct, field, structs
 
-from isocharge.common.errors import ChargeError, DeviceError
+from isocharge.common.errors import DeviceError
 from isocharge.common.structs import Settings, convert, read_toml
 from isocharge.serve.flags import FILM
 from isocharge.serve.frames.formats import AutoFrames, Frames
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.frames.frame_layout import FrameLayout
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain, Saturation
 from isocharge.serve.signal_chain.hum import Hum
@@ -181,35 +180,6 @@ def create_stages(setup: Setup, *, needs_contact: bool = False) -> list[Stage]:
         ModelError: If a stage cannot use the model.
     """
     return [stage(setup) for stage in STAGES if stage.needs_contact is needs_contact and stage.is_used(setup)]
-
-
-def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> None:
-    """Check before the first frame arrives that each electrode has a channel.
-
-    If the device file describes the layout of binary frames, the channels are already known. They are assigned to the
-    electrodes in the same way as in a received frame.
-
-    Otherwise, the channels are determined from the first frame. Only the section `[channels]` can then be checked: if
-    the device file has this section, it must contain a key for each electrode.
-
-    Args:
-        device: Settings of the board.
-        electrodes: Names of the electrodes, in the order of the charges.
-        reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
-
-    Raises:
-        ChargeError: If an electrode has no channel.
-    """
-    if isinstance(device.frames, FrameLayout):
-        channels = Channels(Setup(electrodes, device, reader=reader))
-        channels.channel_indices(device.frames.frame_of_zeros())  # raises an error if an electrode has no channel
-        return
-    missing = [name for name in electrodes if name not in device.channels]
-    if device.channels and missing:
-        raise ChargeError(
-            f"{device.where}: [channels] {missing[0]}: {reader} expects a channel for each of the electrodes "
-            f"{electrodes}, got {', '.join(device.channels)}; add the electrode, or choose the model of this sensor"
-        )
 
 
 ANY_BOARD = Device(

@@ -12,7 +12,7 @@ import numpy as np
 
 from isocharge.common.errors import DeviceError
 from isocharge.common.files import new_folder, refuse_existing, write_whole
-from isocharge.serve.live.device import ANY_BOARD, STAGES, check_channels
+from isocharge.serve.live.device import ANY_BOARD, STAGES
 from isocharge.serve.model.model_folder import load_model
 from isocharge.serve.signal_chain.stage import NOT_IN_C, Device, Setup
 from isocharge.train.export_c.c_text import c_comment, c_double, c_doubles, source_text
@@ -105,8 +105,7 @@ def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: 
 
     Raises:
         ModelError: If the model is missing or damaged, or its graph was not written by isocharge.
-        DeviceError: If the device file is for other electrodes.
-        ChargeError: If the device file has no channel for an electrode.
+        DeviceError: If a setting of the device file is for other electrodes.
         OutputExists: If the folder exists.
         OutputError: If the file system refuses to write. In this case, no files remain.
     """
@@ -129,13 +128,11 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
 
     Raises:
         ModelError: If the model is missing or damaged, or its graph was not written by isocharge.
-        DeviceError: If the device file is for other electrodes.
-        ChargeError: If the device file has no channel for an electrode.
+        DeviceError: If a setting of the device file is for other electrodes.
     """
     loaded = load_model(model)
     path = loaded.folder / "model.onnx"
     metadata = loaded.metadata
-    check_channels(device, metadata.electrodes, f"model {metadata.label}")
     network = read_graph(path.read_bytes(), str(path))
     # The README contains the command between backticks, so the command itself must not contain any.
     command_in_one_line = " ".join(command.replace("`", "'").split())
