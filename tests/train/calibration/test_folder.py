@@ -22,6 +22,8 @@ QUICK = FitConfig(
     training=TrainingConfig(steps=600, misfit_steps=100, misfit_charges=1_000, batch=256),
 )
 
+UNTRAINED = FitConfig(QUICK.network, TrainingConfig(steps=1, misfit_steps=1, misfit_charges=1_000))
+
 
 @pytest.fixture(scope="module")
 def written(problem, synthetic, tmp_path_factory):

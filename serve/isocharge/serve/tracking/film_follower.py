@@ -16,7 +16,7 @@ the film is therefore followed within about twenty touches.
 
 The network was trained for the film as it was calibrated. The charges of a frame are therefore converted into charges
 that the same contact would cause on the calibrated film, and the network computes the contact from the converted
-charges. The conversion depends on the contact, so both are repeated a few times.
+charges. The conversion depends on the contact, so both are repeated once.
 
 The film is considered lost if no state explains the latest touches, or if the estimated pretension or offset is at the
 end of its range. While the film is lost, the estimate from before is used for contacts.
@@ -127,9 +127,6 @@ are less accurate.
 
 MEMORY_TOUCHES = 16
 """Number of touches after which the weight of a touch in this mean has decreased to 1/e."""
-
-CONVERSIONS = 3
-"""Number of repetitions of the conversion of charges and of the computation of the contact."""
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):
@@ -375,10 +372,9 @@ class FilmFollower:
             return contact
         conversion = self._conversion
         if conversion is None or not is_close(contact, self._conversion_contact):
-            conversion = self._conversion_at(contact, state)
-            for _ in range(CONVERSIONS - 1):
-                corrected = self.predictor.predict(charge_pC + conversion.shift_pC)
-                conversion = self._conversion_at(corrected, state)
+            first = self._conversion_at(contact, state)
+            corrected = self.predictor.predict(charge_pC + first.shift_pC)
+            conversion = self._conversion_at(corrected, state)
             self._conversion = conversion
             self._conversion_contact = contact
         return self.predictor.predict(charge_pC + conversion.shift_pC).with_covariance(conversion.covariance)
