@@ -103,25 +103,7 @@ def worker_count(workers: int | None) -> int:
     return workers or min(cores(), 64)
 
 
-def parse_position(text: str) -> tuple[float, float]:
-    """Parse the value of `--at`, and return the position (x, y), mm.
-
-    Raises:
-        InputError: If the text is not two numbers separated by a comma.
-    """
-    return _parse_pair(text, "--at: expected two numbers in mm like '3,-2'")
-
-
-def parse_side_force(text: str) -> tuple[float, float]:
-    """Parse the value of `--side-force`, and return the side force (Fx, Fy), N.
-
-    Raises:
-        InputError: If the text is not two numbers separated by a comma.
-    """
-    return _parse_pair(text, "--side-force: expected two numbers in N like '0.1,0'")
-
-
-def _parse_pair(text: str, expected: str) -> tuple[float, float]:
+def parse_pair(text: str, expected: str) -> tuple[float, float]:
     """Parse two numbers that are separated by a comma.
 
     Args:

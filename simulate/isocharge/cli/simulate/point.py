@@ -10,8 +10,7 @@ from isocharge.cli.shared.options import (
     ForceOption,
     JsonOption,
     SensorArgument,
-    parse_position,
-    parse_side_force,
+    parse_pair,
 )
 from isocharge.cli.shared.terminal import say, show_result
 from isocharge.common.errors import InputError
@@ -89,11 +88,13 @@ def point_command(
         raise InputError("--side-force and --friction: expected one of them, because friction gives the side force")
     if friction is not None:
         check_friction(friction)
-    applied_side_force = (0.0, 0.0) if side_force is None else parse_side_force(side_force)
+    applied_side_force = (0.0, 0.0)
+    if side_force is not None:
+        applied_side_force = parse_pair(side_force, "--side-force: expected two numbers in N like '0.1,0'")
 
     settings = SolveSettings(accuracy=accuracy, theory=theory_by_name(theory))
     film = film_sensor.film
-    position = parse_position(at)
+    position = parse_pair(at, "--at: expected two numbers in mm like '3,-2'")
     equilibrium = press(film, footprint, position, force, settings, side_force=applied_side_force)
     if friction:
         # The friction force follows from the slope of the film in the press without a side force.
