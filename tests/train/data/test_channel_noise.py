@@ -21,3 +21,11 @@ def test_noise_of_repeated_contacts_is_estimated_within_ten_percent(repetitions,
         ratios.append(ChannelNoise.estimate(noisy, contact).sigma(size[None])[0] / np.hypot(1.0, gain * size))
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.03)
     assert np.std(ratios) < 0.1
+
+
+def test_copies_of_presses_show_no_noise():
+    rng = np.random.default_rng(0)
+    contact = rng.uniform(-1.0, 1.0, (300, 3))
+    charge = 300.0 + contact @ rng.uniform(-30.0, 30.0, (3, 4)) + rng.standard_normal((300, 4))
+    sigma = ChannelNoise.estimate(np.tile(charge, (2, 1)), np.tile(contact, (2, 1))).sigma(charge[:1])
+    np.testing.assert_allclose(sigma, 1.0, rtol=0.2)

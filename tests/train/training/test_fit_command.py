@@ -11,6 +11,7 @@ import pytest
 from isocharge.cli.train import fit as fit_command
 from isocharge.common.errors import PressError
 from isocharge.serve import load_model
+from isocharge.train import fit
 
 SHORT_CONFIG = """
 [network]
@@ -81,3 +82,20 @@ def test_each_caution_about_a_file_of_presses_is_printed_once(tmp_path, command)
     assert code == 0, err
     assert "no press has a known force" in err
     assert err.count("caution: ") == 1
+
+
+def test_a_version_that_appears_during_the_training_costs_no_model(dataset_folder, tmp_path, command, monkeypatch):
+    """Two trainings with the same output run at the same time."""
+    (tmp_path / "short.toml").write_text(SHORT_CONFIG)
+    words = ("train", "fit", dataset_folder, "--config", tmp_path / "short.toml", "-o", tmp_path / "m")
+
+    def train_slowly(*arguments):
+        monkeypatch.undo()
+        assert command(*words)[0] == 0
+        return fit(*arguments)
+
+    monkeypatch.setattr(fit_command, "fit", train_slowly)
+    code, _, err = command(*words)
+    assert code == 0, err
+    assert "m/1 was written during the training: this model becomes " in err
+    assert load_model(tmp_path / "m" / "2").metadata.version == 2

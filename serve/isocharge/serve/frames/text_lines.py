@@ -90,6 +90,10 @@ _TOKENS = {kind: _token_pattern(_PATTERNS[kind]) for kind in ("number", "number 
 """Regular expressions of a part of a line, by the kind of the numbers in the line."""
 
 
+_SEPARATORS = ",;|"
+"""Marks between the columns of a line. A word before one of them is no name of the number behind it."""
+
+
 class _Token(NamedTuple):
     """Part of a line: a number, a key before a colon or an equals sign, a text in quotes, a word, or another mark."""
 
@@ -237,32 +241,41 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
 def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     """Return the name of each number without and with its unit; empty without a name.
 
-    The name is the word or the key directly before the number. Words are units and not names if the first number
-    follows no word but the last number precedes one. A name that occurs several times is no name. A single name at the
-    first of several numbers is a label of the line, unless it is a name of a counter or a clock.
+    The name is the last word or key between the number and the previous number or separator, as in `A: 3.5`, `A -> 3.5`
+    and `<A>3.5</A>`. If several numbers have the same name, the word or key before it is the name, as in
+    `{"A": {"pC": 3.5}}`. Words are units and not names if the first number follows no word but the last number precedes
+    one. A name that occurs several times is no name. A single name at the first of several numbers is a label of the
+    line, unless it is a name of a counter or a clock.
 
     A unit of charge or voltage other than pC directly behind a number is added to its name, as in `A_nC`.
 
     Args:
         tokens: Parts of the line.
     """
-    names = []
+    inner_names = []
+    outer_names = []
     words = set()  # names that are neither in quotes nor before a colon or an equals sign
     units = []
     parts = [token for token in tokens if token.content not in ":="]
-    for previous, token, following in zip([None, *parts], parts, [*parts[1:], None], strict=False):
-        if token.kind in _NUMBER_KINDS:
-            is_named = previous is not None and previous.kind in ("key", "word")
-            name = previous.content.strip("\"'") if previous is not None and is_named else ""
-            if previous is not None and previous.kind == "word":
-                words.add(name)
-            names.append(_NAMES_OF_TIMES.get(token.kind, name))
+    path: list[str] = []  # words and keys after the previous number or separator
+    for token, following in zip(parts, [*parts[1:], None], strict=True):
+        if token.kind in ("key", "word"):
+            path.append(token.content.strip("\"'"))
+            if token.kind == "word":
+                words.add(path[-1])
+        elif token.kind in _NUMBER_KINDS:
+            outer_name, name = ["", "", *path][-2:]
+            inner_names.append(_NAMES_OF_TIMES.get(token.kind, name))
+            outer_names.append(outer_name)
             units.append("" if following is None else following.content)
+        if token.kind in _NUMBER_KINDS or token.content in _SEPARATORS:
+            path = []
 
+    names = [name or outer_name for name, outer_name in zip(_unique(inner_names), _unique(outer_names), strict=True)]
     channels = [index for index, name in enumerate(names) if name not in TIMES_US]
-    repeated = {name for name in names if names.count(name) > 1} - set(TIMES_US)
-    are_units = bool(channels) and not names[channels[0]] and tokens[-1].kind == "word"
-    names = ["" if (are_units and name in words) or name in repeated else name for name in names]
+    contents = [token for token in tokens if token.kind != "mark"]
+    are_units = bool(channels) and not names[channels[0]] and contents[-1].kind == "word"
+    names = ["" if are_units and name in words else name for name in names]
     named = [index for index in channels if names[index]]
     if len(channels) > 1 and named == channels[:1] and names[named[0]] != SEQ:
         names[named[0]] = ""
@@ -273,6 +286,11 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
         for number, (name, unit) in enumerate(zip(names, units, strict=True), start=1)
     ]
     return names, names_with_units
+
+
+def _unique(names: list[str]) -> list[str]:
+    """Return names in which each name that occurs several times, and is no name of a clock, is replaced by ""."""
+    return [name if name in TIMES_US or names.count(name) == 1 else "" for name in names]
 
 
 def skeleton_pattern(line: Line) -> re.Pattern[str]:

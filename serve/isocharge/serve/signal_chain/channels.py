@@ -1,6 +1,7 @@
 """Assignment of the channels of a frame to the electrodes."""
 
 import re
+from itertools import takewhile
 from json import dumps
 from operator import itemgetter
 
@@ -20,9 +21,9 @@ class Channels(Stage):
 
     The section `[channels]` of the device file states the name or the number of the channel of each electrode. If the
     device file has no section `[channels]`, a channel belongs to the electrode whose name is among the words of the
-    channel's name, as in `A_pC`, `charge.A` or `electrode a`. If no channel has the name of an electrode, the channels
-    are assigned by their order, which requires as many channels as electrodes. If the channels are numbered, the
-    numbers must increase.
+    channel's name, as in `A_pC`, `charge.A` or `electrode a`, or is the part in which the names of the channels differ,
+    as in `chA`, `chB` and `chC`. If no channel has the name of an electrode, the channels are assigned by their order,
+    which requires as many channels as electrodes. If the channels are numbered, the numbers must increase.
     """
 
     is_required = True
@@ -93,7 +94,11 @@ class Channels(Stage):
         if not names:
             return None
         advice = "" if self._allows_any_unit else _unit_advice(names)
-        words = [set(_words_of(name.casefold())) for name in names]
+        folded_names = [name.casefold() for name in names]
+        words = [
+            {*_words_of(name), distinctive_part}
+            for name, distinctive_part in zip(folded_names, _distinctive_parts(folded_names), strict=True)
+        ]
         indices = [
             [index for index, channel_words in enumerate(words) if channel_words.issuperset(electrode_words)]
             for electrode_words in (_words_of(electrode.casefold()) for electrode in self._electrodes)
@@ -166,8 +171,23 @@ def channel_index(name: str, frame: Frame) -> int | None:
 
 
 def _words_of(text: str) -> list[str]:
-    """Return the words of a text. All characters except letters and digits separate words."""
-    return [word for word in re.split(r"[\W_]+", text) if word]
+    """Return the words of a text, which all characters except letters and digits separate, as well as a unit.
+
+    A unit begins after a capital letter or a digit, as in `AnC`.
+    """
+    return [word for word in re.split(r"[\W_]+|(?<=[A-Z0-9])(?=(?:[fnpuµμ]C|mV)\b)", text) if word]
+
+
+def _distinctive_parts(names: list[str]) -> list[str]:
+    """Return the part of each name that remains without the beginning and the end that all names have in common."""
+    return _reversed_without_common_start(_reversed_without_common_start(names))
+
+
+def _reversed_without_common_start(texts: list[str]) -> list[str]:
+    """Remove the characters at the beginning that all texts have in common, and return the texts backwards."""
+    common = takewhile(lambda characters: len(set(characters)) == 1, zip(*texts, strict=False))
+    n_common = len(list(common))
+    return [text[n_common:][::-1] for text in texts]
 
 
 def _are_in_order(names: tuple[str, ...]) -> bool:
@@ -180,10 +200,11 @@ def _are_in_order(names: tuple[str, ...]) -> bool:
 def stated_unit(name: str) -> str:
     """Return the unit at the end of the name of a channel, such as nC for `A_nC`; empty if the name states no unit.
 
-    A final `C` is no unit, because C may be the name of an electrode.
+    A final `C` is no unit, because C may be the name of an electrode. The case of the unit does not matter.
     """
     *other_words, last_word = _words_of(name) or [""]
-    return last_word if other_words and last_word in {"pC", *OTHER_CHARGE_UNITS} - {"C"} else ""
+    units = {unit.casefold(): unit for unit in ("pC", *OTHER_CHARGE_UNITS) if unit != "C"}
+    return units.get(last_word.casefold(), "") if other_words else ""
 
 
 def _unit_advice(names: tuple[str, ...]) -> str:

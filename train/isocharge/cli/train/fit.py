@@ -13,7 +13,7 @@ from isocharge.cli.shared.options import ConfigOption, JsonOption
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.common.errors import InputError
+from isocharge.common.errors import InputError, OutputExists
 from isocharge.serve import ModelMetadata
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import (
@@ -26,6 +26,7 @@ from isocharge.simulate import (
 from isocharge.simulate.sensor.probe import PROBE_HELP
 from isocharge.train import FitConfig, Fitted, TrainingData, fit, fit_presses, load_config, release
 from isocharge.train.data.presses import is_measured, measured_presses_of
+from isocharge.train.model_release.release import Release
 
 ModelFolderOption = Annotated[
     Path,
@@ -144,7 +145,7 @@ def fit_command(
     version_folder = check_target(output, version, electrodes)
     with shown_progress():
         fitted = train(fit_config)
-        released = release(fitted, version_folder.parent, version=int(version_folder.name), command=this_command())
+        released = _release(fitted, version_folder)
     if json:
         show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})
     say(f"{released.folder}: {_errors_sentence(released.metadata)}")
@@ -165,6 +166,26 @@ def _refuse_options(context: typer.Context, names: Sequence[str], reason: str) -
         source = context.get_parameter_source(parameter.name or "")
         if parameter.name in names and source is not None and source.name == "COMMANDLINE":
             raise InputError(f"{parameter.opts[0]}: {reason}; leave the option out")
+
+
+def _release(fitted: Fitted, version_folder: Path) -> Release:
+    """Write a trained network as a version of a model.
+
+    If another process has written this version during the training, the next free version is written.
+
+    Args:
+        fitted: The network.
+        version_folder: Folder of the version.
+    """
+    version = int(version_folder.name)
+    try:
+        return release(fitted, version_folder.parent, version=version, command=this_command())
+    except OutputExists:
+        if not version_folder.exists():
+            raise
+        next_folder = version_folder.with_name(f"{version + 1}")
+        say(f"caution: {version_folder} was written during the training: this model becomes {next_folder}")
+        return _release(fitted, next_folder)
 
 
 def _is_sensor(argument: Path) -> bool:

@@ -75,11 +75,12 @@ class ChannelNoise:
     def estimate(cls, charge: Array, unit_contact: Array) -> "ChannelNoise":
         """Estimate the noise of each channel from measured presses.
 
-        If contacts are repeated, the residuals are the differences between the repeated charges and their means. They
-        contain only noise. Otherwise, a plane through the neighbours of a press estimates the charges of the press
-        without noise. The residuals are then the differences between the measured and the estimated charges, and also
-        contain the curvature of the map from contacts to charges. The white noise and the noise of the gain are
-        fitted to these residuals. Both kinds of noise have lower limits.
+        Rows that are copies of other rows are left out, because they contain no further noise. If contacts are
+        repeated, the residuals are the differences between the repeated charges and their means. They contain only
+        noise. Otherwise, a plane through the neighbours of a press estimates the charges of the press without noise.
+        The residuals are then the differences between the measured and the estimated charges, and also contain the
+        curvature of the map from contacts to charges. The white noise and the noise of the gain are fitted to these
+        residuals. Both kinds of noise have lower limits.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
@@ -88,6 +89,8 @@ class ChannelNoise:
         Returns:
             Noise model with the white noise and the noise of the gain of each channel.
         """
+        different_rows = np.unique(np.column_stack([unit_contact, charge]), axis=0)
+        unit_contact, charge = np.split(different_rows, [unit_contact.shape[1]], axis=1)
         size, residual = _repeated_residuals(unit_contact, charge)
         if len(residual) < MIN_REPEATED_PRESSES:
             planes = LocalPlanes.fit(unit_contact, charge)
