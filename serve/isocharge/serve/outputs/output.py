@@ -12,13 +12,18 @@ Example of such an entry point in pyproject.toml:
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from isocharge.common.errors import IsochargeError, OutputError
 from isocharge.common.files import AtomicWriter, new_file
+from isocharge.serve.outputs.writer_queue import WriterQueue
 from isocharge.serve.record.record import PredictionRecord
+
+END_TIMEOUT_s = 15.0
+"""Half of the time after which an output of another package that cannot be closed is given up, s."""
 
 
 class Output(Protocol):
@@ -44,6 +49,38 @@ def discard(output: Output) -> None:
     """Call the method `discard` of an output. If the output has no such method, call `close` instead."""
     discard_or_close = getattr(output, "discard", output.close)
     discard_or_close()
+
+
+class AddedOutput:
+    """An output of another package, which can neither change records nor keep the command from ending."""
+
+    def __init__(self, output: Output) -> None:
+        """Store the output of the other package."""
+        self._output = output
+
+    def write(self, record: PredictionRecord) -> None:
+        """Write a copy of the record, so that the other outputs do not receive the changes of this output."""
+        self._output.write(deepcopy(record))
+
+    def close(self) -> None:
+        """Close the output."""
+        self._end(lambda output: output.close())
+
+    def discard(self) -> None:
+        """Discard the output, because the records are incomplete."""
+        self._end(discard)
+
+    def _end(self, end: Callable[[Output], None]) -> None:
+        """Call a function that ends the output in another thread, which may hang.
+
+        Raises:
+            Exception: The error of the function.
+            RuntimeError: If the function does not return in time.
+        """
+        with WriterQueue(end, close_timeout_s=END_TIMEOUT_s) as ending:
+            ending.put(self._output)
+        if ending.is_stuck:
+            raise RuntimeError(f"it is still not closed after {2.0 * END_TIMEOUT_s:g} s")
 
 
 def output_error(error: Exception, target: str) -> Exception:

@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import Any, Self
 
 from isocharge.common.errors import InputError, shown
-from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, discard, is_file_with, output_error
+from isocharge.serve.outputs.output import (
+    AddedOutput,
+    Output,
+    OutputContext,
+    OutputKind,
+    discard,
+    is_file_with,
+    output_error,
+)
 from isocharge.serve.outputs.text_outputs import CSV_FILE, JSON_FILE, STDOUT_CSV, STDOUT_JSON, UDP
 from isocharge.serve.outputs.writer_queue import WriterQueue
 from isocharge.serve.record.record import PredictionRecord
@@ -130,6 +138,8 @@ class Outputs:
         for target, kind in self._kinds.items():
             try:
                 output = kind.open(target, self._context)
+                if kind not in OUTPUT_KINDS:
+                    output = AddedOutput(output)
             except BaseException as error:
                 self._is_discarded = True
                 self.close()

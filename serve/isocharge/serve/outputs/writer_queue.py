@@ -16,10 +16,7 @@ MAX_WAITING = 10_000
 """Largest number of waiting items. Records of ten seconds at 1 kHz occupy about 10 MB."""
 
 CLOSE_TIMEOUT_s = 1.0
-"""Longest time that `close` waits for the consumer to take the next item, s.
-
-After this time, the waiting items count as lost.
-"""
+"""Default of `close_timeout_s`, s."""
 
 
 class WriterQueue(Generic[T]):
@@ -31,15 +28,24 @@ class WriterQueue(Generic[T]):
         lost: Number of items that were dropped without being written.
     """
 
-    def __init__(self, write: Callable[[T], object], is_ready: Callable[[], bool] = lambda: True) -> None:
+    def __init__(
+        self,
+        write: Callable[[T], object],
+        is_ready: Callable[[], bool] = lambda: True,
+        *,
+        close_timeout_s: float = CLOSE_TIMEOUT_s,
+    ) -> None:
         """Start the thread.
 
         Args:
             write: Function that the thread calls with each item.
             is_ready: Function that the thread calls before it writes an item. The function waits for a short time, and
                 returns whether the consumer accepts an item.
+            close_timeout_s: Longest time that `close` waits for the consumer to take the next item, s. After this time,
+                the waiting items count as lost.
         """
         self.lost = 0
+        self._close_timeout_s = close_timeout_s
         self._write = write
         self._is_ready = is_ready
         self._items: Queue[T | None] = Queue()  # None ends the thread
@@ -90,9 +96,9 @@ class WriterQueue(Generic[T]):
         earlier_count = 0
         while self._thread.is_alive() and self._items.unfinished_tasks != earlier_count:
             earlier_count = self._items.unfinished_tasks
-            self._thread.join(CLOSE_TIMEOUT_s)
+            self._thread.join(self._close_timeout_s)
         self._is_abandoned.set()
-        self._thread.join(CLOSE_TIMEOUT_s)
+        self._thread.join(self._close_timeout_s)
         if self._items.unfinished_tasks > 0:
             self.lost += self._items.unfinished_tasks - 1  # the last task is the None
         self._raise_error()
