@@ -54,7 +54,7 @@ TEXT = f"# Größe\nx_mm,y_mm,force_N,A,B,C\n{ROW}"
     ("data", "message"),
     [
         (TEXT.encode("utf-16"), r"presses\.csv, line 1: the byte 0xff is not text in UTF-8: .* iconv -f UTF-16"),
-        (TEXT[8:].encode("utf-16-le"), r"got the header \['x\\x00"),
+        (TEXT[8:].encode("utf-16-le"), r"line 1: the byte 0x00 is not text in UTF-8: .* iconv -f UTF-16"),
         (TEXT.encode("latin-1"), r"line 1: the byte 0xf6 is not text in UTF-8: .*WINDOWS-1252"),
         (f"{TEXT[8:]}{ROW * 5000}1,2,3,4,5,ü".encode("cp1252"), "line 5003: the byte 0xfc"),
         (b"PK\x03\x04\xff\xff", "the byte 0xff is not text in UTF-8: export the file as CSV in UTF-8"),

@@ -187,17 +187,20 @@ def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
         InputError: If the lines are not text in UTF-8, or a line is too long.
     """
     line_count = 0
+    advice = (
+        "is not text in UTF-8: export the file as CSV in UTF-8; convert other text with: iconv -f UTF-16 (or "
+        "WINDOWS-1252) -t UTF-8 FILE > NEW.csv"
+    )
     try:
         for line in lines:
+            if "\0" in line:  # the file is binary, or text in UTF-16
+                raise source.error(f", line {line_count + 1}: the byte 0x00 {advice}")
             yield line.removeprefix("\ufeff") if line_count == 0 else line
             line_count += 1
     except UnicodeDecodeError as cause:
         # The exception contains the part of the file that was decoded last.
         line_number = line_count + cause.object[: cause.start].count(b"\n") + 1
-        raise source.error(
-            f", line {line_number}: the byte 0x{cause.object[cause.start]:02x} is not text in UTF-8: export the file "
-            "as CSV in UTF-8; convert other text with: iconv -f UTF-16 (or WINDOWS-1252) -t UTF-8 FILE > NEW.csv"
-        ) from cause
+        raise source.error(f", line {line_number}: the byte 0x{cause.object[cause.start]:02x} {advice}") from cause
     except ValueError as cause:  # the next line is too long
         raise source.error(f", line {line_count + 1}: not CSV text ({cause})") from cause
 
