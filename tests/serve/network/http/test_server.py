@@ -188,6 +188,18 @@ def test_connections_above_the_limit_are_refused(limited):
     wait_until(lambda: is_well(server))
 
 
+def test_idle_connections_leave_open_files_for_new_connections(limited, monkeypatch):
+    monkeypatch.setattr("resource.setrlimit", lambda *_: None)
+    monkeypatch.setattr("resource.getrlimit", lambda _: (16, 16))
+    server = limited()
+    with ExitStack() as stack:
+        idle = [stack.enter_context(connect(server)) for _ in range(20)]
+        assert is_well(server)
+        idle[0].settimeout(5)  # less than the deadline of a connection without a request
+        with suppress(ConnectionResetError):
+            assert idle[0].recv(1) == b""
+
+
 def test_client_that_does_not_read_is_disconnected(limited):
     server = limited(body_seconds=0.3)
     body = json.dumps({"inputs": [TENSOR | {"shape": [4096, 3], "data": TENSOR["data"] * 4096}]}).encode()

@@ -10,8 +10,10 @@ The signals of the process are left to the program that runs the server.
 
 import asyncio
 import math
+import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, NoReturn
 
@@ -231,6 +233,12 @@ class HttpServer:
         limits = limits or ServerLimits()
         traffic = traffic or Traffic()
         tls_context = tls.context() if tls else None
+        self._address = address
+        self._socket = address.listen(limits.connections)
+        # Each connection needs an open file. Without a free one, no connection could be accepted, nor one ended for it.
+        max_open_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        if max_open_files != resource.RLIM_INFINITY:
+            limits = replace(limits, connections=min(limits.connections, max_open_files * 7 // 8))
         connection: Any = partial(Connection, limits, traffic)
         config = uvicorn.Config(
             application,
@@ -248,8 +256,6 @@ class HttpServer:
             ssl_context_factory=(lambda *_: tls_context) if tls_context else None,
         )
         self._server = _Server(config)
-        self._address = address
-        self._socket = address.listen(config.backlog)
         self.url = address.url(self._socket, secure=tls is not None)
         traffic.open.labels("http").set_function(lambda: len(self._server.server_state.connections))
 
