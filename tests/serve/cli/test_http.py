@@ -49,6 +49,17 @@ def test_sighup_loads_all_models_again(start, film, tmp_path):
     assert process.wait(timeout=30) == 0
 
 
+def test_stderr_of_log_json_has_only_lines_of_json(start, film, tmp_path):
+    film.write(tmp_path)
+    (film.write(tmp_path, version=2) / "golden.json").unlink()
+    process = start("--port", 0, "--log", "json", folder=tmp_path)
+    process.stdout.readline()
+    process.terminate()
+    refused, serving = map(json.loads, process.communicate(timeout=30)[1].splitlines())
+    assert (refused["level"], refused["message"][:9]) == ("warning", "refused: ")
+    assert (serving["level"], serving["message"]) == ("info", "serving linear/1; Ctrl-C stops")
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_server_answers_until_sigterm(start, number):
     process = start("--port", 0, "--grpc-port", 0)

@@ -19,7 +19,7 @@ from isocharge.cli.shared.live_page import (
     given_tls,
     given_token,
 )
-from isocharge.cli.shared.terminal import announce, on_signal, say, unless_hung_up, write_stderr
+from isocharge.cli.shared.terminal import announce, on_signal, unless_hung_up, write_stderr
 from isocharge.common.errors import IsochargeError
 from isocharge.common.extras import require
 from isocharge.serve.network.address import Address, Tls, check_exposure
@@ -29,6 +29,9 @@ from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import ModelStore, open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.outputs.writer_queue import WriterQueue
+
+log = logging.getLogger("isocharge.serve.http")
+log.setLevel(logging.INFO)
 
 
 def http_command(
@@ -61,7 +64,7 @@ def http_command(
     token: TokenOption = None,
     tls_cert: TlsCertOption = None,
     tls_key: TlsKeyOption = None,
-    log: Annotated[
+    log_format: Annotated[
         Literal["text", "json"],
         typer.Option("--log", help="On stderr: sentences for people, or a line of JSON for each request and message."),
     ] = "text",
@@ -85,35 +88,35 @@ def http_command(
     access = AccessCheck(host, allow_host or (), token=secret, any_host=uds is not None)
 
     # Load the models, and serve them until Ctrl-C.
-    with suppress(KeyboardInterrupt), _traffic(log) as traffic:
+    with suppress(KeyboardInterrupt), _traffic(log_format) as traffic:
         store = open_model_store(models)
         for reason in store.refusals():
-            _report(traffic, "warning", "refused", reason)
+            log.warning("refused: %s", reason)
         handler = Handler(store, traffic=traffic, access=access)
         server = HttpServer(Application(handler), address, handler.limits, traffic, tls=tls)
         with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:  # empty without gRPC
-            _report(traffic, "info", "serving", _labels(store))
+            _log_loaded_models(store)
             announce(server.url)
             if grpc_url:
                 announce(grpc_url)
-            with _signals(server, store, traffic):
+            with _signals(server, store):
                 server.run()
 
 
-def _labels(store: ModelStore) -> str:
-    """Return the labels of all loaded models, separated by commas."""
-    return ", ".join(loaded.metadata.label for loaded in store.loaded_versions())
+def _log_loaded_models(store: ModelStore) -> None:
+    """Log the labels of all loaded models, separated by commas."""
+    log.info("serving %s; Ctrl-C stops", ", ".join(loaded.metadata.label for loaded in store.loaded_versions()))
 
 
 @contextmanager
-def _signals(server: HttpServer, store: ModelStore, traffic: Traffic) -> Iterator[None]:
+def _signals(server: HttpServer, store: ModelStore) -> Iterator[None]:
     """Context manager in which SIGTERM and Ctrl-C stop the server, and SIGHUP loads all models again.
 
     If SIGHUP arrives because the terminal of the command was closed, the server stops, too.
     """
 
     def load_all() -> None:
-        threading.Thread(target=_load_all, args=(store, traffic), name="load").start()
+        threading.Thread(target=_load_all, args=(store,), name="load").start()
 
     with ExitStack() as stack:
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -122,53 +125,37 @@ def _signals(server: HttpServer, store: ModelStore, traffic: Traffic) -> Iterato
         yield
 
 
-def _load_all(store: ModelStore, traffic: Traffic) -> None:
-    """Load all models of the repositories again. Models that cannot be loaded are reported, and stay as they were."""
+def _load_all(store: ModelStore) -> None:
+    """Load all models of the repositories again. Models that cannot be loaded are logged, and stay as they were."""
     for name in sorted({row["name"] for row in store.index()}):
         try:
             store.load(name)
         except IsochargeError as error:
-            _report(traffic, "warning", "refused", str(error))
-    _report(traffic, "info", "serving", _labels(store))
+            log.warning("refused: %s", error)
+    _log_loaded_models(store)
 
 
 @contextmanager
-def _traffic(log: str) -> Iterator[Traffic]:
+def _traffic(log_format: str) -> Iterator[Traffic]:
     """Context manager that yields the traffic counters of the servers, and writes a log of requests for `--log json`.
 
     A separate thread writes the log to stderr, so that a slow reader of stderr does not delay the answers. The warnings
     of all packages are written to the same log. For `--log text`, there is no log.
 
     Args:
-        log: Value of `--log`.
+        log_format: Value of `--log`.
     """
-    if log == "text":
+    if log_format == "text":
         yield Traffic()  # counters without a log of requests
         return
     with WriterQueue(write_stderr) as line_queue:
         request_log = RequestLog(line_queue.put)
         logging.basicConfig(level=logging.WARNING, handlers=[request_log], force=True)
+        logging.getLogger("isocharge").handlers.clear()  # its messages also reach `request_log`
         logging.captureWarnings(True)
         traffic = Traffic(request_log)
         traffic.lost_lines.set_function(lambda: line_queue.lost)
         yield traffic
-
-
-def _report(traffic: Traffic, level: str, event: str, message: str) -> None:
-    """Report an event of the server as a line of the log or, without a log, as a sentence on stderr.
-
-    Args:
-        traffic: Counters of the server, which contain the log; `traffic.log` is None without a log.
-        level: Level of the event in the log, "warning" or "info".
-        event: Name of the event: "refused" for a model that is not served, or "serving".
-        message: The reason for the refusal, or the names of the served models.
-    """
-    if traffic.log is not None:
-        traffic.log.write_message(level, event, message)
-    elif event == "refused":
-        say(f"refused: {message}")
-    else:
-        say(f"serving {message}; Ctrl-C stops")
 
 
 def _grpc(handler: Handler, host: str, port: int | None, tls: Tls | None) -> AbstractContextManager[str]:

@@ -190,19 +190,18 @@ class RequestLog(logging.Handler):
         }
         self._write(orjson.dumps(line).decode())
 
-    def write_message(self, level: str, event: str, message: str) -> None:
-        """Write a line about the server itself, for example when the server starts."""
-        self._write_line(level, event=event, message=message)
-
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line with a message of the module `logging`, and with the traceback of the message if it has one."""
-        fields = {"event": "message", "logger": record.name, "message": record.getMessage()}
+        line = {
+            "time": datetime.now(UTC).isoformat(),
+            "level": record.levelname.lower(),
+            "event": "message",
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
         if record.exc_info and record.exc_info[0] is not None:
-            fields["traceback"] = "".join(traceback.format_exception(*record.exc_info))
-        self._write_line(record.levelname.lower(), **fields)
-
-    def _write_line(self, level: str, **fields: str) -> None:
-        self._write(json.dumps({"time": datetime.now(UTC).isoformat(), "level": level} | fields))
+            line["traceback"] = "".join(traceback.format_exception(*record.exc_info))
+        self._write(json.dumps(line))
 
 
 class Traffic:
