@@ -14,7 +14,7 @@ from scipy.fft import dctn
 
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from isocharge.simulate.forward.forward_map import EVEN_FIELD
-from isocharge.simulate.forward.readout import ReadoutPoints
+from isocharge.simulate.forward.readout import ElectrodePieces, PieceRule
 from isocharge.simulate.mesh.conformal_map import automorphism_onto
 from isocharge.simulate.sensor.sensor_file import film_to_dict
 
@@ -63,12 +63,17 @@ def stress_series():
 
 def stress_sum(forward_map, contact, points_mm):
     """Return s11 + s22, MPa, as charges of electrodes of one point with the weights 1, 1 and 0 of the stresses."""
-    points = np.stack([points_mm.real.ravel(), points_mm.imag.ravel()], axis=1)
-    weights = np.tile([1.0, 1.0, 0.0], (len(points), 1, 1))
-    readout = ReadoutPoints(points[:, None], weights, np.ones(len(points), dtype=int))
+    n_point = points_mm.size
+    index = np.arange(n_point)
+    pieces = ElectrodePieces(
+        corners=np.repeat(points_mm.reshape(-1, 1), 4, axis=1),
+        line_area=np.ones(n_point),
+        electrode=index,
+        charge_per_stress=np.tile([1.0, 1.0, 0.0], (n_point, 1)),
+    )
+    rules = [PieceRule(np.zeros_like(index), index, points_mm.reshape(-1, 1), np.ones((n_point, 1)))]
     x, y, force = np.array(contact)[:, None]
-    rules = [(readout, np.ones((1, len(points)), dtype=bool))]
-    charge = forward_map.integrate_fields(x + 1j * y, force, np.zeros(1), EVEN_FIELD, rules)
+    charge = forward_map.integrate_fields(x + 1j * y, force, np.zeros(1), EVEN_FIELD, pieces, rules)
     return charge[0, :, 0].reshape(points_mm.shape)
 
 

@@ -20,11 +20,14 @@ from isocharge.simulate import (
     touch_stress,
 )
 from isocharge.simulate.forward.readout import (
-    GAUSS_RULES,
-    ReadoutPoints,
+    MAP_COUNTS,
+    NEAR_DISTANCE,
+    ElectrodePieces,
     contact_charge,
+    stress_charge,
     thermal_charge,
 )
+from isocharge.simulate.numerics.polygon import to_corners
 
 AREA = 9.0
 D31 = 20.0
@@ -34,8 +37,12 @@ TRIANGLE = Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0)))
 
 def charge_of(sensor: Sensor, stress, per_side: int = 12) -> np.ndarray:
     """Charges under a made-up stress field, a function of x and y that returns (s11, s22, s12)."""
-    readout = ReadoutPoints.of(sensor, per_side)
-    return readout.charge(np.stack(np.broadcast_arrays(*stress(*np.moveaxis(readout.points, -1, 0))), axis=-1))
+    pieces = ElectrodePieces.of(sensor)
+    charge = np.zeros(len(sensor.electrodes))
+    for rule in pieces.rules(Circle(1.0), np.zeros(1), (per_side, per_side)):
+        values = np.broadcast_arrays(*stress(rule.points.real, rule.points.imag))
+        np.add.at(charge, pieces.electrode[rule.piece], pieces.charge(rule, np.stack(values, axis=-1)))
+    return charge
 
 
 @pytest.fixture(params=["area", "edge"])
@@ -153,14 +160,27 @@ def test_each_rule_is_accurate_from_its_smallest_distance_on(film, readout):
     sensor = replace(load_sensor("four-25um-uniaxial"), electrodes=(electrode,), readout=readout)
     reach = 1.0
     unit = 1.5 * np.sqrt(2.0) + reach
-    for smallest_distance, per_side, tolerance in ((0.0, 12, 2e-4), (1.4, 4, 1e-4)):
-        assert per_side in dict(GAUSS_RULES).values()
+    for smallest_distance, tolerance in ((0.0, 2e-4), (NEAR_DISTANCE, 1e-4)):
         pressed = press(film, Circle(reach), (10.0 - smallest_distance * unit, 0.4), 1.0)
-        charge, exact = (
-            rule.charge(touch_stress(pressed, rule.points.reshape(-1, 2)).reshape(*rule.points.shape[:2], 3))
-            for rule in (ReadoutPoints.of(sensor, count) for count in (per_side, 40))
+        np.testing.assert_allclose(
+            stress_charge(sensor, pressed, MAP_COUNTS), stress_charge(sensor, pressed, (40, 40)), rtol=tolerance
         )
-        np.testing.assert_allclose(charge, exact, rtol=tolerance)
+
+
+@pytest.mark.parametrize("probe", [Circle(0.1), Circle(0.3), Polygon.rectangle(4.0, 0.5, 0.3)], ids=str)
+def test_small_probe_on_a_large_electrode(film, probe):
+    """The charge of a square of 24 mm equals the sum over squares of 0.5 mm, for presses and for forward maps."""
+    centres = 0.5 * np.arange(-23.5, 24.0)
+    cells = [Electrode.of_square("A", (x, y), 0.5) for x in centres for y in centres]
+    pressed = press(film, probe, (2.3, -1.1), 0.5)
+    points = ElectrodePieces.covering(cells)
+    large = replace(load_sensor("four-25um-uniaxial"), electrodes=(Electrode.of_square("A", (0.0, 0.0), 24.0),))
+    expected = 0.0
+    for rule in points.rules(Circle(100.0), np.zeros(1), (12, 12)):
+        stress = touch_stress(pressed, to_corners(rule.points.ravel())).reshape(*rule.points.shape, 3)
+        expected += float((rule.area[..., None] * stress * [D31, D32, 0.0]).sum())
+    assert touch_charge(large, pressed)[0] == pytest.approx(expected, rel=5e-5)
+    assert stress_charge(large, pressed, MAP_COUNTS)[0] == pytest.approx(expected, rel=2e-4)
 
 
 def test_touch_charge_with_another_film_raises_error(solved):

@@ -10,6 +10,7 @@ integrals of the interpolated field over the electrodes. The positions of the el
 accuracy of the interpolation. When a map is built, its charges are compared with those of direct solves.
 """
 
+from collections.abc import Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -33,11 +34,11 @@ from isocharge.simulate.forward.family import (
     spread_check_presses,
 )
 from isocharge.simulate.forward.readout import (
+    ElectrodePieces,
+    PieceRule,
     PressChunk,
     PressMeshes,
-    ReadoutPoints,
     contact_charge,
-    pairs_by_rule,
     relative_distances,
 )
 from isocharge.simulate.mechanics.scaling import amplitude_squared
@@ -379,13 +380,13 @@ class ForwardMap:
         if orientation is None:
             orientation = np.zeros(len(contact))
         charges = np.empty((len(contact), len(self.electrodes), is_odd.size))
+        pieces = ElectrodePieces.of(self.sensor)
         with single_threaded_blas():  # faster for the many small matrices of a chunk
             for start in range(0, len(contact), chunk_size):
                 chunk = slice(start, start + chunk_size)
-                distances = relative_distances(self.sensor.part_circles, self.probe.reach, position[chunk])
-                rules = [(ReadoutPoints.of(self.sensor, count), uses) for count, uses in pairs_by_rule(distances)]
+                rules = pieces.rules(self.probe, position[chunk])
                 charges[chunk] = self.integrate_fields(
-                    position[chunk], contact[chunk, 2], orientation[chunk], is_odd, rules
+                    position[chunk], contact[chunk, 2], orientation[chunk], is_odd, pieces, rules
                 )
         return charges
 
@@ -421,7 +422,8 @@ class ForwardMap:
         force: Array,
         orientation: Array,
         is_odd: Booleans,
-        rules: list[tuple[ReadoutPoints, Booleans]],
+        pieces: ElectrodePieces,
+        rules: Iterable[PieceRule],
     ) -> Array:
         """Interpolate the stress fields of one chunk of presses, and integrate the fields to obtain the charges.
 
@@ -431,15 +433,15 @@ class ForwardMap:
             orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
             is_odd: Whether each field of the table is odd with respect to a reflection in the direction of the press,
                 shape (n_field,).
-            rules: Pairs of an integration rule and an array, shape (n, n_electrode), that is True where a press and an
-                electrode use this rule.
+            pieces: Pieces of the electrodes.
+            rules: Integration points of the pairs of a press and a piece.
 
         Returns:
             Charges, shape (n, n_electrode, n_field), pC.
         """
         film = self.sensor.film
         presses = self._interpolated_presses(position, force, orientation)
-        scaled_charge = presses.charges_by_rules(rules, film.radius, is_odd)
+        scaled_charge = presses.charges(pieces, rules, film.radius, is_odd)
 
         # Multiply by the unit of the scaled stress in the table.
         stress_unit = film.young * amplitude_squared(film, force)

@@ -11,9 +11,9 @@ right edges, and the mean of s22 over the lower and upper edges (equation 3 of t
 charge under load minus the charge without load. The charge of a uniform pretension therefore cancels.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,98 +24,162 @@ from isocharge.simulate.mesh.placed_mesh import from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.point_location import locate_points
 from isocharge.simulate.mesh.template import Template
-from isocharge.simulate.numerics.interpolation import gauss_line, tensor_values
-from isocharge.simulate.numerics.polygon import gauss_quadrilateral
+from isocharge.simulate.numerics.interpolation import tensor_values
+from isocharge.simulate.numerics.polygon import (
+    gauss_quadrilaterals,
+    gauss_square_weights,
+    halve_quadrilaterals,
+    to_complex,
+    to_corners,
+)
 from isocharge.simulate.sensor.probe import Probe
-from isocharge.simulate.sensor.sensor import MAX_PART_SIDE, Electrode, Readout, Sensor
+from isocharge.simulate.sensor.sensor import Electrode, Readout, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
 
-DIRECT = 20
-"""Number of Gauss points per side of an electrode for single presses.
+DIRECT_COUNTS = (20, 8)
+"""Numbers of Gauss points along a side of a near piece and of a distant piece of an electrode, for single presses."""
 
-The stress has a kink at the edge of the footprint. Even if this edge crosses an electrode, the relative error of the
-charge is only 1e-5.
+MAP_COUNTS = (12, 4)
+"""Numbers of Gauss points along a side of a near piece and of a distant piece of an electrode, for many presses.
+
+The relative error of a charge is at most 1e-4.
 """
 
-GAUSS_RULES = ((1.4, 12), (np.inf, 4))
-"""Integration rules of electrodes for many presses, in ascending order of the relative distance from the press.
+NEAR_DISTANCE = 1.4
+"""Relative distance from the press below which a piece of an electrode is near; see `ElectrodePieces.rules`."""
 
-Each rule consists of the relative distance below which it is used, and of the number of Gauss points per side of the
-electrode. The function `relative_distances` computes the distances. The kink of the stress at the edge of the footprint
-crosses only electrodes to which the first rule applies. The relative error of a charge is at most 1e-4.
+NEAR_SIDE = 5.0
+"""Longest side of a near piece of an electrode, in units of the width of the footprint.
+
+The stress has a peak at the probe and a kink at the edge of the footprint. With longer sides, the error of a charge
+exceeds 1e-4: it is 9e-4 for a side of 8 widths, and 1e-3 for a side of 20 widths with 20 points along the side.
 """
+
+
+class PieceRule(NamedTuple):
+    """Integration points of pairs of a press and a piece of an electrode.
+
+    Attributes:
+        press: Index of the press of each pair, shape (n_pair,).
+        piece: Index of the piece of each pair in `ElectrodePieces`, shape (n_pair,). If a piece was halved, several
+            pairs have the same press and piece.
+        points: Points x + iy, shape (n_pair, n_point), mm.
+        area: Area that each point represents, shape (n_pair, n_point), mm^2.
+    """
+
+    press: Integers
+    piece: Integers
+    points: Complexes
+    area: Array
 
 
 @dataclass(frozen=True)
-class ReadoutPoints:
-    """Integration points on the electrodes, and weights that convert the stress at these points into charges.
+class ElectrodePieces:
+    """Quadrilaterals that together cover the electrodes of a sensor, or the lines of the edge readout.
 
     Attributes:
-        points: Points (x, y) on the film, shape (n_electrode, n_point, 2), mm.
-        weights: Charge per stress (s11, s22, s12) at each point, shape (n_electrode, n_point, 3), pC/MPa.
-        count: Number of points of each electrode, shape (n_electrode,). An electrode with fewer than n_point points is
-            filled up with points of zero weight.
+        corners: Corners x + iy of each piece, anticlockwise, shape (n_piece, 4), mm. In a triangle, the last two
+            corners are equal. In a line, the first and the last corner are equal, and so are the second and the third.
+        line_area: Area that a line represents, shape (n_piece,), mm^2. Zero for a quadrilateral.
+        electrode: Index of the electrode to which each piece belongs, shape (n_piece,).
+        charge_per_stress: Charge per area and stress (s11, s22, s12) of each piece, shape (n_piece, 3), pC/N.
     """
 
-    points: Array
-    weights: Array
-    count: Integers
+    corners: Complexes
+    line_area: Array
+    electrode: Integers
+    charge_per_stress: Array
 
     @classmethod
-    def of(cls, sensor: Sensor, per_side: int) -> "ReadoutPoints":
-        """Return the integration points on the electrodes of a sensor, with the weights of its readout.
+    def covering(cls, electrodes: Sequence[Electrode], readout: Readout = "area") -> "ElectrodePieces":
+        """Return the pieces of electrodes at their nominal positions, with the weights of s11, s22 and s12 as charges.
+
+        Args:
+            electrodes: Electrodes of a layout, which may be empty.
+            readout: "area" for a mean over the area of an electrode, "edge" for a mean over its edges.
+        """
+        pieces = [
+            (index, *piece)
+            for index, electrode in enumerate(electrodes)
+            for piece in (_edge_lines(electrode) if readout == "edge" else _area_pieces(electrode))
+        ]
+        return cls(
+            corners=to_complex(np.array([corners for _, corners, _, _ in pieces]).reshape(-1, 4, 2)),
+            line_area=np.array([line_area for _, _, line_area, _ in pieces]),
+            electrode=np.array([index for index, _, _, _ in pieces], dtype=np.intp),
+            charge_per_stress=np.array([components for _, _, _, components in pieces]),
+        )
+
+    @classmethod
+    def of(cls, sensor: Sensor) -> "ElectrodePieces":
+        """Return the pieces of the electrodes of a sensor, with the weights of its readout.
 
         Args:
             sensor: Sensor with the electrodes, the readout, the gains and the piezoelectric coefficients.
-            per_side: Number of Gauss points per side of an electrode.
         """
-        nominal = layout_points(sensor.electrodes, sensor.readout, per_side)
+        nominal = cls.covering(sensor.electrodes, sensor.readout)
         # The factor 2 accounts for s12 and s21, which contribute equally.
-        charge_per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
-        weights = sensor.gains[:, None, None] * nominal.weights * charge_per_stress
-        return cls(sensor.calibration.place(nominal.points), weights, nominal.count)
+        coefficients = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
+        return replace(
+            nominal,
+            corners=to_complex(sensor.calibration.place(to_corners(nominal.corners))),
+            charge_per_stress=sensor.gains[nominal.electrode, None] * coefficients * nominal.charge_per_stress,
+        )
 
-    def charge(self, stress: Array) -> Array:
-        """Compute charges from the stress at the points.
+    def rules(self, probe: Probe, position: Complexes, counts: tuple[int, int] = MAP_COUNTS) -> Iterator[PieceRule]:
+        """Compute the integration points of all pieces under several presses.
+
+        A press and a piece are near if the distance of their centres is less than `NEAR_DISTANCE` times the sum of the
+        radii of the circles around the footprint and the piece. A near piece is halved across its longer sides until
+        its parts are distant, or not longer than `NEAR_SIDE`.
 
         Args:
-            stress: Stress (s11, s22, s12), shape (..., n_electrode, n_point, 3), MPa.
+            probe: Probe of the presses.
+            position: Positions x + iy of the presses, shape (n,), mm.
+            counts: Numbers of Gauss points along a side of a near piece and of a distant piece.
+
+        Yields:
+            The integration points of some of the pairs of a press and a piece.
+        """
+        width = probe.area / (np.pi * probe.reach)  # the radius of a circle
+        near_count, distant_count = counts
+        press, piece = (grid.ravel() for grid in np.indices((position.size, len(self.corners))))
+        corners = self.corners[piece]
+        line_area = self.line_area[piece]
+        while press.size:
+            centre = corners.mean(axis=1)
+            radius = np.abs(corners - centre[:, None]).max(axis=1)
+            is_near = np.abs(position[press] - centre) < NEAR_DISTANCE * (radius + probe.reach)
+            sides = np.abs(np.roll(corners, -1, axis=1) - corners)
+            is_halved = is_near & (sides.max(axis=1) > NEAR_SIDE * width)
+            for count, selected in ((near_count, is_near & ~is_halved), (distant_count, ~is_near)):
+                indices = np.flatnonzero(selected)
+                block = 50_000 // count**2  # with more points, the working arrays would exceed 100 MB
+                for start in range(0, indices.size, block):
+                    used = indices[start : start + block]
+                    points, area = gauss_quadrilaterals(corners[used], count)
+                    # The points of a line represent equal shares of its area, except for their weights.
+                    area += line_area[used, None] * gauss_square_weights(count)
+                    yield PieceRule(press[used], piece[used], points, area)
+
+            press = np.tile(press[is_halved], 2)
+            piece = np.tile(piece[is_halved], 2)
+            line_area = np.tile(0.5 * line_area[is_halved], 2)
+            corners = halve_quadrilaterals(corners[is_halved])
+
+    def charge(self, rule: PieceRule, stress: Array) -> Array:
+        """Compute the charge of each pair of a press and a piece.
+
+        Args:
+            rule: Integration points.
+            stress: Stress (s11, s22, s12) at the points, shape (n_pair, n_point, 3), MPa.
 
         Returns:
-            Charges, shape (..., n_electrode), pC.
+            Charge, shape (n_pair,), pC.
         """
-        # For each electrode (index e), sum over the points (p) and the stress components (c).
-        return np.asarray(np.einsum("...epc,epc->...e", stress, self.weights))
-
-
-@lru_cache(maxsize=32)
-def layout_points(electrodes: tuple[Electrode, ...], readout: Readout, per_side: int) -> ReadoutPoints:
-    """Return the integration points at the nominal positions of the electrodes, with areas as weights.
-
-    The result is cached, because many films have the same layout.
-
-    Args:
-        electrodes: Electrodes of the layout.
-        readout: "area" for a mean over the area of an electrode, "edge" for a mean over its edges.
-        per_side: Number of Gauss points along a side of an electrode.
-
-    Returns:
-        Points, with weights that are the areas which the points represent, mm^2. An electrode with fewer points than
-        others is filled up with points of zero area.
-    """
-    rules = [electrode_rule(electrode, readout, per_side) for electrode in electrodes]
-    counts = np.array([len(shares) for _, shares in rules], dtype=np.intp)
-    points = np.zeros((len(electrodes), counts.max(initial=0), 2))
-    areas = np.zeros(
-        (len(electrodes), counts.max(initial=0), 3)
-    )  # an area for each component of the stress (s11, s22, s12)
-    for index, electrode in enumerate(electrodes):
-        electrode_points, shares = rules[index]
-        n_point = counts[index]
-        points[index, :n_point] = electrode_points
-        # The shares are the weights of a mean over the electrode. They sum to 1 for each component of the stress.
-        areas[index, :n_point] = electrode.area * shares
-    return ReadoutPoints(points, areas, counts)
+        # Sum over the points (index p) and then over the stress components (c) of each pair (k).
+        integral = np.einsum("kpc,kp->kc", stress, rule.area)
+        return np.asarray(np.einsum("kc,kc->k", integral, self.charge_per_stress[rule.piece]))
 
 
 def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
@@ -139,15 +203,30 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
             f"surface {sensor.surface!r} needs bending, but the film was solved as a {equilibrium.theory.name}; solve "
             "it with SolveSettings(theory=Theory(bending=True))"
         )
-    # Compute the stress at the integration points of all electrodes. `touch_stress` expects one list of points.
-    readout = ReadoutPoints.of(sensor, DIRECT)
-    n_electrode, n_point, _ = readout.points.shape
-    flat_stress = touch_stress(equilibrium, readout.points.reshape(-1, 2), sensor.surface)
-    charge = readout.charge(flat_stress.reshape(n_electrode, n_point, 3))
-
-    # Add the charge of the contact pressure and the crosstalk.
+    charge = stress_charge(sensor, equilibrium)
     charge += contact_charge(sensor, equilibrium.probe, equilibrium.at, equilibrium.force)
     return sensor.calibration.read(charge)
+
+
+def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, int] = DIRECT_COUNTS) -> Array:
+    """Compute the charge that the stress under a solved press causes, without crosstalk.
+
+    Args:
+        sensor: Sensor whose film was solved.
+        equilibrium: Equilibrium of the film under the press.
+        counts: Numbers of Gauss points along a side of a near piece and of a distant piece of an electrode.
+
+    Returns:
+        Charges, shape (n_electrode,), pC.
+    """
+    pieces = ElectrodePieces.of(sensor)
+    charge = np.zeros(len(sensor.electrodes))
+    for rule in pieces.rules(equilibrium.probe, np.array([complex(*equilibrium.at)]), counts):
+        # `touch_stress` expects one list of points.
+        stress = touch_stress(equilibrium, to_corners(rule.points.ravel()), sensor.surface)
+        pair_charge = pieces.charge(rule, stress.reshape(*rule.points.shape, 3))
+        np.add.at(charge, pieces.electrode[rule.piece], pair_charge)
+    return charge
 
 
 def relative_distances(
@@ -170,22 +249,6 @@ def relative_distances(
     for index, (centres, radii) in enumerate(part_circles):
         distances[:, index] = (np.abs(position[:, None] - centres) / (radii + probe_reach)).min(axis=1)
     return distances
-
-
-def pairs_by_rule(distances: Array) -> Iterator[tuple[int, Booleans]]:
-    """Select one of the `GAUSS_RULES` for each pair of a press and an electrode.
-
-    Args:
-        distances: Relative distances, shape (n, n_electrode).
-
-    Yields:
-        The number of Gauss points per side of each rule, and an array that is True where a press and an electrode use
-        the rule, shape (n, n_electrode).
-    """
-    smallest_distance = 0.0
-    for largest_distance, per_side in GAUSS_RULES:
-        yield per_side, (distances >= smallest_distance) & (distances < largest_distance)
-        smallest_distance = largest_distance
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
@@ -239,86 +302,43 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
     return sensor.calibration.read(sensor.gains * areas * sensor.piezo.pyro * step)
 
 
-def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tuple[Array, Array]:
-    """Return the integration points of one electrode, and their weights in the mean stress of the electrode.
+def _area_pieces(electrode: Electrode) -> Iterator[tuple[Array, float, Array]]:
+    """Divide the area of an electrode into quadrilaterals.
 
     Args:
-        electrode: Electrode over which the mean is computed.
-        readout: "area" for a mean over the area of the electrode, "edge" for a mean over its edges.
-        per_side: Number of Gauss points along a side of the electrode.
+        electrode: Electrode over whose area the stress is averaged.
 
-    Returns:
-        Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3).
+    Yields:
+        Nominal corners (x, y), shape (4, 2), mm. The area of the line, which is zero. Weights of s11, s22 and s12.
     """
-    if readout == "edge":
-        return _edge_rule(electrode, per_side)
-    return _area_rule(electrode, per_side)
+    for polygon in electrode.collecting_polygons:
+        # The quadrilaterals share the first corner. If a corner is missing, the last one is repeated.
+        n_corner = len(polygon)
+        for second in range(1, n_corner - 1, 2):
+            yield polygon[[0, second, second + 1, min(second + 2, n_corner - 1)]], 0.0, np.ones(3)
 
 
-def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
-    """Return the integration points and weights for the mean of the stress over the area of an electrode.
-
-    Args:
-        electrode: Electrode over which the mean is computed.
-        per_side: Number of points along a side of a square, or along the longest side of a part.
-
-    Returns:
-        Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3). The three
-        weights of a point are equal. The sum of each weight over all points is 1.
-    """
-    if len(electrode.parts) == 1:
-        corners = electrode.parts[0]
-        pieces = _quadrilaterals(corners)
-        full_length = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min())
-    else:  # sides that are shorter than the longest possible side have fewer points
-        pieces = list(electrode.parts)
-        full_length = MAX_PART_SIDE
-    rules = [gauss_quadrilateral(piece, per_side, full_length) for piece in pieces]
-    points = np.concatenate([piece_points for piece_points, _ in rules])
-    weights = np.concatenate([piece_weights for _, piece_weights in rules])
-    shares = weights / weights.sum()
-    return points, np.repeat(shares[:, None], 3, axis=1)
-
-
-def _quadrilaterals(corners: Array) -> list[Array]:
-    """Divide a convex polygon into quadrilaterals, and possibly one triangle, that share the first corner.
-
-    Args:
-        corners: Corners (x, y), shape (n, 2), mm.
-    """
-    n_corner = len(corners)
-    return [corners[[0, *range(second, min(second + 3, n_corner))]] for second in range(1, n_corner - 1, 2)]
-
-
-def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
-    """Return the integration points and weights of the edge readout (Mirbagheri et al., 2007, equation 3).
+def _edge_lines(electrode: Electrode) -> Iterator[tuple[Array, float, Array]]:
+    """Return the lines of the edge readout (Mirbagheri et al., 2007, equation 3).
 
     The stress s11 is averaged over the left and right edges of the electrode. The stress s22 is averaged over the lower
-    and upper edges of the electrode.
+    and upper edges of the electrode. Each line is half of an edge, so that there are sufficiently many points.
 
     Args:
         electrode: A square electrode.
-        per_side: Half of the number of points on each edge.
 
-    Returns:
-        Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3). The
-        weights in the mean of s12 are zero.
+    Yields:
+        Nominal corners (x, y) of the line, shape (4, 2), mm. The area that the line represents, mm^2. Weights of s11,
+        s22 and s12.
     """
     # The corners are listed anticlockwise from the lower left corner. Each edge leads from a corner to the next one, so
-    # the first edge is the lower edge.
-    relative_position, line_shares = gauss_line(2 * per_side)  # from 0 at the start of an edge to 1 at its end
+    # the first edge is the lower edge. Each mean is over two edges, so each half of an edge represents a quarter.
     corners = np.array(electrode.corners)
-    edges = np.roll(corners, -1, axis=0) - corners
-    edge_points = corners[:, None] + relative_position[:, None] * edges[:, None]  # shape (4, n_edge_point, 2)
-    lower, right, upper, left = edge_points
-
-    # Each mean is over two edges, so each edge contributes half of the mean. The columns belong to s11, s22 and s12.
-    half_shares = 0.5 * line_shares
-    zero = np.zeros_like(line_shares)
-    s11_shares = np.stack([half_shares, zero, zero], axis=1)
-    s22_shares = np.stack([zero, half_shares, zero], axis=1)
-    points = np.concatenate([left, right, lower, upper])
-    return points, np.concatenate([s11_shares, s11_shares, s22_shares, s22_shares])
+    for edge_index, (start, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
+        middle = 0.5 * (start + end)
+        components = np.array([0.0, 1.0, 0.0]) if edge_index % 2 == 0 else np.array([1.0, 0.0, 0.0])
+        for first, last in ((start, middle), (middle, end)):
+            yield np.array([first, last, last, first]), 0.25 * electrode.area, components
 
 
 @dataclass(frozen=True)
@@ -377,49 +397,46 @@ class PressChunk:
     field: Array
     frame_angle: Array
 
-    def charges_by_rules(
-        self, rules: list[tuple[ReadoutPoints, Booleans]], film_radius: float, is_odd: Booleans
+    def charges(
+        self,
+        pieces: ElectrodePieces,
+        rules: Iterable[PieceRule],
+        film_radius: float,
+        is_odd: Booleans,
     ) -> Array:
-        """Compute the charges of all electrodes under all presses, each with its integration rule.
+        """Compute the charges of all electrodes under all presses.
 
         Args:
-            rules: Pairs of an integration rule and an array, shape (n, n_electrode), that is True where a press and an
-                electrode use this rule.
+            pieces: Pieces of the electrodes.
+            rules: Integration points of the pairs of a press and a piece.
             film_radius: Radius of the film, mm.
             is_odd: Whether each field is odd, shape (n_field,); see `scaled_charges`.
 
         Returns:
             Charges divided by the unit of the scaled stress, shape (n, n_electrode, n_field), pC/MPa.
         """
-        _, pairs_of_first_rule = rules[0]
-        pairs_shape = pairs_of_first_rule.shape  # (n, n_electrode), the same for all rules
-        scaled_charge = np.zeros((*pairs_shape, is_odd.size))
-        for rule, uses_rule in rules:
-            # Electrodes with the same number of points are integrated together, because their arrays have equal shapes.
-            for n_point in np.unique(rule.count):
-                press_index, electrode = np.nonzero(uses_rule & (rule.count == n_point))
-                points_mm = rule.points[electrode, :n_point] @ np.array([1.0, 1j])  # (x, y) becomes x + iy
-                points = points_mm / film_radius
-                weights = rule.weights[electrode, :n_point]
-                scaled_charge[press_index, electrode] = self.scaled_charges(press_index, points, weights, is_odd)
+        scaled_charge = np.zeros((len(self.field), pieces.electrode.max() + 1, is_odd.size))
+        for rule in rules:
+            pair_charge = self.scaled_charges(pieces, rule, film_radius, is_odd)
+            np.add.at(scaled_charge, (rule.press, pieces.electrode[rule.piece]), pair_charge)
         return scaled_charge
 
-    def scaled_charges(self, press_index: Integers, points: Complexes, weights: Array, is_odd: Booleans) -> Array:
-        """Compute the charge of each pair of a press and an electrode, by integration of the stress fields.
+    def scaled_charges(self, pieces: ElectrodePieces, rule: PieceRule, film_radius: float, is_odd: Booleans) -> Array:
+        """Compute the charge of each pair of a press and a piece of an electrode, by integration of the stress fields.
 
         Args:
-            press_index: Index of the press of each pair, shape (n_pair,).
-            points: Integration points x + iy on the electrode of each pair, shape (n_pair, n_point), in film radii.
-            weights: Charge per stress (s11, s22, s12) at each integration point, shape (n_pair, n_point, 3), pC/MPa.
+            pieces: Pieces of the electrodes.
+            rule: Integration points of the pairs.
+            film_radius: Radius of the film, mm.
             is_odd: Whether each field is odd, shape (n_field,). A reflection in the direction of the press leaves an
                 even field unchanged, and changes the sign of an odd field.
 
         Returns:
             Charges divided by the unit of the scaled stress, shape (n_pair, n_field), pC/MPa.
         """
-        stress, is_mirrored = self._interpolated_stress(press_index, points, is_odd.size)
+        stress, is_mirrored = self._interpolated_stress(rule.press, rule.points / film_radius, is_odd.size)
 
-        frame_angle = self.frame_angle[press_index]
+        frame_angle = self.frame_angle[rule.press]
         charge = np.empty((len(stress), is_odd.size))
         for field_index, is_field_odd in enumerate(is_odd):
             field_stress = stress[:, :, field_index]  # shape (n_pair, n_point, 3)
@@ -427,8 +444,7 @@ class PressChunk:
             reversed_components = slice(0, 2) if is_field_odd else slice(2, 3)
             field_stress[is_mirrored, reversed_components] *= -1.0
             film_stress = rotate_stress(field_stress, frame_angle[:, None])
-            # For each pair (index k), sum over the points (p) and the stress components (c).
-            charge[:, field_index] = np.einsum("kpc,kpc->k", film_stress, weights)
+            charge[:, field_index] = pieces.charge(rule, film_stress)
         return charge
 
     def _interpolated_stress(self, press_index: Integers, points: Complexes, n_field: int) -> tuple[Array, Booleans]:

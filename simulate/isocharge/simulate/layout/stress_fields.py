@@ -16,11 +16,10 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.forward.readout import PressMeshes, layout_points, pairs_by_rule, relative_distances
+from isocharge.simulate.forward.readout import ElectrodePieces, PressMeshes
 from isocharge.simulate.mechanics.stress import rotate_stress
-from isocharge.simulate.numerics.polygon import to_complex
 from isocharge.simulate.sensor.film import Surface
-from isocharge.simulate.sensor.probe import Circle
+from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress, touch_stress
 from isocharge.simulate.solver.load_case import SolveSettings
@@ -97,7 +96,7 @@ class PressedFilm:
 
     Attributes:
         presses: Positions x + iy of the presses, shape (n,), mm.
-        probe_radius: Radius of the probe, mm.
+        probe: Probe of the presses.
         film_radius: Radius of the film, mm.
         meshes: Meshes under the presses.
         density: Charge per area (pC/mm^2) and its derivatives, with the columns `COLUMNS`, in the meshed half of the
@@ -106,7 +105,7 @@ class PressedFilm:
     """
 
     presses: Complexes
-    probe_radius: float
+    probe: Probe
     film_radius: float
     meshes: PressMeshes
     density: np.ndarray
@@ -138,28 +137,20 @@ class PressedFilm:
         density = density.reshape(2, len(presses), meshes.template.n_element, -1, len(COLUMNS))
         # The derivative with respect to the movement across the direction of the press is odd.
         density[1, ..., COLUMNS.index("y")] *= -1.0
-        return cls(position, fields.probe.reach, fields.sensor.film.radius, meshes, density)
+        return cls(position, fields.probe, fields.sensor.film.radius, meshes, density)
 
     def rows(self, electrodes: Sequence[Electrode]) -> Array:
         """Compute the charges of electrodes and their derivatives for all presses; see `rows_of`."""
         rows = np.zeros((len(self.presses), len(electrodes), len(COLUMNS)))
-        circles = [(to_complex(centres), radii) for centres, radii in (one.part_circles for one in electrodes)]
-        distances = relative_distances(circles, self.probe_radius, self.presses)
-        for per_side, uses_rule in pairs_by_rule(distances):
-            rule = layout_points(tuple(electrodes), "area", per_side)
-            for n_point in np.unique(rule.count):
-                press_index, electrode = np.nonzero(uses_rule & (rule.count == n_point))
-                if not press_index.size:
-                    continue
-                points = rule.points[electrode, :n_point] @ np.array([1.0, 1j]) / self.film_radius
-                weights = rule.weights[electrode, :n_point, 0]  # the weights of s11, s22 and s12 are equal
-                element, basis_values, is_mirrored = self.meshes.locate(press_index, points)
-                density = self.density[is_mirrored.astype(np.intp), press_index[:, None], element]
-                node_weights = weights[..., None] * basis_values
-                flat_weights = node_weights.reshape(len(press_index), 1, -1).astype(np.float32)
-                rows[press_index, electrode] = (flat_weights @ density.reshape(len(press_index), -1, len(COLUMNS)))[
-                    :, 0
-                ]
+        pieces = ElectrodePieces.covering(electrodes)
+        for rule in pieces.rules(self.probe, self.presses):
+            n_pair = len(rule.press)
+            element, basis_values, is_mirrored = self.meshes.locate(rule.press, rule.points / self.film_radius)
+            density = self.density[is_mirrored.astype(np.intp), rule.press[:, None], element]
+            node_weights = rule.area[..., None] * basis_values
+            flat_weights = node_weights.reshape(n_pair, 1, -1).astype(np.float32)
+            pair_rows = flat_weights @ density.reshape(n_pair, -1, len(COLUMNS))
+            np.add.at(rows, (rule.press, pieces.electrode[rule.piece]), pair_rows[:, 0])
 
         # Rotate the derivatives along and across the direction of each press into derivatives with respect to x and y.
         x_column = COLUMNS.index("x")

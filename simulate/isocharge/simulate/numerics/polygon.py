@@ -63,13 +63,13 @@ def is_convex(corners: Array) -> bool:
 
 
 def to_complex(corners: Array) -> Complexes:
-    """Convert corners (x, y), shape (n, 2), into complex numbers x + iy, shape (n,)."""
+    """Convert corners (x, y), shape (..., n, 2), into complex numbers x + iy, shape (..., n)."""
     return np.asarray(corners @ np.array([1.0, 1j]))
 
 
 def to_corners(z: Complexes) -> Array:
-    """Convert complex numbers x + iy, shape (n,), into corners (x, y), shape (n, 2)."""
-    return np.stack([z.real, z.imag], axis=1)
+    """Convert complex numbers x + iy, shape (..., n), into corners (x, y), shape (..., n, 2)."""
+    return np.stack([z.real, z.imag], axis=-1)
 
 
 def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> Array:
@@ -114,51 +114,62 @@ def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> 
     return np.asarray((triangle_area + sector_area).sum(axis=-1))
 
 
-def gauss_quadrilateral(corners: Array, max_count: int, reference_length: float) -> tuple[Array, Array]:
-    """Compute the points and weights of a Gauss rule for a quadrilateral or a triangle.
-
-    A bilinear function maps the rule of the unit square into the polygon.
+def gauss_square_weights(count: int) -> Array:
+    """Return the weights of the Gauss rule of the unit square, which `gauss_quadrilaterals` uses.
 
     Args:
-        corners: Corners (x, y), anticlockwise, shape (4, 2) or (3, 2).
-        max_count: Number of points along a side of the reference length or longer. Shorter sides have proportionally
-            fewer points, but at least two.
-        reference_length: Length of the shortest side that has `max_count` points, in the unit of the corners.
+        count: Number of points along a side.
 
     Returns:
-        Points (x, y), shape (n, 2), and weights, shape (n,). The weights add up to the area of the polygon.
+        Weights, shape (count^2,). Their sum is 1.
     """
-    # The polygon is the image of the unit square with the coordinates s and t. The digits in the name of a corner are
-    # the values of s and t at this corner. The last corner of a triangle is the image of both corners with t = 1.
-    z00, z10, z11, z01 = to_complex(corners[[0, 1, 2, -1]])
-    s_side = max(abs(z10 - z00), abs(z11 - z01))  # length of the longer side in the direction of s
-    t_side = max(abs(z01 - z00), abs(z11 - z10))
-    s_points, s_weights = _gauss_line_for(s_side, max_count, reference_length)
-    t, t_weights = _gauss_line_for(t_side, max_count, reference_length)
-    s = s_points[:, None]  # shape (n_s, 1), to be combined with each t
+    _, line_weights = gauss_line(count)
+    return np.outer(line_weights, line_weights).ravel()
 
-    points = z00 + (z10 - z00) * s + (z01 - z00) * t + (z00 - z10 + z11 - z01) * s * t  # shape (n_s, n_t)
-    # The determinant of the Jacobian is the cross product of the derivatives of the points.
+
+def gauss_quadrilaterals(corners: Complexes, count: int) -> tuple[Complexes, Array]:
+    """Compute the points and weights of a Gauss rule for quadrilaterals.
+
+    A bilinear function maps the rule of the unit square into each quadrilateral.
+
+    Args:
+        corners: Corners x + iy, anticlockwise, shape (n, 4). The last two corners of a triangle are equal.
+        count: Number of points along a side.
+
+    Returns:
+        Points x + iy, and weights, each of shape (n, count^2). The weights add up to the area of the quadrilateral.
+    """
+    # The digits in the name of a corner are its coordinates s and t in the unit square.
+    z00, z10, z11, z01 = corners.T[:, :, None]  # each of shape (n, 1)
+    line_points, _ = gauss_line(count)
+    s = np.repeat(line_points, count)
+    t = np.tile(line_points, count)
     s_derivative = (z10 - z00) * (1.0 - t) + (z11 - z01) * t
     t_derivative = (z01 - z00) * (1.0 - s) + (z11 - z10) * s
+    points = z00 * (1.0 - t) + z01 * t + s * s_derivative
+    # The determinant of the Jacobian is the cross product of the derivatives of the points.
     determinant = (np.conj(s_derivative) * t_derivative).imag
-    weights = np.outer(s_weights, t_weights) * determinant
-    return to_corners(points.ravel()), weights.ravel()
+    return points, gauss_square_weights(count) * determinant
 
 
-def _gauss_line_for(side: float, max_count: int, reference_length: float) -> tuple[Array, Array]:
-    """Return a Gauss rule on the interval [0, 1] whose number of points is proportional to the length of a side.
+def halve_quadrilaterals(corners: Complexes) -> Complexes:
+    """Divide each quadrilateral into two, by a line between the middles of its longest side and of the opposite side.
 
     Args:
-        side: Length of the side.
-        max_count: Largest number of points. The smallest number is two.
-        reference_length: Length of the shortest side that has `max_count` points, in the unit of `side`.
+        corners: Corners x + iy, anticlockwise, shape (n, 4).
 
     Returns:
-        Points and weights, each of shape (n,).
+        Corners x + iy, shape (2 n, 4): first one half of all quadrilaterals, and then the other half.
     """
-    proportional_count = max(2, int(np.ceil(max_count * side / reference_length)))
-    return gauss_line(min(max_count, proportional_count))
+    # Renumber the corners such that one of the longest sides connects the first two corners or the last two corners.
+    sides = np.abs(np.roll(corners, -1, axis=1) - corners)
+    is_turned = sides[:, 1::2].max(axis=1) > sides[:, ::2].max(axis=1)
+    turned = np.where(is_turned[:, None], np.roll(corners, -1, axis=1), corners)
+    first, second, third, fourth = turned.T
+    middle = 0.5 * (first + second)
+    opposite_middle = 0.5 * (third + fourth)
+    halves = ((first, middle, opposite_middle, fourth), (middle, second, third, opposite_middle))
+    return np.concatenate([np.stack(half, axis=1) for half in halves])
 
 
 def is_simple(corners: Array) -> bool:
