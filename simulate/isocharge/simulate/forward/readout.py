@@ -158,7 +158,7 @@ class ElectrodePieces:
                 for start in range(0, indices.size, block):
                     used = indices[start : start + block]
                     points, area = gauss_quadrilaterals(corners[used], count)
-                    # The points of a line represent equal shares of its area, except for their weights.
+                    # A line has no area of its own, so the area that it represents is added.
                     area += line_area[used, None] * gauss_square_weights(count)
                     yield PieceRule(press[used], piece[used], points, area)
 
