@@ -182,10 +182,8 @@ def port_lines() -> Iterator[str]:
             continue
         if examination.good:
             received = f"{examination.format}, {examination.rate_Hz:.0f} frames/s at {examination.baud} baud"
-        elif examination.missing:
-            received = examination.missing[0]
         else:
-            received = "nothing is missing"
+            received = examination.missing[0]
         yield f"{port.device} ({port.description}): {received}"
 
 

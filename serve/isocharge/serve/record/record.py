@@ -297,12 +297,9 @@ def selected_fields(*, with_tracking: bool = False, with_film: bool = False) -> 
         with_tracking: Whether to include the fields of the tracking.
         with_film: Whether to include the field of the film follower.
     """
-    selected_groups = {""}  # the group of fields that every record has is empty
-    if with_tracking:
-        selected_groups.add("tracking")
-    if with_film:
-        selected_groups.add("film")
-    return tuple(field for field in RECORD_FIELDS if field.group in selected_groups)
+    # The name of the group of fields that every record has is empty.
+    is_selected = {"": True, "tracking": with_tracking, "film": with_film}
+    return tuple(field for field in RECORD_FIELDS if is_selected[field.group])
 
 
 _UNCHANGED = frozenset({str, int, bool, tuple, type(None)})
