@@ -88,6 +88,7 @@ def test_check_of_a_channel_without_a_number():
     assert [(c.name, c.offset_pC) for c in report.channels] == [("A", None), ("B", 1.5), ("C", 2.5)]
     assert report.channels[0].unusable == report.good == 400
     assert "channel A is nan in 400 frames" in missing(report)
+    assert "counts" not in missing(report)
     assert "channel B is dead: every value is 1.5" in missing(report)
     json.dumps(asdict(report), allow_nan=False)
 

@@ -86,10 +86,10 @@ def unit_of(capture: Capture, max_noise_V: float = 0.02) -> str:
     if not capture.frames or capture.parser.format == BINARY:
         return "pC"
     values, _times_s = capture.values()  # shape (frames, channels)
-    finite_rows = values[np.isfinite(values).all(axis=1)]  # frames in which all values are finite
-    if bool((finite_rows == np.round(finite_rows)).all()):
+    finite_values = values[np.isfinite(values)]
+    if bool((finite_values == np.round(finite_values)).all()):
         return "counts"
-    largest_noise = max(estimate_noise(column) for column in finite_rows.T)
+    largest_noise = max(estimate_noise(column) for column in values.T)
     names_state_volts = all(name.endswith("V") for name in capture.names)
     return "V" if names_state_volts or 0.0 < largest_noise <= max_noise_V else "pC"
 
