@@ -148,6 +148,11 @@ def test_every_page_is_in_the_contents_of_the_site(page):
     assert page == "README.md" or page.removesuffix(".md") in SITE_CONTENTS.split()
 
 
+@pytest.mark.parametrize("word", ["Excel", "Teensy"])
+def test_a_search_for_a_program_or_a_board_finds_a_page(word):
+    assert any(word in text for text in PAGES.values())
+
+
 def test_figures_of_the_released_models_are_their_cards():
     rows = re.findall(
         r"^\| `(\S+)` \| within (\S+) mm \| (\S+), (\S+) mm \| (\S+) % \|", PAGES["models/README.md"], re.M

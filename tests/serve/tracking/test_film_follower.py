@@ -11,9 +11,11 @@ import pytest
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
-from isocharge.serve import Contact
+from isocharge.serve import Contact, Frame
+from isocharge.serve.live.device import FollowFilm
 from isocharge.serve.model.charge_file import FILE, charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
+from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.simulate import noise_model
 
@@ -168,6 +170,34 @@ def test_reset_forgets_the_touches(series, tmp_path):
     raw = model.predict(charge[0])
     assert follower.follow_contact(raw, charge[0]) == raw
     assert contact.shape == (20, 3)
+
+
+def test_stage_counts_a_touch_with_invalid_frames_once_and_flags_the_corrected_contact(series, tmp_path):
+    rng = np.random.default_rng(1)
+    model = model_in(tmp_path, series)
+    _, charge = touches(series, np.array([0.3, 0.0, 0.0]), np.ones(4), rng, 21)
+    raw = model.predict(charge[20])
+    model.validity = SimpleNamespace(flags=lambda contact: () if contact == raw else ("misfit",))
+    stage = FollowFilm(Setup(ELECTRODES, Device(), model))
+    stage._follower = followed(model, charge[:20], rng)
+    for number in range(52):
+        frame = Frame(None, None, (), clock_s=100.0 + 0.01 * number, is_valid=number % 20 != 10)
+        if frame.is_valid and number < 50:
+            frame.charge_pC = charge[20]
+            frame.set_contact(raw, model.validity)
+        stage.step(frame)
+        assert frame.contact_flags == (("misfit",) if frame.contact else ())
+    assert frame.film.touches == 21
+
+
+def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, tmp_path):
+    rng = np.random.default_rng(5)
+    model = model_in(tmp_path, series)
+    _, charge = touches(series, np.array([0.4, 0.0, 0.0]), np.ones(4), rng, 40)
+    wrong = charge[:2] * rng.uniform(0.7, 1.4, (2, 4))
+    follower = followed(model, np.concatenate([charge, wrong, charge[:10], wrong]), rng)
+    assert follower.is_lost
+    assert follower.film.pretension_MPa == pytest.approx(1.4, abs=0.1)
 
 
 def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
