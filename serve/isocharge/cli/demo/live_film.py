@@ -1,13 +1,13 @@
 """Demo of the live page with a virtual sensor and a released model, and the area in which the presses of a demo lie."""
 
-import numpy as np
+import math
 
 from isocharge.cli.serve.stream import stream_command
 from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import ModelError
-from isocharge.serve import find_model, load_model
+from isocharge.serve import Predictor, find_model
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 
 DEFAULT_SENSOR = "three-25um-biaxial"
@@ -24,12 +24,10 @@ def played_radius_mm(sensor: str) -> float:
         sensor: Name of the sensor.
     """
     try:
-        model = load_model(find_model(sensor))
+        validity = Predictor(sensor).validity
     except ModelError:
         return DEFAULT_RADIUS
-
-    corners_mm = np.array(model.metadata.working_area_mm)  # shape (n, 2), around the centre of the film
-    return round(float(np.hypot(*corners_mm.T).min()), 2)
+    return round(math.sqrt(validity.inscribed_radius_squared_mm2), 2)
 
 
 def show_live_film(live: str, seconds: float | None, sensor_name: str | None = None) -> None:

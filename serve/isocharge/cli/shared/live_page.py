@@ -263,7 +263,7 @@ class PageFeed:
         elif self._new_recorder is None:
             raise InputError("the command that runs the stream records it already (--record)")
         elif action.on:
-            model_label = stream.predictor.metadata.label
+            model_label = self._touch.predictor.metadata.label
             path = Path(f"{model_label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
             stream.request_recording(self._new_recorder(path, model_label))
             self._page.update(recording=f"{path.name}, which waits for data")

@@ -54,11 +54,6 @@ class RecordedStream:
         self._next_load: Load | None = None
         self._loading_model: Future[Predictor] | None = None
 
-    @property
-    def predictor(self) -> Predictor:
-        """Model with which the next record is computed."""
-        return self._stream.predictor
-
     def request_tare(self) -> None:
         """Request a new measurement of the tare. A signal handler may also call this method."""
         self._requests.append(self._tare)
@@ -152,7 +147,7 @@ class RecordedStream:
             log.error("no recording: %s", error)
             return
         self._stream.restart()
-        present_label = self.predictor.metadata.label
+        present_label = self._stream.predictor.metadata.label
         if recorder.model_label != present_label:  # the model has changed since the request
             recorder.event(use=present_label)
 

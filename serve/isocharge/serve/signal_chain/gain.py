@@ -62,12 +62,9 @@ class Gain(Stage):
 
     def __init__(self, setup: Setup) -> None:
         """Set the conversion. Without settings, the values are charges in pC."""
-        rule = setup.device.rule(GainRule)
-        self.gain_pC = np.ones(len(setup.electrodes))
-        self.zero = np.zeros(len(setup.electrodes))
-        if rule is not None:
-            self.gain_pC = setup.for_each_electrode("gain.pC_per_unit", rule.pC_per_unit)
-            self.zero = setup.for_each_electrode("gain.offset", rule.offset)
+        rule = setup.device.rule(GainRule) or GainRule(pC_per_unit=1.0)
+        self.gain_pC = setup.for_each_electrode("gain.pC_per_unit", rule.pC_per_unit)
+        self.zero = setup.for_each_electrode("gain.offset", rule.offset)
         self.largest = LARGEST / float(np.abs(self.gain_pC).max(initial=np.finfo(float).tiny))
         self._skipped_s = 0.0  # duration of the invalid frames since the last valid frame
 
@@ -75,16 +72,15 @@ class Gain(Stage):
         """Convert the values of a frame to charges, and mark the frame if a value cannot be a charge."""
         magnitude = math.hypot(*frame.sent.tolist())  # at least the largest absolute value; NaN if a value is NaN
         is_valid = magnitude <= self.largest  # false for NaN
+        with np.errstate(over="ignore"):  # a value may be so large that its conversion overflows
+            frame.raw_pC = (frame.sent - self.zero) * self.gain_pC
         if not is_valid:
             self._skipped_s += frame.dt_s
             frame.is_valid = False
             frame.flags.append(INVALID)
-            with np.errstate(over="ignore"):  # a value may be so large that its conversion overflows
-                frame.raw_pC = (frame.sent - self.zero) * self.gain_pC
             return
         frame.dt_s += self._skipped_s
         self._skipped_s = 0.0
-        frame.raw_pC = (frame.sent - self.zero) * self.gain_pC
         frame.charge_pC = frame.raw_pC
 
     @classmethod
