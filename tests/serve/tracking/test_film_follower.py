@@ -187,7 +187,7 @@ def test_stage_counts_a_touch_with_invalid_frames_once_and_flags_the_corrected_c
             frame.set_contact(raw, model.validity)
         stage.step(frame)
         assert frame.contact_flags == (("misfit",) if frame.contact else ())
-    assert frame.film.touches == 21
+    assert stage._follower.film.touches == 21
 
 
 def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, tmp_path):
