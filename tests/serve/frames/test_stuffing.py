@@ -40,6 +40,7 @@ CHECK_VALUES = {
     "xor-8": 0x31,
     "sum-8/negative": 0x23,
     "sum-8/inverted": 0x22,
+    "fletcher-16": 0x1EDE,
 }
 """Check values of checksums that no other library computes."""
 

@@ -102,6 +102,20 @@ class Checksum:
     size: int
 
 
+def _fletcher_16(data: bytes) -> int:
+    """Compute Fletcher's checksum (1982), which has two bytes.
+
+    The low byte of the checksum is the sum of all data bytes, modulo 255. Each time a data byte was added to the low
+    byte, the new low byte is added to the high byte, modulo 255.
+    """
+    byte_sum = 0
+    sum_of_sums = 0
+    for byte in data:
+        byte_sum = (byte_sum + byte) % 255
+        sum_of_sums = (sum_of_sums + byte_sum) % 255
+    return (sum_of_sums << 8) | byte_sum
+
+
 SUMS = {
     "none": Checksum(lambda _: 0, 0),
     "sum-8": Checksum(lambda data: sum(data) & 0xFF, 1),
@@ -109,6 +123,7 @@ SUMS = {
     "sum-8/inverted": Checksum(lambda data: ~sum(data) & 0xFF, 1),
     "xor-8": Checksum(lambda data: reduce(xor, data, 0), 1),
     "sum-16": Checksum(lambda data: sum(data) & 0xFFFF, 2),
+    "fletcher-16": Checksum(_fletcher_16, 2),
 }
 """Checksums that are no CRC, by name.
 
