@@ -23,12 +23,6 @@ from isocharge.serve.record.record import (
 TRACKED = TrackedContact(1.0, 2.0, 0.5, 0.01, 0.02, 0.001, 3.0, 0.0, 0.25)
 
 
-def test_every_field_of_a_record_is_declared_with_its_meaning():
-    for field in RECORD_FIELDS:
-        assert field.meaning.text.endswith("."), field.name
-        assert all(part.meaning.text.endswith(".") for part in field.parts), field.name
-
-
 def test_field_without_a_meaning_is_refused():
     class Undocumented(PredictionRecord, frozen=True, kw_only=True, dict=True):
         speed: float

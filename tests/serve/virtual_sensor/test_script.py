@@ -15,11 +15,6 @@ def script():
     return wander(seed=5, seconds=120.0, rate_Hz=200.0, radius_mm=8.0, force_range_N=(0.05, 2.0))
 
 
-def test_wander_begins_with_one_second_without_a_press(script):
-    assert not script.touching[:200].any()
-    assert script.touching[200:210].any()
-
-
 def test_wander_stays_inside_radius_and_forces(script):
     on = script.touching
     assert 6.0 < np.hypot(script.x_mm[on], script.y_mm[on]).max() <= 8.0

@@ -12,7 +12,6 @@ import serial
 
 from isocharge.common.errors import PortError, SceneError
 from isocharge.serve import BinaryParser, Port, Script, VirtualSensor, encode_frame, wander
-from isocharge.serve.virtual_sensor.script import corrupt
 
 
 def steady(n=10, rate_Hz=200.0, force_N=1.0):
@@ -64,15 +63,6 @@ def test_frame_number_and_clock_overflow(film):
 def test_forward_map_with_wrong_charges_is_refused(charges):
     with pytest.raises(SceneError, match=r"forward map: expected finite charges of shape \(10, electrodes\)"):
         VirtualSensor(lambda *_: charges, steady())
-
-
-def test_corrupt_flips_drops_and_adds_bytes():
-    data = bytes(1000)
-    rng = np.random.default_rng(0)
-    lengths = [len(corrupt(data, 0.01, rng)) for _ in range(200)]
-    assert np.mean(lengths) == pytest.approx(1000, abs=1.0)
-    assert np.std(lengths) == pytest.approx(np.sqrt(1000 * 0.01 * 2 / 3), rel=0.2)
-    assert corrupt(data, 0.0, rng) == data
 
 
 def read(url, count):
