@@ -143,6 +143,15 @@ NOTATIONS = {
     "\x1b[0;32mI (1234) film: {a}, {b}, {c}\x1b[0m": (),
     'I (1234) film: {{"A": {a}, "B": {b}, "C": {c}}}': "ABC",
 }
+STATES = ["12 <{state}> {a} {b} {c}", "12 {state} {a} {b} {c}", "{state} -> {a}, {b}, {c}", "{a} ({state}) {b} {c}"]
+
+
+@pytest.mark.parametrize("notation", STATES)
+def test_word_that_changes_is_no_name(notation):
+    lines = [notation.format(state=state, a=k, b=2, c=3) for k, state in enumerate(["idle", "touch"] * 6)]
+    assert len(feed(*lines)) == 12
+
+
 LEVELS = st.tuples(*[st.integers(-9999, 9999).map(lambda value: value / 10)] * 3)
 
 

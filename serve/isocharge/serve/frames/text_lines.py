@@ -90,8 +90,8 @@ _TOKENS = {kind: _token_pattern(_PATTERNS[kind]) for kind in ("number", "number 
 """Regular expressions of a part of a line, by the kind of the numbers in the line."""
 
 
-_SEPARATORS = ",;|"
-"""Marks between the columns of a line. A word before one of them is no name of the number behind it."""
+_SEPARATORS = ",;|[("
+"""Marks between columns and before lists. A word before one of them is no name of the number behind it."""
 
 
 class _Token(NamedTuple):
@@ -244,8 +244,8 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     The name is the last word or key between the number and the previous number or separator, as in `A: 3.5`, `A -> 3.5`
     and `<A>3.5</A>`. If several numbers have the same name, the word or key before it is the name, as in
     `{"A": {"pC": 3.5}}`. Words are units and not names if the first number follows no word but the last number precedes
-    one. A name that occurs several times is no name. A single name at the first of several numbers is a label of the
-    line, unless it is a name of a counter or a clock.
+    one. A name that occurs several times is no name. A single name of several numbers is a label of the line if it is a
+    word, or the name of the first number, unless it is a name of a counter or a clock.
 
     A unit of charge or voltage other than pC directly behind a number is added to its name, as in `A_nC`.
 
@@ -277,7 +277,8 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     are_units = bool(channels) and not names[channels[0]] and contents[-1].kind == "word"
     names = ["" if are_units and name in words else name for name in names]
     named = [index for index in channels if names[index]]
-    if len(channels) > 1 and named == channels[:1] and names[named[0]] != SEQ:
+    is_single = len(channels) > 1 and len(named) == 1 and names[named[0]] != SEQ
+    if is_single and (named[0] == channels[0] or names[named[0]] in words):
         names[named[0]] = ""
     if tokens and tokens[0].content == ">" and len(names) == 2:  # `>name:time:value`
         names = [_NAMES_OF_TIMES["uptime"], next((token.content for token in tokens if token.kind == "key"), "")]
