@@ -10,7 +10,6 @@ from starlette.applications import Starlette
 from starlette.responses import PlainTextResponse
 from starlette.routing import Mount, Route
 
-from isocharge.common.errors import InputError, ModelError
 from isocharge.serve import asgi_app
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import HttpServer
@@ -61,10 +60,3 @@ def test_mounted_asgi_app_checks_token_size_and_origin(ask):
     assert ask("GET", "/touch/v2")[0] == 401
     assert ask("GET", "/touch/v2", Origin="http://evil.example", **bearer)[0] == 403
     assert ask("POST", "/touch/v2/models/linear/infer", bytes((1 << 20) + 1), **bearer)[0] == 413
-
-
-def test_asgi_app_refuses_wrong_tokens_and_folders(models, tmp_path):
-    with pytest.raises(InputError, match="printable ASCII"):
-        asgi_app(models, token="")
-    with pytest.raises(ModelError, match=r"expected models, .* found none"):
-        asgi_app(tmp_path)

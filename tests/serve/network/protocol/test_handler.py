@@ -82,21 +82,6 @@ def test_every_route_answers_its_method_only(ask, method, path):
     assert error == f"{path}: expected the method {method}, got DELETE"
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "",
-        "/v2/health",
-        "/v2/models",
-        "/v2/models/linear/versions/",
-        "/v2/models/linear/infer/1",
-        "/v2/models/linear/versions/1/versions/1",
-    ],
-)
-def test_unknown_path_gets_404(ask, path):
-    assert refusal(ask("GET", path))[0] == 404
-
-
 @pytest.mark.parametrize("path", ["/v2/models/cubic/ready", "/v2/models/linear/versions/3/ready", "/v2/models//ready"])
 def test_unknown_model_gets_404(ask, path):
     status, error = refusal(ask("GET", path))
