@@ -372,14 +372,20 @@ def test_installed_package_adds_a_source(monkeypatch):
 
     def entry_points(group, name):
         assert group == "isocharge.sources"
-        is_added = name in ("can", "broken")
-        load = {"can": lambda: lambda url: nullcontext(Bus([chunk, url])), "broken": dict.clear}
+        is_added = name in ("can", "broken", "lost")
+        load = {
+            "can": lambda: lambda url: nullcontext(Bus([chunk, url])),
+            "broken": dict.clear,
+            "lost": lambda: lambda _: nullcontext(SimpleNamespace(is_live=True)),  # which cannot be iterated
+        }
         return [SimpleNamespace(value="my_package:open_bus", load=load[name])] if is_added else []
 
     monkeypatch.setattr("isocharge.serve.port.source.entry_points", entry_points)
     with open_source("can://vcan0") as source:
         assert list(source) == [chunk, "can://vcan0"]
-    with pytest.raises(InputError, match=r"broken://x: cannot be opened by my_package:open_bus \(TypeError"):
+    with pytest.raises(InputError, match=r"broken://x: cannot be read by my_package:open_bus \(TypeError"):
         open_source("broken://x")
+    with open_source("lost://x") as source, pytest.raises(InputError, match=r"lost://x: .* not iterable"):
+        list(source)
     with open_source("loop://") as source:
         assert source.is_live

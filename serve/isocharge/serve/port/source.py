@@ -25,11 +25,11 @@ import stat
 import sys
 import time
 from collections.abc import Iterator
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from isocharge.common.errors import InputError, PortError, PortLost
+from isocharge.common.errors import InputError, IsochargeError, PortError, PortLost
 from isocharge.serve.port.file_source import STDIN, Chunk, FileSource, check_file, open_file
 from isocharge.serve.port.serial_line import (
     MAX_READ_BYTES,
@@ -334,6 +334,58 @@ class Source(Protocol):
         """Yield chunks as they arrive, until the source ends."""
 
 
+class AddedSource:
+    """Source of another package, as a context manager whose errors name the package.
+
+    Attributes:
+        is_live: Whether bytes are lost if they are not read in time.
+    """
+
+    def __init__(self, url: str, entry_point: EntryPoint) -> None:
+        """Call the function of the other package.
+
+        Args:
+            url: URL of the source.
+            entry_point: Entry point of the function.
+        """
+        self._name = f"{url}: cannot be read by {entry_point.value}"
+        with self._errors_named():
+            self._opened = entry_point.load()(url)
+
+    def __enter__(self) -> Self:
+        """Open the source."""
+        with self._errors_named():
+            self._source: Source = self._opened.__enter__()
+            self.is_live = self._source.is_live
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close the source."""
+        with self._errors_named():
+            self._opened.__exit__(*error)
+
+    def __iter__(self) -> Iterator[Chunk]:
+        """Yield chunks as they arrive, until the source ends."""
+        with self._errors_named():
+            yield from self._source
+
+    @contextlib.contextmanager
+    def _errors_named(self) -> Iterator[None]:
+        """Convert errors of the other package in a `with` block, except errors of isocharge (context manager).
+
+        Raises:
+            InputError: If the block raises another error.
+        """
+        try:
+            yield
+        except IsochargeError:
+            raise
+        except Exception as error:
+            raise InputError(
+                f"{self._name} ({type(error).__name__}: {error}); correct or remove the package that adds these sources"
+            ) from error
+
+
 def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> contextlib.AbstractContextManager[Source]:
     """Return a context manager that opens a port, a file or the standard input as a source of chunks.
 
@@ -353,14 +405,7 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
 
     scheme, _, _address = url.partition("://")
     for entry_point in entry_points(group=ENTRY_POINTS, name=scheme):
-        try:
-            added: contextlib.AbstractContextManager[Source] = entry_point.load()(url)
-        except Exception as error:
-            raise InputError(
-                f"{url}: cannot be opened by {entry_point.value} ({type(error).__name__}: {error}); correct or remove "
-                "the package that adds these sources"
-            ) from error
-        return added
+        return AddedSource(url, entry_point)
 
     # Wait until the path exists, because the type of a missing path (a file or a port) is unknown.
     is_path = "://" not in url
