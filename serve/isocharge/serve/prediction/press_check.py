@@ -351,7 +351,8 @@ def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[s
         metadata: Metadata of the model.
     """
     min_force_N, max_force_N = metadata.force_range_N
-    area = Validity.of(metadata).area_text
+    validity = Validity.of(metadata)
+    area = f"{validity.area_text} from the centre" if validity.is_centred else validity.area_text
     domain = (
         f"outside the model's working area ({area}) or forces ({min_force_N:.3g} to {max_force_N:.3g} N); if these "
         "are most, look at the units"
