@@ -8,6 +8,7 @@ import pytest
 from isocharge.common.errors import SolveError
 from isocharge.simulate import (
     Circle,
+    Electrode,
     Film,
     Polygon,
     SolveSettings,
@@ -118,3 +119,23 @@ def test_meshes_with_different_equilibria_raise_solve_error(monkeypatch):
     monkeypatch.setattr("isocharge.simulate.solver.press.relative_difference", lambda *_: 0.11)
     with pytest.raises(SolveError, match=r"order 5 and one of order 6 find charges that differ by 11%"):
         press(*scene)
+
+
+@pytest.mark.parametrize(
+    ("radius", "thickness", "pretension", "probe", "force"),
+    [(14.0, 0.104, 0.64, 2.6, 1.0), (30.0, 0.05, 0.0, 1.0, 0.05)],
+)
+def test_film_that_bends_far_from_the_rim_equals_a_finer_mesh(radius, thickness, pretension, probe, force):
+    """Under a small force, a thick film bends within 0.2 to 0.3 film radii from the rim."""
+    nominal = load_sensor("four-25um-uniaxial")
+    film = replace(nominal.film, radius=radius, thickness=thickness, pretension=pretension)
+    centre = 0.45 * radius
+    side = 0.2 * radius
+    left = Electrode.of_square("A", (-centre, centre), side)
+    right = Electrode.of_square("B", (centre, centre), side)
+    sensor = replace(nominal, film=film, electrodes=(left, right))
+    at = (0.2 * radius, 0.05 * radius)
+    finer = SolveSettings(resolution=Resolution(order=7, around=8, rings=8, rim=4))
+    expected = touch_charge(sensor, press(film, Circle(probe), at, force, finer))
+    charge = touch_charge(sensor, press(film, Circle(probe), at, force))
+    np.testing.assert_allclose(charge, expected, rtol=1e-4)
