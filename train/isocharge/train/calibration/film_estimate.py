@@ -54,6 +54,24 @@ def terms(contact: Array, domain: Domain) -> Array:
     return np.asarray(FADING ** degrees.sum(axis=1) * products)
 
 
+def discrepancy_jacobian(charge: Array, contact: Array, domain: Domain) -> Array:
+    """Compute the derivatives of charges with respect to the coefficients of the discrepancy.
+
+    The discrepancy of an electrode multiplies the charge of this electrode.
+
+    Args:
+        charge: Charges without discrepancy, shape (n, n_electrode), pC.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        domain: Range of positions and forces to which the variables of the polynomials are scaled.
+
+    Returns:
+        Derivatives, shape (n, n_electrode, n_coefficient), pC. The index of the electrode changes fastest.
+    """
+    own_charge = charge[:, :, None] * np.eye(charge.shape[1])
+    jacobian = own_charge[:, :, None, :] * terms(contact, domain)[:, None, :, None]
+    return np.asarray(jacobian.reshape(*charge.shape, -1))
+
+
 @cache
 def _degrees() -> Integers:
     """Return the degrees of each term as a polynomial in x, y and ln F, shape (n_term, 3)."""

@@ -24,7 +24,7 @@ from isocharge.simulate.forward.whole_film import outermost_distance, whole_film
 from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.simulate.solver.stress_limit import yield_force
 from isocharge.train.calibration.film_charges import FilmCharges, axisymmetric, circle_of
-from isocharge.train.calibration.film_estimate import FilmEstimate, terms
+from isocharge.train.calibration.film_estimate import FilmEstimate, discrepancy_jacobian
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.charge_fit import fit_film_series, fit_series
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
@@ -98,8 +98,8 @@ def compact_charges(
 def _film_charges(charges: FilmCharges, film: FilmEstimate, contact: Array) -> Array:
     """Compute the most probable charges of contacts, with the discrepancy, without offset, shape (n, n_electrode)."""
     charge = charges.charges(film.film_values, contact)
-    coefficients = film.values[film.layout.coefficients].reshape(-1, charge.shape[1])
-    return np.asarray(charge * (1.0 + terms(contact, charges.domain) @ coefficients))
+    discrepancy = discrepancy_jacobian(charge, contact, charges.domain) @ film.values[film.layout.coefficients]
+    return np.asarray(charge + discrepancy)
 
 
 def _nodes(film: FilmEstimate) -> Array:
@@ -162,9 +162,7 @@ def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge
     """
     layout = film.layout
     _, film_jacobian = charges.linearised(film.film_values, contact)
-    own_charge = charge[:, :, None] * np.eye(charge.shape[1])
-    term_jacobian = own_charge[:, :, None, :] * terms(contact, charges.domain)[:, None, :, None]
-    jacobian = np.concatenate([film_jacobian, term_jacobian.reshape(*charge.shape, -1)], axis=2)
+    jacobian = np.concatenate([film_jacobian, discrepancy_jacobian(charge, contact, charges.domain)], axis=2)
 
     # Square root of the covariance of the film's properties and of the coefficients
     unknowns = np.r_[layout.film, layout.coefficients]

@@ -10,7 +10,7 @@ from isocharge.serve.model.robust_estimate import ModelValues
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import Domain, NoiseModel
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.film_estimate import SESSION, Layout, terms
+from isocharge.train.calibration.film_estimate import SESSION, Layout, discrepancy_jacobian
 
 UNKNOWN_STD = np.inf
 """Standard deviation of a value that was not measured."""
@@ -159,14 +159,8 @@ def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns
     charge, film_jacobian = charges.linearised(film_values, metric_contact)
     session_jacobian = np.stack([one.effect(data.time, charge) for one in SESSION], axis=2)
 
-    # The discrepancy multiplies the charge of its own electrode.
-    term_values = terms(metric_contact, charges.domain)  # shape (n, n_term)
-    own_charge = charge[:, :, None] * np.eye(charge.shape[1])
-    coefficient_jacobian = own_charge[:, :, None, :] * term_values[:, None, :, None]
-
-    jacobian = np.concatenate(
-        [film_jacobian, session_jacobian, coefficient_jacobian.reshape(*charge.shape, -1)], axis=2
-    )
+    coefficient_jacobian = discrepancy_jacobian(charge, metric_contact, charges.domain)
+    jacobian = np.concatenate([film_jacobian, session_jacobian, coefficient_jacobian], axis=2)
     beyond_film = slice(layout.film.stop, None)
     return ModelValues(
         charge_pC=charge + jacobian[:, :, beyond_film] @ unknowns[beyond_film],
