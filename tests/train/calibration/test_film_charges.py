@@ -148,14 +148,3 @@ def test_film_with_charges_of_both_signs_is_calibrated():
     assert abs(result.film.value("pretension") - 1.2) < 4.0 * result.film.std("pretension") < 1.2
     residual = result.charges.charges(result.film.film_values, contact) - charge
     assert np.sqrt(np.mean((residual / problem.noise.sigma(charge)) ** 2)) < 3.0
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_strongly_uneven_film_include_the_change_from_the_even_film(solved):
-    """From a solved film with E1 / E2 = 1.6, the charges are extrapolated to E1 / E2 = 1.4."""
-    prior = solved.prior
-    values = solved.values.copy()
-    values[prior.index("stiffness_x")] = np.log(1.6)
-    uneven = solved.solved(values.copy(), None)
-    values[prior.index("stiffness_x")] = np.log(1.4)
-    np.testing.assert_allclose(uneven.charges(values, CONTACT), direct(*prior.film(values), CONTACT), rtol=2e-3)

@@ -48,19 +48,16 @@ class FilmCharges:
     Attributes:
         prior: Declarations of the properties.
         values: Properties of the solved film, shape (n_property,).
-        even_values: Properties of the axisymmetric film, shape (n_property,).
         film: Forward map of the solved film.
         slopes: Derivatives with respect to the mechanical properties, for the axisymmetric film.
-        same_probe: Forward map of the axisymmetric film under a circular probe, with the few nodes of the slopes.
-        larger_probe: The same map under a probe whose radius is larger by `STEP`; None if the probe is not round.
+        larger_probe: Forward map of the axisymmetric film under a circular probe whose radius is larger by `STEP`; None
+            if the probe is not round.
     """
 
     prior: FilmPrior
     values: Array
-    even_values: Array
     film: ForwardMap
     slopes: FilmSlopes
-    same_probe: ForwardMap
     larger_probe: ForwardMap | None
 
     @classmethod
@@ -100,10 +97,8 @@ class FilmCharges:
         return cls(
             prior=prior,
             values=even_values,
-            even_values=even_values,
             film=same_probe,
             slopes=FilmSlopes.build(same_probe, executor=executor),
-            same_probe=same_probe,
             larger_probe=larger_probe,
         )
 
@@ -203,33 +198,7 @@ class FilmCharges:
             derivatives[one.name] if one.name in derivatives else self._read_difference(sensor, one, contact)
             for one in self.prior.properties
         ]
-        even_jacobian = np.stack(columns, axis=2)
-        return even_jacobian + self._secant_correction(sensor, contact, charge, even_jacobian)
-
-    def _secant_correction(self, sensor: Sensor, contact: Array, charge: Array, jacobian: Array) -> Array:
-        """Compute the change of the derivatives from the axisymmetric film to the solved film, along their difference.
-
-        The charges are assumed to be quadratic along the line between both films. The derivative at the solved film
-        then differs from that at the axisymmetric film by twice the deviation of the charges from the first order, and
-        only along this line (Broyden 1965).
-
-        Args:
-            sensor: Sensor with the electrodes and the coefficients.
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            charge: Charges of the solved film at these contacts, shape (n, n_electrode), pC.
-            jacobian: Derivatives of the axisymmetric film, shape (n, n_electrode, n_property), pC per unit.
-
-        Returns:
-            Change of the derivatives, shape (n, n_electrode, n_property), pC per unit.
-        """
-        step = np.where(self.prior.changes_stress, self.values - self.even_values, 0.0)
-        scaled_step = step / self.prior.std**2
-        length = float(step @ scaled_step)  # squared, in prior standard deviations
-        if length == 0.0 or self.film.probe.is_axisymmetric != self.prior.probe.is_axisymmetric:
-            return np.zeros_like(jacobian)
-        even_charge = _read(self.same_probe, sensor).charges(contact)
-        deviation = charge - even_charge - jacobian @ step
-        return np.asarray(2.0 * deviation[:, :, None] * scaled_step / length)
+        return np.stack(columns, axis=2)
 
     def _mechanical(self, sensor: Sensor, contact: Array, charge: Array) -> dict[str, Array]:
         """Compute the derivatives with respect to the properties that change the stress.
@@ -248,10 +217,9 @@ class FilmCharges:
         derivatives["young"] = charge - force_slope - values[PRETENSION.name] * derivatives[PRETENSION.name]
         if self.larger_probe is not None:
             step = STEP * self.prior.std[self.prior.index(PROBE_RADIUS)]
-            same_charge, larger_charge = (
-                _read(one, sensor).charges(contact) for one in (self.same_probe, self.larger_probe)
-            )
-            derivatives[PROBE_RADIUS] = (larger_charge - same_charge) / step
+            derivatives[PROBE_RADIUS] = (
+                _read(self.larger_probe, sensor).charges(contact) - film.charges(contact)
+            ) / step
         return derivatives
 
     def _read_difference(self, sensor: Sensor, one: FilmProperty, contact: Array) -> Array:
