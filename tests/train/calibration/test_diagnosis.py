@@ -9,8 +9,7 @@ from tests.train.calibration.conftest import rig
 
 from isocharge.common.errors import PressError
 from isocharge.train import calibrate
-from isocharge.train.calibration.diagnosis import OFFSET_STD, PRETENSIONS_MPa, find_mistakes, misfit
-from isocharge.train.data.presses import draw_contacts
+from isocharge.train.calibration.diagnosis import find_mistakes
 
 pytestmark = pytest.mark.usefixtures("never_solved")
 
@@ -48,15 +47,6 @@ def test_mistake_in_the_presses_is_found(problem, synthetic, name):
     contact, charge = make_mistake(presses.contact, presses.charge_pC)
     mistakes = find_mistakes(measured_presses(problem, contact, charge), synthetic)
     assert re.search(message, "; ".join(mistakes))
-
-
-def test_misfit_of_a_common_factor_is_the_square_of_its_logarithm(problem, synthetic):
-    """The charges are three times those of the film with the largest charges."""
-    values = problem.prior.layout.prior.mean.copy()
-    values[problem.prior.layout.index("pretension")] = min(PRETENSIONS_MPa)
-    contact = draw_contacts(np.random.default_rng(3), problem.domain, 10)
-    presses = measured_presses(problem, contact, 3.0 * synthetic.charges(values, contact))
-    assert misfit(presses, synthetic) == pytest.approx((np.log(3.0) / OFFSET_STD) ** 2)
 
 
 @pytest.mark.parametrize("name", IMPOSSIBLE)
