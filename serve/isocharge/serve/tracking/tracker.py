@@ -19,7 +19,10 @@ from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.motion_filter import VELOCITY, ContactFilter
 
 CERTAIN_PROBABILITY = 0.97
-"""Probability above which a statement counts as certain: that there is no other contact, or that the contact moves."""
+"""Probability of a contact above which no other contact is reported."""
+
+SLIDE_PROBABILITY = 0.95
+"""Probability that the contact moves, above which it may slide."""
 
 HOLD_TIME_s = 0.2
 """Time at rest after which a hold begins, and longest duration of a tap, s."""
@@ -59,7 +62,7 @@ class TouchEvents:
         """
         position = complex(tracked.x_mm, tracked.y_mm)
         is_away = abs(position - self._rest_position) > SLIDE_DISTANCE_mm
-        if tracked.moving > CERTAIN_PROBABILITY:
+        if tracked.moving > SLIDE_PROBABILITY:
             if is_away and self._latest_event != "slide":
                 self._latest_event = "slide"
                 return "slide"
