@@ -33,10 +33,11 @@ def test_stress_of_a_plate():
     assert largest_stress(plate, Circle(radius), 1.0) == pytest.approx(6.0 * moment / 2.0**2, rel=0.01)
 
 
-@pytest.mark.parametrize(("force", "stress"), [(1.0, 49.0), (1.65, 66.0), (2.0, 74.0)])
+@pytest.mark.parametrize(("force", "stress"), [(1.0, 48.8), (1.65, 66.1), (2.0, 74.3)])
 def test_probe_of_1_mm_exceeds_the_yield_stress_of_pvdf(force, stress):
-    assert largest_stress(FILM, TIP, force) == pytest.approx(stress, rel=0.05)
-    assert f"{force:g} N under circle:1.0 stress the film to {stress:.0f}" in stress_caution(FILM, TIP, force)
+    largest = largest_stress(FILM, TIP, force)
+    assert largest == pytest.approx(stress, rel=3e-3)
+    assert f"{force:g} N under circle:1.0 stress the film to {largest:.3g} MPa" in stress_caution(FILM, TIP, force)
     assert not stress_caution(FILM, TIP, force, 80.0)
 
 

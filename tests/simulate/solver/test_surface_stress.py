@@ -103,3 +103,18 @@ def test_surface_readout_without_bending_raises_error(film):
         touch_charge(sensor, solved)
     bent = press(film, Circle(1.0), (0.0, 0.0), 1.0)
     assert np.isfinite(touch_charge(sensor, bent)).all()
+
+
+def test_charges_at_a_surface_under_the_probe_equal_those_of_a_finer_mesh():
+    """The bending stress changes its sign at the edge of the footprint, whose radius is 1 mm."""
+    nominal = load_sensor("four-25um-biaxial")
+    film = replace(nominal.film, pretension=1.0)
+    inside = Electrode.of_square("A", (8.0, 3.0), 0.9)
+    at_the_edge = Electrode.of_square("B", (9.0, 3.0), 0.9)
+    sensor = replace(nominal, film=film, surface="top", electrodes=(inside, at_the_edge))
+    finer = SolveSettings(resolution=Resolution(8, 16, 9, 2))
+    charge, expected = (
+        touch_charge(sensor, press(film, Circle(1.0), (8.0, 3.0), 0.05, settings))
+        for settings in (SolveSettings(), finer)
+    )
+    np.testing.assert_allclose(charge, expected, atol=2e-4 * np.abs(expected).max())

@@ -137,8 +137,7 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
 
     # Strain by bending, from the second derivatives of W
     if surface != "middle":
-        nodal_slope_of_deflection = node_slopes(equilibrium)[element, :, :, 2]
-        second_derivatives = gradient @ nodal_slope_of_deflection
+        second_derivatives = gradient @ _continuous_slope(equilibrium)[element]
         total_strain += _bending_strain(equilibrium, surface, second_derivatives)
 
     # Compute the stress in the frame of the press. The shear stress has the opposite sign in the reflected half.
@@ -186,8 +185,7 @@ def _induced_stress(equilibrium: Equilibrium, surface: Surface) -> Array:
     slopes = node_slopes(equilibrium)
     total_strain = strain(slopes, equilibrium.groups.squared_amplitude)
     if surface != "middle":
-        slope_of_deflection = slopes[..., 2]
-        second_derivatives = equilibrium.mesh.node_derivatives(slope_of_deflection)
+        second_derivatives = equilibrium.mesh.node_derivatives(_continuous_slope(equilibrium))
         total_strain += _bending_strain(equilibrium, surface, second_derivatives)
     return scaled_stress(total_strain, equilibrium.groups)
 
@@ -232,6 +230,29 @@ def node_slopes(equilibrium: Equilibrium) -> Array:
     """
     mesh = equilibrium.mesh
     return mesh.node_derivatives(equilibrium.field[mesh.template.nodes])
+
+
+def _continuous_slope(equilibrium: Equilibrium) -> Array:
+    """Compute a continuous slope of the deflection at the nodes of every element.
+
+    The computed slope jumps slightly between elements. The integral of its derivatives over an electrode omits the
+    jumps, so at an outer surface, the charges near the edge of the footprint would be wrong. The slope at a
+    node is therefore the mean over the elements that share the node. It is zero at the clamped rim.
+
+    Args:
+        equilibrium: The solved press.
+
+    Returns:
+        Derivatives of W with respect to (X1, X2), shape (n_element, n_local, 2).
+    """
+    template = equilibrium.mesh.template
+    slope_sum = np.zeros((template.n_node, 2))
+    np.add.at(slope_sum, template.nodes, node_slopes(equilibrium)[..., 2])
+    element_count = np.bincount(template.nodes.ravel())
+    slope = slope_sum / element_count[:, None]
+    slope[template.on_rim] = 0.0
+    slope[template.on_axis, 1] = 0.0  # the deflection is symmetric about the axis of a half mesh
+    return np.asarray(slope[template.nodes])
 
 
 def _bending_strain(equilibrium: Equilibrium, surface: Surface, second_derivatives: Array) -> Array:
