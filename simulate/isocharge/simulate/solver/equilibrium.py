@@ -236,8 +236,8 @@ def _continuous_slope(equilibrium: Equilibrium) -> Array:
     """Compute a continuous slope of the deflection at the nodes of every element.
 
     The computed slope jumps slightly between elements. The integral of its derivatives over an electrode omits the
-    jumps, so at an outer surface, the charges near the edge of the footprint would be wrong. The slope at a
-    node is therefore the mean over the elements that share the node. It is zero at the clamped rim.
+    jumps, so at an outer surface, the charges near the edge of the footprint would be wrong. The slope at a node is
+    therefore the mean over the elements that share the node. It is zero at the clamped rim.
 
     Args:
         equilibrium: The solved press.
