@@ -173,7 +173,7 @@ def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
         "train", "fit", "--sensor", "three-25um-uniaxial", "--config", "quick.toml", "--json", "-o", "models/u"
     )
     assert "caution: 2 N under circle:1.0 stress the film to 74." in err
-    folded = re.search(r"caution: the map from contacts to charges seems to fold about ([0-9.]+) mm", err)
+    folded = re.search(r"caution: the map from contacts to charges folds beyond ([0-9.]+) mm", err)
     assert 1.5 < float(folded[1]) < 5.0
     answer = json.loads(out)
     assert answer["errors"]["position_median_mm"] > 0.0
