@@ -163,7 +163,6 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
 @pytest.mark.slow
 def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
     """The map of three electrodes on a uniaxial film folds within 8 mm. The command prints a warning."""
-    monkeypatch.setattr("isocharge.cli.shared.forward_maps.N_SIMULATED_PRESSES", 4000)
     (tmp_path / "quick.toml").write_text(
         "[network]\nhidden = [24, 24]\nmisfit_hidden = [24, 24]\n"
         "[training]\nsteps = 300\nmisfit_steps = 50\nmisfit_charges = 1000\n"
