@@ -105,7 +105,7 @@ def test_presses_outside_the_radius_reach_up_to_the_clamp(small_dataset):
     about = read.manifest["outside"]
     assert (about["samples"], about["probe"], about["radius_mm"]) == (16_384, "circle:1.0", [8.0, 42.8])
     assert about["interpolation_error"] == 0.05
-    assert read.manifest["yield_force_N"] == pytest.approx(0.866, abs=0.001)
+    assert read.manifest["yield_force_N"] == pytest.approx(0.873, rel=0.005)  # with a mesh of order 9
 
 
 @pytest.mark.parametrize("changes", [{"outside": 0}, {"radius": 42.0}])
