@@ -46,7 +46,7 @@ def in_process(predictor: Predictor, charge_pC: np.ndarray) -> list[Contender]:
     """The session and every way of the predictor, with one press."""
     folder = predictor.folder
     session = open_session((folder / "model.onnx").read_bytes(), str(folder))
-    feed, values, out = {"charge_pC": charge_pC[np.newaxis]}, charge_pC.tolist(), np.zeros(7, np.float32)
+    feed, values, out = {"charge_pC": charge_pC[np.newaxis]}, charge_pC.tolist(), np.zeros(10, np.float32)
     return [
         Contender("session.run", 1, lambda: session.run(None, feed)),
         Contender("predict_into", 1, lambda: predictor.predict_into(charge_pC, out)),
