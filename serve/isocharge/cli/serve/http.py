@@ -110,9 +110,10 @@ def _log_loaded_models(store: ModelStore) -> None:
 
 @contextmanager
 def _signals(server: HttpServer, store: ModelStore) -> Iterator[None]:
-    """Context manager in which SIGTERM and Ctrl-C stop the server, and SIGHUP loads all models again.
+    """Handle signals while a `with` block runs (context manager).
 
-    If SIGHUP arrives because the terminal of the command was closed, the server stops, too.
+    SIGTERM and Ctrl-C stop the server. SIGHUP loads all models again, or stops the server if the signal was sent
+    because the terminal of the command was closed.
     """
 
     def load_all() -> None:
@@ -126,7 +127,10 @@ def _signals(server: HttpServer, store: ModelStore) -> Iterator[None]:
 
 
 def _load_all(store: ModelStore) -> None:
-    """Load all models of the repositories again. Models that cannot be loaded are logged, and stay as they were."""
+    """Load all models of the repositories again.
+
+    If a model cannot be loaded, the reason is logged, and its loaded version is kept.
+    """
     for name in sorted({row["name"] for row in store.index()}):
         try:
             store.load(name)
@@ -137,7 +141,7 @@ def _load_all(store: ModelStore) -> None:
 
 @contextmanager
 def _traffic(log_format: str) -> Iterator[Traffic]:
-    """Context manager that yields the traffic counters of the servers, and writes a log of requests for `--log json`.
+    """Yield the traffic counters of the servers, and write a log of requests for `--log json` (context manager).
 
     A separate thread writes the log to stderr, so that a slow reader of stderr does not delay the answers. The warnings
     of all packages are written to the same log. For `--log text`, there is no log.

@@ -91,7 +91,7 @@ _TOKENS = {kind: _token_pattern(_PATTERNS[kind]) for kind in ("number", "number 
 
 
 _SEPARATORS = ",;|[("
-"""Marks between columns and before lists. A word before one of them is no name of the number behind it."""
+"""Marks that separate columns or begin a list. A word before such a mark does not name the number after the mark."""
 
 
 class _Token(NamedTuple):
@@ -241,11 +241,14 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
 def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     """Return the name of each number without and with its unit; empty without a name.
 
-    The name is the last word or key between the number and the previous number or separator, as in `A: 3.5`, `A -> 3.5`
-    and `<A>3.5</A>`. If several numbers have the same name, the word or key before it is the name, as in
-    `{"A": {"pC": 3.5}}`. Words are units and not names if the first number follows no word but the last number precedes
-    one. A name that occurs several times is no name. A single name of several numbers is a label of the line if it is a
-    word, or the name of the first number, unless it is a name of a counter or a clock.
+    The name of a number is the last word or key between this number and the previous number or separator, as in
+    `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. These rules apply in this order:
+
+    - If several numbers have the same name, the word or key before it is the name, as in `{"A": {"pC": 3.5}}`. A name
+      that still occurs several times is removed.
+    - If no word precedes the first number, but a word follows the last number, the words are units and no names.
+    - If only one of several numbers has a name, the name is a label of the line and is removed. This applies if the
+      name is a word or belongs to the first number. Names of counters and clocks are kept.
 
     A unit of charge or voltage other than pC directly behind a number is added to its name, as in `A_nC`.
 
@@ -290,7 +293,7 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
 
 
 def _unique(names: list[str]) -> list[str]:
-    """Return names in which each name that occurs several times, and is no name of a clock, is replaced by ""."""
+    """Replace every name that occurs several times by an empty name, except the names of clocks."""
     return [name if name in TIMES_US or names.count(name) == 1 else "" for name in names]
 
 

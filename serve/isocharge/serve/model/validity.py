@@ -209,11 +209,14 @@ class Validity:
         return flags
 
     def _conditions(self, contact: Contact | Contacts, is_in_area: Any) -> dict[str, Any]:
-        """Return for each flag whether it is true, for one contact or for n contacts.
+        """Return the condition of each flag for one contact or for n contacts.
 
         Args:
-            contact: The contact or the contacts.
-            is_in_area: Whether each contact lies in the working area, as the result.
+            contact: One contact, or n contacts.
+            is_in_area: Whether the contact lies in the working area; an array of shape (n,) for n contacts.
+
+        Returns:
+            For each flag, whether its condition is true. The values have the form of `is_in_area`.
         """
         min_force_N, max_force_N = self.force_range_N
         centre_x_mm, centre_y_mm = self.centre_mm

@@ -71,7 +71,7 @@ class AddedOutput:
         self._end(discard)
 
     def _end(self, end: Callable[[Output], None]) -> None:
-        """Call a function that ends the output in another thread, which may hang.
+        """Call a function that ends the output in another thread, because the function may never return.
 
         Raises:
             Exception: The error of the function.

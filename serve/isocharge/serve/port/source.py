@@ -342,7 +342,7 @@ class AddedSource:
     """
 
     def __init__(self, url: str, entry_point: EntryPoint) -> None:
-        """Call the function of the other package.
+        """Call the function with which another package opens this URL.
 
         Args:
             url: URL of the source.

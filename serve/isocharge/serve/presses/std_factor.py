@@ -1,8 +1,8 @@
-"""Factor for the standard deviations of a model with a guarantee that held-out presses provide.
+"""Factor for the standard deviations of a model, which makes its regions hold for a guaranteed share of contacts.
 
-The factor is an order statistic of the presses (split conformal prediction, Vovk 2012, proposition 2a). For n presses
-that were not used for the training or the calibration, the share of contacts that the k-th smallest score covers has
-the distribution Beta(k, n + 1 - k), whatever the distribution of the errors.
+The factor is an order statistic of held-out presses (split conformal prediction, Vovk 2012, proposition 2a). For n
+presses that were not used for the training or the calibration, the share of contacts that the k-th smallest score
+covers has the distribution Beta(k, n + 1 - k), whatever the distribution of the errors.
 """
 
 import math
@@ -19,10 +19,10 @@ CONFIDENCE = 0.9
 """Probability that the statement about the coverage is true."""
 
 FEWEST_HELD_OUT = 22
-"""Smallest number of presses from which a factor follows: with fewer, 1 - COVERAGE**n is below CONFIDENCE."""
+"""Smallest number of presses from which a factor follows. For fewer presses n, 1 - COVERAGE**n is below CONFIDENCE."""
 
 REGION_QUANTILES = (3.841, 5.991, 7.815)
-"""Quantiles 95 % of chi-squared with one, two and three degrees of freedom."""
+"""95 % quantiles of chi-squared with one, two and three degrees of freedom."""
 
 
 class StdFactor(NamedTuple):

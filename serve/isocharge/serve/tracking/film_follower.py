@@ -9,17 +9,19 @@ The state of the film is a vector of these unknowns:
 
 The charges of four electrodes have one degree of freedom more than a contact (x, y, force). If the pretension of a film
 changes, for example because the room becomes warmer by 1 K, no contact explains the charges of touches exactly. Each
-touch therefore updates the state: the estimate from the earlier touches is the Gaussian prior, and the most probable
-state and contact of the touch are found together (an iterated extended Kalman filter, whose contact has no prior).
-Before each touch, the covariance of the state moves a little towards that before the first touch. A sudden change of
-the film is therefore followed within about twenty touches.
+touch therefore updates the estimate of the state. An iterated extended Kalman filter finds the most probable state
+together with the contact of the touch. The estimate from the earlier touches is the Gaussian prior of the state, and
+the contact has no prior. Before each touch, the covariance of the state moves a little towards that before the first
+touch. A sudden change of the film is therefore followed within about twenty touches.
 
 The network was trained for the film as it was calibrated. The charges of a frame are therefore converted into charges
 that the same contact would cause on the calibrated film, and the network computes the contact from the converted
-charges. The conversion depends on the contact, so both are repeated once.
+charges. The conversion depends on the contact. Both steps are therefore done twice, the second time with the contact of
+the first time.
 
-The film is considered lost if no state explains the latest touches, or if the estimated pretension or offset is at the
-end of its range. While the film is lost, the estimate from before is used for contacts.
+The estimate is considered wrong if no state explains the latest touches, or if the estimated pretension or offset is at
+the end of its range. The film is then called lost, and contacts are corrected with the last estimate that explained its
+touches, until a new estimate explains the latest ones.
 
 One set of charges of each touch is used. A single frame has the noise of one reading. Therefore the charges of several
 frames are averaged, namely of frames whose contact is close to the contact with the largest force. A touch is not used

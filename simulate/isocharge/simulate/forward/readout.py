@@ -49,15 +49,16 @@ NEAR_DISTANCE = 1.4
 """Relative distance from the press below which a piece of an electrode is near; see `ElectrodePieces.rules`."""
 
 NEAR_SIDE = 5.0
-"""Longest side of a near piece of an electrode, in units of the width of the footprint.
+"""Longest side of a near piece of an electrode, in units of half the width of the footprint.
 
-The stress has a peak at the probe and a kink at the edge of the footprint. With longer sides, the error of a charge
-exceeds 1e-4: it is 9e-4 for a side of 8 widths, and 1e-3 for a side of 20 widths with 20 points along the side.
+Half the width of a circle is its radius. The stress has a peak at the probe and a kink at the edge of the footprint.
+With longer sides, the error of a charge exceeds 1e-4: it is 9e-4 for a side of 8 units, and 1e-3 for a side of 20 units
+with 20 points along the side.
 """
 
 
 class PieceRule(NamedTuple):
-    """Integration points of pairs of a press and a piece of an electrode.
+    """Integration points on pieces of electrodes, for pairs of a press and a piece.
 
     Attributes:
         press: Index of the press of each pair, shape (n_pair,).
@@ -92,7 +93,10 @@ class ElectrodePieces:
 
     @classmethod
     def covering(cls, electrodes: Sequence[Electrode], readout: Readout = "area") -> "ElectrodePieces":
-        """Return the pieces of electrodes at their nominal positions, with the weights of s11, s22 and s12 as charges.
+        """Return the pieces of electrodes at their nominal positions.
+
+        The attribute `charge_per_stress` contains the weights of s11, s22 and s12 in the mean stress, because the
+        electrodes of a layout have no piezoelectric coefficients.
 
         Args:
             electrodes: Electrodes of a layout, which may be empty.
@@ -130,8 +134,8 @@ class ElectrodePieces:
         """Compute the integration points of all pieces under several presses.
 
         A press and a piece are near if the distance of their centres is less than `NEAR_DISTANCE` times the sum of the
-        radii of the circles around the footprint and the piece. A near piece is halved across its longer sides until
-        its parts are distant, or not longer than `NEAR_SIDE`.
+        radii of the circles around the footprint and the piece. A near piece is halved across its longest side until
+        each part is distant, or has sides of at most `NEAR_SIDE` half widths of the footprint.
 
         Args:
             probe: Probe of the presses.
@@ -141,7 +145,7 @@ class ElectrodePieces:
         Yields:
             The integration points of some of the pairs of a press and a piece.
         """
-        width = probe.area / (np.pi * probe.reach)  # the radius of a circle
+        half_width = probe.area / (np.pi * probe.reach)  # the radius of a circle
         near_count, distant_count = counts
         press, piece = (grid.ravel() for grid in np.indices((position.size, len(self.corners))))
         corners = self.corners[piece]
@@ -151,7 +155,7 @@ class ElectrodePieces:
             radius = np.abs(corners - centre[:, None]).max(axis=1)
             is_near = np.abs(position[press] - centre) < NEAR_DISTANCE * (radius + probe.reach)
             sides = np.abs(np.roll(corners, -1, axis=1) - corners)
-            is_halved = is_near & (sides.max(axis=1) > NEAR_SIDE * width)
+            is_halved = is_near & (sides.max(axis=1) > NEAR_SIDE * half_width)
             for count, selected in ((near_count, is_near & ~is_halved), (distant_count, ~is_near)):
                 indices = np.flatnonzero(selected)
                 block = 50_000 // count**2  # with more points, the working arrays would exceed 100 MB

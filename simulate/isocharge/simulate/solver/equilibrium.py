@@ -233,17 +233,19 @@ def node_slopes(equilibrium: Equilibrium) -> Array:
 
 
 def _continuous_slope(equilibrium: Equilibrium) -> Array:
-    """Compute a continuous slope of the deflection at the nodes of every element.
+    """Compute a slope of the deflection that is continuous from element to element.
 
-    The computed slope jumps slightly between elements. The integral of its derivatives over an electrode omits the
-    jumps, so at an outer surface, the charges near the edge of the footprint would be wrong. The slope at a node is
-    therefore the mean over the elements that share the node. It is zero at the clamped rim.
+    The slope that follows from the solved deflection has small jumps between the elements. Its derivatives within the
+    elements do not contain these jumps. The mean bending stress of an electrode would therefore be wrong near the edge
+    of the footprint. For this reason, the slopes that the elements at a node have there are averaged. The slope is zero
+    at the clamped rim.
 
     Args:
         equilibrium: The solved press.
 
     Returns:
-        Derivatives of W with respect to (X1, X2), shape (n_element, n_local, 2).
+        Derivatives of the deflection W with respect to (X1, X2) at the nodes of each element, shape (n_element,
+        n_local, 2).
     """
     template = equilibrium.mesh.template
     slope_sum = np.zeros((template.n_node, 2))

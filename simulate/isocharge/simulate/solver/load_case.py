@@ -288,9 +288,9 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
 
     The mesh is created in a unit disk, which a conformal map maps onto the film. A circle in the disk encloses the
     footprint, and rings of elements lie between this circle and the rim. A small probe needs more rings. A press close
-    to the rim needs more rings and more elements around the circle, because the conformal map stretches the mesh. With
-    trapped air or a static pressure, the film also bends in narrow strips between the probe and the rim, which need
-    more rings. For presses in the inner half of the film, the first resolution is sufficient.
+    to the rim needs more rings and more elements around the circle, because the conformal map stretches the mesh.
+    Trapped air or a static pressure also bends the film between the probe and the rim, in narrow strips that need more
+    rings. For presses in the inner half of the film, the first resolution is sufficient.
 
     Args:
         case: The press and the required accuracy.

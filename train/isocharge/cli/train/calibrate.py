@@ -166,7 +166,11 @@ def _print_result(
 def _write(
     result: CalibrationResult, folder: Path, held_out: MeasuredPresses | None, executor: Executor | None
 ) -> StdFactor | None:
-    """Write the model of a calibrated film, print the name of its version folder, and return its factor, if any."""
+    """Write the model of a calibrated film, and print the name of its version folder.
+
+    Returns:
+        Factor by which the standard deviations were multiplied; None without held-out presses.
+    """
     say("training the network of this film")
     version = write_calibration(result, folder, this_command(), held_out=held_out, executor=executor)
     say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
@@ -174,7 +178,10 @@ def _write(
 
 
 def _check_usage(file: Path | None, output: Path | None, next_count: int, held_out: Path | None) -> None:
-    """Raise InputError if neither presses are given nor proposed, or if a model is needed that is not trained."""
+    """Raise InputError if the options do not belong together.
+
+    Without presses, the command can only propose presses, and writes no model. Held-out presses need a model.
+    """
     if held_out is not None and output is None:
         raise InputError("--held-out: expected --output FOLDER for the model whose standard deviations it changes")
     if file is not None:

@@ -56,18 +56,18 @@ class Service:
     """gRPC service that answers calls with the models, the token and the limits of a `Handler`."""
 
     def __init__(self, handler: Handler) -> None:
-        """Store the objects that the service shares with the HTTP server, and the function that answers each method.
+        """Share the models, limits, counters and access check of the HTTP server, and prepare the gRPC methods.
 
         Args:
-            handler: Handler of the HTTP server. The service uses its models, limits, token and counters.
+            handler: Handler of the requests of the HTTP server.
         """
         self._store = handler.store
         self._limits = handler.limits
         self._traffic = handler.traffic
         self._access = handler.access
         self._open_count = 0
-        # Timeouts of the calls that wait for a message, in the order in which they began to wait. A dictionary without
-        # values is used as an ordered set.
+        # One timeout for each call that waits for a message of its client, in the order in which the waits began. The
+        # dictionary has no values and serves as an ordered set.
         self._waiting: dict[asyncio.Timeout, None] = {}
         self._traffic.open.labels("grpc").set_function(lambda: self._open_count)
         self._answer_functions = self._create_answer_functions()
