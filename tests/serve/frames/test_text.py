@@ -126,6 +126,15 @@ NOTATIONS = {
     "A = {a} | B = {b} | C = {c} |": "ABC",
     "A -> {a}, B -> {b}, C -> {c}": "ABC",
     "A: {a} nC, B: {b} nC, C: {c} nC": ("A_nC", "B_nC", "C_nC"),
+    "A,{a},B,{b},C,{c}": "ABC",
+    "A;{a};B;{b};C;{c};OK": "ABC",
+    '"A",{a},"B",{b},"C",{c}': "ABC",
+    "$FILM,A,{a},B,{b},C,{c}": "ABC",
+    "A[{a}] B[{b}] C[{c}]": "ABC",
+    "A({a}), B({b}), C({c})": "ABC",
+    "{a} A, {b} B, {c} C": "ABC",
+    "{a},A,{b},B,{c},C": "ABC",
+    "12:34:56,A,{a},B,{b},C,{c}": "ABC",
     "Sensor A: {a}, Sensor B: {b}, Sensor C: {c}": "ABC",
     "{{'A': {a}, 'B': {b}, 'C': {c}}}": "ABC",
     "Reading(A={a}, B={b}, C={c})": "ABC",
@@ -143,6 +152,22 @@ NOTATIONS = {
     "\x1b[0;32mI (1234) film: {a}, {b}, {c}\x1b[0m": (),
     'I (1234) film: {{"A": {a}, "B": {b}, "C": {c}}}': "ABC",
 }
+INDICES = {
+    "C[7] A[3]": ("C", "A"),
+    "C[7], A[3]": ("C", "A"),
+    "C[7]A[3]": ("C", "A"),
+    "ch[0] 7 ch[1] 3": ("ch[0]", "ch[1]"),
+    "ch[0],7,ch[1],3": ("ch[0]", "ch[1]"),
+}
+
+
+@pytest.mark.parametrize("text", INDICES)
+def test_number_in_brackets_is_a_value_or_an_index(text):
+    line = parse_line(text)
+    assert line.names == INDICES[text]
+    assert line.numbers == ("7", "3")
+
+
 STATES = ["12 <{state}> {a} {b} {c}", "12 {state} {a} {b} {c}", "{state} -> {a}, {b}, {c}", "{a} ({state}) {b} {c}"]
 
 
@@ -235,6 +260,7 @@ def test_values_that_are_not_numbers_or_out_of_range_are_not_finite():
     [
         ("T:time,A,B,C", "T:{n},4.7,-2.2,3.2", ("time", "A", "B", "C")),
         ("n,mode,phase,A,B", "{n},bare,stance,4.7,-2.2", ("n", "A", "B")),
+        ("state,B,phase,A", "run,{n},idle,-2.2", ("B", "A")),
         ("t [ms], A [pC], B [pC]", "{n}, 4.7, -2.2", ("t [ms]", "A [pC]", "B [pC]")),
         ('"A","B"', "{n},4.7", ("A", "B")),
         ("n\tA B", "{n}\t4.7", ("n", "A B")),

@@ -104,6 +104,23 @@ def test_board_that_restarts_when_the_port_is_opened_may_be_silent_longer_at_fir
         next(iter(port))
 
 
+def test_silent_port_is_opened_again_after_growing_pauses(board, monkeypatch):
+    """A board that restarts at each opening, and needs longer than the wait for the first byte, gets more time."""
+    pauses_s = []
+
+    def sleep(pause_s):
+        pauses_s.append(round(pause_s, 3))
+        if len(pauses_s) == 6:
+            raise InterruptedError
+
+    monkeypatch.setattr("isocharge.serve.port.source.START_UP_s", 0.05)
+    monkeypatch.setattr("isocharge.serve.port.source.RETRY_PAUSE_s", 0.01)
+    monkeypatch.setattr("isocharge.serve.port.source.time.sleep", sleep)
+    with Port(board.url, silence_s=0.01, reconnect=True) as port, pytest.raises(InterruptedError):
+        next(iter(port))
+    assert pauses_s == [0.01, 0.02, 0.04, 0.05, 0.05, 0.05]
+
+
 def test_closing_a_port_leaves_dtr_set(board):
     """With HUPCL, the system would clear DTR at the end, and the next opening would restart an Arduino."""
     with Port(board.url):

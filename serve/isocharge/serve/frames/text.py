@@ -175,6 +175,9 @@ class TextParser(DelimitedParser):
             ValueError: If the line cannot be parsed.
         """
         line = parse_line(text)
+        line_below_header = parse_line(text, has_header=True)
+        if any(header_names(header, line_below_header) for header in self._headers):
+            line = line_below_header
         layout = self.layout
         self.unread_line = text
         if line.numbers:

@@ -11,8 +11,9 @@ skeleton. Lines with the same skeleton are frames of one layout, in whatever not
 | `12:34:56.5 -> (0x1F, 0x2E)` | t_s | 45296.5, 31, 46 |
 | `{"charge": {"A": 801.2, "B": 3}}` | A, B | 801.2, 3 |
 
-A word directly before a number is the name of the number. Digits in a word, as in `ch3`, are not a number. Words that
-are neither names nor followed by a colon or an equals sign may change from line to line.
+A word directly before a number is the name of the number. If different words and numbers alternate, as in `C,7,A,3` and
+`7 C, 3 A`, the words are names, too. Digits in a word, as in `ch3`, are not a number. Words that are neither names nor
+followed by a colon or an equals sign may change from line to line.
 """
 
 import json
@@ -25,7 +26,9 @@ from typing import Literal, NamedTuple
 
 from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US, Frame
 
-_WORD = r"(?>\w+(?:[./-]\w+)*(?:\[\w*\])*)"
+_INDEX = r"\[\w*\](?!\s*[,;]?\s*(?:$|[^\W\d]))"  # not the value in `C[7] A[3]`, which stands before a name or the end
+
+_WORD = rf"(?>\w+(?:[./-]\w+)*(?:{_INDEX})*)"
 
 _QUOTED = r'"(?:[^"\\]|\\.)*"' + r"|(?<!\w)'[^']*'(?!\w)"
 
@@ -95,12 +98,17 @@ _SEPARATORS = ",;|[("
 
 
 class _Token(NamedTuple):
-    """Part of a line: a number, a key before a colon or an equals sign, a text in quotes, a word, or another mark."""
+    """Part of a line: a number, a name, a key before a colon or an equals sign, a text in quotes, a word, or a mark."""
 
     kind: str
     content: str
     start: int
     is_after_blank: bool
+
+    @property
+    def name(self) -> str:
+        """Content without quotes."""
+        return self.content.strip("\"'")
 
 
 class Line(NamedTuple):
@@ -155,11 +163,12 @@ def clean_text(text: str) -> str:
     return "" if text[:1] == "#" else text
 
 
-def parse_line(text: str) -> Line:
+def parse_line(text: str, *, has_header: bool = False) -> Line:
     """Take the numbers out of a line of text.
 
     Args:
         text: The line, as `clean_text` returns it.
+        has_header: Whether a header names the numbers. Words that alternate with the numbers are then no names.
 
     Raises:
         ValueError: If the line contains characters that are not printable, or a decimal number after a hexadecimal
@@ -169,6 +178,8 @@ def parse_line(text: str) -> Line:
         raise ValueError(f"expected printable characters, got {text[:100]!r}")
     number_kind = "number with a decimal comma" if _has_decimal_commas(text) else "number"
     tokens = _tokens(text.rstrip(",; \t"), number_kind)
+    if not has_header:
+        tokens = _with_alternating_names(tokens)
     number_tokens = [token for token in tokens if token.kind in _NUMBER_KINDS]
     kinds = [token.kind for token in number_tokens]
     if "hexadecimal" in kinds and "number" in kinds[kinds.index("hexadecimal") :]:
@@ -179,13 +190,13 @@ def parse_line(text: str) -> Line:
     word_count = 0
     for previous, token in zip([None, *tokens], tokens, strict=False):
         is_beside_mark = previous is None or "mark" in (previous.kind, token.kind)
-        if token.kind == "word" and (previous is None or not is_beside_mark):
+        if token.kind in ("word", "name") and (previous is None or not is_beside_mark):
             word_count += 1
         if is_beside_mark:
             skeleton += _CODES["optional blanks"]
         elif token.is_after_blank:
             skeleton += _CODES["blanks"]
-        if token.kind in ("key", "mark") or (token.kind == "word" and token.content in names):
+        if token.kind in ("key", "name", "mark") or (token.kind == "word" and token.content in names):
             skeleton += token.content
         else:
             skeleton += _CODES[number_kind if token.kind == "number" else token.kind]
@@ -263,7 +274,7 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     path: list[str] = []  # words and keys after the previous number or separator
     for token, following in zip(parts, [*parts[1:], None], strict=True):
         if token.kind in ("key", "word"):
-            path.append(token.content.strip("\"'"))
+            path.append(token.name)
             if token.kind == "word":
                 words.add(path[-1])
         elif token.kind in _NUMBER_KINDS:
@@ -285,11 +296,38 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
         names[named[0]] = ""
     if tokens and tokens[0].content == ">" and len(names) == 2:  # `>name:time:value`
         names = [_NAMES_OF_TIMES["uptime"], next((token.content for token in tokens if token.kind == "key"), "")]
+    alternating_names = [token.name for token in tokens if token.kind == "name"]
+    if alternating_names:
+        names = [name for name in inner_names if name in TIMES_US] + alternating_names
     names_with_units = [
         f"{name or f'ch{number}'}_{unit}" if unit in _CHARGE_UNITS - set(names) else name
         for number, (name, unit) in enumerate(zip(names, units, strict=True), start=1)
     ]
     return names, names_with_units
+
+
+def _with_alternating_names(tokens: list[_Token]) -> list[_Token]:
+    """Mark the names in a line in which names and numbers alternate, and return the parts of the line.
+
+    The names stand before the numbers, as in `C,7,A,3` and `C[7] A[3]`, or behind them, as in `7 C, 3 A`. All names are
+    different, because words that repeat are units or states. A time, a word before the first name and a word behind the
+    last number are no names. If a word that is no name is mistaken for a name, no electrode or not every electrode has
+    a channel with its name.
+
+    Args:
+        tokens: Parts of the line.
+    """
+    positions = [i for i, token in enumerate(tokens) if token.kind not in ("mark", *_NAMES_OF_TIMES)]
+    shape = "".join("#" if tokens[position].kind in _NUMBER_KINDS else "w" for position in positions)
+    are_behind = re.fullmatch("(?:#w){2,}", shape) is not None
+    if not are_behind and not re.fullmatch("w?(?:w#){2,}w?", shape):
+        return tokens
+    distance = 1 if are_behind else -1  # from a number to its name
+    named = {positions[index + distance] for index, kind in enumerate(shape) if kind == "#"}
+    names = {tokens[position].name for position in named}
+    if len(names) < len(named) or not _CHARGE_UNITS.isdisjoint(names):
+        return tokens
+    return [token._replace(kind="name") if position in named else token for position, token in enumerate(tokens)]
 
 
 def _unique(names: list[str]) -> list[str]:

@@ -217,6 +217,9 @@ class Port:
     def _read_after_reconnecting(self, reason: PortLost) -> bytes:
         """Open the port repeatedly until bytes arrive, and return these bytes.
 
+        Opening a port restarts many boards. The pause before the next attempt is therefore doubled each time that an
+        opened port sends nothing, up to `start_up_s`.
+
         Args:
             reason: Exception that states why the port was lost.
 
@@ -226,11 +229,13 @@ class Port:
         if not self._reconnect:
             raise reason
         log.warning("%s; trying again until it is back", reason)
+        pause_s = RETRY_PAUSE_s
         while True:
             self._close()
-            time.sleep(RETRY_PAUSE_s)
+            time.sleep(pause_s)
             with contextlib.suppress(PortError):  # also PortLost, if no bytes have arrived after opening
                 self._open()
+                pause_s = min(2.0 * pause_s, self.start_up_s)
                 return self._read()
 
     def _read(self) -> bytes:
