@@ -2,8 +2,8 @@
 
 The values are replaced by their medians over blocks of 0.1 s, because hum averages out in a block. A single damaged
 value does not change the median of a block. A press begins with a large change within half a second. Warming, creep and
-the slow noise of amplifiers cause slower changes. One function, `find_press`, finds the touches of a film that should
-be at rest, and the press that is held during the port check.
+the slow noise of amplifiers cause slower changes. The stage `isocharge.serve.signal_chain.touch.Touch` finds the
+touches of a film that should be at rest, and the press that is held during the port check.
 
 A press that is held with a constant force during the whole time does not change the values. It cannot be distinguished
 from an amplifier with another rest level.
@@ -25,7 +25,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Reals
+from isocharge.common.arrays import Array, Booleans, Reals
+from isocharge.serve.frames.frame import Frame
+from isocharge.serve.signal_chain.stage import Device, Setup
+from isocharge.serve.signal_chain.touch import Touch, TouchRule
 
 BLOCK_S = 0.1
 """Time over which values are averaged, s. It contains whole periods of 50 and of 60 Hz."""
@@ -34,53 +37,32 @@ CHANGE_BLOCKS = 5
 """Number of blocks within which a touch changes the values, which is half a second."""
 
 
-class Press(NamedTuple):
-    """A press in a sequence of blocks.
+def touched_blocks(levels: Array, noise: Array) -> Booleans:
+    """Return in which blocks something touches the film, shape (blocks,).
 
-    Attributes:
-        begin: Number of the first block of the press.
-        end: Number of the first block after the press; None if the press has not ended.
-    """
-
-    begin: int
-    end: int | None
-
-
-def find_press(levels: Array, noise: Array, sigmas: float = 20.0, release_share: float = 0.3) -> Press | None:
-    """Find the first press in a sequence of blocks.
-
-    A press begins when a channel changes within half a second by much more than its noise. A press ends when most of
-    the change has disappeared within half a second, or all of the change slowly.
+    The stage `Touch` of a stream detects the touches. While nothing touches the film, the charges at rest are the
+    levels half a second ago. A slow change is therefore no touch.
 
     Args:
         levels: Median of each channel in each block, shape (blocks, channels), in any unit.
         noise: Noise of each channel in one frame, shape (channels,).
-        sigmas: Smallest change within half a second with which a press begins, in standard deviations of the noise.
-        release_share: Share of the largest change below which the change must fall at the end of a press. The change
-            must also fall by this share within half a second, because a leaking amplifier loses the charge of a held
-            press slowly. The share is not smaller, because after the release such an amplifier returns to rest slowly.
-
-    Returns:
-        The press; None if no press begins.
     """
-    min_change = sigmas * noise
-    earlier_blocks = np.maximum(np.arange(len(levels)) - CHANGE_BLOCKS, 0)
-    begins_press = (np.abs(levels - levels[earlier_blocks]) > min_change).any(axis=1)
-    if not begins_press.any():
-        return None
-    begin = int(np.argmax(begins_press))
-    changes = levels - levels[earlier_blocks[begin]]
-    peak = begin + int(np.argmax(np.abs(changes[begin:]).sum(axis=1)))
+    channels = tuple(map(str, range(len(noise))))
+    detector = Touch(Setup(channels, Device(rules={TouchRule: BLOCK_RULE}), has_any_sign=True))
+    is_contact = np.zeros(len(levels), dtype=bool)
+    rest = levels[0]
+    for number, level in enumerate(levels):
+        if not is_contact[number - 1]:
+            rest = levels[max(number - CHANGE_BLOCKS, 0)]
+        frame = Frame(seq=None, t_us=None, values=(), dt_s=BLOCK_S, charge_pC=level - rest)
+        frame.noise_pC = noise
+        detector.step(frame)
+        is_contact[number] = frame.is_contact
+    return is_contact
 
-    # Sum of the changes, in which a channel counts as negative if it has another sign than at the largest change
-    total = changes @ np.sign(changes[peak])
-    is_low = total < release_share * total[peak]
-    is_falling = total[earlier_blocks] - total > release_share * total[peak]
-    is_gone = (np.abs(changes) <= min_change).all(axis=1)
-    is_released = (is_low & is_falling) | is_gone
-    is_released[: peak + 1] = False
-    end = int(np.argmax(is_released)) if is_released.any() else None
-    return Press(begin, end)
+
+BLOCK_RULE = TouchRule(sigmas=26.0, floor_pC=0.0)
+"""Threshold of a touch, which is about 20 standard deviations of the noise of three channels."""
 
 
 class TouchFound(NamedTuple):
@@ -125,13 +107,13 @@ def find_touch(
     noise = channel_noise(values)
     if unit_is_pC:
         noise = np.maximum(noise, min_noise_pC)
-    press = find_press(smoothed, noise)
+    is_touched = touched_blocks(smoothed, noise)
     total_changes = np.ptp(smoothed, axis=0)
     is_slow_touch = unit_is_pC and bool((total_changes > max_slow_change_pC).any())
-    if press is None and not is_slow_touch:
+    if not (is_touched.any() or is_slow_touch):
         return None
     column = int(np.argmax(total_changes))
-    begin_block = 1 if press is None else press.begin + 1  # smoothing has removed the first block
+    begin_block = int(np.argmax(is_touched)) + 1  # smoothing has removed the first block
     return TouchFound(column, float(total_changes[column]), BLOCK_S * begin_block)
 
 
@@ -233,12 +215,13 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     levels = block_medians(values, times_s)  # shape (blocks, channels)
     if not np.isfinite(levels).all():
         return None
-    press = find_press(levels, channel_noise(values))
-    if press is None:
+    is_touched = touched_blocks(levels, channel_noise(values))
+    if not is_touched.any():
         return None
 
-    begin_block = press.begin
-    end_block = len(levels) if press.end is None else press.end - 1  # the force may have begun to fall before
+    begin_block = int(np.argmax(is_touched))
+    held_blocks = int(np.argmin([*is_touched[begin_block:], False]))
+    end_block = begin_block + held_blocks - 1  # the force may have begun to fall in the block before
     settled_block = begin_block + CHANGE_BLOCKS  # the force is constant from here on
     rest_blocks = begin_block - 1  # the force may have begun to rise in the block before
     has_rest = rest_blocks >= 2 * CHANGE_BLOCKS
