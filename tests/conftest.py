@@ -14,8 +14,8 @@ from typing import NamedTuple
 import pytest
 from hypothesis import settings
 
+from extras import PACKAGES
 from isocharge.cli.main import main
-from isocharge.common.extras import PACKAGES
 from whole_films import whole_film_map_solved_once
 
 ROOT = Path(__file__).parents[1]
@@ -94,7 +94,7 @@ def whole_films_are_solved_once():
 
 
 @pytest.fixture
-def command(monkeypatch, capsys):
+def command(monkeypatch, capfd):
     """Function that runs `isocharge ...` in this process and returns (exit code, stdout, stderr)."""
     monkeypatch.setenv("COLUMNS", "100")  # the width of the terminal decides how tables are printed
 
@@ -102,7 +102,7 @@ def command(monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["isocharge", *map(str, words)])
         with pytest.raises(SystemExit) as done:
             main()
-        out, err = capsys.readouterr()
+        out, err = capfd.readouterr()
         return int(done.value.code or 0), out, err
 
     return run
@@ -168,11 +168,9 @@ def installed(tmp_path_factory):
     (folder / "sitecustomize.py").write_text(ABSENT)
 
     def environment(*extras):
-        needs = {"train": ["simulate"], "grpc": ["http"], "cluster": ["simulate"], "all": [*PACKAGES]}
-        chosen = {*extras, *(other for extra in extras for other in needs.get(extra, ()))}
-        present = {package for extra in chosen & {*PACKAGES} for package in PACKAGES[extra]}
-        absent = {package for packages in PACKAGES.values() for package in packages} - present
-        absent -= {"google"}  # protobuf comes with onnxruntime
+        chosen = [*PACKAGES] if "all" in extras else extras
+        present = set().union(*(PACKAGES[extra] for extra in chosen))
+        absent = set().union(*PACKAGES.values()) - present
         path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"  # this environment's `isocharge` first
         search = f"{folder}:{os.environ.get('PYTHONPATH', '')}"
         return os.environ | {

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from cli.test_help import COMMANDS
-from isocharge.common.extras import PACKAGES
+from extras import PACKAGES
 
 BASE_COMMANDS = {
     "serve predict",
@@ -90,9 +90,8 @@ The processes are forked after the large packages are imported, because this tak
 """
 
 
-ABSENT_PACKAGES = {extra: packages - {"google"} for extra, packages in PACKAGES.items()}
-"""Packages that are absent without an extra; "every extra" for the base install. protobuf comes with onnxruntime."""
-ABSENT_PACKAGES["every extra"] = frozenset().union(*ABSENT_PACKAGES.values())
+ABSENT_PACKAGES = PACKAGES | {"every extra": set().union(*PACKAGES.values())}
+"""Packages that are absent without an extra; "every extra" for the base install."""
 
 
 def extra_of(command):

@@ -30,7 +30,7 @@ from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
-from msgspec import Meta, Struct, inspect
+from msgspec import Meta, Struct
 
 from isocharge.common.errors import InputError, cut, shown
 from isocharge.common.files import read_needed
@@ -247,8 +247,7 @@ def _describe_mistake(content: object, target_type: Any, error: msgspec.Validati
     if cause is not None:
         return f"{_prefix(path)}{cause}"
     if wrong_key is None:
-        is_literal = get_origin(members[0]) is Literal  # msgspec does not keep the declared order of the words
-        expected = _one_of(get_args(members[0])) if is_literal else _describe_type(inspect.type_info(expected_type))
+        expected = _describe_schema(msgspec.json.schema(expected_type))
         return f"{_prefix(path)}expected {expected}, got {shown(value)}"
     kind, name = wrong_key.groups()
     if kind == "contains unknown":
@@ -339,87 +338,67 @@ def _join(path: str, key: str) -> str:
     return cut(f"{path}.{key}" if path else str(key))
 
 
-def _describe_type(value_type: inspect.Type) -> str:
-    """Describe the values that a type allows for error messages, for example as "a list of 2 numbers".
-
-    If the annotation of the type contains a description, this description is returned. Types for which the function has
-    no `case`, such as tables, are described by their noun.
+def _describe_schema(schema: Mapping[str, Any]) -> str:
+    """Describe the values that a schema allows for error messages, for example as "a list of 2 numbers".
 
     Args:
-        value_type: The type, as `msgspec.inspect.type_info` returns it.
+        schema: JSON schema that msgspec has derived from a type. If the annotation of the type contains a description,
+            the schema contains it, and it is returned.
     """
-    match value_type:
-        case inspect.Metadata(type=annotated_type, extra_json_schema=annotation):
-            description_in_annotation = (annotation or {}).get("description")
-            return description_in_annotation or _describe_type(annotated_type)
-        case inspect.FloatType(gt=exclusive_minimum, ge=minimum, le=maximum):
-            return _describe_number("number", exclusive_minimum, minimum, maximum)
-        case inspect.IntType(gt=exclusive_minimum, ge=minimum, le=maximum):
-            return _describe_number("whole number", exclusive_minimum, minimum, maximum)
-        case inspect.BoolType():
-            return "true or false"
-        case inspect.StrType(max_length=int(max_length)):
-            return f"a text of 1 to {max_length} characters"
-        case inspect.LiteralType(values=values):
-            return _one_of(values)
-        case inspect.EnumType(cls=cls):
-            return _one_of(member.value for member in cls)
-        case inspect.UnionType(types=members):
-            descriptions = [_describe_type(member) for member in members if not isinstance(member, inspect.NoneType)]
-            return " or ".join(dict.fromkeys(descriptions))  # `fromkeys` removes repeated descriptions
-        case inspect.TupleType(item_types=item_types):
-            return f"a list of {len(item_types)} {_noun(item_types[0])}s"  # all items have the same type
-        case inspect.CollectionType(item_type=item_type, min_length=min_length):
-            list_description = f"a list of {_noun(item_type)}s"
-            return f"{list_description}, {min_length} or more" if min_length else list_description
-    return f"a {_noun(value_type)}"
+    if "description" in schema:
+        return str(schema["description"])
+    if "enum" in schema:
+        return f"one of {', '.join(map(str, schema['enum']))}"
+    if "anyOf" in schema and "discriminator" not in schema:  # with a discriminator, all members are tables
+        descriptions = [_describe_schema(member) for member in schema["anyOf"] if member.get("type") != "null"]
+        return " or ".join(dict.fromkeys(descriptions))  # `fromkeys` removes repeated descriptions
+
+    noun = _noun(schema)
+    minimum_length = schema.get("minItems", 0)
+    if "prefixItems" in schema:  # all items have the same type
+        return f"a list of {minimum_length} {_noun(schema['prefixItems'][0])}s"
+    if "items" in schema:
+        list_description = f"a list of {_noun(schema['items'])}s"
+        return f"{list_description}, {minimum_length} or more" if minimum_length else list_description
+    if "maxLength" in schema:
+        return f"a text of 1 to {schema['maxLength']} characters"
+    if noun in ("number", "whole number"):
+        return _describe_number(noun, schema)
+    return "true or false" if noun == "truth value" else f"a {noun}"
 
 
-_NOUNS: tuple[tuple[Any, str], ...] = (
-    (inspect.StrType, "text"),
-    ((inspect.FloatType, inspect.IntType), "number"),
-    ((inspect.StructType, inspect.DictType), "table"),
-    ((inspect.TupleType, inspect.CollectionType), "list"),
-    (inspect.BytesType, "text in base64"),
-)
-"""Pairs of a type of msgspec, or several types, and the noun for the values of the type."""
+_NOUNS = {
+    "array": "list",
+    "boolean": "truth value",
+    "integer": "whole number",
+    "number": "number",
+    "object": "table",
+    "string": "text",
+}
+"""Noun for the values of each type of a JSON schema."""
 
 
-def _noun(value_type: inspect.Type) -> str:
-    """Return the noun for the values of a type, such as "number". For a type that is not in `_NOUNS`, it is "value".
-
-    Args:
-        value_type: The type, as `msgspec.inspect.type_info` returns it.
-    """
-    type_without_annotation = value_type.type if isinstance(value_type, inspect.Metadata) else value_type
-    for types_with_noun, noun in _NOUNS:
-        if isinstance(type_without_annotation, types_with_noun):
-            return noun
-    return "value"
+def _noun(schema: Mapping[str, Any]) -> str:
+    """Return the noun for the values that a schema allows, such as "number", or "value" if they have several types."""
+    if "contentEncoding" in schema:
+        return "text in base64"
+    is_struct = "$ref" in schema or "discriminator" in schema
+    return _NOUNS.get("object" if is_struct else schema.get("type", ""), "value")
 
 
-def _one_of(words: Iterable[object]) -> str:
-    """Return a list of the allowed words for an error message, as in "one of left, right"."""
-    return f"one of {', '.join(map(str, words))}"
-
-
-def _describe_number(noun: str, exclusive_minimum: float | None, minimum: float | None, maximum: float | None) -> str:
+def _describe_number(noun: str, schema: Mapping[str, Any]) -> str:
     """Describe numbers with bounds for an error message, for example as "a number from 0 to 1".
 
     Args:
         noun: Noun for the numbers: "number" or "whole number".
-        exclusive_minimum: Lower bound that is not allowed itself; None if there is no such bound.
-        minimum: Smallest allowed number; None if there is no such bound.
-        maximum: Largest allowed number; None if there is no such bound.
+        schema: JSON schema that contains the bounds.
     """
+    words = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to"}
     # The bounds +-`MAX_FLOAT` exclude only infinity, and are not mentioned.
-    bounds = {"above": exclusive_minimum, "from": minimum, "to": maximum}
-    mentioned = {word: bound for word, bound in bounds.items() if bound is not None and abs(bound) != MAX_FLOAT}
-    if mentioned == {"above": 0}:
+    bounds = {word: schema[key] for key, word in words.items() if abs(schema.get(key, MAX_FLOAT)) != MAX_FLOAT}
+    if bounds == {"above": 0}:
         return f"a positive {noun}"
-    if not mentioned and noun == "number":
+    if not bounds and noun == "number":
         return "a finite number"
-    texts = [
-        f"{word} {bound:g}" if isinstance(bound, float) else f"{word} {bound}" for word, bound in mentioned.items()
-    ]
+    texts = [f"{word} {bound:g}" if isinstance(bound, float) else f"{word} {bound}" for word, bound in bounds.items()]
     return " ".join([f"a {noun}", *texts])

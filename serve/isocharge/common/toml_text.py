@@ -55,7 +55,7 @@ def _pair(key: str, value: object) -> str:
 
 def _key(key: str) -> str:
     """Return a key in the notation of TOML, with quotation marks if they are necessary."""
-    return key if _BARE_KEY.fullmatch(key) else _text(key)
+    return key if _BARE_KEY.fullmatch(key) else _json(key)
 
 
 def _value(value: object) -> str:
@@ -71,18 +71,16 @@ def _value(value: object) -> str:
         return "{" + ", ".join(_pair(key, item) for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_value, value)) + "]"
-    if isinstance(value, bool):  # before the numbers, because bool is a subclass of int
-        return "true" if value else "false"
+    if isinstance(value, bool | str):  # before the numbers, because bool is a subclass of int
+        return _json(value)
     if isinstance(value, int | float):
         return repr(value)
-    if isinstance(value, str):
-        return _text(value)
     raise TypeError(f"expected a text, a number, true or false, a list or a table, got {value!r:.100}")
 
 
-def _text(text: str) -> str:
-    """Return a text as a basic string of TOML.
+def _json(value: bool | str) -> str:
+    """Return a truth value or a text in the notation of JSON, in which TOML also writes them.
 
-    A basic string of TOML is written like a string of JSON, except that the character U+007F must also be escaped.
+    The only difference is that the character U+007F must be escaped in TOML.
     """
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -109,7 +109,9 @@ def test_http_command_refuses_wrong_options_and_models(command, models, tmp_path
         ]
         for folder, words, code, message in cases:
             got, out, error = command("serve", "http", "--models", folder, *words)
-            assert (got, out, error[: len(message)]) == (code, "", message)
+            assert (got, out) == (code, "")
+            # The core of gRPC prints a line of its own if another test has imported it before.
+            assert any(line.startswith(message) for line in error.splitlines())
 
 
 def test_full_log_pipe_delays_no_request(start):

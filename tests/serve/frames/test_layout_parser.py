@@ -230,7 +230,7 @@ WRONG = [
         'cheksum = "crc-16/modbus"',
         r"cheksum'; did you mean 'checksum'\? Known are format, request",
     ),
-    ('type = "i16"', 'type = "i48"', r"fields\[0\]\.type: expected one of pad, u8.*, got 'i48'"),
+    ('type = "i16"', 'type = "i48"', r"fields\[0\]\.type: expected one of f32, f64, i16.*, got 'i48'"),
     (
         'type = "i16"',
         'type = "i16", count = 2',
@@ -246,7 +246,7 @@ WRONG = [
     ('name = "Fy", ', "", r"fields\[1\]\.name' is missing"),
     ("scale = 0.01", "scale = 0", r"fields\[0\]\.scale: expected a finite number that is not 0, got 0"),
     ("scale = 0.01", "scale = nan", r"fields\[0\]\.scale: expected a finite number, got nan"),
-    ("length = 16", 'length = 16\nbyte_order = "middle"', r"byte_order: expected one of little, big, got 'middle'"),
+    ("length = 16", 'length = 16\nbyte_order = "middle"', r"byte_order: expected one of big, little, got 'middle'"),
     (
         "length = 16",
         "length = 16\nchecksum_from = 14",

@@ -31,7 +31,7 @@ from isocharge.serve.signal_chain.touch import TouchRule
 from stage_runner import StageRunner
 
 ELECTRODES = ("A", "B", "C")
-FORMATS = ", ".join(section.__struct_config__.tag for section in get_args(Frames))
+FORMATS = ", ".join(sorted(section.__struct_config__.tag for section in get_args(Frames)))
 """Names of all frame formats, as messages list them."""
 
 FULL = """

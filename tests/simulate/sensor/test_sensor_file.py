@@ -167,7 +167,7 @@ def test_error_message_names_the_key_of_the_wrong_type(path):
         (("electrodes", "side_mm"), 0.0, "electrodes.side_mm: expected a number above 0"),
         (("calibration", "gain"), {"A": 0.0}, "calibration.gain.A: expected a positive number, got 0.0"),
         (("calibration", "gain"), {"Z": 1.0}, "calibration gain: no electrode named"),
-        (("surface",), "inside", r"surface: expected one of middle, top, bottom, got 'inside'"),
+        (("surface",), "inside", r"surface: expected one of bottom, middle, top, got 'inside'"),
         (("name",), "", "name: expected a text"),
         (
             ("electrodes", "A"),

@@ -27,10 +27,10 @@ from isocharge.cli.shared.terminal import (
     on_signal,
     say,
     stdout_is_ready,
-    stdout_writer,
     stop_timer,
     unless_hung_up,
     until_stopped,
+    write_stdout,
 )
 from isocharge.common.errors import InputError, shown
 from isocharge.common.printable_text import is_printable
@@ -108,7 +108,7 @@ def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_liv
         with_tracking=touch.has_tracking,
         with_film=touch.has_film,
         is_live=is_live,
-        write_stdout=stdout_writer(),
+        write_stdout=write_stdout,
         stdout_is_ready=stdout_is_ready,
     )
     return Outputs(targets or DEFAULT_TARGETS, context)

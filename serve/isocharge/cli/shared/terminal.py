@@ -6,7 +6,6 @@ a standard stream is closed, full or slow, the command does not fail, and text f
 another file.
 """
 
-import io
 import json
 import logging
 import os
@@ -137,17 +136,9 @@ def announce(line: str) -> None:
         discard_output(STDOUT_FILENO)
 
 
-def stdout_writer() -> Callable[[str], None]:
-    """Return a function that writes a text to stdout at once.
-
-    The function does not use Python's buffer, in which a thread may hang at exit. If stdout has no file descriptor, the
-    function uses the buffer and flushes it.
-    """
-    try:
-        descriptor = sys.stdout.fileno()
-    except (OSError, io.UnsupportedOperation):
-        return _write_buffered
-    return lambda text: _write_all(descriptor, text.encode())
+def write_stdout(text: str) -> None:
+    """Write a text to stdout at once, without Python's buffer, in which a thread may hang at exit."""
+    _write_all(STDOUT_FILENO, text.encode())
 
 
 def write_stderr(line: str) -> None:
@@ -163,17 +154,8 @@ def stdout_is_ready() -> bool:
 
     A pipe that is ready has room for `PIPE_BUF` bytes, which is more than the length of a record.
     """
-    try:
-        _readable, writable, _exceptional = select.select([], [sys.stdout.fileno()], [], 0.1)
-        return bool(writable)
-    except (OSError, ValueError, io.UnsupportedOperation):
-        return True  # the error is raised again when the line is written
-
-
-def _write_buffered(text: str) -> None:
-    """Write a text to stdout through the buffer of Python, and flush the buffer."""
-    sys.stdout.write(text)
-    sys.stdout.flush()
+    _readable, writable, _exceptional = select.select([], [STDOUT_FILENO], [], 0.1)
+    return bool(writable)
 
 
 def _write_all(descriptor: int, data: bytes) -> None:
@@ -192,17 +174,12 @@ def until_stopped() -> Iterator[None]:
 
     Three events stop the block: Ctrl-C, the signal SIGTERM, and a reader of stdout that closes its end of the pipe.
     """
-    # Without a handler, SIGTERM would end the process at once. This handler raises KeyboardInterrupt, as Ctrl-C does,
-    # so that the block can close its files and ports.
-    previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
-    except KeyboardInterrupt:  # Ctrl-C or SIGTERM
+    except KeyboardInterrupt:  # Ctrl-C, or SIGTERM, whose handler in `isocharge.cli.main` raises the same exception
         pass
     except BrokenPipeError:  # no program reads stdout any more
         discard_output(STDOUT_FILENO)
-    finally:
-        signal.signal(signal.SIGTERM, previous_handler)
 
 
 @contextmanager

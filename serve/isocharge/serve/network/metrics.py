@@ -13,6 +13,7 @@ import logging
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -50,44 +51,55 @@ class ModelMetrics:
         versions = Info("isocharge", "Versions of the server.", registry=registry)
         versions.info({"version": package_version(), "onnxruntime": ort.__version__})
         settings: dict[str, Any] = {"labelnames": VERSION_LABELS, "registry": registry}
-        self.descriptions = Info("isocharge_model", "Versions of the models.", **settings)
-        self.ready = Gauge("isocharge_model_ready", "Whether a version is loaded.", **settings)
-        self.presses = Counter("isocharge_presses", "Presses that were answered.", **settings)
-        self.alarms = Counter(
-            "isocharge_misfit_alarms", "Presses whose misfit is above the limit of the model.", **settings
-        )
-        self.refused = Counter(
-            "isocharge_inferences_refused", "Requests for an inference that were refused.", **settings
-        )
-        self.latency = Histogram(
-            "isocharge_inference_seconds",
-            "Time to read, compute and write an inference, without the network.",
-            buckets=LATENCY_BOUNDS_S,
-            **settings,
-        )
-        self.refused_time = Counter("isocharge_refused_seconds", "Time of refused requests.", **settings)
-        self.latest = Gauge("isocharge_inference_latest_seconds", "Unix time of the latest inference.", **settings)
+        # Each name is a field of `Statistics`.
+        self._metrics: dict[str, Any] = {
+            "description": Info("isocharge_model", "Versions of the models.", **settings),
+            "ready": Gauge("isocharge_model_ready", "Whether a version is loaded.", **settings),
+            "presses": Counter("isocharge_presses", "Presses that were answered.", **settings),
+            "alarms": Counter(
+                "isocharge_misfit_alarms", "Presses whose misfit is above the limit of the model.", **settings
+            ),
+            "refused": Counter(
+                "isocharge_inferences_refused", "Requests for an inference that were refused.", **settings
+            ),
+            "latency": Histogram(
+                "isocharge_inference_seconds",
+                "Time to read, compute and write an inference, without the network.",
+                buckets=LATENCY_BOUNDS_S,
+                **settings,
+            ),
+            "refused_time": Counter("isocharge_refused_seconds", "Time of refused requests.", **settings),
+            "latest": Gauge("isocharge_inference_latest_seconds", "Unix time of the latest inference.", **settings),
+        }
+
+    def of(self, name: str, version: int) -> "Statistics":
+        """Return the metrics of a version. Their values continue if the version has been loaded before."""
+        return Statistics(**{field: metric.labels(name, version) for field, metric in self._metrics.items()})
 
 
+@dataclass(frozen=True)
 class Statistics:
     """Metrics of one version of a model since the start of the server. Any thread may call any method.
 
     Attributes:
         description: Sensor and checksum of the version.
         ready: 1 if the version is loaded, otherwise 0.
+        presses: Number of presses that were answered.
+        alarms: Number of presses whose misfit is above the limit.
+        refused: Number of requests for an inference that were refused.
+        latency: Durations of the requests that were answered, s.
+        refused_time: Total duration of the refused requests, s.
+        latest: Unix time of the latest inference, s.
     """
 
-    def __init__(self, metrics: ModelMetrics, name: str, version: int) -> None:
-        """Create the values of a version in the metrics of the server."""
-        labels = (name, str(version))
-        self.description = metrics.descriptions.labels(*labels)
-        self.ready = metrics.ready.labels(*labels)
-        self._presses = metrics.presses.labels(*labels)
-        self._alarms = metrics.alarms.labels(*labels)
-        self._refused = metrics.refused.labels(*labels)
-        self._latency = metrics.latency.labels(*labels)
-        self._refused_time = metrics.refused_time.labels(*labels)
-        self._latest = metrics.latest.labels(*labels)
+    description: Info
+    ready: Gauge
+    presses: Counter
+    alarms: Counter
+    refused: Counter
+    latency: Histogram
+    refused_time: Counter
+    latest: Gauge
 
     def count_answered(self, presses: int, duration_ns: int, alarms: int = 0) -> None:
         """Count a request that was answered.
@@ -97,10 +109,10 @@ class Statistics:
             duration_ns: Time to read the request, to run the model and to write the response, ns.
             alarms: Number of presses whose misfit is above the limit.
         """
-        self._presses.inc(presses)
-        self._alarms.inc(alarms)
-        self._latency.observe(duration_ns / 1e9)
-        self._latest.set(time.time())
+        self.presses.inc(presses)
+        self.alarms.inc(alarms)
+        self.latency.observe(duration_ns / 1e9)
+        self.latest.set(time.time())
 
     def count_refused(self, ns: int) -> None:
         """Count a request that was refused.
@@ -108,18 +120,18 @@ class Statistics:
         Args:
             ns: Time from the complete request to the refusal, ns.
         """
-        self._refused.inc()
-        self._refused_time.inc(ns / 1e9)
+        self.refused.inc()
+        self.refused_time.inc(ns / 1e9)
 
     def to_json(self) -> dict[str, Any]:
         """Return the counters as a JSON object with the names that Triton uses in its statistics."""
-        answered = int(_value(self._latency, "_count"))
-        answered_ns = round(1e9 * _value(self._latency, "_sum"))
-        refused = int(_value(self._refused, "_total"))
-        refused_ns = round(1e9 * _value(self._refused_time, "_total"))
+        answered = int(_value(self.latency, "_count"))
+        answered_ns = round(1e9 * _value(self.latency, "_sum"))
+        refused = int(_value(self.refused, "_total"))
+        refused_ns = round(1e9 * _value(self.refused_time, "_total"))
         return {
-            "last_inference": round(1e3 * _value(self._latest, "")),
-            "inference_count": int(_value(self._presses, "_total")),
+            "last_inference": round(1e3 * _value(self.latest, "")),
+            "inference_count": int(_value(self.presses, "_total")),
             "execution_count": answered,
             "inference_stats": {
                 "success": {"count": answered, "ns": answered_ns},

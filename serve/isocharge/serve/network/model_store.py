@@ -12,10 +12,9 @@ are refused, the old version remains available.
 import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TypeVar
 
 from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.model.metadata import ModelMetadata
@@ -25,12 +24,6 @@ from isocharge.serve.model.validity import Validity
 from isocharge.serve.network.metrics import ModelMetrics, Statistics
 
 log = logging.getLogger(__name__)
-
-T = TypeVar("T")
-
-
-VersionKey = tuple[str, int]
-"""Name of a model and number of a version."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +54,19 @@ class LoadedVersion:
         return Validity.of(self.metadata)
 
 
+@dataclass(frozen=True)
+class ModelVersions:
+    """Versions of one model by their numbers, in ascending order.
+
+    Attributes:
+        loaded: Versions that are available for requests.
+        refused: Reasons why versions were refused or unloaded. New files of a loaded version may be refused.
+    """
+
+    loaded: Mapping[int, LoadedVersion] = field(default_factory=dict)
+    refused: Mapping[int, str] = field(default_factory=dict)
+
+
 class ModelStore:
     """Loaded models by name and version.
 
@@ -83,10 +89,8 @@ class ModelStore:
         self._folders = folders
         self._change_lock = threading.Lock()
         self.metrics = ModelMetrics()
-        self._statistics: dict[VersionKey, Statistics] = {}
-        # The following dictionaries are replaced as a whole, so that no thread reads half of a change.
-        self._loaded: dict[VersionKey, LoadedVersion] = {}  # in ascending order of names and numbers
-        self._refused: dict[VersionKey, str] = {}  # reasons why versions were refused or unloaded
+        # The dictionary is sorted by name, and is replaced as a whole, so that no thread reads half of a change.
+        self._models: dict[str, ModelVersions] = {}
         for name, folder in folders().items():
             self._load_versions(name, folder)
         if not self.loaded_versions():
@@ -108,7 +112,7 @@ class ModelStore:
             return versions[-1]
         label = f"{name}/{version}" if version else name
         available = ", ".join(loaded.metadata.label for loaded in self.loaded_versions()) or "no model"
-        reasons = [reason for key, reason in self._refused.items() if key[0] == name and version in ("", str(key[1]))]
+        reasons = [reason for number, reason in self._model(name).refused.items() if version in ("", str(number))]
         raise ModelNotFound(
             "; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *dict.fromkeys(reasons)])
         )
@@ -120,7 +124,7 @@ class ModelStore:
 
     def loaded_versions(self) -> list[LoadedVersion]:
         """Return all loaded versions of all models, sorted by name and version."""
-        return list(self._loaded.values())
+        return [loaded for model in self._models.values() for loaded in model.loaded.values()]
 
     def versions_of(self, name: str, version: str = "") -> list[LoadedVersion]:
         """Return the loaded versions of one model, in ascending order of their numbers.
@@ -129,11 +133,11 @@ class ModelStore:
             name: Name of the model.
             version: Number of the only version that is returned, as a text. An empty text selects all versions.
         """
-        return [loaded for key, loaded in _of_model(name, self._loaded).items() if version in ("", str(key[1]))]
+        return [loaded for number, loaded in self._model(name).loaded.items() if version in ("", str(number))]
 
     def refusals(self) -> list[str]:
         """Return the reasons why versions were refused or unloaded, sorted by name and version."""
-        return [reason for _, reason in sorted(self._refused.items())]
+        return [reason for model in self._models.values() for reason in model.refused.values()]
 
     def index(self) -> list[dict[str, str]]:
         """Return one row for every version that is loaded, was refused or was unloaded, and for every other model.
@@ -141,16 +145,17 @@ class ModelStore:
         A row contains the name of the model, and the number and the state of the version. If the version was refused or
         unloaded, the row also contains the reason. The number is empty if no version of a model was found.
         """
-        keys = self._loaded.keys() | self._refused.keys()  # new files of a loaded version may be refused
-        keys |= {(name, 0) for name in self._folders().keys() - {name for name, _ in keys}}
+        names = self._folders().keys() | self._models.keys()
+        models = {name: self._model(name) for name in sorted(names)}
         return [
             {
                 "name": name,
-                "version": str(version or ""),
-                "state": "READY" if (name, version) in self._loaded else "UNAVAILABLE",
-                "reason": self._refused.get((name, version), ""),
+                "version": str(number or ""),
+                "state": "READY" if number in model.loaded else "UNAVAILABLE",
+                "reason": model.refused.get(number, ""),
             }
-            for name, version in sorted(keys)
+            for name, model in models.items()
+            for number in sorted(model.loaded.keys() | model.refused.keys()) or [0]
         ]
 
     def load(self, name: str) -> None:
@@ -189,9 +194,13 @@ class ModelStore:
         """
         with self._change_lock:
             self.get(name)  # raises ModelNotFound
-            self._replace(name, {}, dict.fromkeys(_of_model(name, self._loaded), "unloaded"))
+            self._replace(name, {}, dict.fromkeys(self._model(name).loaded, "unloaded"))
 
-    def _load_versions(self, name: str, folder: Path) -> Mapping[VersionKey, str]:
+    def _model(self, name: str) -> ModelVersions:
+        """Return the versions of a model, which are none if the model is unknown."""
+        return self._models.get(name, ModelVersions())
+
+    def _load_versions(self, name: str, folder: Path) -> Mapping[int, str]:
         """Load every version in the folder of a model, and replace the versions that were loaded before.
 
         If a version is refused, or if no version is found, every earlier version that was not replaced remains loaded.
@@ -201,36 +210,47 @@ class ModelStore:
             folder: Folder of the model.
 
         Returns:
-            Reasons why versions were refused.
+            Reasons why versions were refused, by the numbers of the versions.
         """
-        loaded: dict[VersionKey, LoadedVersion] = {}
-        refused: dict[VersionKey, str] = {}
-        for version, version_folder in version_folders(folder).items():
-            key = (name, version)
-            # The counters continue when files are loaded again, because a Prometheus counter must never decrease.
-            if key not in self._statistics:
-                self._statistics[key] = Statistics(self.metrics, name, version)
+        loaded: dict[int, LoadedVersion] = {}
+        refused: dict[int, str] = {}
+        for number, version_folder in version_folders(folder).items():
             try:
-                loaded[key] = _load_version(name, version, version_folder, self._statistics[key])
+                loaded[number] = self._load_version(name, number, version_folder)
             except Exception as error:  # any error in one folder must not affect the other models
-                refused[key] = _refusal_reason(version_folder, error)
+                refused[number] = _refusal_reason(version_folder, error)
         if refused or not loaded:  # keep the versions that were loaded before, unless new files replace them
-            loaded = _of_model(name, self._loaded) | loaded
+            loaded = {**self._model(name).loaded, **loaded}
         self._replace(name, loaded, refused)
         return refused
 
-    def _replace(self, name: str, loaded: dict[VersionKey, LoadedVersion], refused: dict[VersionKey, str]) -> None:
+    def _load_version(self, name: str, number: int, folder: Path) -> LoadedVersion:
+        """Load one version of a model, check its files, and return the version.
+
+        Args:
+            name: Name of the model, which is the name of the parent folder.
+            number: Number of the version, which is the name of the folder.
+            folder: Folder of the version.
+
+        Raises:
+            ModelError: If a check fails, or if the metadata contain another name than the folder.
+        """
+        model = load_checked_model(folder)
+        if model.metadata.name != name:
+            raise ModelError(
+                f"{folder}: expected the model {name}/{number}, as the folders say, got {model.metadata.label}; "
+                "move it into folders of that name and version"
+            )
+        statistics = self.metrics.of(name, number)
+        statistics.description.info({"sensor": model.metadata.frame_id, "sha256": model.golden.sha256})
+        return LoadedVersion(model, statistics)
+
+    def _replace(self, name: str, loaded: Mapping[int, LoadedVersion], refused: Mapping[int, str]) -> None:
         """Replace the versions of a model, and the reasons why versions were refused or unloaded."""
-        others = {key: version for key, version in self._loaded.items() if key[0] != name}
-        self._loaded = dict(sorted((others | loaded).items()))
-        self._refused = {key: reason for key, reason in self._refused.items() if key[0] != name} | refused
-        for key, statistics in _of_model(name, self._statistics).items():
-            statistics.ready.set(key in loaded)
-
-
-def _of_model(name: str, values: Mapping[VersionKey, T]) -> dict[VersionKey, T]:
-    """Return only the values of one model."""
-    return {key: value for key, value in values.items() if key[0] == name}
+        for number in {*self._model(name).loaded, *loaded, *refused}:
+            self.metrics.of(name, number).ready.set(number in loaded)
+        versions = ModelVersions(dict(sorted(loaded.items())), refused)
+        self._models = dict(sorted({**self._models, name: versions}.items()))
 
 
 def open_model_store(models: Path | None = None) -> ModelStore:
@@ -274,25 +294,3 @@ def _refusal_reason(folder: Path, error: Exception) -> str:
         return str(error)
     log.error("%s: the model cannot be checked", folder, exc_info=error)
     return f"{folder}: cannot be checked ({type(error).__name__}); copy or export the model again"
-
-
-def _load_version(name: str, version: int, folder: Path, statistics: Statistics) -> LoadedVersion:
-    """Load one version of a model, check its files, and return the version.
-
-    Args:
-        name: Name of the model, which is the name of the parent folder.
-        version: Number of the version, which is the name of the folder.
-        folder: Folder of the version.
-        statistics: Counters of the requests to this version, which may have begun before.
-
-    Raises:
-        ModelError: If a check fails, or if the metadata contain another name than the folder.
-    """
-    model = load_checked_model(folder)
-    if model.metadata.name != name:
-        raise ModelError(
-            f"{folder}: expected the model {name}/{version}, as the folders say, got {model.metadata.label}; "
-            "move it into folders of that name and version"
-        )
-    statistics.description.info({"sensor": model.metadata.frame_id, "sha256": model.golden.sha256})
-    return LoadedVersion(model, statistics)

@@ -183,7 +183,7 @@ BAD = {
     "other output": (
         orjson.dumps(request(PRESS, outputs=[{"name": "z"}])),
         400,
-        "one of contact, contact_std, contact_correl",
+        "one of contact, contact_correlation, contact_std",
     ),
     "output twice": (orjson.dumps(request(PRESS, outputs=[{"name": "misfit"}] * 2)), 400, "each name once"),
     "memory": (changed(parameters={"shared_memory_region": "r"}), 400, "does not support it, got 'r'"),

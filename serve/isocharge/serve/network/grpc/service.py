@@ -9,7 +9,7 @@ service ends the call that has waited longest for a message from its client.
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -17,21 +17,22 @@ from typing import Any
 
 import grpc
 import grpc.aio
-from google.protobuf.json_format import ParseDict
-from google.protobuf.message import DecodeError, Message
+from google.protobuf.json_format import MessageToJson, ParseDict
+from google.protobuf.message import DecodeError
 
-from isocharge.common.errors import RequestError, TooMany
+from isocharge.common.errors import ModelError, RequestError, TooMany
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE, read_request, write_response
 from isocharge.serve.network.metrics import Exchange
-from isocharge.serve.network.protocol import Handler, describe
+from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.inference import answer_inference
 from isocharge.serve.network.protocol.response import client_message, statuses
+from isocharge.serve.network.protocol.routes import ROUTES, Request
 
-METHODS_WITHOUT_TOKEN = ("ServerLive", "ServerReady")
-"""Names of the methods that clients may call without a token."""
+ROUTE_OF_METHOD = {name: route for route in ROUTES for name in route.rpcs}
+"""Route of the HTTP server that gives the same answer, by the name of the gRPC method."""
 
-SLOW_METHODS = ("RepositoryModelLoad", "RepositoryModelUnload")
-"""Names of the methods that may take a long time. They are therefore answered in other threads."""
+CONTENT_FIELDS = {"ModelConfig": "config", "RepositoryIndex": "models"}
+"""Field of the response that contains the answer, by the name of the method. Other responses are the answer itself."""
 
 STREAM = "ModelStreamInfer"
 """Name of the method that receives and sends several messages in one call."""
@@ -70,31 +71,6 @@ class Service:
         # dictionary has no values and serves as an ordered set.
         self._waiting: dict[asyncio.Timeout, None] = {}
         self._traffic.open.labels("grpc").set_function(lambda: self._open_count)
-        self._answer_functions = self._create_answer_functions()
-
-    def _create_answer_functions(self) -> dict[str, Callable[[Any], Any]]:
-        """Return the function that answers each method, by the name of the method.
-
-        Each function receives the message of a request. Each function returns the message of the response, the content
-        of this message as a JSON object, or None if the response is empty.
-        """
-        store = self._store
-        return {
-            "ServerLive": lambda _: {"live": True},
-            "ServerReady": lambda _: {"ready": bool(store.loaded_versions())},
-            "ModelReady": lambda request: {"ready": store.label(request.name, request.version) is not None},
-            "ServerMetadata": lambda _: describe.server_metadata(),
-            "ModelMetadata": lambda request: describe.model_metadata(store.get(request.name, request.version), store),
-            "ModelConfig": lambda request: {
-                "config": describe.model_config(store.get(request.name, request.version), self._limits)
-            },
-            "ModelStatistics": lambda request: describe.statistics_of(store, request.name, request.version),
-            "RepositoryIndex": lambda request: {"models": describe.repository_index(store, ready=request.ready)},
-            "RepositoryModelLoad": self._load,
-            "RepositoryModelUnload": lambda request: store.unload(request.model_name),
-            "ModelInfer": self._infer,
-            STREAM: self._infer_in_stream,
-        }
 
     def handlers(self) -> grpc.GenericRpcHandler:
         """Return the handlers of all methods in the form that grpcio requires."""
@@ -158,11 +134,12 @@ class Service:
             IsochargeError: If the call is refused.
         """
         with self._count_open_call():
-            if name not in METHODS_WITHOUT_TOKEN:
+            route = ROUTE_OF_METHOD[name]
+            if route.needs_token:
                 self._access.check_token(_authorization(context))
             timeout_s = self._limits.header_seconds
             while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
-                if name in SLOW_METHODS:
+                if route.may_block:
                     response = await asyncio.to_thread(self._respond, name, data, call)
                 else:
                     response = self._respond(name, data, call)
@@ -199,25 +176,38 @@ class Service:
         model_version = getattr(request, "model_version", "") or getattr(request, "version", "")
         call.model = self._store.label(model_name, model_version)
 
-        # The response is a message, a JSON object with the content of the message, or None if the message is empty.
-        response = self._answer_functions[name](request)
-        if not isinstance(response, Message):
-            response = ParseDict(response or {}, response_type())
+        if name == STREAM:
+            response = self._infer_in_stream(request)
+        elif name == "ModelInfer":
+            response = self._infer(request)
+        else:
+            # The body of the equivalent HTTP request has the same fields as the message.
+            body = MessageToJson(request, preserving_proto_field_name=True).encode()
+            answer = self._answer_route(
+                name, Request(self._store, self._limits, self._traffic, {}, body, model_name, model_version)
+            )
+            response = ParseDict(answer, response_type())
         response_data: bytes = response.SerializeToString()
         call.bytes_out += len(response_data)
         return response_data
 
-    def _load(self, request: Any) -> None:
-        """Read the files of the requested model again. The response is empty.
+    def _answer_route(self, name: str, request: Request) -> dict[str, Any]:
+        """Return the content of the response to a request that is answered like a request to the HTTP server.
+
+        Args:
+            name: Name of the gRPC method.
+            request: The equivalent HTTP request.
 
         Raises:
-            RequestError: If the request has parameters.
-            ModelNotFound: If the repository does not contain the model.
-            ModelError: If a version of the model is refused.
+            IsochargeError: If the request is refused.
         """
-        if request.parameters:
-            raise RequestError(describe.NO_LOAD_PARAMETERS)
-        self._store.load(request.model_name)
+        try:
+            answer = ROUTE_OF_METHOD[name].respond(request)
+        except ModelError:
+            if name not in ("ServerReady", "ModelReady"):
+                raise
+            return {"ready": False}  # gRPC has no status for this answer
+        return {CONTENT_FIELDS[name]: answer} if name in CONTENT_FIELDS else answer
 
     def _infer(self, request: Any) -> Any:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""

@@ -1,6 +1,6 @@
-"""Routes of the HTTP server. Each route is an element of `ROUTES`.
+"""Routes of the servers. Each route is an element of `ROUTES`.
 
-The server uses `ROUTES` to find the function for a request. The file `openapi.json` describes the same routes.
+The servers use `ROUTES` to find the function for a request. The file `openapi.json` describes the same routes.
 """
 
 from collections.abc import Callable, Mapping
@@ -52,12 +52,13 @@ class Request(NamedTuple):
 
 
 class Route(NamedTuple):
-    """Route of the HTTP server, which combines a method, several paths and a function that answers requests.
+    """Route of the servers, which combines a method, several paths and a function that answers requests.
 
     Attributes:
         method: HTTP method. A route with the method GET also answers HEAD requests, without a body.
         paths: Templates of the paths. Requests are logged and counted under the first template.
         respond: Function that answers a request by a response, or by the content of a JSON response.
+        rpcs: Names of the gRPC methods that give the same answer.
         needs_token: Whether requests must contain the token of the server. Health checks need no token, because the
             programs that start and monitor servers do not have it.
         may_block: Whether an answer may take a long time. The server then computes the answer in another thread.
@@ -66,6 +67,7 @@ class Route(NamedTuple):
     method: str
     paths: tuple[str, ...]
     respond: Callable[[Request], Any]
+    rpcs: tuple[str, ...] = ()
     needs_token: bool = True
     may_block: bool = False
 
@@ -139,21 +141,32 @@ def _model_paths(ending: str = "") -> tuple[str, str]:
 
 ROUTES = (
     Route("GET", ("/openapi.json",), lambda request: openapi_document(request.store)),
-    Route("GET", ("/v2/health/live",), lambda _: {"live": True}, needs_token=False),
-    Route("GET", ("/v2/health/ready",), _is_ready, needs_token=False),
+    Route("GET", ("/v2/health/live",), lambda _: {"live": True}, ("ServerLive",), needs_token=False),
+    Route("GET", ("/v2/health/ready",), _is_ready, ("ServerReady",), needs_token=False),
     Route("GET", ("/metrics",), _show_metrics),
-    Route("GET", ("/v2",), lambda _: describe.server_metadata()),
+    Route("GET", ("/v2",), lambda _: describe.server_metadata(), ("ServerMetadata",)),
     Route(
         "GET",
         ("/v2/models/stats", *_model_paths("/stats")),
         lambda request: describe.statistics_of(request.store, request.model, request.version),
+        ("ModelStatistics",),
     ),
-    Route("POST", ("/v2/repository/index",), _show_index),
-    Route("POST", ("/v2/repository/models/{model}/load",), _load, may_block=True),
-    Route("POST", ("/v2/repository/models/{model}/unload",), _unload, may_block=True),
-    Route("GET", _model_paths(), lambda request: describe.model_metadata(request.loaded, request.store)),
-    Route("GET", _model_paths("/ready"), lambda request: {"ready": bool(request.loaded)}),
-    Route("GET", _model_paths("/config"), lambda request: describe.model_config(request.loaded, request.limits)),
-    Route("POST", _model_paths("/infer"), _infer),
+    Route("POST", ("/v2/repository/index",), _show_index, ("RepositoryIndex",)),
+    Route("POST", ("/v2/repository/models/{model}/load",), _load, ("RepositoryModelLoad",), may_block=True),
+    Route("POST", ("/v2/repository/models/{model}/unload",), _unload, ("RepositoryModelUnload",), may_block=True),
+    Route(
+        "GET",
+        _model_paths(),
+        lambda request: describe.model_metadata(request.loaded, request.store),
+        ("ModelMetadata",),
+    ),
+    Route("GET", _model_paths("/ready"), lambda request: {"ready": bool(request.loaded)}, ("ModelReady",)),
+    Route(
+        "GET",
+        _model_paths("/config"),
+        lambda request: describe.model_config(request.loaded, request.limits),
+        ("ModelConfig",),
+    ),
+    Route("POST", _model_paths("/infer"), _infer, ("ModelInfer", "ModelStreamInfer")),
 )
 """All routes of the HTTP server. If several templates match a path, the first of them is used."""
