@@ -169,7 +169,7 @@ def installed(tmp_path_factory):
 
     def environment(*extras):
         chosen = [*PACKAGES] if "all" in extras else extras
-        present = set().union(*(PACKAGES[extra] for extra in chosen))
+        present = set().union(*(PACKAGES.get(extra, set()) for extra in chosen))
         absent = set().union(*PACKAGES.values()) - present
         path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"  # this environment's `isocharge` first
         search = f"{folder}:{os.environ.get('PYTHONPATH', '')}"
