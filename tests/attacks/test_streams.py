@@ -3,14 +3,13 @@
 import json
 import math
 import struct
+from functools import partial
 
 import pytest
-from cobs import cobs
 
+import frame_formats
 from attacks.faults import mutated
 from isocharge.serve import (
-    AutoParser,
-    BinaryParser,
     Chunk,
     Frame,
     Predictor,
@@ -20,64 +19,27 @@ from isocharge.serve import (
 )
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.recognition.recognise import recognise
-from layout_encoder import TEXT_ENCODERS, encode_layout
+from layout_encoder import encode_layout
 
 FRAMES = [Frame(seq, 5000 * seq, (800.0 + seq, 700.0 - seq, 900.5), 0, ("A", "B", "C")) for seq in range(6)]
 
-DESCRIBED = {
-    "format": "described",
-    "sync": "A5 5A",
-    "length": 20,
-    "byte_order": "little",
-    "fields": [
-        {"name": "seq", "type": "u16"},
-        {"name": "t_us", "type": "u32"},
-        {"name": "A", "type": "i16", "scale": 0.1},
-        {"name": "B", "type": "f32"},
-        {"name": "C", "type": "i32"},
-    ],
-    "checksum": "crc-16/ccitt-false",
+DATAGRAMS = device_from_table({"frames": frame_formats.SYNCED | {"framing": "datagram"}}, "attack").frames
+JSON = {"charge": {"A": 1.5, "B": [2, 3], "": {"": 4}}}
+
+FORMATS = {
+    **{
+        name: (form.parser, form.lead + b"".join(map(form.encode, FRAMES)))
+        for name, form in frame_formats.FORMATS.items()
+    },
+    "datagram": (DATAGRAMS.parser, b"".join(encode_layout(DATAGRAMS, frame) for frame in FRAMES)),
+    "sentences": (TextParser, b"".join(b"$PZT,%d,1.5,2.5*%02X\r\n" % (k, 0x4F ^ k) for k in range(6))),
+    "other names": (
+        partial(TextParser, meanings={"n": "seq", "ms": "t_ms"}),
+        b"".join(b"n:%d,ms:%d,A:1.5\n" % (k % 3, 65534 + k & 0xFFFF) for k in range(9)),
+    ),
+    "nested json": (TextParser, b"".join(json.dumps({"seq": k} | JSON).encode() + b"\n" for k in range(6))),
 }
-
-
-def text(notation):
-    return b"".join(TEXT_ENCODERS[notation](frame) for frame in FRAMES)
-
-
-def stuffed(framing):
-    """Frames of 24 bits with a constant byte, stuffed as the framing wants it."""
-    fields = [{"name": "seq", "type": "u8"}, {"type": "pad", "value": "0C"}]
-    fields += [{"name": name, "type": "i24"} for name in "ABC"]
-    keys = {"format": "described", "framing": framing, "length": 12, "checksum": "crc-8", "fields": fields}
-    layout = device_from_table({"frames": keys}, "attack").frames
-    escapes = {
-        "cobs": lambda data: cobs.encode(data) + b"\0",
-        "slip": lambda data: data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0",
-        "hdlc": lambda data: data.replace(b"}", b"}]").replace(b"~", b"}^") + b"~",
-        "datagram": lambda data: data,
-    }
-    return layout.parser, b"".join(escapes[framing](encode_layout(layout, frame)) for frame in FRAMES)
-
-
-def formats():
-    layout = device_from_table({"frames": DESCRIBED}, "attack").frames
-    yield "binary", BinaryParser, b"".join(map(encode_frame, FRAMES))
-    yield "described", layout.parser, b"".join(encode_layout(layout, frame) for frame in FRAMES)
-    for framing in ("cobs", "slip", "hdlc", "datagram"):
-        yield f"described {framing}", *stuffed(framing)
-    for notation in ("csv", "pairs", "teleplot", "json"):
-        yield notation, TextParser, text(notation)
-    yield "sentences", TextParser, b"".join(b"$PZT,%d,1.5,2.5*%02X\r\n" % (k, 0x4F ^ k) for k in range(6))
-    clocks = b"".join(b"n:%d,ms:%d,A:1.5\n" % (k % 3, 65534 + k & 0xFFFF) for k in range(9))
-    yield "other names", lambda: TextParser(meanings={"n": "seq", "ms": "t_ms"}), clocks
-    nested = b"".join(
-        json.dumps({"seq": k, "charge": {"A": 1.5, "B": [2, 3], "": {"": 4}}}).encode() + b"\n" for k in range(6)
-    )
-    yield "nested json", TextParser, nested
-    yield "recognised", AutoParser, b"".join(map(encode_frame, FRAMES[:3])) + text("csv")
-
-
-FORMATS = {name: (make, data) for name, make, data in formats()}
+"""Function that returns a new parser of a format, and bytes of good frames."""
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -28,7 +28,6 @@ from isocharge.serve.network.protocol import Handler
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "serve/deploy"
-UNIT = DEPLOY / "systemd/isocharge.service"
 ENVIRONMENTS = Path(os.environ.get("ISOCHARGE_BENCH_ENVIRONMENTS", ROOT / "build/bench-environments"))
 MODELS = find_model("three-25um-biaxial").parents[1]
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve import AutoParser, Frame
+from isocharge.serve import AutoParser
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_lines import clean_text, line_values, parse_line, skeleton_pattern
@@ -94,13 +94,6 @@ def test_layout_is_recognised_from_the_first_good_lines():
     assert parser.format == "text: 3 columns without names"
     counts = parser.counts
     assert (counts.frames, counts.malformed) == (4, 2)
-
-
-def test_header_names_the_columns():
-    rows = [f"{number},{number * 1000},1,2,3" for number in range(4)]
-    frames = feed("seq,t_us,A,B,C", *rows)
-    assert frames[0] == Frame(0, 0, (1.0, 2.0, 3.0), names=("A", "B", "C"))
-    assert [(frame.seq, frame.t_us) for frame in frames] == [(0, 0), (1, 1000), (2, 2000), (3, 3000)]
 
 
 NOTATIONS = {

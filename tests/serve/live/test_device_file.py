@@ -8,7 +8,6 @@ import pytest
 from isocharge.common.errors import ChargeError, DeviceError, TareError
 from isocharge.serve import (
     AutoParser,
-    BinaryParser,
     Chunk,
     Frame,
     ReadingStream,
@@ -17,7 +16,6 @@ from isocharge.serve import (
     load_device,
 )
 from isocharge.serve.frames.formats import Frames
-from isocharge.serve.frames.frame_layout import SyncParser
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import ANY_BOARD
 from isocharge.serve.signal_chain.channels import Channels
@@ -87,12 +85,6 @@ def test_device_without_a_file_has_tare_and_touch(device):
     assert set(ANY_BOARD.rules) == {TareRule, TouchRule}
     assert device("").rules == ANY_BOARD.rules
     assert isinstance(ANY_BOARD.parser(), AutoParser)
-
-
-def test_format_decides_the_parser(device):
-    assert isinstance(device('[frames]\nformat = "binary"').parser(), BinaryParser)
-    described = '[frames]\nformat = "described"\nsync = "55"\nlength = 5\nfields = [{name = "A", type = "f32"}]'
-    assert isinstance(device(described).parser(), SyncParser)
 
 
 def converted(board, values):

@@ -6,7 +6,7 @@ import pytest
 
 from isocharge.common.errors import OutputError, OutputExists, RecordingError
 from isocharge.serve import Chunk, Recorder, Recording
-from isocharge.serve.port.recording import Event, Marker
+from isocharge.serve.port.recording import Event
 
 CHUNKS = [
     Chunk(bytes([number, 255 - number]), 1e9 + 0.1 * number, 1000 * number, outage_s=1.5 if number == 3 else 0.0)
@@ -127,23 +127,3 @@ def test_error_message_contains_the_number_of_a_damaged_line(recorded, line):
     with pytest.raises(RecordingError, match="line 6: damaged") as caught:
         list(Recording(recorded).events())
     assert len(str(caught.value)) < 600
-
-
-def test_events_and_records_are_read_in_their_order(tmp_path):
-    path = tmp_path / "touch.rec"
-    with Recorder(path, "m/1", {}, name="left") as recorder:
-        recorder.chunk(CHUNKS[0], ['{"timestamp": 5.0, "latency_us": 7.0, "x_mm": 2.5}'])
-        recorder.event(marker=Marker(1e9, "now"))
-        recorder.event(use="m/2")
-        recorder.event(tare=True)
-        recorder.chunk(CHUNKS[3], [])
-    recording = Recording(path)
-    assert recording.name == "left"
-    assert list(recording.events()) == [
-        Event(chunk=CHUNKS[0], latencies_us=[7.0]),
-        Event(marker=Marker(1e9, "now")),
-        Event(use="m/2"),
-        Event(tare=True),
-        Event(chunk=CHUNKS[3]),
-    ]
-    assert list(recording.records(dict)) == [{"timestamp": 5.0, "latency_us": 7.0, "x_mm": 2.5}]

@@ -153,12 +153,6 @@ def test_electrodes_that_cannot_be_columns(names):
         MeasuredPresses(np.ones((1, 3)), np.ones((1, len(names))), one, one, names, (1,))
 
 
-def test_press_file_without_a_column_of_charges_is_refused(tmp_path):
-    (tmp_path / "presses.csv").write_text("x_mm,y_mm,force_N\n1,2,3\n")
-    with pytest.raises(PressError, match=r"presses\.csv: electrodes: expected 1 to 995 different names"):
-        read_presses(tmp_path / "presses.csv")
-
-
 @pytest.mark.parametrize("name", ["nowhere.csv", "."])
 def test_missing_press_file_is_refused(tmp_path, name):
     with pytest.raises(PressError, match=r"cannot be read .*expected a CSV file of presses"):

@@ -85,17 +85,6 @@ def test_chi_squared_up_to_ten_percent_too_large_is_accepted_whatever_the_p_valu
     assert replace(larger[1], p_value=0.2).acceptable
 
 
-def test_force_scale_is_reported(predictor, measure):
-    check = check_presses(predictor, measure(20, force_scale=1.05))
-    assert (check.fits, check.verdict[:14]) == (False, "does not fit: ")
-    assert check.agreement.common.mean[2] == pytest.approx(0.05, abs=4 * check.agreement.common.std[2])
-    assert check.force_percent.beyond == pytest.approx(5.0, abs=0.5)
-    assert check.position_mm.beyond < 0.05
-    assert float(check.notes[0].split("--force-std ")[1]) == pytest.approx(0.05, abs=0.01)
-    assert "isocharge train calibrate" in check.notes[1]
-    assert "forces are 1.0" in check.notes[2]
-
-
 def test_common_shift_is_detected_with_a_smaller_p_value_than_chi_squared(predictor, measure):
     check = check_presses(predictor, measure(40, seed=1, shift_mm=(0.06, 0.0)))
     assert check.fits is False

@@ -9,7 +9,6 @@ from msgspec import structs
 
 from isocharge.serve.record.formats import record_schema
 from isocharge.serve.record.record import (
-    CONTACT_FIELDS,
     RECORD_FIELDS,
     FollowedFilm,
     OtherContact,
@@ -17,7 +16,6 @@ from isocharge.serve.record.record import (
     TrackedContact,
     Tracking,
     fields_of,
-    selected_fields,
 )
 
 TRACKED = TrackedContact(1.0, 2.0, 0.5, 0.01, 0.02, 0.001, 3.0, 0.0, 0.25)
@@ -41,21 +39,9 @@ def test_json_has_the_fields_of_tracking_and_film_after_the_others(contract, rec
     assert written["film"] == {"pretension_MPa": 0.712346, "pretension_std_MPa": 0.05, "touches": 12}
 
 
-def test_json_of_a_tracked_record_without_a_contact_has_nulls(record):
-    written = json.loads(record(tracking=Tracking()).to_json())
-    assert [written[name] for name in ("tracked", "event", "other")] == [None, None, None]
-    assert "film" not in written
-
-
 def test_record_that_is_not_a_number_has_no_json(record):
     with pytest.raises(ValueError, match="not JSON compliant"):
         record(misfit=float("nan")).to_json()
-
-
-def test_names_of_the_fields_follow_from_the_groups(contract):
-    assert contract[:3] == ["timestamp", "t_device_us", "seq"]
-    assert [field.name for field in selected_fields(with_film=True)] == [*contract, "film"]
-    assert set(CONTACT_FIELDS) < set(contract)
 
 
 def test_schema_accepts_null_only_where_a_value_may_be_unknown(record):

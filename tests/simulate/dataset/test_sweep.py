@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.common.errors import OutputError
 from isocharge.common.progress import listening
 from isocharge.simulate import (
     Circle,
@@ -128,13 +127,19 @@ def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp
     assert done == total
 
 
-def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path):
-    """The dataset contains the sum of both angles. The forward map receives the rotation of the press only."""
+def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path, monkeypatch):
+    """The dataset contains the sum of both angles. The forward map receives the rotation of the press only.
+
+    The sweeps have two shards, and each press has its own charges.
+    """
+    monkeypatch.setattr(sweep_module, "SHARD_SIZE", 600)
     probes = [parse_probe(text) for text in ("rectangle:4.0x2.0@30", "triangle:4.0@-30", "circle:1.0@50")]
     for orientation in ("fixed", "random"):
         sweep = Sweep(samples=999, orientation=orientation, outside=0)
         read = read_dataset(write_sweep(tmp_path / orientation, [Spy(probe) for probe in probes], sweep)).samples
         assert read.probe.tolist() == ["rectangle:4.0x2.0", "triangle:4.0", "circle:1.0"] * 333
+        np.testing.assert_array_equal(read.charge_pC[:, :2], sweep.over(probes).contact[:, :2])
+        np.testing.assert_array_equal(read.charge_pC[:, 0], read.x_mm)
         rotation = read.charge_pC[:, 2]
         total = read.orientation_deg
         difference = total - rotation - np.tile([30.0, -30.0, 0.0], 333)
@@ -145,24 +150,4 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path):
     assert read_dataset(tmp_path / "fixed").samples.orientation_deg[:3].tolist() == [30.0, 330.0, 0.0]
 
 
-def test_shards_keep_the_order_of_the_presses(tmp_path, monkeypatch):
-    """The sweep has two shards with several probes. Each press has its own charges."""
-    monkeypatch.setattr(sweep_module, "SHARD_SIZE", 600)
-    sweep = Sweep(samples=610, orientation="random", outside=0)
-    maps = [Spy(Polygon.rectangle(side, 2.0)) for side in (3.0, 4.0, 5.0)]
-    read = read_dataset(write_sweep(tmp_path / "large", maps, sweep))
-    assert [shard["samples"] for shard in read.manifest["shards"]] == [600, 10]
-    presses = sweep.over([made.probe for made in maps])
-    np.testing.assert_array_equal(read.samples.x_mm, presses.contact[:, 0])
-    np.testing.assert_array_equal(read.samples.charge_pC[:, :2], presses.contact[:, :2])
-    np.testing.assert_allclose(read.samples.charge_pC[:, 2], np.rad2deg(presses.rotation))
-
-
 # Errors
-
-
-def test_unwritable_folder_raises_output_error(tmp_path):
-    (tmp_path / "file").write_text("mine")
-    with pytest.raises(OutputError, match=r"file/presses cannot be written: Not a directory; choose another output"):
-        run_sweep(tmp_path / "file" / "presses", SENSOR, (Circle(1.0),), small(), QUICK)
-    assert (tmp_path / "file").read_text() == "mine"

@@ -232,9 +232,6 @@ def test_taut_film_with_a_ratio_of_three_between_its_pretensions_is_interpolated
 
 # Where a family is solved
 
-DOMAIN = Domain(8.0, (0.05, 2.0))
-
-
 FILM = load_sensor("three-25um-biaxial").film
 
 

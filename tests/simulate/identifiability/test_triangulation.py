@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from isocharge.common.errors import ChargeError, SceneError
+from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
@@ -117,18 +117,6 @@ def test_charge_map_with_folds_has_two_positions():
     fix = triangulation.locate(charge_map.charges(contact))
     assert (~fix.found & (fix.spread < 1e-3)).sum() > 5
     assert np.quantile(errors(fix, contact), 0.95) < 0.05
-
-
-@pytest.mark.parametrize(
-    ("charge", "message"),
-    [
-        (np.ones((1, 2)), r"shape \(n, 3\) for \('A', 'B', 'C'\), got shape \(1, 2\)"),
-        (np.array([[1.0, np.nan, 1.0]]), "charge of 'B' in press 0: .* finite number, got nan"),
-    ],
-)
-def test_wrong_charges_are_shown_in_the_error(charge, message):
-    with pytest.raises(ChargeError, match=message):
-        Triangulation(round_map(CENTRES["three"])).locate(charge)
 
 
 @pytest.mark.parametrize(

@@ -32,12 +32,6 @@ def test_noise_and_amplifier_levels_have_the_same_noise(level):
     assert noise_model(level) == load_amplifier(level).noise
 
 
-def test_noise_model_from_a_toml_file(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text('like = "reference"\nwhite_pC = 0.5\ntau_s = 3.0\n')
-    assert noise_model(str(path)).to_dict() == {"name": "mine", "white_pC": 0.5, "gain": 0.002}
-
-
 @pytest.mark.parametrize(("white", "gain"), [(np.inf, 0.0), (np.nan, 0.0), (-1.0, 0.0), (0.0, -1.0)])
 def test_noise_that_is_negative_or_not_finite_raises_input_error(white, gain):
     with pytest.raises(InputError, match="expected a finite number from 0"):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate import Circle, FilmPrior, load_sensor, parse_probe
-from isocharge.simulate.sensor.film_properties import LARGEST_PRETENSION, virtual_film
+from isocharge.simulate.sensor.film_properties import LARGEST_PRETENSION
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
 UNSTRETCHED = load_sensor("four-25um-biaxial")
@@ -95,11 +95,6 @@ def test_only_circular_probes_have_a_radius():
     assert "probe_radius" not in prior.names
     with pytest.raises(SceneError, match=f"expected {len(prior.names)} values"):
         prior.film(PRIOR.described)
-
-
-def test_virtual_film_of_a_seed_is_always_the_same():
-    assert virtual_film(SENSOR, Circle(1.0), 3) == virtual_film(SENSOR, Circle(1.0), 3)
-    assert virtual_film(SENSOR, Circle(1.0), 3) != virtual_film(SENSOR, Circle(1.0), 4)
 
 
 @pytest.mark.parametrize("name", ["eight-25um-biaxial-36mm", "six-25um-biaxial-30mm", "four-25um-biaxial"])

@@ -20,7 +20,6 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.forward.readout import contact_charge
 from isocharge.simulate.numerics.polygon import area_of, to_corners
 
 SENSOR = load_sensor("three-25um-biaxial")
@@ -124,13 +123,6 @@ def test_curved_probe_has_the_charges_of_a_polygon_with_many_corners(shape):
     curved_charge = touch_charge(SENSOR, press(SENSOR.film, shape.probe, (5.0, 3.0), 1.0, settings))
     polygon_charge = touch_charge(SENSOR, press(SENSOR.film, polygon, (5.0, 3.0), 1.0, settings))
     np.testing.assert_allclose(curved_charge, polygon_charge, rtol=3e-4)
-
-
-def test_pressure_charge_of_an_ellipse_on_an_electrode():
-    """The ellipse lies wholly on electrode A. The mean stress is minus half of the pressure, so Q = -d33 F / 2."""
-    sensor = replace(SENSOR, piezo=replace(SENSOR.piezo, d33=-20.0))
-    charge = contact_charge(sensor, Ellipse(2.0, 1.0, 0.7), sensor.electrodes[0].centre, 0.5)
-    np.testing.assert_allclose(charge, [5.0, 0.0, 0.0], atol=1e-9)
 
 
 @pytest.mark.parametrize("share_of_radius", [-0.9, -0.3, 0.0, 0.5, 0.99])

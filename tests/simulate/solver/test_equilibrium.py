@@ -19,7 +19,6 @@ from isocharge.simulate import (
 from isocharge.simulate.solver.equilibrium import principal_stress
 from isocharge.simulate.solver.error_estimate import cautions, estimated_error, mesh_error
 
-FULL = Theory(bending=True)
 MEMBRANE = Theory(bending=False)
 
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,8 +24,6 @@ def solved(problem) -> FilmCharges:
     """The solved film of the sensor file."""
     return kept(solve_even, problem)
 
-
-PRESSES_FILE = Path(__file__).parents[3] / "train" / "examples" / "presses.csv"
 
 CONTACT = np.array([[3.0, 2.0, 0.5], [-4.0, 5.0, 1.0], [1.0, -6.0, 0.2]])
 

@@ -22,8 +22,6 @@ QUICK = FitConfig(
     training=TrainingConfig(steps=600, misfit_steps=100, misfit_charges=1_000, batch=256),
 )
 
-UNTRAINED = FitConfig(QUICK.network, TrainingConfig(steps=1, misfit_steps=1, misfit_charges=1_000))
-
 
 @pytest.fixture(scope="module")
 def written(problem, synthetic, tmp_path_factory):

@@ -102,16 +102,12 @@ def test_split_keeps_positions_together_and_does_not_depend_on_the_order_or_on_o
     assert np.array_equal(of_part, of_all[of_all < len(part)])
 
 
-def test_simulated_and_measured_datasets_are_distinguished(dataset, sensor):
-    assert not is_measured(dataset)
-    presses = measured_presses(random_contacts(60, 2), np.ones((60, 3)))
-    assert is_measured(dataset_of(presses, sensor, Circle(1.0)))
-
-
 def test_measured_presses_keep_the_orientation_of_their_probe(sensor):
     presses = measured_presses(random_contacts(60, 2), np.ones((60, 3)))
     probe = parse_probe("rectangle:4x2@30")
-    samples = dataset_of(presses, sensor, probe).samples
+    dataset = dataset_of(presses, sensor, probe)
+    assert is_measured(dataset)
+    samples = dataset.samples
     assert samples.orientation_deg == pytest.approx(30.0)
     described_probe = parse_probe(str(samples.probe[0])).rotated(np.deg2rad(samples.orientation_deg[0]))
     assert described_probe.angle == pytest.approx(probe.angle)

@@ -21,8 +21,6 @@ from isocharge.simulate.solver.equilibrium import principal_stress
 from isocharge.train import (
     FitConfig,
     LabelledPresses,
-    NetworkConfig,
-    TrainingConfig,
     evaluate,
     load_config,
     release,
@@ -31,10 +29,6 @@ from isocharge.train.data.presses import draw_contacts
 from isocharge.train.model_release.evaluate import simulated_errors
 from kept import kept
 
-QUICK = FitConfig(
-    network=NetworkConfig(hidden=(24, 24), misfit_hidden=(24, 24)),
-    training=TrainingConfig(steps=200, misfit_steps=50, misfit_charges=1_000, batch=256),
-)
 REFERENCE = noise_model("reference")
 MODELS = Path(__file__).parents[3] / "models"
 FORCE_RANGE_N = (0.05, 2.0)

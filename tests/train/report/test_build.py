@@ -6,13 +6,15 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from tests.train.measured import measured_presses
 
 from isocharge.cli.train import report as report_module
-from isocharge.common.errors import DatasetError, ModelError, OutputExists
+from isocharge.common.errors import DatasetError, ModelError, OutputExists, PressError
 from isocharge.serve import benchmark, find_model
-from isocharge.simulate import Sweep, load_sensor
+from isocharge.simulate import Circle, Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train.data.contact_errors import ContactErrorStatistics
+from isocharge.train.data.presses import dataset_of
 from isocharge.train.report import QUICK, evaluation, page, write_report
 from isocharge.train.report.evaluation import contact_errors
 
@@ -93,17 +95,46 @@ def test_report_command_prints_the_record_and_the_errors(film, tmp_path, command
     assert all(f"{method['name']}: {method['errors']['position_rms_mm']} mm" in err for method in section["methods"])
 
 
-def test_dataset_of_another_sensor_is_refused(dataset, tmp_path):
-    other_sensor = replace(dataset, sensor=load_sensor("three-25um-uniaxial"))
-    with pytest.raises(ModelError, match="with another piezo"):
-        write_report(tmp_path / "out", [(other_sensor, find_model(NAME))], SMALL)
-    assert list(tmp_path.iterdir()) == []
+def with_samples(dataset, **columns):
+    """Return a dataset with other values in some columns of its samples."""
+    return replace(dataset, samples=replace(dataset.samples, **columns))
 
 
-def test_dataset_with_other_forces_than_the_model_is_refused(dataset, tmp_path):
-    samples = replace(dataset.samples, force_N=100.0 * dataset.samples.force_N)
-    with pytest.raises(DatasetError, match=r"of its forces, 0.05 to 2 N, got none among 6000 presses"):
-        write_report(tmp_path / "out", [(replace(dataset, samples=samples), find_model(NAME))], SMALL)
+def with_one_position(dataset):
+    """Move every second press to the centre, and the others out of the working area of the model."""
+    is_moved_out = np.arange(len(dataset.samples)) % 2
+    samples = dataset.samples
+    return with_samples(dataset, x_mm=is_moved_out * (20.0 + samples.x_mm), y_mm=is_moved_out * samples.y_mm)
+
+
+def measured(dataset, forces_N):
+    """Return 300 measured presses at one place, of which 260 have the second force."""
+    contact = np.repeat([[1.0, 1.0, force_N] for force_N in forces_N], [40, 260], axis=0)
+    return dataset_of(measured_presses(contact, np.full((300, 3), 500.0)), dataset.sensor, Circle(1.0))
+
+
+UNSUITABLE = {
+    "sensor": (lambda d: replace(d, sensor=load_sensor("three-25um-uniaxial")), NAME, "with another piezo"),
+    "electrodes": (
+        lambda d: measured(d, (1.0, 1.0)),
+        "four-25um-biaxial",
+        "with the electrodes A, B, C, got a model with another",
+    ),
+    "forces": (
+        lambda d: with_samples(d, force_N=100.0 * d.samples.force_N),
+        NAME,
+        "of its forces, 0.05 to 2 N, got none among 6000 presses",
+    ),
+    "forces of measured presses": (lambda d: measured(d, (1.0, 30.0)), NAME, "at least 50 presses .* got 40 of 300"),
+    "one position": (with_one_position, NAME, "50 positions, got 3000 at 1"),
+}
+"""Changes of the dataset, the model, and the message that refuses them."""
+
+
+@pytest.mark.parametrize(("change", "model", "message"), UNSUITABLE.values(), ids=UNSUITABLE)
+def test_unsuitable_datasets_and_models_are_refused(dataset, tmp_path, change, model, message):
+    with pytest.raises((ModelError, DatasetError, PressError), match=message):
+        write_report(tmp_path / "out", [(change(dataset), find_model(model))], SMALL)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -115,17 +146,6 @@ def test_limit_of_an_inaccurate_series_is_left_out_with_the_reason(dataset, tmp_
     (reason,) = section["left_out"]
     assert re.match(r"Cramér-Rao limit: .* 24\d\d presses has an error of 0\.\d+ % of a charge", reason)
     assert f"Left out: {reason}." in (tmp_path / "out" / "report.md").read_text("utf-8")
-
-
-def test_dataset_with_one_position_in_the_working_area_is_refused(dataset, tmp_path):
-    """Every second press is moved to the centre; the others are moved out of the working area of the model."""
-    samples = dataset.samples
-    is_moved_out = np.arange(len(samples)) % 2
-    moved = replace(samples, x_mm=is_moved_out * (20.0 + samples.x_mm), y_mm=is_moved_out * samples.y_mm)
-    one_position = replace(dataset, samples=moved)
-    with pytest.raises(DatasetError, match="50 positions, got 3000 at 1"):
-        write_report(tmp_path / "out", [(one_position, find_model(NAME))], SMALL)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_existing_folder_is_refused(dataset, tmp_path):

@@ -1,12 +1,9 @@
 """Tests of a report on measured presses, which are tested on held-out presses and never on simulated ones."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from tests.train.measured import measured_presses
 
-from isocharge.common.errors import ModelError, PressError
 from isocharge.serve import Predictor, check_presses, find_model
 from isocharge.simulate import (
     Circle,
@@ -56,26 +53,3 @@ def test_errors_equal_those_of_serve_check_on_the_held_out_presses(section, pres
     assert released["position_rms_mm"] == pytest.approx(position_rms_mm, rel=1e-3)
     assert released["force_rms_percent"] == pytest.approx(force_rms_percent, rel=1e-3)
     assert released["position_median_mm"] > 0.3  # it is 0.07 mm on simulated presses of the described film
-
-
-@pytest.fixture
-def uniform_presses():
-    """Presses with the same charge on all electrodes."""
-    contact = draw_contacts(np.random.default_rng(6), Domain(7.8, (0.06, 1.9)), PRESS_COUNT)
-    return measured_presses(contact, np.full((PRESS_COUNT, 3), 500.0))
-
-
-def test_too_few_presses_within_the_forces_of_the_model_are_refused(uniform_presses, tmp_path):
-    contact = uniform_presses.contact.copy()
-    contact[:260] = [1.0, 1.0, 30.0]
-    dataset = dataset_of(replace(uniform_presses, contact=contact), load_sensor(NAME), PROBE)
-    with pytest.raises(PressError, match=r"at least 50 presses .* got 40 of 300"):
-        write_report(tmp_path / "out", [(dataset, find_model(NAME))], QUICK)
-    assert not list(tmp_path.iterdir())
-
-
-def test_model_with_other_electrodes_is_refused(uniform_presses, tmp_path):
-    dataset = dataset_of(uniform_presses, load_sensor(NAME), PROBE)
-    with pytest.raises(ModelError, match="with the electrodes A, B, C, got a model with another"):
-        write_report(tmp_path / "out", [(dataset, find_model("four-25um-biaxial"))], QUICK)
-    assert not list(tmp_path.iterdir())

@@ -204,18 +204,6 @@ def test_charges_between_places_that_were_pressed_many_times_fit_the_presses():
     assert 0.1 < np.median(np.abs(residual)) < 0.4
 
 
-def test_too_few_presses_are_refused():
-    message = "expected at least 500 presses at 50 places with .* got 499 at 499; .*train calibrate"
-    with pytest.raises(PressError, match=message):
-        usable_presses(presses_on_l()[:499])
-
-
-def test_too_few_channels_are_refused():
-    two_channels = presses_on_l().of_electrodes(("Q1", "Q2"), "pad")
-    with pytest.raises(PressError, match=r"expected 3 to 32 channels, got 2 \(Q1, Q2\)"):
-        usable_presses(two_channels)
-
-
 def with_channel(channel, new_charge):
     """Return the presses on the L with other charges of one channel.
 
@@ -250,6 +238,14 @@ def in_eighth_press(value, column):
 JITTER = np.random.default_rng(5).standard_normal(1_200)
 
 FAULTY_PRESSES = {
+    "too few presses": (
+        presses_on_l()[:499],
+        "expected at least 500 presses at 50 places with .* got 499 at 499; .*train calibrate",
+    ),
+    "too few channels": (
+        presses_on_l().of_electrodes(("Q1", "Q2"), "pad"),
+        r"expected 3 to 32 channels, got 2 \(Q1, Q2\)",
+    ),
     "a copied channel": (
         with_channel(1, lambda charge: charge[:, 0]),
         r"channels 'Q1', 'Q2': expected charges that are linearly independent",
