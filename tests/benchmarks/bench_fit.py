@@ -37,7 +37,7 @@ from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.data.presses import LOWEST_CHARGE
 from isocharge.train.training.contact_training import LinearTargets, contact_stage
 from isocharge.train.training.fit import threads_and_seed
-from isocharge.train.training.network import InverseNetwork, WhitenedFeatures, fold_network, logarithmic_features
+from isocharge.train.training.network import InverseNetwork, fold_network, logarithmic_features
 
 NOISE = noise_model("reference")
 N_COPIES = 4
@@ -115,7 +115,8 @@ class Case:
         """Return an untrained network of the default size."""
         return InverseNetwork(
             self.domain,
-            WhitenedFeatures.fit(logarithmic_features(self.train.charge), self.train.charge),
+            logarithmic_features(self.train.charge),
+            self.train.charge,
             NetworkConfig(),
         )
 

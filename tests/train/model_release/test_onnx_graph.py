@@ -83,7 +83,9 @@ def largest_differences(given, expected):
 def test_folded_network_gives_the_answers_of_pytorch(split):
     """The network has random weights, which are evaluated with PyTorch in double precision."""
     torch.manual_seed(0)
-    network = InverseNetwork(split.domain, split.features(REFERENCE), NetworkConfig((32, 32), (24, 24)))
+    network = InverseNetwork(
+        split.domain, split.features(REFERENCE), split.train.charge, NetworkConfig((32, 32), (24, 24))
+    )
     for perceptron in (network.contact, network.misfit_vector):
         torch.nn.init.normal_(perceptron.skip.weight, std=0.1)
     folded = fold_network(network)

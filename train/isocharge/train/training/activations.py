@@ -1,14 +1,10 @@
-"""Activation functions of hidden layers, and the names of the functions in NumPy, PyTorch, ONNX and C.
+"""Activation functions of hidden layers, and the names of the functions in PyTorch, ONNX and C.
 
-The dictionary `ACTIVATIONS` contains all activation functions. Training, the evaluation of networks, the ONNX export
-and the C export look up the activation functions in this dictionary.
+The dictionary `ACTIVATIONS` contains all activation functions. Training, the ONNX graph and the C
+export look up the activation functions in this dictionary.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
 
 
 @dataclass(frozen=True)
@@ -17,7 +13,6 @@ class Activation:
 
     Attributes:
         name: Name of the activation function in configurations and files.
-        numpy_function: Implementation for NumPy arrays of any shape and float type.
         torch_name: Name of the function in `torch.nn.functional`. The attribute is a text, and not the function itself,
             because only training needs PyTorch.
         onnx_operator: Name of the ONNX operator, which has one input, one output and no attributes.
@@ -25,7 +20,6 @@ class Activation:
     """
 
     name: str
-    numpy_function: Callable[[Any], Any]
     torch_name: str
     onnx_operator: str
     c_source: str
@@ -62,7 +56,7 @@ static float tanh_of(float x)
 }
 """
 
-TANH = Activation("tanh", np.tanh, torch_name="tanh", onnx_operator="Tanh", c_source=_TANH_C)
+TANH = Activation("tanh", torch_name="tanh", onnx_operator="Tanh", c_source=_TANH_C)
 """Hyperbolic tangent, the activation of all released models."""
 
 ACTIVATIONS = {activation.name: activation for activation in (TANH,)}

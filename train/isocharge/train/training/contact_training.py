@@ -298,6 +298,6 @@ def contact_stage(
         posterior = network.posterior(noisy_batch)
         return contact_loss(posterior, contact, contact - posterior.mean)
 
-    sizes = config.sizes(network.n_electrode)
+    sizes = config.sizes(network.features.n_electrode)
     rate = config.learning_rate * sizes.rate_factor
     return TrainingStage("contact", network.contact, loss, sizes.steps, rate, config.seed)

@@ -45,7 +45,6 @@ from isocharge.train.training.misfit_training import draw_charges, misfit_stage
 from isocharge.train.training.network import (
     InverseNetwork,
     Posterior,
-    WhitenedFeatures,
     as_tensor,
     fold_network,
     signed_features,
@@ -113,11 +112,11 @@ def fit_presses(
     domain = PressedArea.of_contacts(labelled.contact)
     noise = ChannelNoise.estimate(labelled.charge, domain.to_unit(labelled.contact))
     with threads_and_seed(training.threads, training.seed):
-        transition_charge = noise.transition_charge(labelled.charge)
-        features = WhitenedFeatures.fit(signed_features(labelled.charge, transition_charge), labelled.charge)
+        features = signed_features(labelled.charge, noise.transition_charge(labelled.charge))
         # The first network will be returned. The other networks each belong to one fold of the cross-validation.
         network, *fold_networks = (
-            InverseNetwork(domain, features, settings.network, force_std) for _ in range(1 + HELD_PARTS)
+            InverseNetwork(domain, features, labelled.charge, settings.network, force_std)
+            for _ in range(1 + HELD_PARTS)
         )
         # For the cross-validation, train a network for each fold on the presses of all other folds.
         fold_of_press = (HELD_PARTS * position_ranks(labelled.contact)).astype(int)
@@ -356,7 +355,7 @@ def _distillation_stage(
         squares = 0.5 * mean_difference**2 + (log_std - target.log_std) ** 2 + (turn - target.turn) ** 2
         return squares.sum(dim=1).mean()
 
-    steps = config.sizes(network.n_electrode).steps
+    steps = config.sizes(network.features.n_electrode).steps
     return TrainingStage("contact", network.contact, loss, steps, config.learning_rate, config.seed)
 
 

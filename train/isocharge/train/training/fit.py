@@ -135,7 +135,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         for caution in split.cautions:
             _log.warning("%s", caution)
         features = split.features(misfit_noise(training.noise_model))
-        network = InverseNetwork(split.domain, features, settings.network)
+        network = InverseNetwork(split.domain, features, split.train.charge, settings.network)
         outside = OutsidePresses.of(split.domain, data.presses, data.outside, training.seed)
 
         def train_misfit() -> None:
@@ -146,7 +146,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         # Second thread: train the misfit perceptron. This thread: train the contact perceptron
         misfit_training = executor.submit(train_misfit)
         linear_targets = None
-        has_many_electrodes = network.n_electrode > FEW_ELECTRODES
+        has_many_electrodes = n_electrode > FEW_ELECTRODES
         if has_many_electrodes and training.noise_model.white > 0.0:
             linear_targets = LinearTargets.compute(split.train, split.field, training.noise_model)
         stage = contact_stage(network, split.train, training.noise_model, training, linear_targets=linear_targets)

@@ -1,4 +1,4 @@
-"""Whole network that computes contacts from charges. NumPy evaluates the network in double precision.
+"""Whole network that computes contacts from charges, and its ONNX graph.
 
 The network has three parts:
 
@@ -7,8 +7,9 @@ The network has three parts:
 - A perceptron computes a vector from the input features. The entries of this vector are called answers.
 - The output functions convert the answers to position, force, standard deviations, correlations and misfit.
 
-The ONNX export (`isocharge.train.model_release.onnx_graph`) and the C export (`isocharge.train.export_c.model_source`)
-write networks of this form.
+The ONNX graph defines how a network is evaluated. The runtimes of ONNX evaluate the graph, in single precision in a
+released model, and in double precision in the reference implementation of ONNX. The C export
+(`isocharge.train.export_c.model_source`) writes networks of the same form.
 
 Perceptron
 ----------
@@ -38,15 +39,24 @@ In the exported graph, one node computes the cosines, and another node computes 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
+import onnx
+import onnx.parser
+from numpy.typing import NDArray
+from onnx import numpy_helper
+from onnx.reference import ReferenceEvaluator
 from scipy.linalg import block_diag
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
+from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS
 from isocharge.train.training.activations import Activation
+
+OPSET = 17
+"""Version of the ONNX operators, which runtimes since 2022 support."""
 
 
 @dataclass(frozen=True)
@@ -74,20 +84,6 @@ class ChargeFeatures:
     def n_electrode(self) -> int:
         """Number of electrodes, which is also the number of charges of a press."""
         return self.typical_pC.size
-
-    def evaluate(self, charge_pC: Array) -> Array:
-        """Compute the features of charges.
-
-        Args:
-            charge_pC: Charges, shape (..., n_electrode), pC.
-
-        Returns:
-            Features, of the same shape, dimensionless.
-        """
-        ratio = np.clip(charge_pC, self.low_pC, self.high_pC) / self.typical_pC
-        if self.mean is None:
-            return np.asarray(np.log(ratio))
-        return np.asarray(np.arcsinh(ratio) - self.mean)
 
 
 LARGEST_INT8 = np.iinfo(np.int8).max
@@ -121,13 +117,6 @@ class Perceptron:
     last: Layer
     skip: Array
     activation: Activation
-
-    def evaluate(self, inputs: Array) -> Array:
-        """Compute the outputs, shape (n, n_output), of inputs of shape (n, n_input)."""
-        value = inputs
-        for layer in self.hidden:
-            value = self.activation.numpy_function(value @ layer.weight + layer.bias)
-        return np.asarray(value @ self.last.weight + self.last.bias + inputs @ self.skip)
 
 
 POSITION = slice(0, 2)
@@ -178,6 +167,42 @@ The network learns misfits below this value on a linear scale and misfits above 
 """
 
 
+@dataclass
+class GraphBuilder:
+    """Builder of a graph, which collects nodes and constants in the order in which they are added.
+
+    The nodes are lines in the textual syntax of ONNX, and a tensor is represented by its name.
+
+    Attributes:
+        number_type: NumPy type of all constants that are not integers.
+        nodes: Lines of the nodes.
+        constants: Constant tensors.
+    """
+
+    number_type: type
+    nodes: list[str] = field(default_factory=list)
+    constants: list[onnx.TensorProto] = field(default_factory=list)
+
+    def add(self, operator: str, *inputs: str, to: str = "") -> str:
+        """Add a node, and return the name of its result.
+
+        Args:
+            operator: ONNX operator of the node, with its attributes in angle brackets.
+            *inputs: Names of the tensors that are the inputs of the node.
+            to: Name of the result, or several names with commas between them; empty for a generated name.
+        """
+        result_name = to or f"t{len(self.nodes)}"
+        self.nodes.append(f"{result_name} = {operator} ({', '.join(inputs)})")
+        return result_name
+
+    def constant(self, values: object, dtype: type | None = None) -> str:
+        """Add a constant tensor, and return its generated name."""
+        name = f"c{len(self.constants)}"
+        array: NDArray[Any] = np.array(values, dtype=dtype or self.number_type, order="C")
+        self.constants.append(numpy_helper.from_array(array, name))
+        return name
+
+
 @dataclass(frozen=True)
 class FoldedNetwork:
     """A whole network that computes contacts from charges.
@@ -206,7 +231,7 @@ class FoldedNetwork:
         return contact, std, misfit
 
     def outputs(self, charge: Array) -> tuple[Array, Array, Array, Array]:
-        """Compute the outputs of the exported graph.
+        """Compute the outputs of the graph in double precision.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -215,16 +240,53 @@ class FoldedNetwork:
             Contacts and standard deviations, as `predict` returns them. Correlations, shape (n, 3). Misfits, shape
             (n, 1).
         """
-        answers = self.layers.evaluate(self.features.evaluate(charge))
-        position = answers[:, POSITION]
-        force = _limited_exp(answers[:, LOG_FORCE])
-        contact = np.concatenate([position, force], axis=1)
-        std = _limited_exp(answers[:, LOG_STD])
-        # Each correlation is a weighted sum of the cosines of the eight angles.
-        correlation = np.cos(answers[:, ANGLES]) @ COSINES_TO_CORRELATIONS
-        # The misfit vector follows the angles. Its length is asinh(misfit / MISFIT_UNIT).
-        compressed_misfit = np.linalg.norm(answers[:, ANGLES.stop :], axis=1, keepdims=True)
-        return contact, std, correlation, MISFIT_UNIT * np.sinh(compressed_misfit)
+        outputs: Any = ReferenceEvaluator(self.onnx_model(np.float64)).run(None, {INPUT: charge.astype(float)})
+        contact, std, correlation, misfit = outputs
+        return contact, std, correlation, misfit
+
+    def onnx_model(self, number_type: type = np.float32) -> onnx.ModelProto:
+        """Return the network as an ONNX model without metadata.
+
+        The nodes after the perceptron convert the answers into the outputs of the graph.
+
+        Args:
+            number_type: NumPy type of the charges, of the constants and of the outputs.
+
+        Returns:
+            Model with the input `charge_pC` [n, n_electrode], and the outputs `contact` [n, 3], `contact_std` [n, 3],
+            `contact_correlation` [n, 3] and `misfit` [n, 1].
+        """
+        builder = GraphBuilder(number_type)
+        n_electrode = self.features.n_electrode
+        tensor_type = "double" if number_type is np.float64 else "float"
+        features = _add_features(builder, self.features)
+        answers = _add_perceptron(builder, features, self.layers)
+
+        # Split the answers: x and y, the logarithms of the force and of the three standard deviations, the angles that
+        # determine the correlations, and the misfit vector. The exponentials of the limited logarithms are the force
+        # and the standard deviations. A result of a split has the name of an output, so it needs no further node.
+        widths = builder.constant((2, 4, len(COSINES_TO_CORRELATIONS), n_electrode), np.int64)
+        builder.add("Split <axis = 1>", answers, widths, to="plane, logs, angles, misfit_vector")
+        limits = (builder.constant(-LARGEST_LOGARITHM), builder.constant(LARGEST_LOGARITHM))
+        exponentials = builder.add("Exp", builder.add("Clip", "logs", *limits))
+        builder.add("Split <axis = 1>", exponentials, builder.constant((1, 3), np.int64), to="force, contact_std")
+        builder.add("Concat <axis = 1>", "plane", "force", to="contact")
+        cosines = builder.add("Cos", "angles")
+        builder.add("MatMul", cosines, builder.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
+        # The length of the misfit vector is asinh(misfit / MISFIT_UNIT).
+        compressed_misfit = builder.add("ReduceL2 <axes = [1], keepdims = 1>", "misfit_vector")
+        builder.add("Mul", builder.add("Sinh", compressed_misfit), builder.constant(MISFIT_UNIT), to="misfit")
+
+        outputs = ", ".join(f"{tensor_type}[n, {width}] {name}" for name, width in OUTPUTS.items())
+        nodes = "\n".join(builder.nodes)
+        model = onnx.parser.parse_model(
+            f'<ir_version: 8, opset_import: ["" : {OPSET}], producer_name: "isocharge">\n'
+            f"isocharge ({tensor_type}[n, {n_electrode}] {INPUT}) => ({outputs}) {{\n{nodes}\n}}"
+        )
+        for node in model.graph.node:
+            node.ClearField("domain")  # the parser states the empty domain, and `onnx.helper` does not
+        model.graph.initializer.extend(builder.constants)
+        return model
 
     def with_scaled_std(self, position_factor: float, force_factor: float) -> "FoldedNetwork":
         """Return a network whose standard deviations of position and force are multiplied by two given factors.
@@ -238,9 +300,52 @@ class FoldedNetwork:
         return replace(self, layers=replace(self.layers, last=Layer(weight, bias + bias_change)))
 
 
-def _limited_exp(logarithm: Array) -> Array:
-    """Return the exponentials of logarithms whose magnitudes are limited to `LARGEST_LOGARITHM`."""
-    return np.exp(np.clip(logarithm, -LARGEST_LOGARITHM, LARGEST_LOGARITHM))
+def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
+    """Add nodes that compute the input features of the charges.
+
+    The charges Q are first limited to a range. If all charges are positive, the features are ln(Q / typical charge),
+    and the operator `Clip` applies the same limits to all electrodes. If charges may be negative, the features are
+    asinh(Q / typical charge) - mean. In this case, the operators `Max` and `Min` apply separate limits to each
+    electrode.
+
+    Args:
+        builder: Builder of the graph.
+        features: Limits, typical charges and means of the features.
+
+    Returns:
+        Name of the tensor with the features.
+    """
+    inverse_typical = 1.0 / features.typical_pC
+    if features.mean is None:
+        clipped = builder.add("Clip", INPUT, builder.constant(features.low_pC), builder.constant(features.high_pC))
+        ratio = builder.add("Mul", clipped, builder.constant(inverse_typical))
+        return builder.add("Log", ratio)
+    clipped_below = builder.add("Max", INPUT, builder.constant(features.low_pC))
+    clipped = builder.add("Min", clipped_below, builder.constant(features.high_pC))
+    ratio = builder.add("Mul", clipped, builder.constant(inverse_typical))
+    return builder.add("Sub", builder.add("Asinh", ratio), builder.constant(features.mean))
+
+
+def _add_perceptron(builder: GraphBuilder, inputs: str, perceptron: Perceptron) -> str:
+    """Add nodes that evaluate a perceptron with hidden layers and a skip layer.
+
+    The operator `Gemm` computes inputs @ weights + bias. The last layer adds the output of the skip layer.
+
+    Args:
+        builder: Builder of the graph.
+        inputs: Name of the tensor with the inputs.
+        perceptron: Weights and biases of the layers, and the activation.
+
+    Returns:
+        Name of the tensor with the outputs.
+    """
+    hidden_outputs = inputs
+    for layer in perceptron.hidden:
+        linear = builder.add("Gemm", hidden_outputs, builder.constant(layer.weight), builder.constant(layer.bias))
+        hidden_outputs = builder.add(perceptron.activation.onnx_operator, linear)
+    output_layer = perceptron.last
+    skip_and_bias = builder.add("Gemm", inputs, builder.constant(perceptron.skip), builder.constant(output_layer.bias))
+    return builder.add("Gemm", hidden_outputs, builder.constant(output_layer.weight), skip_and_bias)
 
 
 TURN = slice(6, 9)
@@ -283,14 +388,14 @@ def fold(perceptrons: Sequence[Perceptron], mean: Array, matrix: Array, answer_m
     Returns:
         Perceptron that computes the answers from the features.
     """
-    first_layers, *later_groups = zip(*(perceptron.hidden for perceptron in perceptrons), strict=True)
-    first = _join_layers(first_layers, np.hstack([layer.weight for layer in first_layers]))
-    later = [_join_blocks(layers) for layers in later_groups]
-    last = _join_blocks([perceptron.last for perceptron in perceptrons])
-    # ((features - mean) @ matrix) @ weight + bias  =  features @ (matrix @ weight) + (bias - mean @ matrix @ weight)
-    first_weight = matrix @ first.weight
+    first, *later = map(_join, zip(*(perceptron.hidden for perceptron in perceptrons), strict=True))
+    last = _join([perceptron.last for perceptron in perceptrons])
+    # All perceptrons have the same inputs: ((features - mean) @ matrix) @ weight + bias
+    #   = features @ (matrix @ weight) + (bias - mean @ matrix @ weight)
+    inputs_matrix = np.tile(matrix, len(perceptrons))
+    first_weight = inputs_matrix @ first.weight
     first_bias = first.bias - mean @ first_weight
-    skip = matrix @ np.hstack([perceptron.skip for perceptron in perceptrons]) @ answer_map.weight
+    skip = inputs_matrix @ block_diag(*[perceptron.skip for perceptron in perceptrons]) @ answer_map.weight
     # The skip layer has no bias. The term - mean @ skip is therefore added to the bias of the last layer.
     last_bias = last.bias @ answer_map.weight + answer_map.bias - mean @ skip
     return Perceptron(
@@ -333,11 +438,7 @@ def linear_answer_map(domain: Domain, n_electrode: int) -> Layer:
     return Layer(weight, bias)
 
 
-def _join_blocks(layers: Sequence[Layer]) -> Layer:
+def _join(layers: Sequence[Layer]) -> Layer:
     """Join layers with different inputs into one layer. Its weights are a block-diagonal matrix."""
-    return _join_layers(layers, block_diag(*[layer.weight for layer in layers]))
-
-
-def _join_layers(layers: Sequence[Layer], weight: Array) -> Layer:
-    """Return a layer with the given weights, which computes the outputs of all given layers in order."""
-    return Layer(weight, np.concatenate([layer.bias for layer in layers]))
+    weights, biases = zip(*layers, strict=True)
+    return Layer(block_diag(*weights), np.concatenate(biases))

@@ -17,8 +17,8 @@ from isocharge.train.data.channel_noise import ChannelNoise, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.training.config import TrainingConfig
 from isocharge.train.training.descent import TrainingStage
-from isocharge.train.training.folded_network import MISFIT_UNIT
-from isocharge.train.training.network import InverseNetwork, WhitenedFeatures, as_tensor, compress_length
+from isocharge.train.training.folded_network import MISFIT_UNIT, ChargeFeatures
+from isocharge.train.training.network import InverseNetwork, as_tensor, compress_length
 from isocharge.train.training.training_data import Split
 
 LOG_DISTANCES = (-1.0, 3.0)
@@ -64,7 +64,7 @@ FOCUS_MISFIT = 2.0 * MISFIT_LIMIT
 
 
 def misfit_examples(
-    split: Split, features: WhitenedFeatures, outside: OutsidePresses | None, config: TrainingConfig
+    split: Split, features: ChargeFeatures, outside: OutsidePresses | None, config: TrainingConfig
 ) -> Array:
     """Draw the examples from which the misfit network learns, for a model of simulated presses.
 
@@ -81,16 +81,15 @@ def misfit_examples(
         Array of shape (2, n, n_electrode): first the charges, pC, and then their residuals with respect to the nearest
         contact, in standard deviations of the noise.
     """
-    limits = features.charge_features
     rng = np.random.default_rng(config.seed)
-    noise = ChannelNoise.alike(misfit_noise(config.noise_model), limits.n_electrode)
-    count = config.sizes(limits.n_electrode).misfit_charges
-    outside_charge = np.empty((0, limits.n_electrode))
+    noise = ChannelNoise.alike(misfit_noise(config.noise_model), features.n_electrode)
+    count = config.sizes(features.n_electrode).misfit_charges
+    outside_charge = np.empty((0, features.n_electrode))
     if outside is not None:
         rows = rng.integers(len(outside.train), size=round(OUTSIDE_SHARE * count))
         outside_charge = noise.add(outside.train.charge[rows], rng)
     drawn_charge = draw_charges(rng, split.train.charge, noise, count - len(outside_charge))
-    charge = np.clip(np.concatenate([drawn_charge, outside_charge]), limits.low_pC, limits.high_pC)
+    charge = np.clip(np.concatenate([drawn_charge, outside_charge]), features.low_pC, features.high_pC)
     _, residual = search(split.field, charge, noise.sigma(charge))
     return np.stack([charge, residual])
 
@@ -117,7 +116,7 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
         rows = torch.randint(len(inputs), (config.batch,), generator=random)
         return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows], focus)
 
-    steps = config.sizes(network.n_electrode).misfit_steps
+    steps = config.sizes(network.features.n_electrode).misfit_steps
     rate = MISFIT_RATE_FACTOR * config.learning_rate
     return TrainingStage("misfit", network.misfit_vector, loss, steps, rate, config.seed)
 

@@ -1,6 +1,6 @@
 """Trainable network in PyTorch that estimates contacts, standard deviations and misfits from charges.
 
-The inputs are whitened logarithms of the charges (`isocharge.train.training.network`). A larger force increases all
+The inputs are whitened logarithms of the charges. A larger force increases all
 charges by nearly the same factor. Therefore, the common factor of the charges depends mostly on the force, and the
 ratios of the charges depend mostly on the position. A first perceptron estimates the means of x, y and ln F and the
 logarithms of their standard deviations.
@@ -13,7 +13,7 @@ length is not smooth. Therefore, the perceptron learns the vector instead of the
 several thousand, so it is compressed by the function asinh.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -40,32 +40,6 @@ from isocharge.train.training.folded_network import (
     fold,
     linear_answer_map,
 )
-
-
-@dataclass(frozen=True)
-class WhitenedFeatures:
-    """Input features (charge features - mean) @ matrix, which have zero mean and unit covariance.
-
-    Attributes:
-        charge_features: Charge features, which are logarithms or inverse hyperbolic sines of the charges.
-        mean: Mean of the charge features over the presses, shape (n_electrode,).
-        matrix: Whitening matrix, shape (n_electrode, n_electrode).
-    """
-
-    charge_features: ChargeFeatures
-    mean: Array
-    matrix: Array
-
-    @classmethod
-    def fit(cls, charge_features: ChargeFeatures, charge: Array) -> "WhitenedFeatures":
-        """Fit the mean and the whitening matrix to the charge features of presses.
-
-        Args:
-            charge_features: Charge features before the whitening.
-            charge: Charges of the presses, shape (n, n_electrode), pC.
-        """
-        mean, matrix = whitening(charge_features.evaluate(charge))
-        return cls(charge_features, mean, matrix)
 
 
 def logarithmic_features(charge: Array) -> ChargeFeatures:
@@ -105,25 +79,6 @@ def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
         high_pC=np.sinh(highest + margin) * typical,
         mean=asinh_charge.mean(axis=0),
     )
-
-
-def whitening(values: Array) -> tuple[Array, Array]:
-    """Compute the whitening transform of values by a principal component analysis.
-
-    The covariance of the transformed values (values - mean) @ matrix is the identity matrix.
-
-    Args:
-        values: Values, shape (n, k), where n is at least k.
-
-    Returns:
-        Mean, shape (k,), and matrix, shape (k, k).
-    """
-    # The rows of `axes` are the principal axes. The standard deviation of the values along an axis is its singular
-    # value divided by the square root of the number of values.
-    mean = values.mean(axis=0)
-    _, singular_values, axes = np.linalg.svd(values - mean, full_matrices=False)
-    inverse_std = np.sqrt(len(values)) / np.maximum(singular_values, np.finfo(float).eps)
-    return mean, axes.T * inverse_std
 
 
 FIRST_LAYER_SLOPES = (0.5, 3.5)
@@ -251,29 +206,37 @@ class InverseNetwork(nn.Module):
 
     Args:
         domain: Contacts for which the network is trained.
-        features: Whitened input features.
+        features: Features of the charges, before they are whitened.
+        charge: Charges of the presses for training, shape (n, n_electrode), pC. Their features determine the whitening.
         config: Widths of the hidden layers.
         force_std: Relative standard deviation of the force if all presses have the same force. The network then always
             answers the force in the middle of the domain with this standard deviation. None to learn the force.
     """
 
     def __init__(
-        self, domain: Domain, features: WhitenedFeatures, config: NetworkConfig, force_std: float | None = None
+        self,
+        domain: Domain,
+        features: ChargeFeatures,
+        charge: Array,
+        config: NetworkConfig,
+        force_std: float | None = None,
     ) -> None:
-        """Create the perceptrons with random weights.
+        """Create the perceptrons with random weights, and compute the whitening by a principal component analysis.
 
-        The mean and the whitening matrix of the features are stored as buffers, because they are not trained.
+        The inputs (features - mean) @ matrix of the presses for training have zero mean and unit covariance. The mean
+        and the matrix are stored as buffers, because they are not trained.
 
         Args:
             domain: Contacts for which the network is trained.
-            features: Whitened input features.
+            features: Features of the charges, before they are whitened.
+            charge: Charges of the presses for training, shape (n, n_electrode), pC.
             config: Widths of the hidden layers.
             force_std: Relative standard deviation of a constant force; None to learn the force.
         """
         super().__init__()
         self.domain = domain
         self.features = features
-        n_electrode = self.n_electrode
+        n_electrode = features.n_electrode
         widths, misfit_widths = config.widths(n_electrode)
         activation = ACTIVATIONS[config.activation]
         self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop, activation)
@@ -284,13 +247,14 @@ class InverseNetwork(nn.Module):
         if force_std is not None:
             self.output_factor[FORCE_OUTPUTS] = 0.0
             self.output_offset[LOG_STD.stop - 1] = np.log(force_std / domain.scale[2])
-        self.features_mean = nn.Buffer(as_tensor(features.mean))
-        self.whitening = nn.Buffer(as_tensor(features.matrix))
-
-    @property
-    def n_electrode(self) -> int:
-        """Number of electrodes."""
-        return self.features.charge_features.n_electrode
+        values = feature_values(features, torch.tensor(charge))
+        mean = values.mean(dim=0)
+        # The rows of `axes` are the principal axes. The standard deviation of the values along an axis is its singular
+        # value divided by the square root of the number of values.
+        _, singular_values, axes = torch.linalg.svd(values - mean, full_matrices=False)
+        inverse_std = len(values) ** 0.5 / singular_values.clamp(min=torch.finfo(values.dtype).eps)
+        self.features_mean = nn.Buffer(mean.float())
+        self.whitening = nn.Buffer((axes.T * inverse_std).float())
 
     def inputs(self, charge: Tensor) -> Tensor:
         """Compute whitened features, which are the inputs of both perceptrons. Finite charges give finite inputs.
@@ -301,17 +265,24 @@ class InverseNetwork(nn.Module):
         Returns:
             Inputs, shape (n, n_electrode).
         """
-        features = self.features.charge_features
-        clipped_charge = charge.clamp(as_tensor(features.low_pC), as_tensor(features.high_pC))
-        ratio = clipped_charge / as_tensor(features.typical_pC)
-        # Without a mean, all charges of the presses are positive.
-        values = torch.log(ratio) if features.mean is None else torch.asinh(ratio) - as_tensor(features.mean)
-        return (values - self.features_mean) @ self.whitening
+        return (feature_values(self.features, charge) - self.features_mean) @ self.whitening
 
     def posterior(self, charge: Tensor) -> Posterior:
         """Estimate the contacts of n presses from their charges, shape (n, n_electrode), pC."""
         outputs = self.contact(self.inputs(charge)) * self.output_factor + self.output_offset
         return Posterior(outputs[:, MEAN], outputs[:, LOG_STD], outputs[:, TURN])
+
+
+def feature_values(features: ChargeFeatures, charge: Tensor) -> Tensor:
+    """Compute the features of charges, pC. Charges and features have the shape (n, n_electrode)."""
+
+    def constant(values: Array) -> Tensor:
+        """Return an array as a tensor with the number type of the charges."""
+        return torch.tensor(values, dtype=charge.dtype)
+
+    ratio = charge.clamp(constant(features.low_pC), constant(features.high_pC)) / constant(features.typical_pC)
+    # Without a mean, all charges of the presses are positive.
+    return torch.log(ratio) if features.mean is None else torch.asinh(ratio) - constant(features.mean)
 
 
 def compress_length(residual: Tensor) -> Tensor:
@@ -336,16 +307,15 @@ def as_tensor(values: Array) -> Tensor:
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
     """Fold both perceptrons of a trained network into one perceptron. A constant force is part of its last layer."""
-    charge_features = network.features.charge_features
     contact = network.contact.to_numpy()
     factor = _to_numpy(network.output_factor)
     offset = _to_numpy(network.output_offset)
     weight, bias = contact.last
     contact = replace(contact, last=Layer(weight * factor, bias * factor + offset), skip=contact.skip * factor)
     perceptrons = [contact, network.misfit_vector.to_numpy()]
-    answer_map = linear_answer_map(network.domain, charge_features.n_electrode)
+    answer_map = linear_answer_map(network.domain, network.features.n_electrode)
     layers = fold(perceptrons, _to_numpy(network.features_mean), _to_numpy(network.whitening), answer_map)
-    return FoldedNetwork(charge_features, layers)
+    return FoldedNetwork(network.features, layers)
 
 
 def _to_numpy(tensor: Tensor) -> Array:

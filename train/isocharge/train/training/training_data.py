@@ -23,7 +23,8 @@ from isocharge.train.data.presses import (
     split_by_position,
 )
 from isocharge.train.training.config import TrainingConfig
-from isocharge.train.training.network import WhitenedFeatures, logarithmic_features, signed_features
+from isocharge.train.training.folded_network import ChargeFeatures
+from isocharge.train.training.network import logarithmic_features, signed_features
 
 SIGNED_FEATURE_SCALE = 0.1
 """Charge above which features of charges of both signs are logarithmic, dimensionless.
@@ -186,8 +187,8 @@ class Split:
         folded_charges = replace(whole_field, is_folded=True) if is_folded else None
         return cls(domain, train, test, field, cautions, folded_charges)
 
-    def features(self, noise: NoiseModel) -> WhitenedFeatures:
-        """Fit the input features to the training presses.
+    def features(self, noise: NoiseModel) -> ChargeFeatures:
+        """Choose the features of the charges for the training presses.
 
         The features are logarithms of the charges if all charges are positive. Otherwise, they are inverse hyperbolic
         sines of charge / typical charge, which are linear for small charges and logarithmic for large charges.
@@ -198,9 +199,9 @@ class Split:
         charge = self.train.charge
         has_both_signs = self.train.signed or self.test.signed
         if not has_both_signs:
-            return WhitenedFeatures.fit(logarithmic_features(charge), charge)
+            return logarithmic_features(charge)
         channel_noise = ChannelNoise.alike(noise, charge.shape[1])
         # The typical charge of a channel is the charge above which the noise would be proportional to the charge if the
         # white noise were multiplied by `SIGNED_FEATURE_SCALE`.
         smaller_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
-        return WhitenedFeatures.fit(signed_features(charge, smaller_noise.transition_charge(charge)), charge)
+        return signed_features(charge, smaller_noise.transition_charge(charge))
