@@ -10,7 +10,7 @@ Bayes limit takes about 15 ms for each press.
 
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -124,8 +124,8 @@ class Case:
 class Adam:
     """The optimiser Adam of PyTorch with the interface of `Soap`."""
 
-    def __init__(self, parameters: Iterable[torch.Tensor]) -> None:
-        self._adam = torch.optim.Adam(parameters, betas=(0.9, 0.99))
+    def __init__(self, parameter: torch.Tensor) -> None:
+        self._adam = torch.optim.Adam([parameter], betas=(0.9, 0.99))
 
     def step(self, rate: float) -> None:
         """Update all parameters. A quarter of the rate for SOAP is the best rate for Adam."""

@@ -19,7 +19,7 @@ def run(take_step, parameter, loss, steps):
 
 
 def run_soap(parameter, loss, steps, rate):
-    optimiser = Soap([parameter])
+    optimiser = Soap(parameter)
     run(lambda: optimiser.step(rate), parameter, loss, steps)
 
 
@@ -67,7 +67,7 @@ def test_rows_that_get_a_gradient_only_later_do_not_cause_long_steps(shape):
     random = torch.Generator().manual_seed(0)
     mean_gradient = torch.randn(shape, generator=random)
     weight = nn.Parameter(torch.zeros(shape))
-    optimiser = Soap([weight])
+    optimiser = Soap(weight)
     longest_step = 0.0
     for step in range(60):
         weight.grad = mean_gradient + torch.randn(shape, generator=random)

@@ -243,7 +243,7 @@ class ChargeSeries:
         """
         nearest, excess = self._nearest_in_domain(contact)
         values = _continued(self._calibrated.values_and_derivatives(nearest), excess)
-        charge_pC, by_contact = self._charges(values, nearest, excess)
+        charge_pC, _, by_contact = self._charges(values, nearest, excess)
         return charge_pC + self.offset_pC, by_contact
 
     def changes(self, contact: Array, state: Array) -> ModelValues:
@@ -274,8 +274,7 @@ class ChargeSeries:
             value = value + np.einsum("nk,nske->nse", states[:, 1:], direction_values)
             value_by_state = np.concatenate([value_by_state, direction_values[:, 0].swapaxes(1, 2)], axis=2)
 
-        charge_pC, by_contact = self._charges(value, nearest, excess)
-        charge_per_value = self._charge_per_value(charge_pC, nearest, excess)
+        charge_pC, charge_per_value, by_contact = self._charges(value, nearest, excess)
         return ModelValues(charge_pC + self.offset_pC, by_contact, charge_per_value[:, :, None] * value_by_state)
 
     def at_state(self, state: Array) -> "ChargeSeries":
@@ -336,7 +335,7 @@ class ChargeSeries:
         nearest[:, :2] = unit_contact[:, :2] / np.maximum(distance, 1.0)[:, None]
         return nearest, unit_contact - nearest
 
-    def _charges(self, value: Array, nearest: Array, excess: Array) -> tuple[Array, Array]:
+    def _charges(self, value: Array, nearest: Array, excess: Array) -> tuple[Array, Array, Array]:
         """Convert values v of the series into charges without the offset.
 
         Args:
@@ -345,30 +344,20 @@ class ChargeSeries:
             excess: Differences to the nearest contacts.
 
         Returns:
-            Charges without the offset, and their derivatives, as `linearised` returns them.
+            Charges without the offset, and their derivatives with respect to v, both of shape (n, n_electrode), pC.
+            Derivatives of the charges with respect to the contact, as `linearised` returns them.
         """
         slopes = value[:, 1:].swapaxes(1, 2)  # shape (n, n_electrode, 3)
         if self.log_size is None:  # Q = exp(v)
-            charge_pC = _limited_exp(value[:, 0])
+            charge_pC = charge_per_value = _limited_exp(value[:, 0])
             by_unit_contact = charge_pC[:, :, None] * slopes
         else:  # Q = S(l) v, so the derivative with respect to l is S (v' + (ln S)' v)
-            size_pC, log_size_slope = self._size(nearest, excess)
+            size_pC, log_size_slope = series_size(self.log_size, nearest[:, 2], excess[:, 2])
             charge_pC = size_pC * value[:, 0]
+            charge_per_value = np.broadcast_to(size_pC, charge_pC.shape)
             by_unit_contact = size_pC[:, :, None] * slopes
             by_unit_contact[:, :, 2] += log_size_slope * charge_pC
-        return charge_pC, by_unit_contact / self.domain.scale
-
-    def _charge_per_value(self, charge_pC: Array, nearest: Array, excess: Array) -> Array:
-        """Return the derivative of each charge with respect to its value v, shape (n, n_electrode), pC."""
-        if self.log_size is None:
-            return charge_pC
-        size_pC, _ = self._size(nearest, excess)
-        return np.broadcast_to(size_pC, charge_pC.shape)
-
-    def _size(self, nearest: Array, excess: Array) -> tuple[Array, Array]:
-        """Compute the size S of the charges, pC, and the derivative of ln S with respect to l, each of shape (n, 1)."""
-        assert self.log_size is not None
-        return series_size(self.log_size, nearest[:, 2], excess[:, 2])
+        return charge_pC, charge_per_value, by_unit_contact / self.domain.scale
 
 
 def series_size(log_size: Array, unit_log_force: Array, excess: Array | float = 0.0) -> tuple[Array, Array]:

@@ -54,18 +54,19 @@ MAX_SQUARED_DEVIATION = 4.0
 BETTER_MISFIT_RATIO = 0.25
 """Ratio of two misfits below which one explanation of the presses counts as clearly better than another."""
 
-AXES = (
-    ("they are turned by 90 degrees", np.array([[0.0, -1.0], [1.0, 0.0]])),
-    ("they are turned by 180 degrees", np.array([[-1.0, 0.0], [0.0, -1.0]])),
-    ("they are turned by -90 degrees", np.array([[0.0, 1.0], [-1.0, 0.0]])),
-    ("x is mirrored", np.array([[-1.0, 0.0], [0.0, 1.0]])),
-    ("y is mirrored", np.array([[1.0, 0.0], [0.0, -1.0]])),
-    ("x and y are exchanged", np.array([[0.0, 1.0], [1.0, 0.0]])),
-    ("x and y are exchanged and mirrored", np.array([[0.0, -1.0], [-1.0, 0.0]])),
-)
+AXES = {
+    "they are turned by 90 degrees": ("-y", "x"),
+    "they are turned by 180 degrees": ("-x", "-y"),
+    "they are turned by -90 degrees": ("y", "-x"),
+    "x is mirrored": ("-x", "y"),
+    "y is mirrored": ("x", "-y"),
+    "x and y are exchanged": ("y", "x"),
+    "x and y are exchanged and mirrored": ("-y", "-x"),
+}
 """Rotations and reflections of the axes that the search for mistakes considers.
 
-Each entry is a description, and the matrix that converts written positions into correct positions."""
+Each entry is a description, and the correct coordinates x and y in terms of the written coordinates.
+"""
 
 
 def check_places(presses: MeasuredPresses, radius: float) -> None:
@@ -273,8 +274,10 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
         sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {held_names}"
         yield sentence, contact, charge[:, np.argsort(electrode_of_column)]
 
-    for description, matrix in AXES:
-        rotated_contact = np.column_stack([contact[:, :2] @ matrix.T, contact[:, 2]])
+    x, y, force = contact.T
+    coordinates = {"x": x, "-x": -x, "y": y, "-y": -y}
+    for description, (correct_x, correct_y) in AXES.items():
+        rotated_contact = np.column_stack([coordinates[correct_x], coordinates[correct_y], force])
         yield f"the rig's axes are not the film's: {description}", rotated_contact, charge
 
     for unit, factor in FORCE_UNITS_N.items():

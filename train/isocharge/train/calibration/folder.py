@@ -21,7 +21,7 @@ diagonal, rounded to six digits. The correlations of an unknown whose standard d
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -39,7 +39,6 @@ from isocharge.common.json_values import plain_values
 from isocharge.common.structs import Text, convert, read_json
 from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
-from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target
 from isocharge.serve.model.model_search import version_folders
 from isocharge.serve.presses.measured_presses import MeasuredPresses, presses_text
@@ -347,12 +346,12 @@ def write_calibration(
         PICTURE: picture_bytes(calibration_picture(result)),
         PRESSES: presses_text(result.presses).encode(),
     }
+    description = _film_section(result, fitted.made_with)
     released_model = release(
-        replace(fitted, files={**fitted.files, **files}),
+        replace(fitted, description=description, files={**fitted.files, **files}),
         folder,
         version=max(version_folders(folder), default=0) + 1,
         command=command,
-        card=lambda about, trained: _card(result, about, trained.domain.radius),  # replaces the usual card of a model
     )
     _copy_last_version(folder)
     return released_model.folder
@@ -418,36 +417,31 @@ def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
     return read_film(path, problem).drifted()
 
 
-def _card(result: CalibrationResult, about: ModelMetadata, radius: float) -> str:
-    """Return the Markdown text of the card of a calibrated model.
+def _film_section(result: CalibrationResult, made_with: Mapping[str, Any]) -> str:
+    """Return the section of the card of a calibrated model that describes the film, in Markdown.
 
     Args:
         result: Result of the calibration.
-        about: Metadata of the model.
-        radius: Radius of the working area of the network, mm.
+        made_with: Entries of the metadata, which may contain the factor of the standard deviations.
     """
     problem = result.problem
-    min_force, max_force = about.force_range_N
-    sentences = (*result.summary, *(f"Caution: {caution}." for caution in result.cautions))
-    if "std_factor" in about.made_with:
-        sentences = (*sentences, f"Held-out presses: {StdFactor(**about.made_with['std_factor']).statement}.")
+    sentences = [*result.summary, *(f"Caution: {caution}." for caution in result.cautions)]
+    if "std_factor" in made_with:
+        sentences.append(f"Held-out presses: {StdFactor(**made_with['std_factor']).statement}.")
     summary_list = "\n".join(f"- {sentence}" for sentence in sentences)
     property_rows = "\n".join(
         f"| `{name}` | {one.meaning} | {one.value:.4g} | {one.std:.2g} | {one.before_std:.2g} | "
         f"{'' if one.unit == '1' else one.unit} | {'yes' if one.identified else 'no'} |"
         for name, one in result.properties.items()
     )
-    return f"""# {about.name}, version {about.version}: a calibrated film
+    return f"""## The film
 
-The sensor `{problem.sensor.name}`, calibrated on {len(result.presses)} presses, with `{problem.probe.notation}`
-(radius as found).
-The model answers within {radius:g} mm of the centre, {min_force:g} to {max_force:g} N.
+A calibration estimated the film from {len(result.presses)} presses with `{problem.probe.notation}` (radius as found).
+The model was trained, and its errors below were measured, on simulated films that these presses leave possible.
 
 {summary_list}
 
 ![errors by the film, residuals]({PICTURE})
-
-## The film
 
 | property | what it is | value | standard deviation | before | unit | identified |
 |---|---|---|---|---|---|---|
@@ -455,30 +449,10 @@ The model answers within {radius:g} mm of the centre, {min_force:g} to {max_forc
 
 Identified: the presses at least halved its standard deviation. `calibration.json` has the correlations.
 
-## The model on this film
-
-On new simulated presses, with noise, on films that these presses leave possible:
-
-| error | figure |
-|---|---|
-| position, median | {about.errors["position_median_mm"]:g} mm |
-| position, rms | {about.errors["position_rms_mm"]:g} mm |
-| force, rms | {about.errors["force_rms_percent"]:g} % |
-
-{LIMITS}
-## Make it again
-
-```bash
-{about.made_with.get("command") or "(made by a program, see metadata)"}
-```
-"""
-
-
-LIMITS = """## Limits
-
 - A real film differs from the simulated one: by wrinkles, a seam under an electrode, a spot of glue. Such differences
   are learned from the presses as far as they are smooth. The rest shows as residuals above 1 in the picture.
 - Pretension creeps and coefficients age. Press a few times now and then and ask `isocharge serve check`; calibrate
   again with `--from` this folder.
 - Positions refer to the rig's zero: an offset of the rig is taken for a shift of the electrodes.
+
 """

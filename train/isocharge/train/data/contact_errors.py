@@ -90,3 +90,7 @@ class ContactErrorStatistics:
             force_rms_percent=rms(force_percent),
             force_p99_percent=float(np.percentile(force_percent, 99)),
         )
+
+    def rounded(self) -> dict[str, float]:
+        """Return the statistics by name, rounded to four significant digits."""
+        return {name: rounded(value) for name, value in vars(self).items()}

@@ -217,7 +217,14 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
             is not finite, if a force is not positive, or if the charge of an electrode never varies.
     """
     presses = LabelledPresses.of(dataset)
-    _check_finite(presses)
+    numbers = np.column_stack([presses.contact, presses.charge])
+    is_usable = np.isfinite(numbers).all(axis=1) & (presses.contact[:, 2] > 0.0)
+    if not is_usable.all():
+        row = int(np.argmin(is_usable))
+        raise DatasetError(
+            f"sample {row}: expected finite numbers and a positive force, got the contact "
+            f"{presses.contact[row].tolist()} (mm, mm, N) and {presses.charge[row].tolist()} pC"
+        )
 
     rounded_positions_mm = np.round(presses.contact[:, :2], 3)  # positions within a micrometre count as the same
     n_position = len(np.unique(rounded_positions_mm, axis=0))
@@ -234,24 +241,7 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
     for name, charge in zip(dataset.sensor.electrode_names, presses.charge.T, strict=True):
         if np.ptp(charge) == 0.0:
             raise DatasetError(f"electrode {name!r}: expected charges that vary, got {charge[0]:g} pC everywhere")
-
-    force = presses.contact[:, 2]
-    rows_without_positive_force = np.flatnonzero(force <= 0.0)
-    if rows_without_positive_force.size:
-        row = int(rows_without_positive_force[0])
-        raise DatasetError(f"sample {row}: expected a positive force, got {force[row]:g} N")
     return presses
-
-
-def _check_finite(presses: LabelledPresses) -> None:
-    """Raise a DatasetError for the first press with a contact or a charge that is not finite."""
-    is_finite = np.isfinite(presses.charge).all(axis=1) & np.isfinite(presses.contact).all(axis=1)
-    if not is_finite.all():
-        row = int(np.argmin(is_finite))
-        raise DatasetError(
-            f"sample {row}: expected finite numbers, got the contact {presses.contact[row].tolist()} (mm, mm, N) and "
-            f"{presses.charge[row].tolist()} pC"
-        )
 
 
 HELD_PARTS = 5

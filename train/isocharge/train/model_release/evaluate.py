@@ -1,7 +1,6 @@
 """Measurement of the errors of a network, and of its wrong answers without a flag, on presses outside its training."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from statistics import NormalDist
 
 import numpy as np
@@ -108,9 +107,8 @@ def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]
     Returns:
         Errors by name, as `evaluate` returns them.
     """
-    statistics = asdict(ContactErrorStatistics.of(contact, truth))
-    del statistics["presses"]  # the number of presses is not an error
-    errors = {name: rounded(value) for name, value in statistics.items()}
+    errors = ContactErrorStatistics.of(contact, truth).rounded()
+    del errors["presses"]  # the number of presses is not an error
     return errors | _coverages(contact, std, truth)
 
 

@@ -1,7 +1,6 @@
 """Release of a trained network as a model folder with an ONNX graph, measured errors, golden vectors and a card."""
 
 import platform
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version as installed_version
 from pathlib import Path
@@ -93,7 +92,7 @@ Estimates the position and the force of one press from the charges of the sensor
 | probes | {", ".join(metadata.probes)} |
 | noise `{metadata.noise.name}` | {noise_text} |
 
-## Errors
+{fitted.description}## Errors
 
 The errors are those on {len(fitted.test)} {_presses_text(metadata)}.
 
@@ -160,10 +159,6 @@ def _presses_text(metadata: ModelMetadata) -> str:
     )
 
 
-CardWriter = Callable[[ModelMetadata, Fitted], str]
-"""Function from the metadata and the trained network to the text of the card."""
-
-
 @dataclass(frozen=True)
 class Release:
     """A released model.
@@ -183,7 +178,6 @@ def release(
     *,
     version: int = 1,
     command: str = "",
-    card: CardWriter = model_card,
 ) -> Release:
     """Write a trained network as a version of a model.
 
@@ -195,7 +189,6 @@ def release(
         folder: Folder of the model, for example `models/NAME`. The name of the folder is the name of the model.
         version: Number of the version folder.
         command: Command that makes this model again, for the card.
-        card: Function that writes the card.
 
     Returns:
         The version folder and the metadata.
@@ -232,8 +225,8 @@ def release(
     graph = write_graph(fitted.network, complete_metadata.to_props())
     floors = contact_floors(complete_metadata)
     golden_charges = check_graph(graph, fitted.network.outputs, fitted.test, misfit_noise(fitted.noise), floors)
-    card_text = card(complete_metadata, fitted)
-    version_folder = write_model(folder, graph, complete_metadata, golden_charges, card_text, fitted.files)
+    card = model_card(complete_metadata, fitted)
+    version_folder = write_model(folder, graph, complete_metadata, golden_charges, card, fitted.files)
     return Release(version_folder, complete_metadata)
 
 

@@ -4,7 +4,7 @@ Every function in `METHOD_BUILDERS` adds a method to all reports. Models are add
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -390,7 +390,7 @@ def contact_errors(estimate: Array, truth: Array) -> tuple[float, dict[str, floa
     if not has_estimate.any():
         return 0.0, {}
     statistics = ContactErrorStatistics.of(estimate[has_estimate], truth[has_estimate])
-    return float(np.mean(has_estimate)), {name: rounded(value) for name, value in asdict(statistics).items()}
+    return float(np.mean(has_estimate)), statistics.rounded()
 
 
 def _call_next(calls: Iterator[Callable[[], object]]) -> None:

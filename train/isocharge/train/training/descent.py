@@ -9,7 +9,7 @@ are updated every few steps by one orthogonal iteration.
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -36,36 +36,14 @@ averaged gradient to an entry whose mean square is nearly zero. Without the limi
 
 
 class Soap:
-    """The optimiser SOAP. Parameters with one dimension, such as biases, are trained by Adam.
+    """The optimiser SOAP for one parameter. A parameter with one dimension, such as a bias, is trained by Adam.
 
     The class is not derived from `torch.optim.Optimizer`, because creating the first object of that class imports
     PyTorch's compiler. The import takes longer than a tenth of a training.
 
-    Args:
-        parameters: Parameters to train, which are vectors or matrices.
-    """
-
-    def __init__(self, parameters: Iterable[Tensor]) -> None:
-        """Prepare the moving averages of each parameter."""
-        self._states = [_ParameterState(parameter) for parameter in parameters]
-
-    @torch.no_grad()
-    def step(self, rate: float) -> None:
-        """Update all parameters from their gradients.
-
-        Args:
-            rate: Learning rate, which is approximately the change of each entry.
-        """
-        for state in self._states:
-            state.update(rate)
-
-
-class _ParameterState:
-    """One parameter with its moving averages and its eigenbases.
-
     Attributes:
-        parameter: The parameter.
-        step: Number of completed steps.
+        parameter: The parameter, a vector or a matrix.
+        count: Number of completed steps.
         mean: Moving average of the gradient.
         square: Moving average of the squared entries of the gradient in the eigenbasis.
         moments: Moving averages of G G^T and of G^T G for a matrix; empty for a vector.
@@ -75,14 +53,15 @@ class _ParameterState:
     def __init__(self, parameter: Tensor) -> None:
         """Begin with averages of zero, and with eigenbases that are identity matrices."""
         self.parameter = parameter
-        self.step = 0
+        self.count = 0
         self.mean = torch.zeros_like(parameter)
         self.square = torch.zeros_like(parameter)
         sizes = parameter.shape if parameter.ndim == 2 else ()
         self.moments = [torch.zeros(size, size) for size in sizes]
         self.bases = [torch.eye(size) for size in sizes]
 
-    def update(self, rate: float) -> None:
+    @torch.no_grad()
+    def step(self, rate: float) -> None:
         """Change the parameter by one step of SOAP (Vyas et al., 2024, algorithm 3).
 
         The averaged gradient is rotated into the eigenbasis. As in Adam, each entry of the rotated gradient is divided
@@ -90,7 +69,7 @@ class _ParameterState:
         the step.
 
         Args:
-            rate: Learning rate.
+            rate: Learning rate, which is approximately the change of each entry.
         """
         gradient = self.parameter.grad
         assert gradient is not None
@@ -98,15 +77,15 @@ class _ParameterState:
         if self.moments:
             for moment, square in zip(self.moments, (gradient @ gradient.T, gradient.T @ gradient), strict=True):
                 moment.lerp_(square, new_weight)
-            if self.step % BASIS_PERIOD == 0:
+            if self.count % BASIS_PERIOD == 0:
                 pairs = zip(self.moments, self.bases, strict=True)
                 self.bases = [torch.linalg.qr(moment @ basis).Q for moment, basis in pairs]
-        self.step += 1
+        self.count += 1
         self.mean.lerp_(gradient, new_weight)
         self.square.lerp_(_rotate(gradient, self.bases) ** 2, new_weight)
 
         # The moving averages begin at zero. They are therefore divided by the total weight of all gradients so far.
-        total_weight = 1.0 - DECAY**self.step
+        total_weight = 1.0 - DECAY**self.count
         root_mean_square = torch.sqrt(self.square / total_weight) + EPSILON
         ratio = _rotate(self.mean, self.bases) / (total_weight * root_mean_square)
         ratio.clamp_(-MAX_RATIO, MAX_RATIO)
@@ -120,9 +99,6 @@ def _rotate(matrix: Tensor, bases: Sequence[Tensor]) -> Tensor:
     row_basis, column_basis = bases
     return row_basis.T @ matrix @ column_basis
 
-
-RATE_INCREASE_FRACTION = 0.1
-"""Fraction of the steps during which the learning rate increases, dimensionless."""
 
 REPORT_EVERY = 200
 """Number of steps between two progress reports. The weights are stored as often."""
@@ -155,8 +131,8 @@ class TrainingStage:
     def run(self) -> None:
         """Train the network.
 
-        The learning rate increases to its largest value during the first tenth of the steps, and then decreases to zero
-        along a cosine. Weights that require no gradient, such as rounded weights, are not trained.
+        The learning rate decreases from its largest value to zero along a cosine. Weights that require no gradient,
+        such as rounded weights, are not trained.
 
         If a loss or its gradient is not finite, the training continues from the latest stored weights with half of the
         learning rate.
@@ -165,7 +141,7 @@ class TrainingStage:
             TrainingError: If this happens more than `MAX_RETRIES` times.
         """
         parameters = [parameter for parameter in self.network.parameters() if parameter.requires_grad]
-        optimiser = Soap(parameters)
+        optimisers = [Soap(parameter) for parameter in parameters]
         rate = self.rate
         retry_count = 0
         stored_weights = copy.deepcopy(self.network.state_dict())
@@ -185,24 +161,13 @@ class TrainingStage:
                         "or check the presses"
                     )
                 self.network.load_state_dict(stored_weights)
-                optimiser = Soap(parameters)
+                optimisers = [Soap(parameter) for parameter in parameters]
                 rate *= 0.5
                 continue
             is_reported = (step + 1) % REPORT_EVERY == 0 or step + 1 == self.steps
             if is_reported:
                 stored_weights = copy.deepcopy(self.network.state_dict())
-            optimiser.step(rate * relative_rate(progress))
+            for optimiser in optimisers:
+                optimiser.step(0.5 * rate * (1.0 + math.cos(math.pi * progress)))
             if is_reported:
                 report(f"training the {self.name} network", step + 1, self.steps, f"loss {loss.item():.3f}")
-
-
-def relative_rate(progress: float) -> float:
-    """Return the learning rate divided by its largest value.
-
-    Args:
-        progress: Number of completed steps divided by the number of all steps.
-    """
-    if progress < RATE_INCREASE_FRACTION:
-        return progress / RATE_INCREASE_FRACTION
-    angle = math.pi * (progress - RATE_INCREASE_FRACTION) / (1.0 - RATE_INCREASE_FRACTION)  # from 0 to pi
-    return 0.5 * (1.0 + math.cos(angle))

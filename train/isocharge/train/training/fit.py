@@ -63,6 +63,7 @@ class Fitted:
         made_with: Entries that the metadata of a release contain in addition to the usual entries.
         files: Contents of additional files in the version folder of a release, by file name.
         cautions: Sentences that users of the network should read.
+        description: Sections in Markdown that the card of a release contains before the errors; empty for none.
         cross_validated: Answers to the charges of `test` by networks that were not trained on these presses; None if
             `network` itself was not trained on them.
         outside: Presses outside the working area; None if they were not simulated.
@@ -82,6 +83,7 @@ class Fitted:
     made_with: Mapping[str, object] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
     cautions: tuple[str, ...] = ()
+    description: str = ""
     cross_validated: Answers | None = None
     outside: OutsidePresses | None = None
     yield_force_N: float | None = None
