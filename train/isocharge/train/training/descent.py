@@ -100,6 +100,9 @@ def _rotate(matrix: Tensor, bases: Sequence[Tensor]) -> Tensor:
     return row_basis.T @ matrix @ column_basis
 
 
+RATE_INCREASE_FRACTION = 0.1
+"""Fraction of the steps during which the learning rate increases, dimensionless."""
+
 REPORT_EVERY = 200
 """Number of steps between two progress reports. The weights are stored as often."""
 
@@ -131,8 +134,8 @@ class TrainingStage:
     def run(self) -> None:
         """Train the network.
 
-        The learning rate decreases from its largest value to zero along a cosine. Weights that require no gradient,
-        such as rounded weights, are not trained.
+        The learning rate increases to its largest value during the first tenth of the steps, and then decreases to zero
+        along a cosine. Weights that require no gradient, such as rounded weights, are not trained.
 
         If a loss or its gradient is not finite, the training continues from the latest stored weights with half of the
         learning rate.
@@ -168,6 +171,18 @@ class TrainingStage:
             if is_reported:
                 stored_weights = copy.deepcopy(self.network.state_dict())
             for optimiser in optimisers:
-                optimiser.step(0.5 * rate * (1.0 + math.cos(math.pi * progress)))
+                optimiser.step(rate * relative_rate(progress))
             if is_reported:
                 report(f"training the {self.name} network", step + 1, self.steps, f"loss {loss.item():.3f}")
+
+
+def relative_rate(progress: float) -> float:
+    """Return the learning rate divided by its largest value.
+
+    Args:
+        progress: Number of completed steps divided by the number of all steps.
+    """
+    if progress < RATE_INCREASE_FRACTION:
+        return progress / RATE_INCREASE_FRACTION
+    angle = math.pi * (progress - RATE_INCREASE_FRACTION) / (1.0 - RATE_INCREASE_FRACTION)  # from 0 to pi
+    return 0.5 * (1.0 + math.cos(angle))
