@@ -18,7 +18,7 @@ LARGEST_ERRORS = {
 
 @pytest.fixture(scope="module")
 def presses(dataset):
-    return LabelledPresses.of(dataset)
+    return LabelledPresses.of(dataset.samples)
 
 
 @pytest.fixture(scope="module")

@@ -94,7 +94,7 @@ def fitted_pad():
 def fresh():
     """Presses on the L that were not used in the training."""
     contact = contacts_on_l(4_000, 2)
-    return LabelledPresses(contact, charges_on_l(contact, 3), measured=True)
+    return LabelledPresses(contact, charges_on_l(contact, 3))
 
 
 def errors_on(fitted, presses):
@@ -364,7 +364,7 @@ def test_a_real_pad_is_learned_better_than_by_boosted_trees():
     is_held_out = position_ranks(presses.contact) < 0.2
     fitted = fit_presses(presses[~is_held_out], "pad")
     held_out_presses = presses[is_held_out]
-    errors = errors_on(fitted, LabelledPresses(held_out_presses.contact, held_out_presses.charge_pC, measured=True))
+    errors = errors_on(fitted, LabelledPresses(held_out_presses.contact, held_out_presses.charge_pC))
     assert errors["position_rms_mm"] < 6.93
     assert errors["force_rms_percent"] < 27.0
     assert 0.63 < errors["coverage_68"] < 0.75

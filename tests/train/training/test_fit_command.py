@@ -1,9 +1,12 @@
 """The command `train fit` with a dataset: what it imports, and what it keeps if the release is refused."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -99,3 +102,23 @@ def test_a_version_that_appears_during_the_training_costs_no_model(dataset_folde
     assert code == 0, err
     assert "m/1 was written during the training: this model becomes " in err
     assert load_model(tmp_path / "m" / "2").metadata.version == 2
+
+
+@pytest.mark.parametrize("obstacle", ["m", "m/config.pbtxt"], ids=["a file", "a model of another sensor"])
+def test_a_training_whose_release_is_refused_costs_no_model(obstacle, dataset_folder, tmp_path, command, monkeypatch):
+    (tmp_path / "short.toml").write_text(SHORT_CONFIG)
+
+    def train_slowly(*arguments):
+        path = tmp_path / obstacle
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("written by another process")
+        return fit(*arguments)
+
+    monkeypatch.setattr(fit_command, "fit", train_slowly)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    code, _, err = command("train", "fit", dataset_folder, "--config", tmp_path / "short.toml", "-o", tmp_path / "m")
+    assert code != 0
+    kept_folder = Path(re.search(r"The trained model is kept in (\S+)", err)[1])
+    assert kept_folder.parts[-2:] == ("m", "1")
+    assert load_model(kept_folder).metadata.name == "m"
+    assert (tmp_path / obstacle).read_text() == "written by another process"

@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Annotated
 
 import typer
@@ -13,7 +14,7 @@ from isocharge.cli.shared.options import ConfigOption, JsonOption
 from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.common.errors import InputError, OutputExists
+from isocharge.common.errors import InputError, ModelError, OutputError, OutputExists
 from isocharge.serve import ModelMetadata
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import (
@@ -171,18 +172,25 @@ def _refuse_options(context: typer.Context, names: Sequence[str], reason: str) -
 def _release(fitted: Fitted, version_folder: Path) -> Release:
     """Write a trained network as a version of a model.
 
-    If another process has written this version during the training, the next free version is written.
+    If another process has written this version during the training, the next free version is written. If the folder of
+    the model refuses the version for another reason, the version is written to a new temporary folder.
 
     Args:
         fitted: The network.
         version_folder: Folder of the version.
+
+    Raises:
+        IsochargeError: If the folder refuses the version. The message names the temporary folder.
     """
+    model_folder = version_folder.parent
     version = int(version_folder.name)
     try:
-        return release(fitted, version_folder.parent, version=version, command=this_command())
-    except OutputExists:
+        return release(fitted, model_folder, version=version, command=this_command())
+    except (OutputExists, OutputError, ModelError) as error:
         if not version_folder.exists():
-            raise
+            temporary_folder = Path(mkdtemp(prefix="isocharge-"), model_folder.resolve().name)
+            kept = release(fitted, temporary_folder, version=version, command=this_command())
+            raise type(error)(f"{error}. The trained model is kept in {kept.folder}") from error
         next_folder = version_folder.with_name(f"{version + 1}")
         say(f"caution: {version_folder} was written during the training: this model becomes {next_folder}")
         return _release(fitted, next_folder)

@@ -43,27 +43,19 @@ class LabelledPresses:
     Attributes:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         charge: Charges, shape (n, n_electrode), pC.
-        measured: Whether the charges were measured. Measured charges already contain noise.
     """
 
     contact: Array
     charge: Array
-    measured: bool = False
 
     @classmethod
-    def of(cls, dataset: Dataset) -> "LabelledPresses":
-        """Return all presses of a dataset without checking them."""
-        return cls.of_samples(dataset.samples, measured=is_measured(dataset))
-
-    @classmethod
-    def of_samples(cls, samples: Samples, *, measured: bool) -> "LabelledPresses":
-        """Return the contacts and charges of samples, which were measured or simulated."""
-        contact = np.stack([samples.x_mm, samples.y_mm, samples.force_N], axis=1)
-        return cls(contact, samples.charge_pC, measured)
+    def of(cls, samples: Samples) -> "LabelledPresses":
+        """Return the contacts and charges of samples without checking them."""
+        return cls(np.stack([samples.x_mm, samples.y_mm, samples.force_N], axis=1), samples.charge_pC)
 
     def __getitem__(self, rows: np.ndarray | slice) -> "LabelledPresses":
         """Return some of the presses."""
-        return LabelledPresses(self.contact[rows], self.charge[rows], self.measured)
+        return LabelledPresses(self.contact[rows], self.charge[rows])
 
     def __len__(self) -> int:
         return len(self.contact)
@@ -85,7 +77,7 @@ class LabelledPresses:
     def joined(self, other: "LabelledPresses") -> "LabelledPresses":
         """Return these presses, followed by other presses of the same kind."""
         contact = np.concatenate([self.contact, other.contact])
-        return LabelledPresses(contact, np.concatenate([self.charge, other.charge]), self.measured)
+        return LabelledPresses(contact, np.concatenate([self.charge, other.charge]))
 
     def repeated(self, min_count: int) -> "LabelledPresses":
         """Return at least `min_count` presses, by repeating all presses in their order.
@@ -153,19 +145,12 @@ def domain_of(dataset: Dataset) -> Domain:
         ) from error
 
     domain = Domain(radius, (min_force, max_force))
-    if not domain.contains(LabelledPresses.of(dataset).contact).all():
+    if not domain.contains(LabelledPresses.of(samples).contact).all():
         raise DatasetError(
             f"manifest ranges: radius_mm {radius:g} and force_N [{min_force:g}, {max_force:g}] do not hold the "
             f"samples, which reach {sample_radius:g} mm and {sample_forces[0]:g} to {sample_forces[1]:g} N"
         )
     return domain
-
-
-def outside_presses_of(dataset: Dataset) -> LabelledPresses | None:
-    """Return the presses of a dataset that lie between its working area and the clamp; None if there are none."""
-    if dataset.outside is None:
-        return None
-    return LabelledPresses.of_samples(dataset.outside, measured=is_measured(dataset))
 
 
 def split_by_position(presses: LabelledPresses, share: float) -> tuple[LabelledPresses, LabelledPresses]:
@@ -216,7 +201,7 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
         DatasetError: If the dataset has too few presses, positions or electrodes. The error is also raised if a number
             is not finite, if a force is not positive, or if the charge of an electrode never varies.
     """
-    presses = LabelledPresses.of(dataset)
+    presses = LabelledPresses.of(dataset.samples)
     numbers = np.column_stack([presses.contact, presses.charge])
     is_usable = np.isfinite(numbers).all(axis=1) & (presses.contact[:, 2] > 0.0)
     if not is_usable.all():
@@ -282,7 +267,7 @@ def measured_presses_of(dataset: Dataset) -> MeasuredPresses:
     samples = dataset.samples
     count = len(samples)
     return MeasuredPresses(
-        contact=LabelledPresses.of(dataset).contact,
+        contact=LabelledPresses.of(samples).contact,
         charge_pC=samples.charge_pC,
         position_std_mm=np.full(count, POSITION_STD_MM),
         force_std=np.full(count, FORCE_STD),

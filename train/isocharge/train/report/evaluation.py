@@ -277,7 +277,8 @@ class DatasetEvaluation:
         domain = domain_of(self.dataset)
         seed = self.settings.seed
         test = self.held_out_presses
-        if not test.measured:
+        measured = is_measured(self.dataset)
+        if not measured:
             test = test.repeated(self.settings.presses)
             test = replace(test, charge=test.noisy(NOISE, seed))
 
@@ -290,12 +291,12 @@ class DatasetEvaluation:
             task = FittingTask(self.presses, charge_map, NOISE)
             methods += [build_method(task) for build_method in METHOD_BUILDERS]
             # The limit follows from the derivatives of the series, and the noise of measured presses is unknown.
-            if not test.measured and charge_map.charge_std >= NOISE.gain:
+            if not measured and charge_map.charge_std >= NOISE.gain:
                 failure_reasons.append(
                     f"Cramér-Rao limit: a series that is fitted to {len(train)} presses has an error of "
                     f"{100.0 * charge_map.charge_std:.2g} % of a charge, more than the noise; simulate more presses"
                 )
-            elif not test.measured:
+            elif not measured:
                 cramer_rao = limits_at(charge_map, test.contact, NOISE)
                 limits = {
                     "position_rms_mm": rounded(rms(cramer_rao.position)),
@@ -306,11 +307,11 @@ class DatasetEvaluation:
             failure_reasons.append(str(error))
         return Section(
             sensor=self.dataset.sensor.name,
-            measured=test.measured,
+            measured=measured,
             probes=[str(notation) for notation in np.unique(self.dataset.samples.probe)],
             radius_mm=domain.radius,
             force_N=domain.force_range,
-            noise=None if test.measured else NOISE.name,
+            noise=None if measured else NOISE.name,
             dataset_sha256=self.dataset.sha256,
             fitted_presses=len(self.presses),
             test_presses=len(test),

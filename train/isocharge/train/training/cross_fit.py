@@ -108,7 +108,7 @@ def fit_presses(
     training = _with_defaults_for_measured(settings.training)
     usable = usable_presses(presses)
     force_std = constant_force_std(usable)  # None if the forces vary
-    labelled = LabelledPresses(usable.contact, usable.charge_pC, measured=True)
+    labelled = LabelledPresses(usable.contact, usable.charge_pC)
     domain = PressedArea.of_contacts(labelled.contact)
     noise = ChannelNoise.estimate(labelled.charge, domain.to_unit(labelled.contact))
     with threads_and_seed(training.threads, training.seed):

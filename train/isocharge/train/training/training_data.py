@@ -18,7 +18,7 @@ from isocharge.train.data.presses import (
     YIELD_FORCE,
     LabelledPresses,
     domain_of,
-    outside_presses_of,
+    is_measured,
     presses_of,
     split_by_position,
 )
@@ -67,8 +67,7 @@ class TrainingData:
         Raises:
             DatasetError: If the dataset has too few presses or electrodes, or is measured.
         """
-        presses = presses_of(dataset)
-        if presses.measured:
+        if is_measured(dataset):
             raise DatasetError(
                 "expected simulated presses, got a measured dataset, whose manifest has no settings of a simulator; "
                 "train with `isocharge train fit DATASET`, or with `fit_presses` in Python"
@@ -77,9 +76,9 @@ class TrainingData:
             sensor=dataset.sensor,
             probes=tuple(sorted({str(probe) for probe in dataset.samples.probe})),
             domain=domain_of(dataset),
-            presses=presses,
+            presses=presses_of(dataset),
             sha256=dataset.sha256,
-            outside=outside_presses_of(dataset),
+            outside=None if dataset.outside is None else LabelledPresses.of(dataset.outside),
             yield_force_N=dataset.manifest.get(YIELD_FORCE),
         )
 
