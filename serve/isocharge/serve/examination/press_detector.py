@@ -50,7 +50,7 @@ def touched_blocks(levels: Array, noise: Array) -> Booleans:
     channels = tuple(map(str, range(len(noise))))
     detector = Touch(Setup(channels, Device(rules={TouchRule: BLOCK_RULE}), has_any_sign=True))
     is_contact = np.zeros(len(levels), dtype=bool)
-    rest = levels[0]
+    rest = np.zeros(len(noise))  # replaced in the first block
     for number, level in enumerate(levels):
         if not is_contact[number - 1]:
             rest = levels[max(number - CHANGE_BLOCKS, 0)]
