@@ -81,11 +81,6 @@ class Domain:
         contact[..., 2] = np.exp(contact[..., 2])
         return contact
 
-    @property
-    def _allowed_positions(self) -> str:
-        """Description of the allowed positions for error messages."""
-        return f"at most {self.radius:g} mm from the centre"
-
     def within(self, radius: float) -> "Domain":
         """Return a copy of the domain with another radius (mm) and the same range of forces."""
         return Domain(radius, self.force_range)
@@ -101,8 +96,10 @@ class Domain:
         Returns:
             Whether each contact lies in the domain, shape (n,).
         """
-        is_in_disk = np.hypot(contact[:, 0], contact[:, 1]) <= self.radius * LIMIT_TOLERANCE
-        return np.asarray(is_in_disk & are_within(contact[:, 2], self.force_range))
+        x, y, force = contact.T
+        low, high = self.force_range
+        is_in_disk = np.hypot(x, y) <= self.radius * LIMIT_TOLERANCE
+        return np.asarray(is_in_disk & (force >= low / LIMIT_TOLERANCE) & (force <= high * LIMIT_TOLERANCE))
 
     def check(self, contact: Array, source: str) -> Array:
         """Convert contacts into an array of floats, and raise an error if a contact lies outside the domain.
@@ -125,7 +122,7 @@ class Domain:
             low, high = self.force_range
             raise SceneError(
                 f"press {first_outside} at ({x:.4g}, {y:.4g}) mm with {force:.4g} N is outside the {source}: expected "
-                f"{self._allowed_positions} and {low:g} to {high:g} N"
+                f"at most {self.radius:g} mm from the centre and {low:g} to {high:g} N"
             )
         return contact
 
@@ -150,16 +147,3 @@ def as_contacts(contact: Array, source: str) -> Array:
             f"{contact.shape}"
         )
     return contact
-
-
-def are_within(force: Array, force_range: tuple[float, float]) -> Booleans:
-    """Return whether each force lies in a range.
-
-    The comparison allows for rounding errors. A force that is NaN lies outside the range.
-
-    Args:
-        force: Forces, shape (n,), N.
-        force_range: Smallest and largest force of the range, N.
-    """
-    low, high = force_range
-    return np.asarray((force >= low / LIMIT_TOLERANCE) & (force <= high * LIMIT_TOLERANCE))

@@ -1,8 +1,9 @@
 """Conversion of values for JSON. NaN and infinity become None, because JSON cannot represent these numbers."""
 
 import math
+from typing import Any
 
-import numpy as np
+import msgspec
 
 
 def finite_or_none(value: float | None) -> float | None:
@@ -12,7 +13,7 @@ def finite_or_none(value: float | None) -> float | None:
     return float(value)
 
 
-def plain_values(value: object) -> object:
+def plain_values(value: object) -> Any:
     """Convert a value to a value that `json.dumps(..., allow_nan=False)` accepts.
 
     Arrays and tuples become lists. NumPy numbers become Python numbers. Numbers that are not finite become None. The
@@ -21,12 +22,5 @@ def plain_values(value: object) -> object:
     Args:
         value: Number, text, truth value, None, array, tuple, list or dictionary.
     """
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()  # a list for an array, and a Python number for a NumPy number
-    if isinstance(value, dict):
-        return {str(key): plain_values(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain_values(item) for item in value]
-    if isinstance(value, float):
-        return finite_or_none(value)
-    return value
+    # msgspec calls `enc_hook` for arrays and for NumPy numbers, and writes null for numbers that are not finite.
+    return msgspec.json.decode(msgspec.json.encode(value, enc_hook=lambda item: item.tolist()))

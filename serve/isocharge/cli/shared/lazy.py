@@ -10,6 +10,7 @@ command line.
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from importlib import import_module
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import typer
@@ -34,13 +35,11 @@ def insert_live_address(words: Sequence[str]) -> list[str]:
         ['--live', '127.0.0.1:8001', '--seconds', '5']
     """
     completed_words: list[str] = []
-    for index, word in enumerate(words):
-        if word == "--":
-            return [*completed_words, *words[index:]]
+    for word, next_word in pairwise([*words, ""]):
         completed_words.append(word)
-        next_word = "".join(words[index + 1 : index + 2])  # empty after the last word
+        is_option = word == "--live" and "--" not in completed_words
         is_address = next_word.isdecimal() or (":" in next_word and not next_word.startswith("-"))
-        if word == "--live" and not is_address:
+        if is_option and not is_address:
             completed_words.append(DEFAULT_LIVE_ADDRESS)
     return completed_words
 

@@ -122,20 +122,23 @@ def write_response(loaded: LoadedVersion, request: InferRequest, outputs: dict[s
         request: The request, which states which outputs are sent as binary tensors.
         outputs: Values of the requested outputs by their names, each of shape (n, width).
     """
-    _, response_type = METHODS["ModelInfer"]
-    message = response_type()
-    message.model_name = loaded.metadata.name
-    message.model_version = loaded.version
-    message.id = request.id
+    tensors: list[dict[str, Any]] = []
+    raw_contents: list[bytes] = []
     for name, rows in outputs.items():
         is_text = name == FLAGS
-        datatype = "BYTES" if is_text else "FP32"
-        tensor = message.outputs.add(name=name, datatype=datatype, shape=rows.shape)
+        tensor: dict[str, Any] = {"name": name, "datatype": "BYTES" if is_text else "FP32", "shape": rows.shape}
         if request.outputs[name]:
-            message.raw_output_contents.append(binary_tensor(rows))
+            raw_contents.append(binary_tensor(rows))
         elif is_text:
-            texts = rows[:, 0].tolist()  # the output `flags` has a single column
-            tensor.contents.bytes_contents.extend(text.encode() for text in texts)
+            tensor["contents"] = {"bytes_contents": [text.encode() for text in rows.ravel().tolist()]}
         else:
-            tensor.contents.fp32_contents.extend(rows.ravel().tolist())
-    return message
+            tensor["contents"] = {"fp32_contents": rows.ravel().tolist()}
+        tensors.append(tensor)
+    _, response_type = METHODS["ModelInfer"]
+    return response_type(
+        model_name=loaded.metadata.name,
+        model_version=loaded.version,
+        id=request.id,
+        outputs=tensors,
+        raw_output_contents=raw_contents,
+    )

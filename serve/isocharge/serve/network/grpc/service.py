@@ -299,5 +299,5 @@ def _authorization(context: grpc.aio.ServicerContext) -> bytes:
 
     The value is empty if the client has not sent the field.
     """
-    value = dict(context.invocation_metadata() or ()).get("authorization", "")
-    return value.encode() if isinstance(value, str) else bytes(value)
+    metadata = dict(context.invocation_metadata() or ())
+    return str(metadata.get("authorization", "")).encode()

@@ -62,20 +62,15 @@ class Connection(HttpToolsProtocol):
         """
         super().connection_made(transport)
         self.deadline = self.loop.time() + self._limits.header_seconds
-        if len(self.connections) > self._limits.connections and not self._end_oldest_unused():
-            self.refuse(503, f"all {self._limits.connections} connections are taken; try again later")
-
-    def _end_oldest_unused(self) -> bool:
-        """End the oldest other connection that has not sent a request, and return whether there was such a connection.
-
-        The oldest connection is the connection with the earliest deadline.
-        """
-        others = [other for other in self.connections if isinstance(other, Connection) and other is not self]
+        if len(self.connections) <= self._limits.connections:
+            return
+        others: Any = self.connections - {self}  # all connections are of this class
         unused = [other for other in others if other.cycle is None and not other.transport.is_closing()]
         if unused:
-            oldest = min(unused, key=lambda other: other.deadline)
+            oldest = min(unused, key=lambda other: other.deadline)  # the earliest deadline belongs to the oldest one
             oldest.transport.abort()
-        return bool(unused)
+        else:
+            self.refuse(503, f"all {self._limits.connections} connections are taken; try again later")
 
     def data_received(self, data: bytes) -> None:
         """Parse data of the client. Refuse a request whose head, trailers or chunk extensions are too long."""
@@ -293,7 +288,7 @@ class _Server(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:
         """End overdue connections. uvicorn calls this method ten times per second until the server is stopped."""
         now = asyncio.get_running_loop().time()
-        for connection in list(self.server_state.connections):
-            if isinstance(connection, Connection):
-                connection.close_if_overdue(now)
+        connections: Any = list(self.server_state.connections)
+        for connection in connections:
+            connection.close_if_overdue(now)
         return await super().on_tick(counter)

@@ -89,14 +89,6 @@ def statistics_of(store: ModelStore, name: str = "", version: str = "") -> dict[
     }
 
 
-def repository_index(store: ModelStore, *, ready: bool) -> list[dict[str, str]]:
-    """Return one row for each version in the repository.
-
-    If `ready` is true, the result contains only the rows of loaded versions.
-    """
-    return [row for row in store.index() if row["state"] == "READY" or not ready]
-
-
 def openapi_document(store: ModelStore) -> dict[str, Any]:
     """Return the OpenAPI document of the file `openapi.json`, with the names and versions of the loaded models.
 

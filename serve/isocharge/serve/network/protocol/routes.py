@@ -90,7 +90,7 @@ def _show_index(request: Request) -> list[dict[str, str]]:
     If the body contains `ready: true`, the index contains only the loaded versions.
     """
     body = parse_json(request.body or b"{}", "", RequestError, IndexBody)
-    return describe.repository_index(request.store, ready=body.ready is True)
+    return [row for row in request.store.index() if row["state"] == "READY" or not body.ready]
 
 
 def _load(request: Request) -> dict[str, Any]:
