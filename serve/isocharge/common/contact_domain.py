@@ -46,6 +46,8 @@ class Domain:
     def is_outside(self, contact: Array) -> Booleans:
         """Return whether each contact lies outside the disk or has a force outside the range of forces.
 
+        The comparison allows for rounding errors.
+
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N. A position or a force that is NaN counts as inside.
 
@@ -54,7 +56,8 @@ class Domain:
         """
         x, y, force = contact.T
         low, high = self.force_range
-        return np.asarray((np.hypot(x, y) > self.radius) | (force < low) | (force > high))
+        is_off_disk = np.hypot(x, y) > self.radius * LIMIT_TOLERANCE
+        return np.asarray(is_off_disk | (force < low / LIMIT_TOLERANCE) | (force > high * LIMIT_TOLERANCE))
 
     def to_unit(self, contact: Array) -> Array:
         """Convert contacts (x, y, F) into coordinates (x, y, ln F) that are scaled to the cube [-1, 1]^3.
@@ -96,10 +99,7 @@ class Domain:
         Returns:
             Whether each contact lies in the domain, shape (n,).
         """
-        x, y, force = contact.T
-        low, high = self.force_range
-        is_in_disk = np.hypot(x, y) <= self.radius * LIMIT_TOLERANCE
-        return np.asarray(is_in_disk & (force >= low / LIMIT_TOLERANCE) & (force <= high * LIMIT_TOLERANCE))
+        return np.asarray(~self.is_outside(contact) & ~np.isnan(contact).any(axis=1))
 
     def check(self, contact: Array, source: str) -> Array:
         """Convert contacts into an array of floats, and raise an error if a contact lies outside the domain.

@@ -305,24 +305,18 @@ def flush_to_disk(path: Path) -> None:
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[None]:
     """Lock a folder for the `with` block, so that no other process can lock the folder.
 
-    If the given path does not exist, it is created as a lock file. The operating system unlocks the folder if this
-    process is killed.
+    The operating system unlocks the folder if this process is killed.
 
     Args:
-        path: The folder, or a lock file in the folder.
+        folder: The folder, which must exist.
 
     Raises:
         OutputExists: If another process has locked the folder.
     """
-    if path.is_dir():
-        folder = path
-        descriptor = os.open(path, os.O_RDONLY)  # a folder cannot be opened for writing
-    else:
-        folder = path.parent
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT)
+    descriptor = os.open(folder, os.O_RDONLY)  # a folder cannot be opened for writing
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises an error at once instead of waiting

@@ -1,11 +1,14 @@
 """What the tests of the commands share."""
 
+import io
+import signal
+import sys
 from functools import partial
 from itertools import chain, islice
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from boards import TcpBoard, interrupt, taps
 from isocharge.cli.main import app
@@ -32,16 +35,20 @@ def frames(tmp_path_factory, film):
 
 
 @pytest.fixture
-def run():
-    """A function that runs a command in this process; an error of ours is raised."""
+def run(capfd, monkeypatch):
+    """A function that runs a command in this process; an error of ours is raised. SIGTERM acts as in `main`."""
+    previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
 
-    def invoke(*arguments, stdin=None):
-        result = CliRunner().invoke(app, ["serve", *map(str, arguments)], input=stdin)
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result
+    def invoke(*arguments, stdin=b""):
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(stdin)))
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            app(["serve", *map(str, arguments)])
+        printed = capfd.readouterr()
+        return SimpleNamespace(exit_code=int(ended.value.code or 0), stdout=printed.out, stderr=printed.err)
 
-    return invoke
+    yield invoke
+    signal.signal(signal.SIGTERM, previous_handler)
 
 
 @pytest.fixture

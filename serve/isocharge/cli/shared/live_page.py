@@ -4,7 +4,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +14,7 @@ import typer
 from msgspec import structs
 
 from isocharge.cli.shared.lazy import DEFAULT_LIVE_ADDRESS
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.terminal import say, warnings_passed_to
 from isocharge.common.errors import InputError, shown
 from isocharge.common.extras import require
 from isocharge.serve import PredictionRecord, Recorder, TouchStream
@@ -177,14 +177,11 @@ def live_page(
 
     access = AccessCheck(address.host, allow_host or (), token=secret)
     page = LivePage(describe_film(name, metadata), is_recording=is_recording, access=access)
-    handler = logging.Handler()
-    handler.emit = lambda record: page.update(  # type: ignore[method-assign]
-        note={"text": record.getMessage(), "at": time.time()}
-    )
-    logger = logging.getLogger("isocharge.serve")
-    with serve_page(page, address, tls) as url, ExitStack() as stack:
-        logger.addHandler(handler)
-        stack.callback(logger.removeHandler, handler)
+
+    def show_warning(record: logging.LogRecord) -> None:
+        page.update(note={"text": record.getMessage(), "at": time.time()})
+
+    with serve_page(page, address, tls) as url, warnings_passed_to(show_warning, "isocharge.serve"):
         say(f"{'replay' if is_recording else 'live'} page: {url}")
         yield page
 

@@ -38,9 +38,9 @@ def open_closed_streams() -> None:
     Without this replacement, the next file that is opened would get the file descriptor of stdout, and printed text
     would be written into that file.
     """
-    for descriptor, (name, mode) in zip(STANDARD_DESCRIPTORS, STREAM_MODES.items(), strict=True):
+    for name, mode in STREAM_MODES.items():
         if getattr(sys, name) is None:  # Python found the descriptor closed
-            os.open(os.devnull, os.O_RDWR)  # gets the lowest free file descriptor, which is `descriptor`
+            descriptor = os.open(os.devnull, os.O_RDWR)  # the lowest free file descriptor, which is that of the stream
             setattr(sys, name, open(descriptor, mode, closefd=False))  # noqa: SIM115
 
 
@@ -270,26 +270,30 @@ def this_command() -> str:
 
 @contextmanager
 def warnings_to_stderr() -> Iterator[None]:
-    """Context manager that prints the warnings of all packages of isocharge on stderr.
+    """Context manager that prints the warnings of all packages of isocharge on stderr, without time and traceback.
 
     Warnings of simulation and training begin with `caution:`.
     """
-    handler = logging.StreamHandler()  # writes to stderr
-    handler.setFormatter(_WarningFormatter())
-    logger = logging.getLogger("isocharge")
+
+    def print_warning(record: logging.LogRecord) -> None:
+        caution = "" if record.name.startswith("isocharge.serve") else "caution: "
+        say(caution + record.getMessage())
+
+    with warnings_passed_to(print_warning, "isocharge"):
+        yield
+
+
+@contextmanager
+def warnings_passed_to(write: Callable[[logging.LogRecord], None], package: str) -> Iterator[None]:
+    """Context manager that calls a function with each warning of a package and of the packages in it."""
+    handler = logging.Handler()
+    handler.emit = write  # type: ignore[method-assign, assignment]
+    logger = logging.getLogger(package)
     logger.addHandler(handler)
     try:
         yield
     finally:
         logger.removeHandler(handler)
-
-
-class _WarningFormatter(logging.Formatter):
-    """Formats a warning as one sentence in printable characters, without time and traceback."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        caution = "" if record.name.startswith("isocharge.serve") else "caution: "
-        return caution + printable_lines(record.getMessage())
 
 
 @contextmanager

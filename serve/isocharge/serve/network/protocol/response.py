@@ -108,8 +108,8 @@ def error_response(error: Exception) -> Response:
     return response
 
 
-_WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
-"""Argument `wbits` of zlib for each encoding. The encoding `deflate` of HTTP is the zlib format."""
+ENCODINGS = (b"gzip", b"x-gzip", b"deflate")
+"""Supported encodings of a body. The encoding `deflate` of HTTP is the zlib format."""
 
 
 def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
@@ -127,9 +127,9 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     """
     if encoding in (b"", b"identity"):
         return body
-    if encoding not in _WINDOW_BITS:
+    if encoding not in ENCODINGS:
         raise errors.UnknownEncoding(f"Content-Encoding {_quoted(encoding)}: expected gzip, deflate or identity")
-    decompressor = zlib.decompressobj(_WINDOW_BITS[encoding])
+    decompressor = zlib.decompressobj(zlib.MAX_WBITS | 32)  # recognises both formats
     try:
         plain_body = decompressor.decompress(body, limit + 1)  # the additional byte shows that the limit is exceeded
     except zlib.error as error:
