@@ -14,6 +14,7 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.readout import touch_charge
+from isocharge.simulate.forward.turns import Turns
 from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
@@ -21,7 +22,6 @@ from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import (
     chebyshev_nodes,
     lagrange_values,
-    periodic_weights,
 )
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
@@ -30,49 +30,36 @@ from isocharge.simulate.solver.load_case import SolveSettings, check_press, laye
 from isocharge.simulate.solver.press import needed_resolution, press
 from isocharge.simulate.solver.press_chain import Chain, Reading, solve_chains
 
-ROTATIONS = 7
-"""Smallest number of orientations of a probe that is not axisymmetric.
+HARMONICS = (3, 2, 1, 0)
+"""Usual largest harmonics of a family; see `Turns.spread`.
 
-In a frame that rotates with the probe, the orientation changes only the direction to the centre and to the rim of the
-film. The rim is far from the probe. A few harmonics of the orientation therefore describe the stress.
+A T1 / T2 of 1.7 and a rectangle of 4 mm by 2 mm on a film of 45 mm radius give terms of up to 3e-5 beyond them.
 """
-
-DIRECTION_PERIOD = np.pi
-"""Rotation of a film that is not axisymmetric, after which its properties are the same again, rad."""
-
-DIRECTIONS = 7
-"""Smallest number of directions, within half a turn, on a film that is not axisymmetric.
-
-The stress contains even harmonics of the direction, whose amplitudes decrease like powers of the relative differences
-of the moduli and of the pretensions.
-"""
-
 
 CHARGE_FLOOR = 0.1
 """Smallest charge by which an error is divided, in units of the largest charge of the press, dimensionless."""
 
 
 class NodeCount(NamedTuple):
-    """Numbers of distances, forces, orientations and directions for which a family of presses is solved.
+    """Numbers of distances and forces, and harmonics of the angles, for which a family of presses is solved.
 
     Attributes:
         distances: Number of distances of the presses from the centre of the film.
         forces: Number of forces of the presses.
-        min_orientations: Smallest number of orientations of a probe that is not axisymmetric.
-        directions: Number of directions within half a turn, on a film that is not axisymmetric.
+        largest_harmonics: Largest harmonic of the rotation of a probe, for each harmonic of the direction; see
+            `Turns.spread`.
     """
 
     distances: int
     forces: int
-    min_orientations: int = ROTATIONS
-    directions: int = DIRECTIONS
+    largest_harmonics: tuple[int, ...] = HARMONICS
 
 
 NODE_COUNTS = (
     NodeCount(5, 3),
-    NodeCount(8, 5, 2 * ROTATIONS),
-    NodeCount(10, 7, 3 * ROTATIONS),
-    NodeCount(13, 12, 3 * ROTATIONS),
+    NodeCount(8, 5, (6,)),
+    NodeCount(10, 7, (10,)),
+    NodeCount(13, 12, (10,)),
 )
 """Numbers of nodes that are tried one after the other, until the interpolation is sufficiently accurate.
 
@@ -83,8 +70,8 @@ power of the force to another, and pass through zero.
 ASYMMETRIC_NODE_COUNTS = (
     NodeCount(5, 3),
     NodeCount(5, 7),
-    NodeCount(8, 7, 2 * ROTATIONS, directions=9),
-    NodeCount(13, 12, 3 * ROTATIONS, directions=11),
+    NodeCount(8, 7, (7, 5, 3, 2, 1)),
+    NodeCount(13, 12, (10, 8, 6, 4, 2, 1)),
 )
 """Numbers of nodes that are tried for a film that is not axisymmetric.
 
@@ -103,22 +90,14 @@ class Family:
         distance: Distances of the solved presses from the centre of the film, shape (n_distance,), mm. Their
             `distance_coordinate` has Chebyshev nodes.
         force: Forces of the solved presses, shape (n_force,), N. Their logarithms are Chebyshev nodes.
-        direction: Directions of the solved presses on the film, evenly spaced over half a turn, shape (n_direction,),
-            rad. This is the direction from the centre of the film to the press, plus the rotation of a probe that is
-            not axisymmetric. An axisymmetric film has a single direction.
-        rotation: Rotations of the probe relative to the direction of the press, evenly spaced over a full turn, shape
-            (n_rotation,), rad.
-        symmetry_order: Order of the rotational symmetry of the probe: the number of rotations within a full turn that
-            map the probe onto itself.
+        turns: Directions of the presses on the film, and rotations of the probe.
     """
 
     domain: Domain
     film_radius: float
     distance: Array
     force: Array
-    direction: Array
-    rotation: Array
-    symmetry_order: int
+    turns: Turns
 
     @classmethod
     def spread(cls, domain: Domain, film: Film, probe: Probe, count: NodeCount) -> "Family":
@@ -128,7 +107,7 @@ class Family:
             domain: Presses for which the stress will be interpolated.
             film: Film on which the probe presses.
             probe: Probe that presses the film.
-            count: Numbers of distances, forces, orientations and directions.
+            count: Numbers of distances and forces, and harmonics of the angles.
 
         Returns:
             The family. It has only one force if the smallest and the largest force of the domain are equal.
@@ -144,84 +123,37 @@ class Family:
         else:
             force = np.array([domain.force_range[0]])
 
-        # The rotations cover a full turn, with the same number of rotations in each period of the probe. An
-        # axisymmetric probe needs only one rotation.
-        symmetry_order = 1
-        n_rotation = 1
-        if not probe.is_axisymmetric:
-            symmetry_order = round(2.0 * np.pi / probe.period)
-            n_rotation = symmetry_order * math.ceil(count.min_orientations / symmetry_order)
-        rotation = 2.0 * np.pi * np.arange(n_rotation) / n_rotation
-
-        # The elasticity, the pretension and the clamp do not change if the film is turned by half a turn.
-        n_direction = 1 if film.is_axisymmetric else count.directions
-        direction = DIRECTION_PERIOD * np.arange(n_direction) / n_direction
-        return cls(domain, film.radius, distance, force, direction, rotation, symmetry_order)
-
-    @property
-    def solved_rotations(self) -> Array:
-        """Rotations at which presses are solved, shape (n_solved_rotation,), rad.
-
-        The rotations cover one period of the probe. The stress for all other rotations follows from the symmetry of the
-        probe.
-        """
-        return self.rotation[: self.rotation.size // self.symmetry_order]
+        turns = Turns.spread(film, probe, count.largest_harmonics)
+        return cls(domain, film.radius, distance, force, turns)
 
     def weights(self, position: Complexes, force: Array, rotation: Array) -> Array:
         """Compute the weights that interpolate the stress between the solved presses (nodes).
 
-        Lagrange polynomials interpolate in the distance coordinate and in the logarithm of the force. Trigonometric
-        polynomials interpolate in the direction of the press and in the rotation of the probe.
+        Lagrange polynomials interpolate in the distance coordinate and in the logarithm of the force, and a Fourier
+        series in the direction of the press and in the rotation of the probe.
 
         Args:
             position: Positions x + iy of the interpolated presses, shape (n,), mm.
             force: Forces of the interpolated presses, shape (n,), N.
-            rotation: Rotations of the probe relative to the direction of the press, shape (n,), rad.
+            rotation: Rotations of the probe relative to the direction of the press, shape (n,), rad. Zero if the probe
+                is axisymmetric.
 
         Returns:
-            Weights, shape (n, n_distance * n_force * n_direction * n_rotation), dimensionless. An interpolated value is
+            Weights, shape (n, n_distance * n_force * n_turn), dimensionless. An interpolated value is
             the sum over the nodes of the weight of a node times the value at this node.
         """
-        # Interpolation weights along each axis; `rotation` may have the shape (1,) if it is the same for all presses.
+        # Interpolation weights along each axis
         distance_nodes = distance_coordinate(self.distance / self.film_radius)
         press_coordinates = distance_coordinate(np.abs(position) / self.film_radius)
         distance_weights = lagrange_values(distance_nodes, press_coordinates)
         force_nodes = np.log(self.force)
         force_weights = lagrange_values(force_nodes, np.log(force))
-        turn_weights = self._turn_weights(np.angle(position), rotation)
+        turn_weights = self.turns.weights(np.angle(position) + rotation, rotation)
 
         # The weight of a node is the product of its weights along the axes (press, distance, force, turn).
         distance_force_weights = distance_weights[:, :, None, None] * force_weights[:, None, :, None]
         weights = distance_force_weights * turn_weights[:, None, None, :]
         return np.asarray(weights.reshape(position.size, -1))
-
-    def _turn_weights(self, angle: Array, rotation: Array) -> Array:
-        """Compute the weights that interpolate between the directions and the rotations of the family.
-
-        In the frame of the probe, the stress depends on the direction of the axes of the film through even harmonics,
-        and on the direction of the centre of the film through low harmonics. The sum of both angles and the rotation
-        are therefore interpolated separately. The solved presses cover one period of the probe. If the probe is rotated
-        by further periods, the press is the same, but the sum of both angles is larger by these periods.
-
-        Args:
-            angle: Directions from the centre of the film to the interpolated presses, shape (n,), rad.
-            rotation: Rotations of the probe relative to the direction of the press, shape (n,) or (1,), rad.
-
-        Returns:
-            Weights, shape (n, n_direction * n_rotation).
-        """
-        rotation_weights = periodic_weights(self.rotation, 2.0 * np.pi, rotation)
-        is_axisymmetric_probe = self.rotation.size == 1
-        film_angle = angle if is_axisymmetric_probe else angle + rotation
-        period_starts = 2.0 * np.pi * np.arange(self.symmetry_order) / self.symmetry_order
-        angle_in_periods = film_angle[:, None] - period_starts  # shape (n, symmetry_order)
-        direction_weights = periodic_weights(self.direction, DIRECTION_PERIOD, angle_in_periods.ravel())
-        direction_weights = direction_weights.reshape(angle.size, self.symmetry_order, -1)
-
-        # All rotations within one period have the same direction weights.
-        weights_of_rotations = np.repeat(direction_weights, self.solved_rotations.size, axis=1)
-        weights = weights_of_rotations.swapaxes(1, 2) * rotation_weights[:, None, :]
-        return np.asarray(weights.reshape(angle.size, -1))
 
     def solve(
         self,
@@ -241,15 +173,16 @@ class Family:
             read: Function that computes the returned values from each solved press.
 
         Returns:
-            Values that `read` computes, shape (n_distance, n_force, n_direction, n_solved_rotation, n_value),
-            dimensionless. The method `unfold` extends stresses to all rotations.
+            Values that `read` computes, shape (n_distance, n_force, n_solved_turn, n_value), dimensionless. The method
+            `unfold` extends stresses to all rotations.
         """
         # A chain contains the presses with all forces at one position and rotation. Instead of the press, the film is
         # rotated, so that every press lies on the positive x axis.
+        turns = self.turns.solved
         chains = [
             Chain(
-                film=sensor.film.rotated(float(rotation - direction)),
-                probe=probe.rotated(float(rotation)),
+                film=sensor.film.rotated(rotation - direction),
+                probe=probe.rotated(rotation),
                 distance=float(distance),
                 forces=self.force,
                 surface=sensor.surface,
@@ -257,12 +190,10 @@ class Family:
                 read=read,
             )
             for distance in self.distance
-            for direction in self.direction
-            for rotation in self.solved_rotations
+            for direction, rotation in turns
         ]
         solved = solve_chains(chains, executor)
-        shape = (self.distance.size, self.direction.size, self.solved_rotations.size, self.force.size, -1)
-        return np.moveaxis(solved.reshape(shape), 3, 1)
+        return solved.reshape(self.distance.size, len(turns), self.force.size, -1).swapaxes(1, 2)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
         """By symmetry, extend the stress from the rotations within one period of the probe to all rotations.
@@ -273,26 +204,27 @@ class Family:
 
         Args:
             solved: Scaled stress in a frame that rotates with the probe, as returned by `solve`, shape
-                (n_distance, n_force, n_direction, n_solved_rotation, n_element * n_local * 3), dimensionless.
+                (n_distance, n_force, n_solved_turn, n_element * n_local * 3), dimensionless.
             mesh: Template of the mesh of the solves.
 
         Returns:
-            Scaled stress, shape (n_distance * n_force * n_direction * n_rotation, n_element * n_local * 3),
-            dimensionless. The rows have the order of the columns of `weights`.
+            Scaled stress, shape (n_distance * n_force * n_turn, n_element * n_local * 3), dimensionless. The rows have
+            the order of the columns of `weights`.
         """
         n_value = solved.shape[-1]
-        if self.symmetry_order == 1:
+        symmetry_order = self.turns.symmetry_order
+        if symmetry_order == 1:
             return solved.reshape(-1, n_value)
         solved_period = solved.reshape(*solved.shape[:-1], mesh.n_element, -1, 3)
         stress_of_periods = []
-        for period_index in range(self.symmetry_order):
-            angle = 2.0 * np.pi * period_index / self.symmetry_order
-            rotated_elements = mesh.rotated(period_index, self.symmetry_order)
+        for period_index in range(symmetry_order):
+            angle = 2.0 * np.pi * period_index / symmetry_order
+            rotated_elements = mesh.rotated(period_index, symmetry_order)
             reordered_stress = solved_period[..., rotated_elements, :, :]
             # The stress itself does not change, but its components refer to a frame that was rotated by `angle`.
             stress_of_periods.append(rotate_stress(reordered_stress, -angle))
-        all_rotations = np.concatenate(stress_of_periods, axis=3)
-        return np.asarray(all_rotations.reshape(-1, n_value))
+        all_turns = np.concatenate(stress_of_periods, axis=2)
+        return np.asarray(all_turns.reshape(-1, n_value))
 
 
 def node_counts(film: Film) -> tuple[NodeCount, ...]:

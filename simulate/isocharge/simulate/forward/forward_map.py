@@ -82,12 +82,12 @@ class ForwardMap:
     Attributes:
         sensor: Sensor whose charges are computed.
         probe: Probe that presses the film.
-        family: Distances, forces, directions and orientations of the solved presses.
+        family: Distances, forces, directions and rotations of the solved presses.
         theory: Terms of the film theory that the solves include.
         resolution: Fineness of the mesh of the solves.
         layer: Width of the thin rings of the mesh at the rim, in film radii.
         table: Scaled stress at the nodes of every element under the solved presses, in a frame that rotates with the
-            probe, shape (n_distance * n_force * n_direction * n_rotation, n_element * n_local * 3), dimensionless.
+            probe, shape (n_distance * n_force * n_turn, n_element * n_local * 3), dimensionless.
         error: Largest relative error of a charge with respect to the direct solves of `build`, dimensionless.
     """
 
@@ -175,7 +175,7 @@ class ForwardMap:
             sensor: Sensor whose charges the map computes.
             probe: Probe that presses the film.
             domain: Presses for which the map will be used.
-            count: Numbers of distances, forces, orientations and directions at which presses are solved.
+            count: Numbers of distances and forces, and harmonics of the angles, for which presses are solved.
             settings: Accuracy, theory and mesh; see `build`.
             read: Function that computes the stress fields of the table from each solved press, shape (n_element,
                 n_local, ..., 3), in the frame of the probe.
@@ -240,8 +240,7 @@ class ForwardMap:
     def solves(self) -> int:
         """Number of equilibria that were solved for the map."""
         family = self.family
-        n_position = family.distance.size * family.direction.size
-        return n_position * family.force.size * family.solved_rotations.size
+        return family.distance.size * family.force.size * len(family.turns.solved)
 
     def charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
         """Compute the touch charges of presses.
@@ -328,7 +327,7 @@ class ForwardMap:
         """
         n_distance = self.family.distance.size
         n_force = self.family.force.size
-        n_turn = self.family.direction.size * self.family.rotation.size
+        n_turn = self.family.turns.rotation.size
         stress = self.table.reshape(n_distance, n_force, n_turn, -1, 3)
         force_as_field = np.moveaxis(stress, 1, 3)  # shape (n_distance, n_turn, n_node, n_force, 3)
         table = force_as_field.reshape(n_distance * n_turn, -1)
@@ -456,14 +455,11 @@ class ForwardMap:
             orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
         """
         direction = np.angle(position)  # from the centre of the film to the press, rad
-        rotation = orientation - direction  # of the probe relative to the direction of the press
+        # The stress refers to the probe or, if the probe is axisymmetric, to the direction of the press.
+        rotation = np.zeros_like(direction) if self.probe.is_axisymmetric else orientation - direction
         weights = self.family.weights(position, force, rotation)
         nodal_fields = weights.astype(self.table.dtype) @ self.table  # in the precision of the table
-
-        # The stress refers to the direction of the press or, if the probe is not axisymmetric, to the probe.
-        frame_angle = direction
-        if not self.probe.is_axisymmetric:
-            frame_angle = direction + rotation + self.probe.angle
+        frame_angle = direction + rotation + self.probe.angle
         return PressChunk(self.meshes_under(position, rotation), nodal_fields, frame_angle)
 
     def meshes_under(self, position: Complexes, rotation: Array) -> PressMeshes:

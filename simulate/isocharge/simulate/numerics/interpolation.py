@@ -71,33 +71,6 @@ def chebyshev_nodes(count: int, low: float, high: float) -> Array:
     return np.asarray(middle + half_width * np.cos(angles))
 
 
-def periodic_weights(nodes: Array, period: float, angle: Array) -> Array:
-    """Compute the weights that interpolate between evenly spaced nodes of a periodic function.
-
-    The interpolation is a trigonometric polynomial. Let N be the number of nodes, and let t be the difference between
-    an angle and a node, scaled such that one period is a full turn. The weight of the node is the Dirichlet kernel
-
-        (1 + 2 cos(t) + 2 cos(2 t) + ...) / N.
-
-    It contains all harmonics up to N / 2. If N is even, the highest harmonic has the amplitude 1 instead of 2, because
-    its sine is zero at every node.
-
-    Args:
-        nodes: Nodes, evenly spaced over one period, shape (n_node,), rad.
-        period: Period of the function, rad.
-        angle: Angles at which the function is interpolated, shape (n,), rad.
-
-    Returns:
-        Weights, shape (n, n_node). The weights of each angle sum to 1.
-    """
-    n_node = nodes.size
-    harmonics = np.arange(1, n_node // 2 + 1)
-    amplitudes = np.where(2 * harmonics == n_node, 1.0, 2.0)
-    scaled_difference = (2.0 * np.pi / period) * (angle[:, None] - nodes)  # shape (n, n_node)
-    phase = scaled_difference[..., None] * harmonics  # shape (n, n_node, n_harmonic)
-    return np.asarray((1.0 + np.cos(phase) @ amplitudes) / n_node)
-
-
 def lagrange_values(nodes: Array, points: Array) -> Array:
     """Evaluate the Lagrange polynomials of given nodes.
 

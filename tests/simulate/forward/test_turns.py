@@ -1,0 +1,55 @@
+"""Directions and rotations of the solved presses of a family."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.simulate import Circle, Ellipse, Film, Polygon, load_sensor
+from isocharge.simulate.forward.turns import Turns
+
+EVEN = load_sensor("three-25um-biaxial").film
+UNEVEN = replace(EVEN, pretension=1.0, deviator=(0.3, 0.1))
+IRREGULAR = Polygon.of(np.array([(0.0, 0.0), (3.0, 0.0), (1.0, 2.0)]))
+
+
+@pytest.mark.parametrize("film", [EVEN, UNEVEN], ids=["even", "uneven"])
+@pytest.mark.parametrize(
+    "probe", [Circle(1.0), IRREGULAR, Ellipse(4.0, 2.0), Polygon.triangle(4.0), Polygon.rectangle(3.0, 3.0)]
+)
+@pytest.mark.parametrize("largest", [(3, 2, 1, 0), (7, 5, 3, 2, 1)])
+def test_fourier_series_is_interpolated_exactly(film: Film, probe, largest):
+    """The expected values are those of the series itself, with the terms of which the docstring speaks."""
+    turns = Turns.spread(film, probe, largest)
+    rng = np.random.default_rng(3)
+    terms = [
+        (m, k, rng.normal(), rng.uniform(0.0, 2.0 * np.pi))
+        for m in range(1 if film.is_axisymmetric else len(largest))
+        for k in (range(-largest[m], largest[m] + 1) if not probe.is_axisymmetric else [0])
+    ]
+
+    def series(direction: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        return sum(size * np.cos(2.0 * m * direction + k * rotation + phase) for m, k, size, phase in terms)
+
+    direction, rotation = rng.uniform(-np.pi, np.pi, (2, 20))
+    found = turns.weights(direction, rotation) @ series(turns.direction, turns.rotation)
+    np.testing.assert_allclose(found, series(direction, rotation), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("probe", "solves", "all_pairs"),
+    [(Circle(1.0), 7, 7), (IRREGULAR, 25, 49), (Ellipse(4.0, 2.0), 13, 28), (Polygon.triangle(4.0), 11, 21)],
+)
+def test_fewer_turns_are_solved_than_all_pairs_of_angles(probe, solves, all_pairs):
+    """All pairs are seven directions times the rotations, of which the symmetry of the probe saves some."""
+    assert len(Turns.spread(UNEVEN, probe, (3, 2, 1, 0)).solved) == solves <= all_pairs
+
+
+@pytest.mark.parametrize("probe", [Ellipse(4.0, 2.0), Polygon.triangle(4.0), Polygon.rectangle(3.0, 3.0)])
+def test_rotation_by_a_period_of_the_probe_is_the_same_press(probe):
+    """Both angles increase by the period. Directions that differ by half a turn are equal."""
+    turns = Turns.spread(UNEVEN, probe, (3, 2, 1, 0))
+    n_solved = len(turns.solved)
+    np.testing.assert_allclose(turns.rotation[n_solved:] - turns.rotation[:-n_solved], probe.period)
+    change = turns.direction[n_solved:] - turns.direction[:-n_solved] - probe.period
+    np.testing.assert_allclose(np.sin(change), 0.0, atol=1e-12)
