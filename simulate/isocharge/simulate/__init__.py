@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from isocharge.simulate.mesh.blocks import Resolution
     from isocharge.simulate.sensor.film import Film, Piezo
     from isocharge.simulate.sensor.film_properties import FilmPrior, virtual_film
-    from isocharge.simulate.sensor.probe import Circle, Ellipse, Finger, Polygon, Probe, parse_probe
+    from isocharge.simulate.sensor.probe import Circle, Ellipse, Finger, GrowingFinger, Polygon, Probe, parse_probe
     from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor
     from isocharge.simulate.sensor.sensor_file import built_in_sensors, load_sensor, write_sensor
     from isocharge.simulate.solver.equilibrium import Equilibrium, deflection, touch_stress
@@ -68,6 +68,7 @@ __all__ = [
     "Finger",
     "ForwardMap",
     "FunctionMap",
+    "GrowingFinger",
     "NoiseModel",
     "Piezo",
     "Polygon",

@@ -7,11 +7,14 @@ import pytest
 
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
+    ChargeSpline,
     Circle,
     Domain,
     Electrode,
     Ellipse,
+    Finger,
     ForwardMap,
+    GrowingFinger,
     Polygon,
     Resolution,
     SolveSettings,
@@ -81,6 +84,27 @@ def test_forward_map_agrees_with_direct_solves_for_random_orientations(oriented_
     charge, period = oriented_map.charges(contact, rotation), oriented_map.probe.period
     np.testing.assert_allclose(oriented_map.charges(contact, rotation + period), charge, rtol=1e-6)
     assert np.abs(oriented_map.charges(contact, rotation + 0.5 * period) / charge - 1.0).max() > 1e-2
+
+
+def test_footprint_grows_with_the_cube_root_of_the_force(near_electrodes):
+    """The expected charges are those of fingers with the radius that each force has, solved one by one."""
+    wide_range = QUICK | {"force_range": (0.125, 1.0)}
+    sensor = replace(near_electrodes, piezo=replace(near_electrodes.piezo, d33=-20.0))
+    growing = ForwardMap.build(sensor, GrowingFinger(2.0), **wide_range)
+    contact, _ = draw(growing, 6, seed=3)
+    expected = np.array(
+        [
+            touch_charge(
+                sensor, press(sensor.film, Finger(2.0 * force ** (1.0 / 3.0)), (x, y), force, growing.settings)
+            )
+            for x, y, force in contact.tolist()
+        ]
+    )
+    largest = np.abs(expected).max(axis=1, keepdims=True)
+    assert (np.abs(growing.charges(contact) - expected) / largest).max() < 1e-3
+    assert (np.abs(ChargeSpline.of(growing).charges(contact) - expected) / largest).max() < 1e-3
+    fixed = ForwardMap.build(sensor, Finger(2.0), **wide_range)
+    assert (np.abs(fixed.charges(contact) - expected) / largest).max() > 0.01, "the radius does not matter"
 
 
 def test_forward_map_error_at_the_ends_of_the_domain(near_map):

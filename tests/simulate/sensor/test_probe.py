@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate import Circle, Ellipse, Finger, Polygon, Probe, parse_probe
+from isocharge.simulate import Circle, Ellipse, Finger, GrowingFinger, Polygon, Probe, parse_probe
 from isocharge.simulate.sensor.probe import PROBE_HELP
 
 SIZES = st.floats(0.05, 1e6)
@@ -54,6 +54,7 @@ def test_notation_round_trip(width, height, angle):
         Polygon.triangle(width, angle),
         Circle(width),
         Finger(width),
+        GrowingFinger(width),
         Ellipse(width, height, angle),
     ):
         read = parsed_again(probe)

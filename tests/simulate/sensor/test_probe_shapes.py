@@ -11,6 +11,7 @@ from isocharge.simulate import (
     Circle,
     Ellipse,
     Finger,
+    GrowingFinger,
     Polygon,
     Probe,
     SolveSettings,
@@ -51,6 +52,7 @@ SHAPES = {
     "polygon": ShapeCase(Polygon.of(HOUSE), 3.0, np.sqrt(130.0) / 9.0, 2 * np.pi),
     "ellipse": ShapeCase(Ellipse(4.0, 2.0, 0.5), 2.0 * np.pi, 2.0, np.pi),
     "finger": ShapeCase(Finger(2.0), 4.0 * np.pi, 2.0, 0.0),
+    "growing finger": ShapeCase(GrowingFinger(2.0), 4.0 * np.pi, 2.0, 0.0),
 }
 
 

@@ -8,7 +8,17 @@ import pytest
 from tests.benchmarks.measured_films import measured_presses, with_rig_errors
 
 from isocharge.serve import Predictor
-from isocharge.simulate import Circle, ForwardMap, load_sensor, local_workers, parse_probe, press, touch_charge
+from isocharge.simulate import (
+    Circle,
+    Finger,
+    ForwardMap,
+    GrowingFinger,
+    load_sensor,
+    local_workers,
+    parse_probe,
+    press,
+    touch_charge,
+)
 from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import CalibrationProblem, FitConfig, TrainingConfig, calibrate, write_calibration
@@ -44,6 +54,16 @@ def test_charges_of_a_similar_film_agree_with_direct_solves(solved):
     change = np.abs(expected / solved.charges(prior.mean, CONTACT) - 1.0)
     assert change.max() > 0.04
     np.testing.assert_allclose(charge, expected, rtol=0.01)
+
+
+@pytest.mark.parametrize("finger", [Finger(5.0), GrowingFinger(5.0)])
+def test_fingertip_is_solved_with_its_own_pressure(problem, finger):
+    """A circle of the same area causes charges that differ by up to 1 %."""
+    charges = solve_even(replace(problem, probe=finger))
+    values = charges.prior.mean
+    np.testing.assert_allclose(
+        charges.charges(values, CONTACT), direct(*charges.prior.film(values), CONTACT), rtol=2e-3
+    )
 
 
 def test_no_contacts_give_no_charges(solved):

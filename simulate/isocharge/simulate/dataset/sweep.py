@@ -136,7 +136,7 @@ def outside_map(
         The map; None if the sweep has no presses outside, because none are requested, the ring is too narrow, or the
         film cannot be solved up to the clamp. The last case is logged as a warning.
     """
-    probe = Circle(max(probe.reach for probe in probes))
+    probe = Circle(max(probe.under(sweep.force_range[1]).reach for probe in probes))
     if sweep.outside == 0 or outermost_distance(sensor.film, probe) < sweep.radius + MIN_RING_WIDTH:
         return None
     try:

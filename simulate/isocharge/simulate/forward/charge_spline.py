@@ -296,13 +296,12 @@ class _ScaledCharges:
         force_weights = lagrange_values(nodes, np.log(self.force))
         scaled_charge = force_weights @ scaled_stress_charge  # shape (n, n_force, n_electrode)
 
-        # Add the charge of the contact pressure, which is proportional to the force.
-        pressure_charge_per_force = forward_map.pressure_charges(
-            position, np.zeros(len(position))
-        )  # shape (n, n_electrode)
-        scaled_force = self.force / amplitude_squared(film, self.force)  # shape (n_force,)
-        scaled_pressure_charge = pressure_charge_per_force[:, None] * scaled_force[:, None]
-        return np.asarray(scaled_charge + scaled_pressure_charge)
+        # Add the charge of the contact pressure.
+        for index, force in enumerate(self.force.tolist()):
+            contact = np.column_stack([position, np.full(len(position), force)])
+            pressure_charge = forward_map.pressure_charges(contact, np.zeros(len(position)))
+            scaled_charge[:, index] += pressure_charge / amplitude_squared(film, force)
+        return np.asarray(scaled_charge)
 
 
 def _fit_disk(

@@ -313,12 +313,13 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
         raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {min_force} to {max_force}")
     if not (np.isfinite(radius) and radius > 0.0):
         raise SceneError(f"radius: expected a positive number, got {radius} mm")
-    if radius + probe.reach >= film.radius:
+    largest_probe = probe.under(max_force)
+    if radius + largest_probe.reach >= film.radius:
         raise SceneError(
             f"radius: presses up to {radius:.4g} mm from the centre with {probe.notation}, which reaches "
-            f"{probe.reach:.4g} mm, leave the film of radius {film.radius:.4g} mm"
+            f"{largest_probe.reach:.4g} mm, leave the film of radius {film.radius:.4g} mm"
         )
-    check_press(film, probe, nearest_to_clamp(film, radius), max_force)
+    check_press(film, largest_probe, nearest_to_clamp(film, radius), max_force)
 
 
 def nearest_to_clamp(film: Film, distance: float) -> tuple[float, float]:
@@ -347,8 +348,8 @@ def family_mesh(film: Film, probe: Probe, domain: Domain, settings: SolveSetting
     min_force, max_force = domain.force_range
     middle_force = float(np.sqrt(min_force * max_force))
     layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
-    # The smallest force needs the finest mesh if the pretension is uneven.
-    force = middle_force if film.is_axisymmetric else min_force
+    # The smallest force needs the finest mesh if the pretension is uneven, or if the footprint is smallest then.
+    force = middle_force if film.is_axisymmetric and not probe.grows else min_force
     outermost = nearest_to_clamp(film, domain.radius)
     resolution = needed_resolution(film, probe, outermost, force, replace(settings, layer=layer))
     return resolution, layer

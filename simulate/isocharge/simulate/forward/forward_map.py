@@ -47,6 +47,7 @@ from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placed_mesh import distance_on_circular_film, film_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import template_for
+from isocharge.simulate.numerics.interpolation import lagrange_values
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings
@@ -305,6 +306,9 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_force, n_electrode), pC.
         """
+        if self.probe.grows:  # the mesh depends on the force
+            return np.stack([one.stress_charges_by_force(position)[:, 0] for one in self._maps_by_force], axis=1)
+
         # Integrate all fields of the stacked map. All fields have the symmetry of the stress.
         n_force = self.family.force.size
         first_force = self.family.force[0]
@@ -318,6 +322,21 @@ class ForwardMap:
         unit_ratio = amplitude_squared(film, self.family.force) / amplitude_squared(film, first_force)
         charge_by_force = charges.swapaxes(1, 2)  # shape (n, n_force, n_electrode)
         return np.asarray(charge_by_force * unit_ratio[:, None])
+
+    @cached_property
+    def _maps_by_force(self) -> "list[ForwardMap]":
+        """Forward map of each force of the family, for the footprint that the probe has under this force."""
+        n_distance, n_force = self.family.distance.size, self.family.force.size
+        table = self.table.reshape(n_distance, n_force, -1, self.table.shape[1]).swapaxes(0, 1)
+        return [
+            replace(
+                self,
+                probe=self.probe.under(force),
+                family=replace(self.family, force=np.array([force])),
+                table=table[index].reshape(-1, self.table.shape[1]),
+            )
+            for index, force in enumerate(self.family.force.tolist())
+        ]
 
     @cached_property
     def _stacked_forces(self) -> "ForwardMap":
@@ -348,7 +367,7 @@ class ForwardMap:
             Charges, shape (n, n_electrode), pC.
         """
         charge: Array = self.field_charges(contact, EVEN_FIELD, orientation)[..., 0]
-        charge += contact[:, 2:] * self.pressure_charges(contact[:, :2], orientation)
+        charge += self.pressure_charges(contact, orientation)
         return self.sensor.calibration.read(charge)
 
     def field_charges(
@@ -361,7 +380,8 @@ class ForwardMap:
         """Compute the charges of each stress field in the table.
 
         The result includes neither the crosstalk nor the charges that the contact pressure causes. The presses are
-        evaluated in chunks, which limits the required memory.
+        evaluated in chunks, which limits the required memory. If the footprint grows with the force, so does the mesh,
+        so that not the stress but the scaled charges are interpolated between the forces.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -375,6 +395,16 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_electrode, n_field), pC.
         """
+        if self.probe.grows:
+            squared_amplitude = partial(amplitude_squared, self.sensor.film)
+            weights = lagrange_values(np.log(self.family.force), np.log(contact[:, 2]))
+            weights *= squared_amplitude(contact[:, 2])[:, None] / squared_amplitude(self.family.force)
+            charges_by_force = [
+                one.field_charges(np.column_stack([contact[:, :2], np.full(len(contact), force)]), is_odd)
+                for one, force in zip(self._maps_by_force, self.family.force.tolist(), strict=True)
+            ]
+            return np.asarray(np.einsum("nk,knef->nef", weights, charges_by_force))
+
         position = contact[:, 0] + 1j * contact[:, 1]
         if orientation is None:
             orientation = np.zeros(len(contact))
@@ -389,30 +419,31 @@ class ForwardMap:
                 )
         return charges
 
-    def pressure_charges(self, position: Array, orientation: Array) -> Array:
-        """Compute the charges per force that the contact pressure causes.
+    def pressure_charges(self, contact: Array, orientation: Array) -> Array:
+        """Compute the charges that the contact pressure causes.
 
         Crosstalk is omitted.
 
         Args:
-            position: Positions (x, y), shape (n, 2), mm.
+            contact: Presses (x, y, F), shape (n, 3), mm and N.
             orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
 
         Returns:
-            Charges per force, shape (n, n_electrode), pC/N.
+            Charges, shape (n, n_electrode), pC.
         """
-        charge = np.zeros((len(position), len(self.electrodes)))
+        charge = np.zeros((len(contact), len(self.electrodes)))
         if self.sensor.piezo.d33 == 0.0:
             return charge
 
         # The contact pressure acts only on electrodes under the probe. Presses far from all electrodes cause no charge.
-        complex_position = position @ np.array([1.0, 1j])
-        distances = relative_distances(self.sensor.part_circles, self.probe.reach, complex_position)
+        position = contact[:, 0] + 1j * contact[:, 1]
+        largest_reach = self.probe.under(float(contact[:, 2].max(initial=0.0))).reach
+        distances = relative_distances(self.sensor.part_circles, largest_reach, position)
         presses_near_electrodes = np.flatnonzero((distances < 1.0).any(axis=1))
         for press_index in presses_near_electrodes:
-            probe = self.probe.rotated(float(orientation[press_index]))
-            x, y = position[press_index].tolist()
-            charge[press_index] = contact_charge(self.sensor, probe, (x, y), force=1.0)
+            x, y, force = contact[press_index].tolist()
+            probe = self.probe.under(force).rotated(float(orientation[press_index]))
+            charge[press_index] = contact_charge(self.sensor, probe, (x, y), force)
         return charge
 
     def integrate_fields(

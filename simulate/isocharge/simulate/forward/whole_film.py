@@ -39,7 +39,7 @@ An element of the coarse mesh would be folded in a narrower gap. The gap decreas
 """
 
 NODE_COUNT = NodeCount(distances=10, forces=4)
-"""Numbers of distances, forces, orientations and directions at which presses are solved."""
+"""Numbers of distances and forces at which presses are solved."""
 
 
 def outermost_distance(film: Film, probe: Probe) -> float:
@@ -72,6 +72,6 @@ def whole_film_map(
         SolveError: If a press has no equilibrium.
     """
     settings = SolveSettings(resolution=COARSE_RESOLUTION)
-    domain = Domain(outermost_distance(sensor.film, probe), force_range)
+    domain = Domain(outermost_distance(sensor.film, probe.under(force_range[1])), force_range)
     forward_map = ForwardMap.build_unchecked(sensor, probe, domain, NODE_COUNT, settings, executor=executor)
     return replace(forward_map, error=COARSE_ERROR)

@@ -182,8 +182,8 @@ def mirror_region(
         SceneError: If some presses cannot exist.
         SolveError: If a press has no equilibrium.
     """
-    if not 0.0 < radius < outermost_distance(sensor.film, probe):
-        return None
     round_probe = probe if probe.is_axisymmetric else Circle(probe.reach)
+    if not 0.0 < radius < outermost_distance(sensor.film, round_probe.under(charges.domain.force_range[1])):
+        return None
     whole_film = whole_film_map(sensor, round_probe, charges.domain.force_range, executor=executor)
     return MirrorRegion.of(charges, radius, whole_film, noise)

@@ -8,6 +8,7 @@ Examples of the notation:
     triangle:4.0           side of an equilateral triangle with one corner towards +y
     polygon:x,y;x,y;x,y    corners of a convex polygon, anticlockwise
     finger:6.0             radius of the contact area of a fingertip
+    growing-finger:6.0     radius at 1 N of a contact area that grows with the cube root of the force
 
 All lengths are in mm. The suffix `@30` rotates the footprint by 30 degrees anticlockwise. The position of a probe is
 the centroid of its footprint.
@@ -19,9 +20,9 @@ from isocharge.common.errors import SceneError, cut
 from isocharge.simulate.sensor.probe_shapes.base import NUMBER, Probe, ProbeNotation
 from isocharge.simulate.sensor.probe_shapes.ellipse import Ellipse
 from isocharge.simulate.sensor.probe_shapes.polygon import Polygon
-from isocharge.simulate.sensor.probe_shapes.round import Circle, Finger
+from isocharge.simulate.sensor.probe_shapes.round import Circle, Finger, GrowingFinger
 
-__all__ = ["PROBE_HELP", "Circle", "Ellipse", "Finger", "Polygon", "Probe", "parse_probe"]
+__all__ = ["PROBE_HELP", "Circle", "Ellipse", "Finger", "GrowingFinger", "Polygon", "Probe", "parse_probe"]
 
 PROBE_SHAPES = (
     ProbeNotation("circle", "RADIUS", Circle),
@@ -35,6 +36,7 @@ PROBE_SHAPES = (
     ),
     ProbeNotation("ellipse", "WIDTHxHEIGHT", Ellipse),
     ProbeNotation("finger", "RADIUS", Finger),
+    ProbeNotation("growing-finger", "RADIUS", GrowingFinger),
 )
 """Notations of all probe shapes. The parser, the help text and the error messages are derived from this list."""
 

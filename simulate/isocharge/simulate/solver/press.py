@@ -63,7 +63,8 @@ def press(
 
     Args:
         film: The clamped film.
-        probe: The probe. The direction of its pressure does not change while the film deflects.
+        probe: The probe. The direction of its pressure does not change while the film deflects. The attribute `probe`
+            of the result has the footprint under this force.
         at: Centroid (x, y) of the footprint, mm.
         force: Force, N, positive in the direction of the push.
         settings: Accuracy, theory and mesh.
@@ -81,7 +82,7 @@ def press(
         SceneError: If the press cannot exist, or if the mesh is too distorted.
         SolveError: If the solve fails and `throw` is True.
     """
-    case = LoadCase(film, probe, at, force, settings, side_force)
+    case = LoadCase(film, probe.under(force), at, force, settings, side_force)
     with single_threaded_blas():
         if settings.resolution != "auto":
             solved = _solve(case, case.place(settings.resolution), start)
@@ -112,7 +113,7 @@ def needed_resolution(
         SceneError: If the press cannot exist, or if every mesh for the press is too distorted.
         SolveError: If two meshes must be compared and no equilibrium is found.
     """
-    case = LoadCase(film, probe, at, force, settings)
+    case = LoadCase(film, probe.under(force), at, force, settings)
     if settings.resolution != "auto":
         return settings.resolution
     if needs_second_mesh(case):

@@ -118,7 +118,7 @@ def calibrate(
 def solve_even(
     problem: CalibrationProblem, executor: Executor | None = None, values: Array | None = None
 ) -> FilmCharges:
-    """Solve the axisymmetric film with given properties under a circular probe.
+    """Solve the axisymmetric film with given properties under an axisymmetric probe.
 
     Args:
         problem: The calibration problem.
@@ -153,8 +153,8 @@ def _fit_uneven_film(
 ) -> Estimation:
     """Solve the estimated film with its imperfections and its real probe, and estimate the properties again.
 
-    This step is repeated once if the estimate changes the film much. A nearly even film under a circular probe needs no
-    step.
+    This step is repeated once if the estimate changes the film much. A nearly even film under an axisymmetric probe
+    needs no step.
     """
     for _ in range(2):
         charges, values = estimation.charges, estimation.film.film_values

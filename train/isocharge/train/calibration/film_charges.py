@@ -3,8 +3,8 @@
 The charges of the solved film are exact, for any film and any probe. The positions and gains of the electrodes and the
 piezoelectric coefficients only change how the solved stress is read, so their effect is exact as well. The other
 properties change the stress, and their effects are first-order changes. They are computed for an axisymmetric film with
-the mean properties under a circular probe, because this takes only seconds. If the properties differ much from those of
-the solved film, the film is solved again (`calibrate`).
+the mean properties under an axisymmetric probe, because this takes only seconds. If the properties differ much from
+those of the solved film, the film is solved again (`calibrate`).
 """
 
 from concurrent.futures import Executor
@@ -36,9 +36,9 @@ def axisymmetric(sensor: Sensor) -> Sensor:
     return replace(sensor, film=film)
 
 
-def circle_of(probe: Probe) -> Circle:
-    """Return the circular probe with the same area as a probe."""
-    return probe if isinstance(probe, Circle) else Circle(float(np.sqrt(probe.area / np.pi)))
+def round_probe(probe: Probe) -> Probe:
+    """Return an axisymmetric probe unchanged, and the circular probe with the same area for any other probe."""
+    return probe if probe.is_axisymmetric else Circle(float(np.sqrt(probe.area / np.pi)))
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class FilmCharges:
         film: Forward map of the solved film.
         slopes: Derivatives with respect to the mechanical properties, for the axisymmetric film.
         larger_probe: Forward map of the axisymmetric film under a circular probe whose radius is larger by `STEP`; None
-            if the probe is not round.
+            if the radius of the probe is not a property.
     """
 
     prior: FilmPrior
@@ -68,7 +68,7 @@ class FilmCharges:
         domain: Domain,
         executor: Executor | None,
     ) -> "FilmCharges":
-        """Solve the axisymmetric film with the mean properties, under a circular probe, at a few presses.
+        """Solve the axisymmetric film with the mean properties, under an axisymmetric probe, at a few presses.
 
         Args:
             prior: Declarations of the properties, with the described sensor and probe.
@@ -83,10 +83,10 @@ class FilmCharges:
         even_values = np.where(prior.is_imperfection, 0.0, values)
 
         def solve(film_values: Array) -> ForwardMap:
-            """Solve the axisymmetric film with the given properties under the circular probe."""
+            """Solve the axisymmetric film with the given properties under the axisymmetric probe."""
             sensor, probe = prior.film(film_values)
             return ForwardMap.build_unchecked(
-                axisymmetric(sensor), circle_of(probe), domain, NODE_COUNT, executor=executor
+                axisymmetric(sensor), round_probe(probe), domain, NODE_COUNT, executor=executor
             )
 
         same_probe = solve(even_values)

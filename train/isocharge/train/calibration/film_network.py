@@ -23,7 +23,7 @@ from isocharge.simulate.forward.derivative_maps import NODE_COUNT
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.simulate.solver.stress_limit import yield_force
-from isocharge.train.calibration.film_charges import FilmCharges, axisymmetric, circle_of
+from isocharge.train.calibration.film_charges import FilmCharges, axisymmetric, round_probe
 from isocharge.train.calibration.film_estimate import FilmEstimate, discrepancy_jacobian
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.charge_fit import fit_film_series, fit_series
@@ -129,13 +129,13 @@ def _tension_factors(
         Factors, shape (n, n_node, n_electrode), dimensionless.
     """
     sensor, probe = charges.prior.film(film.film_values)
-    sensor, circle = axisymmetric(sensor), circle_of(probe)
+    sensor, probe = axisymmetric(sensor), round_probe(probe)
 
     def charges_after(change_MPa: float) -> Array:
         """Solve the axisymmetric film after a change of its pretension, and return its charges."""
         changed_film = replace(sensor.film, pretension=sensor.film.pretension + change_MPa)
         changed = replace(sensor, film=changed_film)
-        forward_map = ForwardMap.build_unchecked(changed, circle, charges.domain, NODE_COUNT, executor=executor)
+        forward_map = ForwardMap.build_unchecked(changed, probe, charges.domain, NODE_COUNT, executor=executor)
         return forward_map.charges(contact)
 
     before = charges_after(0.0)
@@ -223,7 +223,7 @@ def _outside_presses(charges: FilmCharges, domain: Domain, executor: Executor | 
     They only teach the network which charges belong to no contact, so that the imperfections do not matter.
     """
     round_map = charges.slopes.film
-    outermost = outermost_distance(round_map.sensor.film, round_map.probe)
+    outermost = outermost_distance(round_map.sensor.film, round_map.probe.under(domain.force_range[1]))
     if outermost <= domain.radius:
         return None
     whole_map = whole_film_map(round_map.sensor, round_map.probe, domain.force_range, executor=executor)

@@ -6,7 +6,7 @@ from functools import cached_property, partial
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.simulate import Domain, FilmPrior, NoiseModel, Probe, Sensor, noise_model
 from isocharge.train.calibration.estimator import Prior
-from isocharge.train.calibration.film_charges import circle_of
+from isocharge.train.calibration.film_charges import round_probe
 from isocharge.train.calibration.film_estimate import FilmEstimate, Layout
 
 POSITION_MARGIN_MM = 0.5
@@ -65,7 +65,8 @@ class CalibrationProblem:
     def solved_domain(self) -> Domain:
         """Contacts for which the film is solved."""
         low, high = self.force_range
-        reach = max(self.probe.reach, circle_of(self.probe).radius)
+        probe = self.probe.under(high * FORCE_MARGIN)
+        reach = max(probe.reach, round_probe(probe).reach)
         largest_radius = self.sensor.film.inner_radius - RIM_MARGIN * reach
         radius = min(self.radius + POSITION_MARGIN_MM, max(self.radius, largest_radius))
         return Domain(radius, (low / FORCE_MARGIN, high * FORCE_MARGIN))

@@ -184,6 +184,15 @@ class Probe(ABC):
             return self
         return replace(self, angle=self.angle + angle)  # type: ignore[type-var]
 
+    @property
+    def grows(self) -> bool:
+        """Whether the footprint becomes larger with the force."""
+        return False
+
+    def under(self, force: float) -> "Probe":  # noqa: ARG002
+        """Return a probe with the footprint that this probe has under a force (N)."""
+        return self
+
     def farthest_distance(self, at: tuple[float, float]) -> float:
         """Return the distance from the centre of the film to the farthest point of the outline, mm.
 

@@ -1,8 +1,9 @@
-"""Probes with a circular footprint: a circle with a uniform pressure, and a fingertip with a Hertzian pressure.
+"""Probes with a circular footprint: a circle with a uniform pressure, and fingertips with a Hertzian pressure.
 
 A soft sphere that is pressed against a flat surface touches the surface in a circle of radius a. If F is the force, the
 pressure at the distance r from the centre of this circle is p(r) = p0 sqrt(1 - (r / a)^2), with the maximum
-p0 = 1.5 F / (pi a^2) (Johnson 1985, Contact Mechanics, equation 3.39).
+p0 = 1.5 F / (pi a^2) (Johnson 1985, Contact Mechanics, equation 3.39). The radius a is proportional to the cube root of
+the force (equation 3.40).
 """
 
 from dataclasses import dataclass
@@ -125,3 +126,23 @@ class Finger(RoundProbe):
 
         # For a force of 1, the mean pressure is 1 / area, and the peak pressure is `PEAK_PRESSURE` times as large.
         return float(PEAK_PRESSURE / self.area * (weights @ common_areas))
+
+
+@dataclass(frozen=True)
+class GrowingFinger(Finger):
+    """Fingertip whose contact area grows with the force, as that of an elastic sphere does.
+
+    Attributes:
+        radius: Radius of the footprint at 1 N, mm. Under the force F, it is larger by the cube root of F / (1 N).
+    """
+
+    grows = True
+
+    @property
+    def notation(self) -> str:
+        """Notation of this probe, which `parse_probe` converts back into the probe."""
+        return f"growing-finger:{tidy(self.radius)}"
+
+    def under(self, force: float) -> Finger:
+        """Return the fingertip with the radius that it has under a force (N)."""
+        return Finger(self.radius * float(np.cbrt(force)))
