@@ -35,7 +35,6 @@ class Connection(HttpToolsProtocol):
 
     Attributes:
         deadline: Time by which the client must send further data, s, on the clock of the event loop.
-        write_deadline: Time by which the client must have read its responses, s.
     """
 
     def __init__(self, limits: ServerLimits, traffic: Traffic, **uvicorn_arguments: Any) -> None:
@@ -48,7 +47,7 @@ class Connection(HttpToolsProtocol):
         """
         super().__init__(**uvicorn_arguments)
         self.deadline = math.inf
-        self.write_deadline = math.inf
+        self._write_deadline = math.inf  # time by which the client must have read its responses, s
         self._limits = limits
         self._traffic = traffic
         self._is_reading = False  # whether a request has begun and is not complete
@@ -129,23 +128,15 @@ class Connection(HttpToolsProtocol):
         if not self._is_reading:
             self.deadline = self.loop.time() + self._limits.idle_seconds
 
-    def pause_writing(self) -> None:
-        """Set the deadline by which the client must read its responses."""
-        super().pause_writing()
-        self.write_deadline = self.loop.time() + self._limits.body_seconds
-
-    def resume_writing(self) -> None:
-        """Remove the deadline, because the client has read its responses."""
-        super().resume_writing()
-        self.write_deadline = math.inf
-
     def close_if_overdue(self, now: float) -> None:
         """End the connection if a deadline has passed. If a request has begun, the client receives the reason.
 
         Args:
             now: Present time on the clock of the event loop, s.
         """
-        if min(self.deadline, self.write_deadline) > now:
+        if not self.flow.write_paused:  # uvicorn pauses if the client does not read its responses
+            self._write_deadline = now + self._limits.body_seconds
+        if min(self.deadline, self._write_deadline) > now:
             return
         if self._is_reading:
             self._is_reading = False
