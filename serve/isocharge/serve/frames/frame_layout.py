@@ -32,7 +32,7 @@ length of the datagram is wrong.
 
 import struct
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta, field
 
@@ -47,14 +47,16 @@ from isocharge.serve.frames.frame import (
 )
 from isocharge.serve.frames.transmission import CHECKSUMS, STUFFINGS, SUMS, Checksum
 
-STRUCT_FORMATS = {
+FieldType = Literal["pad", "u8", "u16", "u24", "u32", "i8", "i16", "i24", "i32", "f32", "f64"]
+
+STRUCT_FORMATS: dict[FieldType, str] = {
     "u8": "B",
-    "u16": "H",
-    "u24": "3s",
-    "u32": "I",
     "i8": "b",
+    "u16": "H",
     "i16": "h",
+    "u24": "3s",
     "i24": "3s",
+    "u32": "I",
     "i32": "i",
     "f32": "f",
     "f64": "d",
@@ -64,7 +66,7 @@ STRUCT_FORMATS = {
 A number of three bytes is read as bytes, because `struct` has no format for such numbers.
 """
 
-PADDING = "pad"
+PADDING: Final = "pad"
 """Type of a field whose bytes are not read."""
 
 MAX_PADDING = 4096
@@ -76,19 +78,19 @@ Hexadecimal = Annotated[
 ]
 
 
-class Field(Settings, frozen=True):
+class Field(Settings, frozen=True, kw_only=True, omit_defaults=True):
     """A field of a frame.
 
     Attributes:
-        type_name: Type of the field.
         name: Name of the channel, or a name with a meaning, such as `seq`; empty for padding.
+        type_name: Type of the field.
         scale: Factor that converts the number in the field to the unit of the channel or of the clock.
         count: Number of bytes of padding.
         value: Bytes that the padding must have in every frame, in hexadecimal; None if any bytes are allowed.
     """
 
-    type_name: Literal["pad", "u8", "u16", "u24", "u32", "i8", "i16", "i24", "i32", "f32", "f64"] = field(name="type")
     name: Annotated[str, Meta(max_length=1000)] = ""
+    type_name: FieldType = field(name="type")
     scale: Finite = 1.0
     count: Annotated[int, Meta(ge=1, le=MAX_PADDING)] = 1
     value: Hexadecimal | None = None
@@ -143,10 +145,10 @@ class Field(Settings, frozen=True):
         return self.type_name.startswith("i")
 
 
-SYNC = "sync"
+SYNC: Final = "sync"
 """Name of the framing in which every frame begins with a sync pattern."""
 
-DATAGRAM = "datagram"
+DATAGRAM: Final = "datagram"
 """Name of the framing in which every datagram contains one or more whole frames."""
 
 Framing = Literal["sync", "cobs", "slip", "hdlc", "datagram"]
@@ -164,28 +166,28 @@ class FrameSection(Settings, frozen=True, tag_field="format"):
     request_Hz: Positive = 100.0
 
 
-class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only=True):
+class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only=True, omit_defaults=True):
     """Layout of a frame. The attributes are the keys of the section `[frames]` in a device file.
 
     Attributes:
-        length: Length of the whole frame without stuffing, bytes.
-        fields_and_padding: Fields of the frame, including padding.
         framing: Method by which the beginning of each frame is found in the stream.
         sync_bytes: Bytes with which every frame begins, in hexadecimal.
+        length: Length of the whole frame without stuffing, bytes.
         byte_order: Byte order of the fields.
         checksum: Name of the checksum.
         checksum_from: First byte that the checksum covers.
         checksum_order: Byte order of the checksum; None means the byte order of the fields.
+        fields_and_padding: Fields of the frame, including padding.
     """
 
-    length: int
-    fields_and_padding: tuple[Field, ...] = field(name="fields")
     framing: Framing = "sync"
     sync_bytes: Hexadecimal | None = field(name="sync", default=None)
+    length: int
     byte_order: ByteOrder = "little"
     checksum: str = "none"
     checksum_from: Annotated[int, Meta(ge=0)] = 0
     checksum_order: ByteOrder | None = None
+    fields_and_padding: tuple[Field, ...] = field(name="fields")
 
     def __post_init__(self) -> None:
         """Check that the keys of the layout are valid and consistent with each other.

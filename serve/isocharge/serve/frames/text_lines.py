@@ -20,6 +20,7 @@ import json
 import math
 import re
 from functools import reduce
+from itertools import pairwise
 from operator import xor
 from string import ascii_uppercase
 from typing import Literal, NamedTuple
@@ -266,24 +267,17 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     Args:
         tokens: Parts of the line.
     """
-    inner_names = []
-    outer_names = []
-    words = set()  # names that are neither in quotes nor before a colon or an equals sign
-    units = []
+    paths = [[token.name for token in path if token.kind != "quoted"] for path in _paths(tokens, _SEPARATORS)]
+    kinds = [token.kind for token in tokens if token.kind in _NUMBER_KINDS]
+    inner_names = [_NAMES_OF_TIMES.get(kind, ["", *path][-1]) for kind, path in zip(kinds, paths, strict=True)]
+    outer_names = [["", "", *path][-2] for path in paths]
+    words = {token.name for token in tokens if token.kind == "word"}
     parts = [token for token in tokens if token.content not in ":="]
-    path: list[str] = []  # words and keys after the previous number or separator
-    for token, following in zip(parts, [*parts[1:], None], strict=True):
-        if token.kind in ("key", "word"):
-            path.append(token.name)
-            if token.kind == "word":
-                words.add(path[-1])
-        elif token.kind in _NUMBER_KINDS:
-            outer_name, name = ["", "", *path][-2:]
-            inner_names.append(_NAMES_OF_TIMES.get(token.kind, name))
-            outer_names.append(outer_name)
-            units.append("" if following is None else following.content)
-        if token.kind in _NUMBER_KINDS or token.content in _SEPARATORS:
-            path = []
+    units = [
+        following.content
+        for token, following in pairwise([*parts, _Token("mark", "", 0, False)])
+        if token.kind in _NUMBER_KINDS
+    ]
 
     names = [name or outer_name for name, outer_name in zip(_unique(inner_names), _unique(outer_names), strict=True)]
     channels = [index for index, name in enumerate(names) if name not in TIMES_US]
@@ -296,9 +290,9 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
         names[named[0]] = ""
     if tokens and tokens[0].content == ">" and len(names) == 2:  # `>name:time:value`
         names = [_NAMES_OF_TIMES["uptime"], next((token.content for token in tokens if token.kind == "key"), "")]
-    alternating_names = [token.name for token in tokens if token.kind == "name"]
-    if alternating_names:
-        names = [name for name in inner_names if name in TIMES_US] + alternating_names
+    alternating_names = (token.name for token in tokens if token.kind == "name")
+    if any(token.kind == "name" for token in tokens):
+        names = [_NAMES_OF_TIMES.get(kind) or next(alternating_names) for kind in kinds]
     names_with_units = [
         f"{name or f'ch{number}'}_{unit}" if unit in _CHARGE_UNITS - set(names) else name
         for number, (name, unit) in enumerate(zip(names, units, strict=True), start=1)
@@ -309,25 +303,41 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
 def _with_alternating_names(tokens: list[_Token]) -> list[_Token]:
     """Mark the names in a line in which names and numbers alternate, and return the parts of the line.
 
-    The names stand before the numbers, as in `C,7,A,3` and `C[7] A[3]`, or behind them, as in `7 C, 3 A`. All names are
-    different, because words that repeat are units or states. A time, a word before the first name and a word behind the
-    last number are no names. If a word that is no name is mistaken for a name, no electrode or not every electrode has
-    a channel with its name.
+    The name of a number is the word that is next to the number, either before each number, as in `C,7,A,3` and
+    `C[7] A[3]`, or behind each number, as in `7 C, 3 A`. All names are different, because words that repeat are units
+    or states. Times have no names. If words that are no names are mistaken for names, not every electrode has a channel
+    with its name.
 
     Args:
         tokens: Parts of the line.
     """
-    positions = [i for i, token in enumerate(tokens) if token.kind not in ("mark", *_NAMES_OF_TIMES)]
-    shape = "".join("#" if tokens[position].kind in _NUMBER_KINDS else "w" for position in positions)
-    are_behind = re.fullmatch("(?:#w){2,}", shape) is not None
-    if not are_behind and not re.fullmatch("w?(?:w#){2,}w?", shape):
-        return tokens
-    distance = 1 if are_behind else -1  # from a number to its name
-    named = {positions[index + distance] for index, kind in enumerate(shape) if kind == "#"}
-    names = {tokens[position].name for position in named}
-    if len(names) < len(named) or not _CHARGE_UNITS.isdisjoint(names):
-        return tokens
-    return [token._replace(kind="name") if position in named else token for position, token in enumerate(tokens)]
+    without_times = [token for token in tokens if token.kind not in _NAMES_OF_TIMES]
+    for ordered_tokens in (without_times, without_times[::-1]):
+        paths = _paths(ordered_tokens)
+        named = [path[-1] for path in paths if path]
+        names = {token.name for token in named}
+        if len(names) == len(paths) > 1 and _CHARGE_UNITS.isdisjoint(names):
+            return [token._replace(kind="name") if token in named else token for token in tokens]
+    return tokens
+
+
+def _paths(tokens: list[_Token], separators: str = "") -> list[list[_Token]]:
+    """Return the words, keys and texts between each number and the previous number or separator.
+
+    Args:
+        tokens: Parts of the line.
+        separators: Marks that separate columns.
+    """
+    paths = []
+    path: list[_Token] = []
+    for token in tokens:
+        if token.kind in _NUMBER_KINDS:
+            paths.append(path)
+        if token.kind in _NUMBER_KINDS or token.content in separators:
+            path = []
+        elif token.kind != "mark":
+            path.append(token)
+    return paths
 
 
 def _unique(names: list[str]) -> list[str]:

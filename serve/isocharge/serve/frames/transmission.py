@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import anycrc
 from cobs import cobs
@@ -81,7 +81,7 @@ def _hdlc_decode(stuffed: bytes) -> bytes:
     return bytes(decoded)
 
 
-STUFFINGS = {
+STUFFINGS: dict[Literal["cobs", "slip", "hdlc"], Stuffing] = {
     "cobs": Stuffing(b"\x00", cobs_decode),
     "slip": Stuffing(b"\xc0", _slip_decode),
     "hdlc": Stuffing(b"\x7e", _hdlc_decode),

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.serve.frames.frame_layout import ByteOrder
+from isocharge.serve.frames.frame_layout import STRUCT_FORMATS, ByteOrder, FieldType
 from isocharge.serve.recognition.framing import INTACT_SHARE, Bytes, usual_bytes
 
 CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
@@ -25,9 +25,6 @@ CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
 
 PLAUSIBLE_MAGNITUDES = (1e-7, 1e8)
 """Smallest and largest typical magnitude of a floating-point channel."""
-
-TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "f32", "f64")
-"""Types of numbers, as in device files."""
 
 
 def steady_step(steps: Array, max_deviation: float = 0.7) -> float:
@@ -105,7 +102,7 @@ class Part(NamedTuple):
     """
 
     role: Literal["pad", "seq", "clock", "channel"]
-    type_name: str
+    type_name: FieldType
     size: int
     score: float
     is_constant: bool = False
@@ -122,9 +119,9 @@ class Part(NamedTuple):
 def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[list[Part]]:
     """List the possible parts of a frame that begin at each byte.
 
-    A part is a single byte without a meaning (padding), or a number of one of the types `TYPES`. The first byte of the
-    frames is not yet known. A number may therefore begin near the end of the first `length` bytes of a row, and end in
-    the following bytes.
+    A part is a single byte without a meaning (padding), or a number of one of the types in `STRUCT_FORMATS`. The first
+    byte of the frames is not yet known. A number may therefore begin near the end of the first `length` bytes of a row,
+    and end in the following bytes.
 
     Args:
         rows: Bytes of two consecutive frames in each row, shape (n, 2 * length). The frames may begin at any position
@@ -144,7 +141,7 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
     for position in range(length):
         pad_score = Weights.constant if is_constant[position] else Weights.noise
         parts = [Part("pad", "pad", 1, pad_score)]  # one byte of padding
-        for type_name in TYPES:  # such as "u16", whose size is 16 bits
+        for type_name in STRUCT_FORMATS:  # such as "u16", whose size is 16 bits
             size = int(type_name[1:]) // 8  # in bytes
             end = position + size
             if end <= row_length:
@@ -161,7 +158,7 @@ def _number_parts(
     number_bytes: Bytes,
     is_constant: Booleans,
     is_zero: Booleans,
-    type_name: str,
+    type_name: FieldType,
     frame_rate_Hz: float,
 ) -> Iterator[Part]:
     """Yield the possible parts of a frame for bytes that contain a number of a given type.

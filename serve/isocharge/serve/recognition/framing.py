@@ -14,12 +14,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from itertools import product
 from math import gcd
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC, ByteOrder
+from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC, ByteOrder, Framing
 from isocharge.serve.frames.transmission import CHECKSUMS, STUFFINGS, Stuffing
 
 Bytes = NDArray[np.uint8]
@@ -53,13 +53,13 @@ class FrameDivision(NamedTuple):
     not be the first byte of the frame.
 
     Attributes:
-        framing: Kind of framing, one of `isocharge.serve.frames.frame_layout.Framing`.
+        framing: Kind of framing, as in device files.
         stream: All bytes of the stream, shape (n,).
         window_starts: Positions in the stream at which the windows begin, shape (frames,).
         length: Number of bytes in a window, which is the length of a frame.
     """
 
-    framing: str
+    framing: Framing
     stream: Bytes
     window_starts: NDArray[np.int64]
     length: int
@@ -115,7 +115,7 @@ def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Itera
     yield from _synchronised_frames(np.frombuffer(data, np.uint8))
 
 
-def _adjacent_frames(framing: str, data: bytes, length: int) -> FrameDivision:
+def _adjacent_frames(framing: Framing, data: bytes, length: int) -> FrameDivision:
     """Divide a stream that consists only of whole frames of one length into its frames.
 
     Args:
@@ -128,7 +128,7 @@ def _adjacent_frames(framing: str, data: bytes, length: int) -> FrameDivision:
     return FrameDivision(framing, stream, window_starts, length)
 
 
-def _stuffed_frames(name: str, stuffing: Stuffing, data: bytes) -> Iterator[FrameDivision]:
+def _stuffed_frames(name: Framing, stuffing: Stuffing, data: bytes) -> Iterator[FrameDivision]:
     """Decode a stream with a byte stuffing. If most of the decoded frames have the same length, yield these frames.
 
     A byte stuffing is an encoding that marks the ends of frames with a delimiter. At most one division is yielded.
@@ -249,12 +249,14 @@ class Check(NamedTuple):
     Attributes:
         size: Number of bytes of the checksum; 0 if the frames have no checksum.
         order: Byte order of the checksum.
-        keys: Keys that describe the checksum in a device file.
+        name: Name of the checksum.
+        start: First byte that the checksum covers.
     """
 
     size: int
     order: ByteOrder
-    keys: dict[str, Any]
+    name: str = "none"
+    start: int = 0
 
 
 def find_checks(rows: Bytes) -> Iterator[Check]:
@@ -289,10 +291,7 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
         for order in orders:
             for start, name in product(possible_starts, names):
                 if _fits(CHECKSUMS[name].compute, frames, start, size, order):
-                    keys: dict[str, Any] = {"checksum": name}  # keys of the checksum in a device file
-                    if start > 0:  # the default is that the checksum covers a frame from its first byte
-                        keys["checksum_from"] = start
-                    yield Check(size, order, keys)
+                    yield Check(size, order, name, start)
                     break
 
 

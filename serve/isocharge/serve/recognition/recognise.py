@@ -9,10 +9,11 @@ from string import printable
 from typing import Any
 
 import numpy as np
+from msgspec import structs, to_builtins
 
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import SEQ, Frame, Parser
-from isocharge.serve.frames.frame_layout import PADDING, SYNC, ByteOrder
+from isocharge.serve.frames.frame_layout import PADDING, SYNC, ByteOrder, Field, FrameLayout
 from isocharge.serve.frames.text import Layout, TextParser
 from isocharge.serve.recognition.fields import Part, Weights, identify_clock, possible_parts, split_frame, steady_step
 from isocharge.serve.recognition.framing import (
@@ -97,7 +98,7 @@ def _scored_sections(division: FrameDivision, seconds: float) -> Iterator[tuple[
     for order in ORDERS:
         parts_in_window = possible_parts(rows, order, frame_rate_Hz)  # parts that may begin at each byte
         if not has_check:  # try frames without a checksum
-            starts_and_checks = [(start, Check(0, order, {})) for start in starts]
+            starts_and_checks = [(start, Check(0, order)) for start in starts]
         for start, check in starts_and_checks:
             parts_from_start = parts_in_window[start:] + parts_in_window[:start]  # from the first byte of the frame
             parts_before_check = parts_from_start[: length - check.size]
@@ -125,42 +126,42 @@ def _frames_section(
         order: Byte order of the numbers.
         parts: Parts of a frame between the sync pattern and the checksum.
     """
-    section: dict[str, Any] = {"format": "described"}
-    if division.framing == SYNC:  # the default framing, which needs no key
-        section["sync"] = sync.hex(" ").upper()
-    else:
-        section["framing"] = division.framing
-    section["length"] = division.length
-    section["byte_order"] = order
-    section |= check.keys
-    if check.size > 1 and check.order != order:  # a checksum of one byte has no byte order
-        section["checksum_order"] = check.order
-    section["fields"] = _field_tables(parts)
+    layout = FrameLayout(
+        framing=division.framing,
+        sync_bytes=sync.hex(" ").upper() or None,
+        length=division.length,
+        byte_order=order,
+        checksum=check.name,
+        checksum_from=check.start,
+        checksum_order=check.order if check.order != order and check.size > 1 else None,
+        fields_and_padding=_fields(parts),
+    )
+    section: dict[str, Any] = to_builtins(layout)
     return section
 
 
-def _field_tables(parts: Sequence[Part]) -> list[dict[str, Any]]:
-    """Convert the parts of a frame to the list `fields` of a device file.
+def _fields(parts: Sequence[Part]) -> tuple[Field, ...]:
+    """Convert the parts of a frame to fields and padding.
 
     Channels are called ch1, ch2, and so on. A second counter or a second clock becomes padding, because a device file
     can describe only one counter and one clock. Adjacent padding is joined.
     """
-    fields: list[dict[str, Any]] = []
+    fields: list[Field] = []
     channel_count = 0
-    roles = set()
+    roles = {"pad"}
     for part in parts:
         if part.role == "channel":
             channel_count += 1
-            fields.append({"name": f"ch{channel_count}", "type": part.type_name})
-        elif part.role != "pad" and part.role not in roles:
+            fields.append(Field(name=f"ch{channel_count}", type_name=part.type_name))
+        elif part.role not in roles:
             roles.add(part.role)
-            scale = {} if part.scale == 1.0 else {"scale": part.scale}  # 1 is the default value of the key
-            fields.append({"name": part.name, "type": part.type_name} | scale)
-        elif fields and fields[-1]["type"] == PADDING:
-            fields[-1]["count"] = fields[-1].get("count", 1) + part.size  # padding without a count is one byte
+            field = Field(name=part.name, type_name=part.type_name)
+            fields.append(field if part.scale == 1.0 else structs.replace(field, scale=part.scale))
+        elif fields and fields[-1].type_name == PADDING:
+            fields[-1] = structs.replace(fields[-1], count=fields[-1].count + part.size)
         else:
-            fields.append({"type": PADDING} | ({} if part.size == 1 else {"count": part.size}))
-    return fields
+            fields.append(Field(type_name=PADDING, count=part.size))
+    return tuple(fields)
 
 
 def is_text(chunks: Sequence[bytes], min_share: float = 0.95) -> bool:

@@ -266,10 +266,12 @@ SEARCH_INTERVAL_s = 0.05
 MAX_RELATIVE_RADIUS = 1.1
 """Distance from the centre, relative to the radius of the film, beyond which components are removed."""
 
-FOLD_DISTANCE = 4.0
-"""Distance of a fold from the most probable component, in standard deviations, below which two components are added.
+CLEAR_DISTANCE = 4.0
+"""Distance, in standard deviations, above which two positions are clearly different.
 
-The distance is large, because an error of a gain displaces the fold. The contact then seems to stop before the fold.
+Components that are further apart are different contacts. If a fold is nearer to the most probable component, two
+components are added. The distance is large, because an error of a gain displaces the fold. The contact then seems to
+stop before the fold.
 """
 
 SPLIT_DISTANCE = 2.5
@@ -277,9 +279,6 @@ SPLIT_DISTANCE = 2.5
 
 SPLIT_VARIANCE_RATIO = 0.25
 """Variance of a component added at a fold along the axis of the split, relative to the original component."""
-
-SEPARATE_DISTANCE = 3.0
-"""Distance, in standard deviations, above which components on the same side of a fold are different contacts."""
 
 GRID_POINTS = 13
 """Number of components along each axis of the film when a touch begins."""
@@ -395,7 +394,7 @@ class ContactMixture:
         components = prune_components(components._replace(log_weight=log_weight))  # the most probable is now the first
         count = len(components.mean)
         ends = _components_at_ends(components)
-        far = components.mean[0] + FOLD_DISTANCE / SPLIT_DISTANCE * (ends.mean - components.mean[0])
+        far = components.mean[0] + CLEAR_DISTANCE / SPLIT_DISTANCE * (ends.mean - components.mean[0])
         is_across_fold = self._is_across_fold(np.vstack([components.mean, far]))
         misfit = math.sqrt(updated.squared_misfit[best])
         self._hypotheses = _hypotheses_of(components, is_across_fold[:count, :count], misfit)
@@ -438,7 +437,7 @@ def _components_at_ends(components: Components) -> Components:
 def _hypotheses_of(components: Components, is_across_fold: Booleans, misfit: float) -> list[ContactHypothesis]:
     """Combine the components that describe the same contact, and return one hypothesis for each contact.
 
-    Two components describe the same contact if x and y differ by less than `SEPARATE_DISTANCE` standard deviations of
+    Two components describe the same contact if x and y differ by less than `CLEAR_DISTANCE` standard deviations of
     the difference, and no fold lies between them.
 
     Args:
@@ -457,7 +456,7 @@ def _hypotheses_of(components: Components, is_across_fold: Booleans, misfit: flo
     while remaining.any():
         first = int(remaining.argmax())
         difference_mm = np.abs(components.mean - components.mean[first])[:, POSITION]
-        is_near = (difference_mm < SEPARATE_DISTANCE * np.sqrt(variance + variance[first])).all(axis=1)
+        is_near = (difference_mm < CLEAR_DISTANCE * np.sqrt(variance + variance[first])).all(axis=1)
         is_same = remaining & is_near & ~is_across_fold[first]
         is_same[first] = True  # even if rounding errors make it appear to be across a fold
         remaining &= ~is_same
