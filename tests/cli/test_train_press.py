@@ -4,6 +4,7 @@ import os
 import re
 import threading
 from collections.abc import Iterator
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +19,7 @@ from isocharge.serve.live.steady_press import (
     SteadyPress,
     WatchResult,
 )
-from isocharge.simulate import Circle, ForwardMap, load_amplifier, load_sensor
+from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.calibration import session as session_module
@@ -160,25 +161,28 @@ def problem():
 
 
 @pytest.fixture(scope="module")
-def film(problem):
-    """Return the map of the film of a seed."""
-    prior = problem.prior.layout.prior
-    sensor, probe = prior.film(prior.draw(np.random.default_rng(3), 1)[0])
-    return kept(ForwardMap.build, sensor, probe)
+def described_film(problem):
+    return kept(solve_even, problem)
 
 
 @pytest.fixture(scope="module")
-def places(problem):
-    return np.array([press.contact for press in next_presses(problem, kept(solve_even, problem), 3)])
+def charges(described_film):
+    """Return the function that returns the charges of contacts on the film of a seed."""
+    return partial(described_film.charges, described_film.prior.draw(np.random.default_rng(3), 1)[0])
 
 
-def board(film, places, seed=0) -> Iterator[bytes]:
+@pytest.fixture(scope="module")
+def places(problem, described_film):
+    return np.array([press.contact for press in next_presses(problem, described_film, 3)])
+
+
+def board(charges, places, seed=0) -> Iterator[bytes]:
     """Return the frames that a board sends while a machine presses each position for 1.2 s."""
     t = np.arange(round(1.2 * RATE_HZ)) / RATE_HZ
     rise = np.clip(np.minimum(t, 1.2 - t) / 0.1, 0.0, 1.0)[:, None] ** (2 / 3)
     pause = np.zeros((round(0.8 * RATE_HZ), 4))
     pieces = [np.zeros((400, 4))]
-    for charge in film.charges(places):
+    for charge in charges(places):
         pieces += [rise * charge, pause]
     measure = load_amplifier("reference").start(4, RATE_HZ, np.random.default_rng(seed))
     for number, row in enumerate(measure(np.concatenate(pieces))):
@@ -186,21 +190,21 @@ def board(film, places, seed=0) -> Iterator[bytes]:
 
 
 @pytest.fixture
-def desk(film, places, tmp_path, monkeypatch):
+def desk(charges, places, tmp_path, monkeypatch):
     """A folder with the bytes of a board, in two parts, and the list of the presses that it makes."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "some.bin").write_bytes(b"".join(board(film, places[:2])))
-    (tmp_path / "rest.bin").write_bytes(b"".join(board(film, places[2:], seed=1)))
+    (tmp_path / "some.bin").write_bytes(b"".join(board(charges, places[:2])))
+    (tmp_path / "rest.bin").write_bytes(b"".join(board(charges, places[2:], seed=1)))
     np.savetxt(tmp_path / "list.csv", places, fmt="%.17g", delimiter=",", header="x_mm,y_mm,force_N", comments="")
     return tmp_path
 
 
-def test_a_press_that_had_begun_is_left_out_and_a_line_is_not(film, places):
+def test_a_press_that_had_begun_is_left_out_and_a_line_is_not(charges, places):
     """The board waits in the middle of its first press until the dialogue wants the next."""
     (reader, keyboard), armed = os.pipe(), threading.Event()
 
     def chunks():
-        for number, data in enumerate(board(film, places[:2])):
+        for number, data in enumerate(board(charges, places[:2])):
             if number == 440:
                 armed.wait(60)
             yield Chunk(data, number / RATE_HZ, 0)
@@ -215,19 +219,20 @@ def test_a_press_that_had_begun_is_left_out_and_a_line_is_not(film, places):
         press = next(event.press for event in coming if event.press)
         with pytest.raises(SessionEnd):
             list(coming)
-    np.testing.assert_allclose(press.charge_pC, film.charges(places[1:2])[0], rtol=0.01, atol=2.0)
+    np.testing.assert_allclose(press.charge_pC, charges(places[1:2])[0], rtol=0.01, atol=2.0)
     os.close(keyboard)
 
 
 PRESS = ("train", "press", "--sensor", "four-25um-biaxial", "-o", "presses.csv")
 
 
-def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk, film, places, monkeypatch, problem):
+def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(
+    command, desk, charges, places, monkeypatch, described_film
+):
     """The port ends after two presses. The same command continues with the third row of the list.
 
     The described film is solved once for all tests, and the film that the presses determine is not solved.
     """
-    described_film = kept(solve_even, problem)
     monkeypatch.setattr(session_module, "solve_even", lambda *_: described_film)
     monkeypatch.setattr(calibrate_module, "solve_even", lambda *_: described_film)
     monkeypatch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
@@ -241,7 +246,7 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk
     assert "isocharge train calibrate presses.csv --sensor four-25um-biaxial" in err
 
     presses = read_presses(desk / "presses.csv", NAMES)
-    clean = film.charges(places)
+    clean = charges(places)
     std = np.hypot(1.0, 0.002 * clean) * np.sqrt(1 / 90 + 1 / 50)
     assert (np.abs(presses.charge_pC - clean) < 5 * std).all()
     np.testing.assert_array_equal(presses.contact, places)
