@@ -181,7 +181,6 @@ def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
 
 BAD = [
     (("simulate", "point", SENSOR, "--force", "-1"), 2, "SceneError: force: expected a positive number of newtons"),
-    (("simulate", "point", SENSOR, "--at", "44.5,0"), 2, "SceneError: probe off the film: centre (44.5, 0) mm"),
     (("simulate", "point", SENSOR, "--side-force", "0.1"), 2, "InputError: --side-force: expected two numbers in N"),
     (
         ("simulate", "point", SENSOR, "--friction", "0.1", "--side-force", "0.1,0"),
@@ -190,26 +189,13 @@ BAD = [
     ),
     (("simulate", "point", SENSOR, "--at", "3"), 2, "InputError: --at: expected two numbers in mm"),
     (("simulate", "point", SENSOR, "--probe", "cube:1"), 2, "SceneError: probe 'cube:1'"),
-    (
-        ("simulate", "point", SENSOR, "--probe", "rectangle:4x0"),
-        2,
-        "SceneError: probe height: expected at least 0.02 mm",
-    ),
-    (("simulate", "point", SENSOR, "--theory", "magic"), 2, "SceneError: theory: expected one of"),
     (("simulate", "point", SENSOR, "--accuracy", "0"), 2, "InputError: --accuracy: expected"),
-    (("simulate", "sweep", SENSOR, "--samples", "0", "-o", "OUT"), 2, "SceneError: samples: expected at least 1"),
-    (
-        ("simulate", "sweep", SENSOR, "--force", "2", "1", "-o", "OUT"),
-        2,
-        "SceneError: force: expected 0 < smallest <= largest",
-    ),
     (("simulate", "sweep", SENSOR, "--radius", "44.5", "-o", "OUT"), 2, "leave the film of radius 45 mm"),
     (
         ("simulate", "sweep", SENSOR, "--workers", "2", "--cluster", "tcp://127.0.0.1:9", "-o", "OUT"),
         2,
         "InputError: expected either --workers or --cluster, got both",
     ),
-    (("simulate", "sweep", SENSOR, "--cluster", "pigeon://1", "-o", "OUT"), 2, "InputError: cluster 'pigeon://1'"),
     (("train", "fit", "-o", "OUT"), 2, "InputError: expected either a DATASET folder or a SENSOR"),
     (("train", "fit", SENSOR, "--sensor", SENSOR, "-o", "OUT"), 2, f"expected one sensor, got {SENSOR} and"),
     (("simulate", "identify", SENSOR, "--noise", "clean"), 2, "expected white noise above 0 pC, got that of 'clean'"),
@@ -247,17 +233,10 @@ BAD = [
             (f"none.csv --sensor {SENSOR}", "none.csv: expected a dataset folder or a file of measured presses"),
         ]
     ),
-    (("train", "fit", ".", "-o", "OUT"), 2, "DatasetError: . is not a dataset: it has no manifest.json"),
     (
         ("train", "fit", "--sensor", SENSOR, "--config", "none.toml", "-o", "OUT"),
         2,
         "ConfigError: none.toml: cannot be",
-    ),
-    (("simulate", "point", SENSOR, "--force", "1e6"), 2, "beyond small strains"),
-    (
-        ("simulate", "sweep", SENSOR, "--samples", "1000000000000", "-o", "OUT"),
-        2,
-        "SceneError: samples: expected at most",
     ),
     (("train", "fit", "--sensor", SENSOR, "-o", "a b"), 2, "ModelError: model name 'a b'"),
     (
@@ -266,10 +245,10 @@ BAD = [
         "OutputError: /proc/x cannot be written",
     ),
     (("serve", "predict", SENSOR, "x.csv", "--models", "nope"), 2, "ModelError: nope: expected a folder of models"),
-    (("serve", "predict", "no-such-model", "x.csv"), 2, "ModelError"),
     (("serve", "predict", SENSOR, "none.csv"), 2, "ChargeError: none.csv: cannot be read"),
     (("serve", "predict", SENSOR, "-"), 2, "stdin"),
     (("serve", "stream", SENSOR, "--port", "/dev/none"), 1, "PortError"),
+    (("demo", "--sensor", "no-such-sensor"), 2, "no-such-sensor"),
 ]
 
 
@@ -317,8 +296,3 @@ def test_demo_plays_the_working_area_of_the_released_model_of_the_sensor():
     assert played_radius_mm("three-25um-biaxial") == pytest.approx(8.0, rel=2e-3)
     assert played_radius_mm("four-25um-biaxial-15mm") == pytest.approx(15.0, rel=2e-3)
     assert played_radius_mm("no-such-sensor") == 8.0
-
-
-def test_demo_refuses_an_unknown_sensor(refused, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    refused("demo", "--sensor", "no-such-sensor", message="no-such-sensor", code=2)

@@ -96,17 +96,6 @@ def test_check_refuses_with_the_reason(tmp_path, models, refused, text, words, m
     refused("serve", "check", "linear", path, "--models", models, *words, message=message)
 
 
-def test_stream_writes_a_record_for_each_frame_of_a_port(board, models, run):
-    result = run("stream", "linear", "--port", board.url, "--count", 500, "--models", models)
-    records = records_of(result.stdout)
-    assert [record["seq"] - records[0]["seq"] for record in records] == list(range(500))
-    pressed = [(r["x_mm"], r["y_mm"], r["force_N"]) for r in records if r["contact"]]
-    np.testing.assert_allclose(pressed, np.tile([3.0, -2.0, 1.0], (len(pressed), 1)), atol=0.05)
-    assert "tared: A " in result.stderr
-    last = result.stderr.splitlines()[-1]
-    assert "0 lost, 0 repeated, 0 restarts; 0 CRC errors, 0 malformed" in last
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stream_ends_cleanly_at_sigint_and_sigterm(board_until, models, run, number):
     with board_until(400, lambda: interrupt(number)) as board:
@@ -148,12 +137,17 @@ def test_stream_that_waits_for_its_port_can_be_stopped(models, tmp_path, run, st
     assert list(tmp_path.iterdir()) == []
 
 
-def test_replay_has_the_name_and_the_pace_of_the_recording(board, models, tmp_path, run):
+def test_stream_writes_a_record_for_each_frame_and_replay_repeats_them_at_their_pace(board, models, tmp_path, run):
     path, words = tmp_path / "touch.rec", ["--name", "left, \u00fc"]
     words += ["--count", 1000, "--models", models]
     streamed = run("stream", "linear", "--port", board.url, "--record", path, *words)
     records = records_of(streamed.stdout)
     assert {record["frame_id"] for record in records} == {"left, \u00fc"}
+    assert [record["seq"] - records[0]["seq"] for record in records] == list(range(1000))
+    pressed = [(r["x_mm"], r["y_mm"], r["force_N"]) for r in records if r["contact"]]
+    np.testing.assert_allclose(pressed, np.tile([3.0, -2.0, 1.0], (len(pressed), 1)), atol=0.05)
+    assert "tared: A " in streamed.stderr
+    assert "0 lost, 0 repeated, 0 restarts; 0 CRC errors, 0 malformed" in streamed.stderr.splitlines()[-1]
     began = time.monotonic()
     assert run("replay", path, "--real-time", "--models", models).stdout == streamed.stdout
     assert time.monotonic() - began > 0.2  # 50 chunks of 10 ms

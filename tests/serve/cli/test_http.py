@@ -9,9 +9,7 @@ import socket
 import pytest
 import tritonclient.grpc
 
-BODY = json.dumps(
-    {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}]}
-)
+from infer_requests import BODY, INFER
 
 
 @pytest.fixture
@@ -22,9 +20,9 @@ def start(models, start_command):
     return start
 
 
-def ask(url, method="POST", path="/v2/models/linear/infer", body=BODY):
+def ask(url):
     client = http.client.HTTPConnection(url.removeprefix("http://"), timeout=20)
-    client.request(method, path, body)
+    client.request("POST", INFER, BODY)
     answer = client.getresponse()
     content = json.loads(answer.read())
     client.close()
@@ -120,7 +118,7 @@ def test_full_log_pipe_delays_no_request(start):
     address = process.stdout.readline().strip().removeprefix("http://")
     client = http.client.HTTPConnection(address, timeout=20)
     for _ in range(1500):
-        client.request("POST", "/v2/models/linear/infer", BODY)
+        client.request("POST", INFER, BODY)
         answer = client.getresponse()
         assert answer.status == 200
         answer.read()

@@ -27,28 +27,17 @@ def test_tls_files_that_cannot_be_used(handler, tls_files, certificate, key):
         HttpServer(Application(handler), Address(), tls=tls)
 
 
-def test_server_on_a_unix_socket(handler, start_http, tmp_path):
+def test_server_on_a_unix_socket_takes_over_a_socket_left_by_a_killed_server(handler, start_http, tmp_path):
     path = tmp_path / "touch.sock"
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(path))
     assert start_http(handler, uds=path).url == f"unix:{path}"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert answer_of(path).startswith(b"HTTP/1.1 200")
-
-
-def answer_of(path):
-    """The first bytes of what the server on a Unix socket answers."""
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(20)
         connection.connect(str(path))
         connection.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
-        return connection.recv(1000)
-
-
-def test_a_socket_left_by_a_killed_server_is_taken_over(handler, start_http, tmp_path):
-    path = tmp_path / "touch.sock"
-    with socket.socket(socket.AF_UNIX) as left:
-        left.bind(str(path))
-    start_http(handler, uds=path)
-    assert answer_of(path).startswith(b"HTTP/1.1 200")
+        assert connection.recv(1000).startswith(b"HTTP/1.1 200")
 
 
 def test_addresses_in_use_or_impossible_are_refused(handler, start_http, tmp_path):

@@ -1,10 +1,10 @@
 """The metrics of the server, read by the parser of prometheus_client: counts, labels, and access by the token."""
 
-import json
-
 import numpy as np
+import orjson
 from prometheus_client.parser import text_string_to_metric_families
 
+from infer_requests import BODY, INFER, infer_request
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.flags import MISFIT
 from isocharge.serve.model.metadata import ModelMetadata
@@ -12,15 +12,7 @@ from isocharge.serve.model.validity import Validity
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 
-INFER = "/v2/models/linear/infer"
 MODEL = "three-25um-biaxial"
-
-
-def body(charges, **more):
-    """Return the body of a request with charges."""
-    charges = np.atleast_2d(charges)
-    tensor = {"name": "charge_pC", "datatype": "FP32", "shape": list(charges.shape), "data": charges.ravel().tolist()}
-    return json.dumps({"inputs": [tensor]} | more).encode()
 
 
 def families(text):
@@ -68,11 +60,11 @@ def test_misfit_alarms_are_the_flags_of_records():
     assert 20 < sum(alarms) < 280
     path = f"/v2/models/{MODEL}/infer"
     contact_only = {"outputs": [{"name": "contact"}]}
-    handler.answer("POST", path, [], body(charges))
+    handler.answer("POST", path, [], orjson.dumps(infer_request(charges)))
     for row in charges[:50]:
-        handler.answer("POST", path, [], body(row))
-        handler.answer("POST", path, [], body(row, **contact_only))
-    handler.answer("POST", path, [], body(charges, **contact_only))
+        handler.answer("POST", path, [], orjson.dumps(infer_request(row)))
+        handler.answer("POST", path, [], orjson.dumps(infer_request(row, **contact_only)))
+    handler.answer("POST", path, [], orjson.dumps(infer_request(charges, **contact_only)))
     samples = scrape(handler)
     of = {"model": MODEL, "version": "1"}
     counts = [value(samples, f"{name}_total", **of) for name in ("presses", "misfit_alarms")]
@@ -81,7 +73,7 @@ def test_misfit_alarms_are_the_flags_of_records():
 
 def test_counters_do_not_fall_when_a_model_is_loaded_again(handler):
     for action in ("load", "unload", "load"):
-        handler.answer("POST", INFER, [], body([1, 2, 3]))
+        handler.answer("POST", INFER, [], BODY)
         assert handler.answer("POST", f"/v2/repository/models/linear/{action}", [], b"").status == 200
     samples = scrape(handler)
     assert value(samples, "presses_total", model="linear", version="2") == 2  # the third met no model

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import helper, numpy_helper
 
+from infer_requests import BODY, INFER
 from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.common.files import sha256_of
 from isocharge.serve.network.address import Token
@@ -154,7 +155,6 @@ def test_model_name_is_not_taken_as_a_path(store, name):
 SECRET = 'open "sesame"'
 NAMES = {"time", "level", "event", "transport", "route", "status", "model", "error", "duration_us", "bytes_in"}
 NAMES |= {"bytes_out", "client"}
-BODY = b'{"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [1, 2, 3]}]}'
 FORGED = '"}\n{"time": "2026", "level": "info", "event": "request", "status": 200}\n'
 
 
@@ -178,7 +178,7 @@ def bearer(token=SECRET):
 
 
 def test_log_has_one_line_for_each_request(app, lines):
-    app.answer("POST", "/v2/models/linear/infer", bearer(), BODY, ("127.0.0.1", 5000))
+    app.answer("POST", INFER, bearer(), BODY, ("127.0.0.1", 5000))
     (line,) = map(json.loads, lines)
     assert set(line) == NAMES
     assert datetime.fromisoformat(line.pop("time")).tzinfo == UTC
@@ -270,9 +270,6 @@ def test_log_has_a_line_for_an_unreadable_request(app, lines, start_http):
 def test_no_inference_is_lost_while_folders_are_moved_and_loaded(film, store, folder, tmp_path):
     film.write(tmp_path / "other")
     handler = Handler(store)
-    body = json.dumps(
-        {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}]}
-    ).encode()
     has_ended = threading.Event()
 
     def move_folders():
@@ -292,7 +289,7 @@ def test_no_inference_is_lost_while_folders_are_moved_and_loaded(film, store, fo
     for thread in threads:
         thread.start()
     try:
-        statuses = {handler.answer("POST", "/v2/models/linear/infer", [], body).status for _ in range(3_000)}
+        statuses = {handler.answer("POST", INFER, [], BODY).status for _ in range(3_000)}
     finally:
         has_ended.set()
         for thread in threads:

@@ -10,11 +10,10 @@ from starlette.applications import Starlette
 from starlette.responses import PlainTextResponse
 from starlette.routing import Mount, Route
 
+from infer_requests import BODY, INFER
 from isocharge.serve import asgi_app
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import HttpServer
-
-BODY = json.dumps({"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100, 200, 300]}]})
 
 
 @pytest.fixture
@@ -47,7 +46,7 @@ def ask(models):
 def test_asgi_app_mounted_in_starlette_answers_under_its_path(ask, predictor):
     assert ask("GET", "/") == (200, b"the program")
     bearer = {"Authorization": "Bearer sesame"}
-    status, content = ask("POST", "/touch/v2/models/linear/infer", BODY, **bearer)
+    status, content = ask("POST", "/touch" + INFER, BODY, **bearer)
     assert status == 200
     contact = np.float32(json.loads(content)["outputs"][0]["data"])
     np.testing.assert_array_equal(contact, np.float32(predictor.predict([100.0, 200.0, 300.0])[:3]))
@@ -59,4 +58,4 @@ def test_mounted_asgi_app_checks_token_size_and_origin(ask):
     bearer = {"Authorization": "Bearer sesame"}
     assert ask("GET", "/touch/v2")[0] == 401
     assert ask("GET", "/touch/v2", Origin="http://evil.example", **bearer)[0] == 403
-    assert ask("POST", "/touch/v2/models/linear/infer", bytes((1 << 20) + 1), **bearer)[0] == 413
+    assert ask("POST", "/touch" + INFER, bytes((1 << 20) + 1), **bearer)[0] == 413

@@ -11,15 +11,14 @@ from contextlib import ExitStack, suppress
 from threading import Event
 
 import numpy as np
+import orjson
 import pytest
 
+from infer_requests import BODY, INFER, infer_request
 from isocharge.serve.network.address import ServerLimits, Tls, Token
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.protocol import Handler
 
-INFER = "/v2/models/linear/infer"
-TENSOR = {"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}
-BODY = json.dumps({"inputs": [TENSOR]}).encode()
 LOAD = b"POST /v2/repository/models/linear/load HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\n\r\n"
 LAST = b"Connection: close\r\n"
 
@@ -111,7 +110,7 @@ def test_requests_of_a_stock_http_client(server, predictor):
         outputs = json.loads(client.getresponse().read())["outputs"]
         numbers = np.float32([value for output in outputs for value in output["data"]])
         in_order = np.concatenate([numbers[:6], numbers[9:], numbers[6:9]])  # the correlations of a contact are last
-        np.testing.assert_array_equal(in_order, np.float32(predictor.predict(TENSOR["data"])))
+        np.testing.assert_array_equal(in_order, np.float32(predictor.predict([100.0, 200.0, 300.0])))
     for method, path, status, has_body in (("POST", "/nope", 404, True), ("HEAD", "/v2?a=b", 200, False)):
         client.request(method, path)
         answer = client.getresponse()
@@ -202,7 +201,7 @@ def test_idle_connections_leave_open_files_for_new_connections(limited, monkeypa
 
 def test_client_that_does_not_read_is_disconnected(limited):
     server = limited(body_seconds=0.3)
-    body = json.dumps({"inputs": [TENSOR | {"shape": [4096, 3], "data": TENSOR["data"] * 4096}]}).encode()
+    body = orjson.dumps(infer_request([[100.0, 200.0, 300.0]] * 4096))
     with connect(server) as connection, pytest.raises(OSError, match=r"reset|Broken pipe"):
         drip(connection, infer(body=body), 1000)
     assert is_well(server)

@@ -24,11 +24,10 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
+from infer_requests import INFER, infer_request
 from isocharge.common.errors import InputError
 from isocharge.serve.network.protocol import routes
 from isocharge.serve.network.protocol.response import decompress
-
-INFER = "/v2/models/linear/infer"
 
 
 @pytest.fixture
@@ -50,13 +49,6 @@ def bare(tmp_path, store):  # noqa: ARG001
     session = onnxruntime.InferenceSession(tmp_path / "models/linear/2/model.onnx", providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
     return lambda charges: dict(zip(names, session.run(None, {"charge_pC": np.float32(charges)}), strict=True))
-
-
-def request(charges, datatype="FP32", **more):
-    """Return the JSON object of a request with charges."""
-    charges = np.asarray(charges)
-    tensor = {"name": "charge_pC", "datatype": datatype, "shape": list(charges.shape), "data": charges.ravel().tolist()}
-    return {"inputs": [tensor]} | more
 
 
 def refusal(answer):
@@ -99,7 +91,7 @@ def test_unknown_model_gets_404(ask, path):
 def test_outputs_equal_those_of_onnxruntime(ask, bare, film, n, datatype, form):
     data = form(np.resize(film.golden_pC(), (n, 3)))
     charges = data.reshape(n, 3)
-    sent = request(np.zeros((n, 3)), datatype, id="a")
+    sent = infer_request(np.zeros((n, 3)), datatype, id="a")
     sent["inputs"][0]["data"] = data.tolist()
     status, _, body = ask("POST", INFER, orjson.dumps(sent))
     content = orjson.loads(body)
@@ -122,7 +114,7 @@ def test_optional_fields_may_be_null(ask):
     """Older clients of KServe send null for every field that is not given."""
     null_parameters = dict.fromkeys(["binary_data", "binary_data_output", "binary_data_size", "classification"])
     fields = {"id": None, "outputs": None, "parameters": None}
-    body = request([[1.0, 2.0, 3.0]])
+    body = infer_request([[1.0, 2.0, 3.0]])
     expected = ask("POST", INFER, orjson.dumps(body))
     for parameters in (None, null_parameters):
         body["inputs"][0]["parameters"] = parameters
@@ -135,7 +127,7 @@ def test_optional_fields_may_be_null(ask):
 
 @pytest.mark.parametrize(("way", "pack"), [("gzip", gzip.compress), ("deflate", zlib.compress), ("identity", bytes)])
 def test_compressed_request_body(ask, film, way, pack):
-    plain = orjson.dumps(request(film.golden_pC()))
+    plain = orjson.dumps(infer_request(film.golden_pC()))
     assert ask("POST", INFER, pack(plain), content_encoding=way)[2] == ask("POST", INFER, plain)[2]
 
 
@@ -153,7 +145,7 @@ PRESS = [[100.0, 200.0, 300.0]]
 
 
 def changed(**changes):
-    content = request(PRESS)
+    content = infer_request()
     content["inputs"][0] |= changes
     return orjson.dumps(content)
 
@@ -181,11 +173,11 @@ BAD = {
     "ragged": (changed(shape=[2, 3], data=[[1, 2, 3], [1, 2]]), 400, "expected `data`, numbers"),
     "yes": (changed(data=[1, 2, True]), 400, r"data\[2\]: expected a finite number or .*, got True"),
     "other output": (
-        orjson.dumps(request(PRESS, outputs=[{"name": "z"}])),
+        orjson.dumps(infer_request(outputs=[{"name": "z"}])),
         400,
         "one of contact, contact_correlation, contact_std",
     ),
-    "output twice": (orjson.dumps(request(PRESS, outputs=[{"name": "misfit"}] * 2)), 400, "each name once"),
+    "output twice": (orjson.dumps(infer_request(outputs=[{"name": "misfit"}] * 2)), 400, "each name once"),
     "memory": (changed(parameters={"shared_memory_region": "r"}), 400, "does not support it, got 'r'"),
     "size without bytes": (changed(parameters={"binary_data_size": 12}), 400, "binary_data_size 12 and 0 bytes"),
 }
@@ -230,7 +222,7 @@ def test_binary_data_of_another_size_is_refused(ask, changes, spoil, message):
 
 def test_output_that_is_not_finite_is_null(ask, bare):
     """The model of the test divides by the sum of the charges. The OpenAPI document allows null instead of NaN."""
-    status, _, body = ask("POST", INFER, orjson.dumps(request([[0.0, 0.0, 0.0]])))
+    status, _, body = ask("POST", INFER, orjson.dumps(infer_request([[0.0, 0.0, 0.0]])))
     np.testing.assert_array_equal(bare([[0.0, 0.0, 0.0]])["contact"].ravel(), [np.nan, np.nan, 0.0])
     assert (status, orjson.loads(body)["outputs"][0]["data"]) == (200, [None, None, 0.0])
     schema = orjson.loads(ask("GET", "/openapi.json")[2])["components"]["schemas"]["answer"]
@@ -246,7 +238,7 @@ def test_openapi_describes_request_and_response_of_each_route(ask):
     for path, item in sorted(document["paths"].items(), key=lambda row: row[0].endswith("unload")):
         (method,) = item.keys() - {"parameters"}
         (kind,) = item[method]["responses"]["200"]["content"]
-        body = orjson.dumps(request(PRESS)) if path.endswith("/infer") else b""
+        body = orjson.dumps(infer_request()) if path.endswith("/infer") else b""
         status, headers, _ = ask(method.upper(), path.format(model="linear", version=1), body)
         assert (status, headers["content-type"].partition(";")[0]) == (200, kind), path
         assert item[method].get("requestBody", {}).get("required", False) == bool(body), path
