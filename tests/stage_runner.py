@@ -3,8 +3,9 @@
 from types import SimpleNamespace
 
 import numpy as np
+from msgspec import structs
 
-from isocharge.serve import Frame, Validity, device_from_table
+from isocharge.serve import Chunk, Frame, TouchStream, Validity, device_from_table, encode_frame
 from isocharge.serve.flags import INVALID, in_order
 from isocharge.serve.frames.frame import SATURATED_BIT
 from isocharge.serve.live.device import create_stages
@@ -65,3 +66,19 @@ def track(tracker, contact, t_s, flags=(), charge_pC=None):
     frame.is_valid = INVALID not in flags
     tracker.step(frame)
     return frame.tracking.tracked, frame.tracking.event
+
+
+def recorded_lines(predictor, rows, table):
+    """Return the records of a stream of charges as lines of JSON.
+
+    Args:
+        predictor: The model.
+        rows: Charges of the frames, shape (n, n_electrode), pC.
+        table: Sections of the device file, in addition to `[tare]`.
+    """
+    touch = TouchStream(predictor, device_from_table({"tare": {"frames": 10}} | table, "b"))
+    lines = []
+    for number, row in enumerate(rows.tolist()):
+        chunk = Chunk(encode_frame(Frame(number, 1000 * number, tuple(row))), 5.0 + 1e-3 * number, 0)
+        lines += [structs.replace(record, latency_us=0.0).to_json() for record in touch.feed(chunk)]
+    return lines

@@ -5,6 +5,7 @@ import io
 import numpy as np
 import pytest
 
+from drawn_contacts import draw_contacts
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
 from isocharge.serve.model.charge_file import charge_map_bytes, charge_map_from_bytes, read_charge_map
@@ -41,13 +42,6 @@ def random_series(*, is_signed=False, seed=0):
     )
 
 
-def random_contacts(count=20, radius=7.5, seed=1):
-    rng = np.random.default_rng(seed)
-    angle = rng.uniform(0.0, 2.0 * np.pi, count)
-    distance = radius * np.sqrt(rng.random(count))
-    return np.column_stack([distance * np.cos(angle), distance * np.sin(angle), np.exp(rng.uniform(-2.9, 0.6, count))])
-
-
 def polynomial_values(series, contact, state):
     """Compute v with NumPy's polynomials: `chebval3d`, and `polyfit` through the nodes."""
     unit = series.domain.to_unit(contact)
@@ -62,7 +56,7 @@ def polynomial_values(series, contact, state):
 @pytest.mark.parametrize("is_signed", [False, True])
 def test_charges_at_any_state_are_those_of_numpy_polynomials(is_signed):
     series = random_series(is_signed=is_signed)
-    contact = random_contacts()
+    contact = draw_contacts(1, 20, 7.5, (0.055, 1.8))
     state = np.array([0.13, 0.7, -1.2])
     value = polynomial_values(series, contact, state)
     unit_log_force = series.domain.to_unit(contact)[:, 2]
@@ -78,7 +72,7 @@ def test_charges_at_any_state_are_those_of_numpy_polynomials(is_signed):
 @pytest.mark.parametrize("is_signed", [False, True])
 def test_derivatives_are_finite_differences_also_outside_the_range_of_forces(is_signed):
     series = random_series(is_signed=is_signed)
-    contact = random_contacts()
+    contact = draw_contacts(1, 20, 7.5, (0.055, 1.8))
     contact[:3, 2] = [1e-3, 0.02, 7.0]
     state = np.array([-0.2, 0.5, 1.0])
     changes = series.changes(contact, state)
@@ -106,7 +100,7 @@ def test_charges_beyond_the_domain_continue_linearly_in_position_and_as_a_power_
 def test_file_is_read_as_it_was_written(is_signed):
     written = random_series(is_signed=is_signed)
     read = charge_map_from_bytes(charge_map_bytes(written), ELECTRODES)
-    contact = random_contacts()
+    contact = draw_contacts(1, 20, 7.5, (0.055, 1.8))
     state = np.array([0.1, 1.0, -1.0])
     np.testing.assert_array_equal(read.changes(contact, state).charge_pC, written.changes(contact, state).charge_pC)
     for name in ("domain", "electrodes", "is_folded", "charge_std", "offset_pC", "pretension_MPa", "tension_std_MPa"):

@@ -13,9 +13,9 @@ import onnx
 import pytest
 
 from isocharge.common.errors import ChargeError, ModelError, OutputExists
-from isocharge.common.files import sha256_of
 from isocharge.serve import ModelMetadata, check_golden, find_labelled_model, find_model, load_model, write_model
 from isocharge.serve.model.golden import make_golden
+from model_files import golden_json, put_graph
 
 
 @pytest.fixture
@@ -128,10 +128,8 @@ def test_version_with_other_electrodes_in_the_same_model_folder_is_refused(film,
 )
 def test_file_that_is_not_an_onnx_model_is_refused_with_its_cause(own_model, damage):
     path = own_model / "model.onnx"
-    golden = own_model / "golden.json"
     data = damage(path.read_bytes())
-    golden.write_text(golden.read_text().replace(sha256_of(path.read_bytes()), sha256_of(data)))
-    path.write_bytes(data)
+    put_graph(own_model, data)
     with pytest.raises(ModelError, match=f"these {len(data)} bytes") as caught:
         load_model(own_model)
     assert caught.value.__cause__ is not None
@@ -165,9 +163,7 @@ def test_damaged_golden_json_is_refused(own_model, damage, message):
 )
 def test_graph_with_other_inputs_or_outputs_is_refused(film, own_model, changes, message):
     data = film.onnx(film.metadata().to_props(), **changes)
-    golden = own_model / "golden.json"
-    golden.write_text(json.dumps(json.loads(golden.read_text()) | {"sha256": sha256_of(data)}))
-    (own_model / "model.onnx").write_bytes(data)
+    put_graph(own_model, data)
     with pytest.raises(ModelError, match=message):
         load_model(own_model)
 
@@ -176,18 +172,15 @@ def test_graph_that_loads_its_numbers_from_another_file_is_refused(own_model):
     path = own_model / "model.onnx"
     graph = onnx.load(path)
     onnx.save_model(graph, path, save_as_external_data=True, location="weights.bin", size_threshold=0)
-    golden = own_model / "golden.json"
-    golden.write_text(json.dumps(json.loads(golden.read_text()) | {"sha256": sha256_of(path.read_bytes())}))
+    put_graph(own_model, path.read_bytes())
     with pytest.raises(ModelError, match="external data"):
         load_model(own_model)
 
 
 def test_golden_check_detects_a_relative_change_of_2e_5(own_model):
-    golden = own_model / "golden.json"
-    content = json.loads(golden.read_text())
-    x_mm = content["outputs"]["contact"][3][0]
-    content["outputs"]["contact"][3][0] = x_mm + 2e-5 * max(1.0, abs(x_mm))
-    golden.write_text(json.dumps(content))
+    with golden_json(own_model) as golden:
+        x_mm = golden["outputs"]["contact"][3][0]
+        golden["outputs"]["contact"][3][0] = x_mm + 2e-5 * max(1.0, abs(x_mm))
     with pytest.raises(ModelError, match=r"contact\[3, 0\]: expected .*golden.json"):
         check_golden(load_model(own_model))
 

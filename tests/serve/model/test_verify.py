@@ -6,6 +6,7 @@ import shutil
 import pytest
 
 from isocharge.serve import write_model
+from model_files import golden_json
 
 
 @pytest.fixture
@@ -30,15 +31,14 @@ def flip_a_byte(path):
     path.write_bytes(content)
 
 
-def change_an_output(path):
-    golden = json.loads(path.read_text("utf-8"))
-    golden["outputs"]["contact"][0][0] += 1.0
-    path.write_text(json.dumps(golden), "utf-8")
+def change_an_output(folder):
+    with golden_json(folder) as golden:
+        golden["outputs"]["contact"][0][0] += 1.0
 
 
 FAULTS = (
     (lambda folder: flip_a_byte(folder / "model.onnx"), "model.onnx: expected sha256"),
-    (lambda folder: change_an_output(folder / "golden.json"), "contact[0, 0]: expected"),
+    (change_an_output, "contact[0, 0]: expected"),
     (lambda folder: flip_a_byte(folder / "charges.npz"), "charges.npz: expected sha256"),
     (lambda folder: (folder / "other.npz").write_bytes(b"map") and None, "other.npz: expected sha256 no such file"),
     (lambda folder: shutil.copytree(folder, folder.parent / "17"), "17: expected version 17, got linear/1"),

@@ -18,7 +18,6 @@ from onnx import helper, numpy_helper
 
 from infer_requests import BODY, INFER
 from isocharge.common.errors import ModelError, ModelNotFound
-from isocharge.common.files import sha256_of
 from isocharge.serve.network.address import Token
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.grpc import grpc_server
@@ -27,6 +26,7 @@ from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.routes import ROUTES
+from model_files import golden_json, put_graph
 
 
 @pytest.fixture
@@ -43,13 +43,6 @@ def labels(store):
     return [loaded.metadata.label for loaded in store.loaded_versions()]
 
 
-def put_in_place(version, graph):
-    """Replace the graph of a version, and its checksum."""
-    (version / "model.onnx").write_bytes(graph)
-    content = json.loads((version / "golden.json").read_text())
-    (version / "golden.json").write_text(json.dumps(content | {"sha256": sha256_of(graph)}))
-
-
 def a_failing_graph(version):
     """Replace the graph by one that declares the right shapes, but fails with the golden charges."""
     model = onnx.load_from_string((version / "model.onnx").read_bytes())
@@ -58,16 +51,15 @@ def a_failing_graph(version):
     node.output[0] = "inner"
     model.graph.node.append(helper.make_node("Gather", ["inner", "row 99"], ["one row"], axis=0))
     model.graph.node.append(helper.make_node("Mul", ["inner", "one row"], ["contact"]))
-    put_in_place(version, model.SerializeToString())
+    put_graph(version, model.SerializeToString())
 
 
 def golden(change):
     """Return a function that changes the golden contacts of a version."""
 
     def spoil(version):
-        content = json.loads((version / "golden.json").read_text())
-        change(content["outputs"]["contact"])
-        (version / "golden.json").write_text(json.dumps(content))
+        with golden_json(version) as content:
+            change(content["outputs"]["contact"])
 
     return spoil
 

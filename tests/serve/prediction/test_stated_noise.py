@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from drawn_contacts import draw_contacts
 from isocharge.cli.main import app
 from isocharge.serve import Frame, Predictor, device_from_table
 from isocharge.serve.live.device import create_stages
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.simulate import Circle, ForwardMap, NoiseModel, load_sensor
+from kept import kept
 
 NAME = "four-25um-biaxial"
 
@@ -24,11 +26,8 @@ def released():
 @pytest.fixture(scope="module")
 def pressed():
     """Contacts (x, y, F), shape (n, 3), in the working area, and their charges, pC, from the finite-element solver."""
-    rng = np.random.default_rng(3)
-    radius, angle = 8.0 * np.sqrt(rng.random(1500)), rng.uniform(0.0, 2.0 * np.pi, 1500)
-    force = np.exp(rng.uniform(np.log(0.1), np.log(2.0), 1500))
-    contact = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force])
-    forward_map = ForwardMap.build(load_sensor(NAME), Circle(1.0), force_range=(0.05, 2.0))
+    contact = draw_contacts(3, 1500, 8.0, (0.1, 2.0))
+    forward_map = kept(ForwardMap.build, load_sensor(NAME), Circle(1.0), force_range=(0.05, 2.0))
     return contact, forward_map.charges(contact)
 
 

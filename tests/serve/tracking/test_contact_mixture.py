@@ -6,20 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from msgspec import structs
 from numpy.polynomial import Polynomial, chebyshev
 
-from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
-from isocharge.common.files import sha256_of
-from isocharge.serve import Chunk, Frame, Predictor, TouchStream, encode_frame
+from isocharge.serve import Predictor, TouchStream
 from isocharge.serve.live.device import device_from_table
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.tracking.contact_mixture import GAIN_STD, ContactMixture
-from stage_runner import new_tracker
+from model_files import put_charge_map
+from stage_runner import new_tracker, recorded_lines
 from stage_runner import track as track_frame
 
 RADIUS = 6.0
@@ -169,40 +167,15 @@ def test_charges_of_no_contact_are_not_tracked_and_saturated_frames_are_ignored(
 def model(models, tmp_path):
     """A model with the file `charges.npz` of its film."""
     folder = shutil.copytree(models / "linear", tmp_path / "linear") / "1"
-    put_charges(folder, charge_map_bytes(folded_series()))
+    put_charge_map(folder, charge_map_bytes(folded_series()))
     return folder
-
-
-def put_charges(folder, data):
-    """Write `charges.npz` into the folder of a model, and its checksum into `golden.json`, as `write_model` does."""
-    (folder / "charges.npz").write_bytes(data)
-    golden = json.loads((folder / "golden.json").read_text("utf-8"))
-    golden["files"] = {"charges.npz": sha256_of(data)}
-    (folder / "golden.json").write_text(json.dumps(golden), "utf-8")
-
-
-def recorded_lines(predictor: Predictor, rows: Array, table: dict) -> list[str]:
-    """Return the records of a stream of charges as lines of JSON.
-
-    Args:
-        predictor: The model.
-        rows: Charges of the frames, shape (n, 3), pC.
-        table: Sections of the device file, in addition to `[tare]` and `[track]`.
-    """
-    device = device_from_table({"tare": {"frames": 10}, "track": {}} | table, "b")
-    touch = TouchStream(predictor, device)
-    lines = []
-    for number, row in enumerate(rows.tolist()):
-        chunk = Chunk(encode_frame(Frame(number, 1000 * number, tuple(row))), 5.0 + 1e-3 * number, 0)
-        lines += [structs.replace(record, latency_us=0.0).to_json() for record in touch.feed(chunk)]
-    return lines
 
 
 def test_records_with_track_have_the_field_other_and_are_repeated_bit_for_bit(model):
     rows = np.concatenate([np.zeros((10, 3)), noisy_charges(np.zeros(40)), np.zeros((5, 3))])
     predictor = Predictor(model)
-    lines = recorded_lines(predictor, rows, {})
-    assert lines == recorded_lines(predictor, rows, {})
+    lines = recorded_lines(predictor, rows, {"track": {}})
+    assert lines == recorded_lines(predictor, rows, {"track": {}})
 
     last = json.loads(lines[45])
     released = json.loads(lines[-1])
@@ -217,7 +190,7 @@ def test_records_with_track_have_the_field_other_and_are_repeated_bit_for_bit(mo
 def test_stream_keeps_its_model_if_the_charges_npz_of_the_next_model_is_damaged(model, models):
     first = Predictor(models / "linear")
     stream = TouchStream(first, device_from_table({"track": {}}, "b"))
-    put_charges(model, b"damaged")
+    put_charge_map(model, b"damaged")
     with pytest.raises(ModelError, match=r"charges\.npz"):
         stream.use(Predictor(model))
     assert stream.predictor is first

@@ -1,6 +1,6 @@
 """Following a film through touches, on a film whose charges are a closed formula and whose model searches exactly."""
 
-import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,16 +8,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from drawn_contacts import draw_contacts
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
-from isocharge.common.files import sha256_of
 from isocharge.serve import Contact, Frame
 from isocharge.serve.live.device import FollowFilm
-from isocharge.serve.model.charge_file import FILE, charge_map_bytes
+from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.simulate import noise_model
+from model_files import put_charge_map
 
 NOISE = noise_model("reference")
 ELECTRODES = ("A", "B", "C", "D")
@@ -53,10 +54,8 @@ def series() -> ChargeSeries:
 
 def model_in(folder, series: ChargeSeries) -> SimpleNamespace:
     """Return a model of the calibrated film that searches for the nearest contact, and write its charge map."""
-    data = charge_map_bytes(series)
-    (folder / FILE).write_bytes(data)
-    golden = json.loads(GOLDEN.read_text("utf-8")) | {"files": {FILE: sha256_of(data)}}
-    (folder / "golden.json").write_text(json.dumps(golden), "utf-8")
+    shutil.copy(GOLDEN, folder)
+    put_charge_map(folder, charge_map_bytes(series))
     calibrated = series.at_state(series.calibrated_state)
 
     def predict(charge_pC) -> Contact:
@@ -79,10 +78,7 @@ def model_in(folder, series: ChargeSeries) -> SimpleNamespace:
 
 def touches(series, state, gains, rng, count):
     """Contacts and charges of a changed film."""
-    distance = 6.5 * np.sqrt(rng.random(count))
-    angle = 2.0 * np.pi * rng.random(count)
-    force = np.exp(rng.uniform(np.log(0.1), np.log(1.5), count))
-    contact = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), force])
+    contact = draw_contacts(rng, count, 6.5, (0.1, 1.5))
     return contact, series.changes(contact, state).charge_pC * gains
 
 

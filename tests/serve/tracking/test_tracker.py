@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from isocharge.serve import Chunk, Contact, Frame, TouchStream, encode_frame
+from isocharge.serve import Contact
 from isocharge.serve.flags import INVALID
 from isocharge.serve.live.device import device_from_table, with_settings
 from isocharge.serve.record.record import TrackedContact
@@ -19,7 +19,7 @@ from isocharge.serve.tracking.motion_filter import (
     MotionFilter,
 )
 from isocharge.serve.tracking.tracker import TouchEvents
-from stage_runner import new_tracker, track
+from stage_runner import new_tracker, recorded_lines, track
 
 STD = 0.06
 """Standard deviation of a simulated position, mm."""
@@ -248,26 +248,15 @@ def test_saturated_frames_have_a_small_weight():
     assert max(tracked.x_mm for tracked, _ in moved) < 0.1
 
 
-def recorded_lines(predictor, frames, table):
-    """Return the records of frames as JSON."""
-    touch = TouchStream(predictor, device_from_table({"tare": {"frames": 10}} | table, "b"))
-    lines = []
-    for number, frame in enumerate(frames):
-        chunk = Chunk(encode_frame(frame), 5.0 + 1e-3 * number, 0)
-        lines += [structs.replace(record, latency_us=0.0).to_json() for record in touch.feed(chunk)]
-    return lines
-
-
 def test_records_with_track_only_add_fields_and_are_repeated_bit_for_bit(film, predictor):
     rest = np.zeros((10, 3))
     noise = np.random.default_rng(0).standard_normal((30, 3))
     pressed = film.charge_pC(np.full(30, 2.0), np.full(30, -3.0), np.full(30, 0.5)) + noise
-    rows = np.concatenate([rest, pressed, rest]).tolist()
-    frames = [Frame(number, 1000 * number, tuple(row)) for number, row in enumerate(rows)]
+    rows = np.concatenate([rest, pressed, rest])
 
-    plain_lines = recorded_lines(predictor, frames, {})
-    lines = recorded_lines(predictor, frames, {"track": {}})
-    assert lines == recorded_lines(predictor, frames, {"track": {}})
+    plain_lines = recorded_lines(predictor, rows, {})
+    lines = recorded_lines(predictor, rows, {"track": {}})
+    assert lines == recorded_lines(predictor, rows, {"track": {}})
     records = [json.loads(line) for line in lines]
     assert [record["event"] for record in records].count("press") == 1
     assert records[40]["event"] == "tap"

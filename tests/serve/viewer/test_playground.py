@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from drawn_contacts import draw_contacts
 from isocharge.serve import Predictor, find_model, load_model
 from isocharge.serve.viewer.film_description import describe_film
 from isocharge.serve.viewer.playground_page import MODELS, playground_html
@@ -74,15 +75,6 @@ def page(open_page):
     return open_page(1280, 800)
 
 
-def random_presses(count, radius_mm, seed=0):
-    """Return presses (x, y, F) in a disk, mm and N, with log-uniform forces."""
-    random = np.random.default_rng(seed)
-    radius = radius_mm * np.sqrt(random.random(count))
-    angle = 2 * np.pi * random.random(count)
-    force = np.exp(random.uniform(*np.log(FORCE_RANGE_N), count))
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force])
-
-
 def test_the_file_is_small_and_loads_nothing_from_elsewhere(open_page, file):
     page = open_page(1280, 800, bypass_csp=False)
     assert file.stat().st_size <= MAX_SIZE_BYTES
@@ -119,7 +111,7 @@ def test_charges_are_those_of_the_solver(page, index):
 @pytest.mark.parametrize("index", range(len(MODELS)))
 def test_flags_are_those_of_the_predictor(page, index):
     """With a dead electrode, a wrong gain, and presses outside of the working area."""
-    charges = np.array(page.evaluate(CHARGES, [index, random_presses(120, 24.0).tolist()]))
+    charges = np.array(page.evaluate(CHARGES, [index, draw_contacts(0, 120, 24.0, FORCE_RANGE_N).tolist()]))
     charges[::3, 0] = 0.0
     charges[1::3, 1] *= 1.2
     predictor = Predictor(MODELS[index])

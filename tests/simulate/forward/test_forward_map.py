@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from drawn_contacts import draw_contacts
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
     ChargeSpline,
@@ -62,9 +63,7 @@ def errors(forward_map: ForwardMap, contact: np.ndarray, rotation: np.ndarray | 
 def draw(forward_map: ForwardMap, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Draw contacts in the whole domain, and orientations (rad)."""
     rng, domain = np.random.default_rng(seed), forward_map.domain
-    z = domain.radius * np.sqrt(rng.random(count)) * np.exp(2j * np.pi * rng.random(count))
-    force = np.exp(rng.uniform(*np.log(domain.force_range), count))
-    return np.column_stack([z.real, z.imag, force]), rng.uniform(-np.pi, np.pi, count)
+    return draw_contacts(rng, count, domain.radius, domain.force_range), rng.uniform(-np.pi, np.pi, count)
 
 
 def test_forward_map_agrees_with_direct_solves_between_the_nodes(three_map, near_map):

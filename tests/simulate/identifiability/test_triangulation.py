@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from drawn_contacts import draw_contacts
 from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     ChargeSpline,
@@ -43,14 +44,6 @@ def errors(fix, contact: np.ndarray) -> np.ndarray:
     return np.hypot(*(fix.contact - contact)[fix.found, :2].T)
 
 
-def draw(count: int, seed: int, radius: float = 7.0, forces: tuple[float, float] = FORCES) -> np.ndarray:
-    """Draw contacts that are uniform over a disk and over the logarithm of the force, shape (count, 3)."""
-    rng = np.random.default_rng(seed)
-    r = radius * np.sqrt(rng.random(count))
-    angle = 2.0 * np.pi * rng.random(count)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), np.exp(rng.uniform(*np.log(forces), count))], axis=1)
-
-
 def test_triangulation_agrees_with_least_squares_of_scipy():
     """The four charges are not those of any press. The result is then the minimum that a general solver finds."""
     charge_map = round_map(CENTRES["four"])
@@ -79,7 +72,7 @@ def on_film(triangle_map) -> Triangulation:
 
 def test_round_trip_of_presses_of_a_triangle(triangle_map, on_film):
     """The force is known. Without noise, the median error is below 1 um, and with noise it is 0.02 to 0.2 mm."""
-    contact = draw(300, seed=5, radius=8.0, forces=(1.0, 1.0))
+    contact = draw_contacts(5, 300, 8.0, (1.0, 1.0))
     charge = triangle_map.charges(contact)
     fix = on_film.locate(charge)
     assert fix.found.mean() > 0.98
@@ -112,7 +105,7 @@ def test_contours_that_meet_twice_have_no_contact():
 def test_charge_map_with_folds_has_two_positions():
     """On a uniaxial film with three electrodes, two contacts with different forces may have the same charges."""
     charge_map = kept(ForwardMap.build, load_sensor("three-25um-uniaxial"), Circle(1.0), 8.0, FORCES, QUICK)
-    contact = draw(100, seed=8)
+    contact = draw_contacts(8, 100, 7.0, FORCES)
     triangulation = Triangulation(ChargeSpline.of(charge_map, spacing=0.5))
     fix = triangulation.locate(charge_map.charges(contact))
     assert (~fix.found & (fix.spread < 1e-3)).sum() > 5
