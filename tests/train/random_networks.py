@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from isocharge.train.training.activations import TANH
-from isocharge.train.training.folded_network import ANGLES, LARGEST_INT8, FoldedNetwork, Layer, Perceptron, fold
+from isocharge.train.training.folded_network import ANGLES, LARGEST_INT8, FoldedNetwork, Layer, Perceptron
 from isocharge.train.training.network import logarithmic_features
 
 TYPICAL_pC = 512.0
@@ -36,16 +36,18 @@ def random_network(n_electrode, hidden, misfit_hidden, *, is_int8=False, activat
     """
     rng = np.random.default_rng(0)
     n_contact = ANGLES.stop
-    perceptrons = [
-        random_perceptron(rng, (n_electrode, *hidden, n_contact), activation),
-        random_perceptron(rng, (n_electrode, *misfit_hidden, n_electrode), activation),
-    ]
-    n_answer = n_contact + n_electrode
-    units = Layer(np.diag([8.0, 8.0, *np.ones(n_answer - 2)]), np.zeros(n_answer))
-    layers = fold(perceptrons, np.zeros(n_electrode), np.eye(n_electrode), units)
+    contact = random_perceptron(rng, (n_electrode, *hidden, n_contact), activation)
+    weight, bias = contact.last
+    millimetres = np.array([8.0, 8.0, *np.ones(n_contact - 2)])
+    contact = replace(contact, last=Layer(weight * millimetres, bias * millimetres), skip=contact.skip * millimetres)
+    misfit = random_perceptron(rng, (n_electrode, *misfit_hidden, n_electrode), activation)
     if is_int8:
-        first, second = layers.hidden
-        scale = np.abs(second.weight).max(axis=0) / LARGEST_INT8
-        rounded = Layer(np.round(second.weight / scale) * scale, second.bias)
-        layers = replace(layers, hidden=(first, rounded))
-    return FoldedNetwork(logarithmic_features(np.full((1, n_electrode), TYPICAL_pC)), layers)
+        contact, misfit = map(round_to_int8, (contact, misfit))
+    return FoldedNetwork(logarithmic_features(np.full((1, n_electrode), TYPICAL_pC)), contact, misfit)
+
+
+def round_to_int8(perceptron):
+    """Return a perceptron of two hidden layers, with weights between them that are rounded to 8 bits."""
+    first, second = perceptron.hidden
+    scale = np.abs(second.weight).max(axis=0) / LARGEST_INT8
+    return replace(perceptron, hidden=(first, Layer(np.round(second.weight / scale) * scale, second.bias)))

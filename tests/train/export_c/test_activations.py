@@ -49,5 +49,5 @@ def test_onnx_and_c_give_the_network(name, build, tmp_path):
     check_close(build(folder).predict(charge_pC)[:, :7], expected)
 
     read_network = read_graph(graph, "graph")
-    assert read_network.layers.activation.name == name
+    assert read_network.misfit.activation.name == name
     check_close(np.concatenate(read_network.predict(charge_pC.astype(float)), axis=1), expected)

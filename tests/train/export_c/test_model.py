@@ -48,7 +48,7 @@ def test_self_test_of_each_released_model_passes(name, compile_c, tmp_path):
 
 def test_self_test_fails_if_a_weight_is_changed(exports, compile_c, tmp_path):
     source = (exports[0] / "isocharge_model.c").read_text()
-    begin = source.index("layer_1_weights_0[")
+    begin = source.index("contact_1_weights[")
     (tmp_path / "changed.c").write_text(source[:begin] + source[begin:].replace("{\n    ", "{\n    1.0f + ", 1))
     program = compile_c("gcc", exports[0], tmp_path / "self_test", "self_test.c", tmp_path / "changed.c")
     done = subprocess.run([program], capture_output=True, text=True, check=False)

@@ -64,14 +64,14 @@ def write_random_model(folder, network):
 @pytest.mark.parametrize(
     ("electrodes", "hidden", "misfit_hidden", "is_int8", "arrays"),
     [
-        (3, (32, 32), (24, 24), False, ["float layer_1_weights_0[1024]", "float layer_1_weights_1[576]"]),
-        (4, (5, 7), (9, 3), True, ["signed char layer_1_weights_0[35]", "signed char layer_1_weights_1[27]"]),
-        (5, (48, 48, 48), (33, 17, 8), False, ["float layer_2_weights_1[136]", "float last_weights_1[40]"]),
-        (8, (24,), (16,), False, ["float layer_0_weights_0[320]", "float last_weights_0[336]"]),
+        (3, (32, 32), (24, 24), False, ["float contact_1_weights[1024]", "float misfit_1_weights[576]"]),
+        (4, (5, 7), (9, 3), True, ["signed char contact_1_weights[35]", "signed char misfit_1_weights[27]"]),
+        (5, (48, 48, 48), (33, 17, 8), False, ["float misfit_2_weights[136]", "float misfit_last_weights[40]"]),
+        (8, (24,), (16,), False, ["float contact_0_weights[192]", "float contact_last_weights[336]"]),
     ],
 )
 def test_any_width_and_number_of_electrodes(electrodes, hidden, misfit_hidden, is_int8, arrays, build, tmp_path):
-    """The zeros beside the two blocks of a layer are left out, and weights of 8 bits take one byte."""
+    """The zeros beside the two blocks of a layer of the graph are left out, and weights of 8 bits take one byte."""
     network = random_network(electrodes, hidden, misfit_hidden, is_int8=is_int8)
     exported = build(write_random_model(tmp_path / "random", network))
     charge_pC = np.random.default_rng(2).uniform(50.0, 5000.0, (500, electrodes)).astype(np.float32)

@@ -118,8 +118,7 @@ def test_the_graph_answers_as_the_network_does(exact, held_out, session, case):
 
 
 def test_a_network_with_infinite_answers_is_not_released(exact, held_out):
-    layers = exact.layers
-    diverging = replace(exact, layers=replace(layers, skip=100.0 * layers.skip))
+    diverging = replace(exact, misfit=replace(exact.misfit, skip=100.0 * exact.misfit.skip))
     with pytest.raises(TrainingError, match=r"answers misfit = .* expected finite numbers for any charges"):
         check_graph(write_graph(diverging, {}), diverging.outputs, held_out, REFERENCE)
 

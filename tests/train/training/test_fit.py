@@ -196,7 +196,7 @@ def test_the_units_of_a_sharpened_layer_bend_among_the_inputs():
 
 @pytest.mark.usefixtures("split_once")
 def test_rounded_weights_are_whole_numbers_times_the_scale_of_their_output(dataset):
-    rounded, exact = (fit(dataset, settings(weights=form)).network.layers for form in ("int8", "float32"))
+    rounded, exact = (fit(dataset, settings(weights=form)).network.contact for form in ("int8", "float32"))
     for rounded_layer, layer in zip(rounded.hidden[1:], exact.hidden[1:], strict=True):
         scale = np.abs(rounded_layer.weight).max(axis=0) / LARGEST_INT8
         multiples = rounded_layer.weight / scale

@@ -23,15 +23,11 @@ A layer computes its outputs y = f(x W + c) from its inputs x. W are the weights
 bias, and f is the hyperbolic tangent or the identity. The C function processes a few inputs at a time. Each input is
 multiplied by its row of W, which gives one product for each output, to which it is added. The inner loop of the C
 function runs over neighbouring outputs, and its number of iterations is constant. With -O2 or a higher level of
-optimisation, compilers therefore vectorise the loop without changing the order of any sum. If two perceptrons run side
-by side, the weight matrix consists of two blocks, and the zeros outside the blocks are left out. Each weight that the
+optimisation, compilers therefore vectorise the loop without changing the order of any sum. Each weight that the
 training rounded to 8 bits is stored in one byte.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import chain, cycle, islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -56,6 +52,7 @@ from isocharge.train.training.folded_network import (
     POSITION,
     ChargeFeatures,
     FoldedNetwork,
+    Perceptron,
 )
 
 N_ROWS = 4
@@ -64,110 +61,48 @@ N_ROWS = 4
 The program then reads and writes each output only once for all of these rows."""
 
 
-Block = tuple[slice, slice]
-"""Rows and columns of a part of a matrix."""
+def layer_source(name: str, weight: Array, bias: Array | None = None, activation: Activation | None = None) -> str:
+    """Return the C text of a layer: its constant arrays, and the function `void name(x, c, y)`.
 
-WHOLE_MATRIX: Block = (slice(0, None), slice(0, None))
-"""The block that contains all rows and columns."""
-
-
-@dataclass(frozen=True)
-class LayerSource:
-    """Generator of the C function `void name(x, c, y)`, which computes y = f(x W + c).
-
-    Attributes:
-        name: Name of the function.
-        weight: Weights W, shape (inputs, outputs), float32.
-        bias: Bias c, shape (outputs,), which is written as the array `name_bias`. None if c is not constant.
-        blocks: Blocks of W. All weights outside the blocks are zero.
-        activation: The function f; None for the identity.
-    """
-
-    name: str
-    weight: Singles
-    bias: Singles | None = None
-    blocks: tuple[Block, ...] = (WHOLE_MATRIX,)
-    activation: Activation | None = None
-
-    def text(self) -> str:
-        """Return the C text of the constant arrays, and of the function that computes y = f(x @ weight + c).
-
-        The arguments of the C function are the inputs x, the bias c and the outputs y. The function adds c last. If a
-        large c were added first, the intermediate sums would lose accuracy.
-        """
-        n_input, n_output = self.weight.shape
-
-        # The arrays: the weights of each block, the scales if the weights are integers, and the bias if it is constant
-        values, scale = round_to_int8(self.weight)
-        block_names = [f"{self.name}_weights_{block_index}" for block_index in range(len(self.blocks))]
-        named_blocks = list(zip(block_names, self.blocks, strict=True))
-        arrays = [c_array(name, values[block]) for name, block in named_blocks]
-        if scale is not None:
-            arrays.append(c_array(f"{self.name}_scale", scale))
-        if self.bias is not None:
-            arrays.append(c_array(f"{self.name}_bias", self.bias))
-
-        # C expression for output j. At first, y[j] contains the sum of the products for this output. If the weights are
-        # integers, the sum is multiplied by the scale of its column.
-        result = "y[j] + c[j]" if scale is None else f"y[j] * {self.name}_scale[j] + c[j]"
-        if self.activation is not None:
-            result = f"{self.activation.c_function}({result})"
-
-        # The function: set the sums to zero, add the products of each block, and compute the outputs.
-        products = [_product_lines(name, block, values[block]) for name, block in named_blocks]
-        lines = [
-            f"/* {n_input} numbers x to {n_output} numbers y */",
-            f"static void {self.name}(const float *restrict x, const float *restrict c, float *restrict y)",
-            "{",
-            f"    for (int j = 0; j < {n_output}; ++j)",
-            "        y[j] = 0.0f;",
-            *chain.from_iterable(products),
-            f"    for (int j = 0; j < {n_output}; ++j)",
-            f"        y[j] = {result};",
-            "}",
-            "",
-        ]
-        return "\n".join([*arrays, *lines])
-
-
-def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Block, ...]]:
-    """Find the blocks of the weight matrices of consecutive layers, outside which all weights are zero.
-
-    In some layers, two perceptrons run side by side, and no weight connects them. The weight matrix then has two blocks
-    on its diagonal: the upper left block of the first perceptron, and the lower right block of the second one. All
-    other layers have a single block, which is the whole matrix.
-
-    The layers are examined from the last to the first. When a layer is examined, the number of its outputs that belong
-    to the first perceptron is known. The weights of the layer then show which inputs of the layer belong to the first
-    perceptron. These inputs are the outputs of the layer before.
+    The arguments of the C function are the inputs x, the bias c and the outputs y. The function computes y = f(x W + c)
+    and adds c last. If a large c were added first, the intermediate sums would lose accuracy.
 
     Args:
-        weights: Weights of each layer except the first layer, whose inputs both perceptrons share.
-        first_width: Number of outputs of the last layer that belong to the first perceptron.
-
-    Returns:
-        Blocks of each layer, as slices of the rows (inputs) and of the columns (outputs) of its weights.
+        name: Name of the function.
+        weight: Weights W, shape (inputs, outputs).
+        bias: Bias c, shape (outputs,), which is written as the array `name_bias`. None if c is not constant.
+        activation: The function f; None for the identity.
     """
-    blocks: list[tuple[Block, ...]] = []
-    n_first_output = first_width  # number of outputs of the examined layer that belong to the first perceptron
-    for matrix in reversed(weights):
-        # Each row of the matrix is an input. The inputs of the second perceptron begin at the first row with a weight
-        # for an output of the second perceptron.
-        is_used_by_second = matrix[:, n_first_output:].any(axis=1)
-        n_first_input = int(is_used_by_second.argmax())  # index of the first true value, or 0 without true values
-        # The matrix has two blocks if no later row has a weight for an output of the first perceptron.
-        connects_second_to_first = matrix[n_first_input:, :n_first_output].any()
-        is_block_diagonal = n_first_input > 0 and not connects_second_to_first
-        if is_block_diagonal:
-            first_block = (slice(0, n_first_input), slice(0, n_first_output))
-            second_block = (slice(n_first_input, None), slice(n_first_output, None))
-            blocks.append((first_block, second_block))
-            n_first_output = n_first_input  # the inputs of this layer are the outputs of the layer before it
-        else:
-            # Both perceptrons share the inputs of this layer, so all layers before it have a single block, too.
-            blocks.append((WHOLE_MATRIX,))
-            n_first_output = 0
-    return blocks[::-1]
+    n_input, n_output = weight.shape
+
+    # The arrays: the weights, the scales if the weights are integers, and the bias if it is constant
+    values, scale = round_to_int8(_to_single_precision(weight))
+    arrays = [c_array(f"{name}_weights", values)]
+    if scale is not None:
+        arrays.append(c_array(f"{name}_scale", scale))
+    if bias is not None:
+        arrays.append(c_array(f"{name}_bias", _to_single_precision(bias)))
+
+    # C expression for output j. At first, y[j] contains the sum of the products for this output. If the weights are
+    # integers, the sum is multiplied by the scale of its column.
+    result = "y[j] + c[j]" if scale is None else f"y[j] * {name}_scale[j] + c[j]"
+    if activation is not None:
+        result = f"{activation.c_function}({result})"
+
+    # The function: set the sums to zero, add the products, and compute the outputs.
+    lines = [
+        f"/* {n_input} numbers x to {n_output} numbers y */",
+        f"static void {name}(const float *restrict x, const float *restrict c, float *restrict y)",
+        "{",
+        f"    for (int j = 0; j < {n_output}; ++j)",
+        "        y[j] = 0.0f;",
+        *_product_lines(f"{name}_weights", values),
+        f"    for (int j = 0; j < {n_output}; ++j)",
+        f"        y[j] = {result};",
+        "}",
+        "",
+    ]
+    return "\n".join([*arrays, *lines])
 
 
 def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
@@ -190,18 +125,16 @@ def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
     return values, None
 
 
-def _product_lines(name: str, block: Block, values: NDArray[Any]) -> list[str]:
-    """Return C lines that multiply the inputs x by one block of the weights, and add the products to the outputs y.
+def _product_lines(name: str, values: NDArray[Any]) -> list[str]:
+    """Return C lines that multiply the inputs x by weights, and add the products to the outputs y.
 
     Each loop over the outputs adds the products of up to `N_ROWS` inputs, so that y is read and written less often.
 
     Args:
-        name: Name of the array with the weights of the block.
-        block: Rows and columns of the block in the weight matrix of the layer.
-        values: Weights of the block, float32 or int8.
+        name: Name of the array with the weights.
+        values: Weights, shape (inputs, outputs), float32 or int8.
     """
     n_row, n_column = values.shape
-    rows, columns = block
     is_int8 = values.dtype == np.int8
     number_type = "signed char" if is_int8 else "float"
     cast = "(float)" if is_int8 else ""
@@ -213,7 +146,7 @@ def _product_lines(name: str, block: Block, values: NDArray[Any]) -> list[str]:
         group_size = min(N_ROWS, end - begin)
         if group_size == 0:
             continue
-        inputs = ", ".join(f"x{row} = x[{rows.start + row} + i]" for row in range(group_size))
+        inputs = ", ".join(f"x{row} = x[{row} + i]" for row in range(group_size))
         products = " + ".join(f"x{row} * {cast}w[{row * n_column} + j]" for row in range(group_size))
         lines += [
             f"    for (int i = {begin}; i < {end}; i += {group_size}) {{",
@@ -221,7 +154,7 @@ def _product_lines(name: str, block: Block, values: NDArray[Any]) -> list[str]:
             f"        const float {inputs};",
             "",
             f"        for (int j = 0; j < {n_column}; ++j)",
-            f"            y[{columns.start} + j] += {products};",
+            f"            y[j] += {products};",
             "    }",
         ]
     return lines
@@ -286,19 +219,9 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         metadata: Metadata of the model. The label of the model appears in a comment.
         network: The network.
     """
-    hidden, skip, last = _layer_sources(network)
-    widest = max(layer.weight.shape[1] for layer in hidden)
-
-    # Write the C calls of the layers. The first hidden layer reads the inputs of the network from the buffer `logs`.
-    # The hidden layers write alternately to the buffers `one` and `other`, and each layer reads the buffer that the
-    # layer before it wrote.
-    buffers = ["logs", *islice(cycle(["one", "other"]), len(hidden))]
-    calls = []
-    for layer, (input_buffer, output_buffer) in zip(hidden, pairwise(buffers), strict=True):
-        calls.append(f"{layer.name}({input_buffer}, {layer.name}_bias, {output_buffer});")
-    calls.append(f"skip({buffers[0]}, skip_bias, skipped);")
-    calls.append(f"last({buffers[-1]}, skipped, answers);")
-    hidden_buffers = dict.fromkeys(buffers[1:])  # removes repeated names, and keeps the order
+    contact_layers, contact_calls = _perceptron_source("contact", network.contact, network.features, "answers")
+    misfit_answers = f"answers + {ANGLES.stop}"
+    misfit_layers, misfit_calls = _perceptron_source("misfit", network.misfit, network.features, misfit_answers)
 
     # The template of the file contains a placeholder for each of these arguments. The arguments `plane`, `logs`
     # and `known` are the numbers of outputs of the last layer up to the position, up to the standard deviations, and up
@@ -306,17 +229,17 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),
-        activation=network.layers.activation.c_source,
+        activation=network.contact.activation.c_source,
         features=_features_source(network.features),
-        layers="\n".join(layer.text() for layer in (*hidden, skip, last)),
-        rows=", ".join(f"{buffer}[{widest}]" for buffer in hidden_buffers),
-        calls="\n    ".join(calls),
+        layers="\n".join((*contact_layers, *misfit_layers)),
+        widest=max(bias.size for _, bias in (*network.contact.hidden, *network.misfit.hidden)),
+        calls="\n    ".join((*contact_calls, *misfit_calls)),
         electrodes=network.features.n_electrode,
         plane=POSITION.stop,
         logs=LOG_STD.stop,
         largest_logarithm=c_float(LARGEST_LOGARITHM),
         known=ANGLES.stop,
-        answers=last.weight.shape[1],
+        answers=ANGLES.stop + network.features.n_electrode,
         table=c_array("COSINES", COSINES_TO_CORRELATIONS.astype(np.float32)),
         cosines=len(COSINES_TO_CORRELATIONS),
         first=ANGLES.start,
@@ -324,42 +247,42 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     )
 
 
-def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSource, LayerSource]:
-    """Return the hidden layers, the skip layer and the output layer of a network.
+def _perceptron_source(
+    name: str, perceptron: Perceptron, features: ChargeFeatures, answers: str
+) -> tuple[list[str], list[str]]:
+    """Return the C texts of the layers of a perceptron, and the C calls of their functions.
 
-    The weights and biases are converted to single precision. The first hidden layer and the skip layer read the
-    features, which are the inputs of the network. If the features are logarithms, the weights of these two layers are
-    also changed by `_convert_to_differences`.
+    The first hidden layer and the skip layer read the features from the buffer `logs`. The hidden layers write
+    alternately to two buffers, and each layer reads the buffer that the layer before it wrote. If the features are
+    logarithms, the weights of the first layer and of the skip layer are changed by `_convert_to_differences`.
 
     Args:
-        network: The network.
+        name: Beginning of the names of the C functions.
+        perceptron: The perceptron.
+        features: Features of the network.
+        answers: C expression of the array to which the last layer writes.
     """
-    perceptron = network.layers
-    is_logarithmic = network.features.mean is None
-    convert_input_weights = _convert_to_differences if is_logarithmic else _to_single_precision
+    (first_weight, first_bias), *later = perceptron.hidden
+    skip_weight = perceptron.skip
+    if features.mean is None:
+        first_weight = _convert_to_differences(first_weight)
+        skip_weight = _convert_to_differences(skip_weight)
 
-    # From the second layer on, the contact perceptron and the misfit perceptron run side by side, so that the weights
-    # consist of blocks. The outputs of the last layer before the misfit vector belong to the contact perceptron.
-    first_layer, *other_layers = perceptron.hidden
-    other_weights = [_to_single_precision(layer.weight) for layer in other_layers]
-    last_weight = _to_single_precision(perceptron.last.weight)
-    n_contact_output = ANGLES.stop
-    *other_blocks, last_blocks = find_blocks([*other_weights, last_weight], n_contact_output)
+    layers = []
+    calls = []
+    buffer = "logs"
+    for index, (weight, bias) in enumerate([(first_weight, first_bias), *later]):
+        layers.append(layer_source(f"{name}_{index}", weight, bias, perceptron.activation))
+        next_buffer = f"rows[{index % 2}]"
+        calls.append(f"{name}_{index}({buffer}, {name}_{index}_bias, {next_buffer});")
+        buffer = next_buffer
 
-    # The hidden layers
-    first_weight = convert_input_weights(first_layer.weight)
-    hidden = [
-        LayerSource("layer_0", first_weight, _to_single_precision(first_layer.bias), activation=perceptron.activation)
-    ]
-    for layer, weight, blocks in zip(other_layers, other_weights, other_blocks, strict=True):
-        name = f"layer_{len(hidden)}"
-        bias = _to_single_precision(layer.bias)
-        hidden.append(LayerSource(name, weight, bias, blocks, activation=perceptron.activation))
-
-    # The skip layer and the output layer. The bias of the output layer is added with the skip layer.
-    skip = LayerSource("skip", convert_input_weights(perceptron.skip), _to_single_precision(perceptron.last.bias))
-    last = LayerSource("last", last_weight, blocks=last_blocks)
-    return hidden, skip, last
+    # The bias of the output layer is added with the skip layer.
+    layers.append(layer_source(f"{name}_skip", skip_weight, perceptron.last.bias))
+    layers.append(layer_source(f"{name}_last", perceptron.last.weight))
+    calls.append(f"{name}_skip(logs, {name}_skip_bias, skipped);")
+    calls.append(f"{name}_last({buffer}, skipped, {answers});")
+    return layers, calls
 
 
 def self_test(golden: Golden, metadata: ModelMetadata) -> str:
@@ -417,7 +340,7 @@ def _to_single_precision(values: Array) -> Singles:
     return np.asarray(values, dtype=np.float32)
 
 
-def _convert_to_differences(weight: Array) -> Singles:
+def _convert_to_differences(weight: Array) -> Array:
     """Convert weights of (ln q_0, ln q_1, ...) into weights of (ln q_0, ln(q_1 / q_0), ...) that give the same sums.
 
     The equation in the docstring of the module shows that only the weights of ln q_0 change.
@@ -426,8 +349,8 @@ def _convert_to_differences(weight: Array) -> Singles:
         weight: Weights of the logarithms, shape (inputs, outputs).
 
     Returns:
-        Weights of the first logarithm and of the logarithms of the ratios, same shape, float32.
+        Weights of the first logarithm and of the logarithms of the ratios, same shape.
     """
     new_weight = np.array(weight)
     new_weight[0] = weight.sum(axis=0)
-    return new_weight.astype(np.float32)
+    return new_weight

@@ -22,6 +22,7 @@ from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 from isocharge.train.training.activations import ACTIVATIONS
 from isocharge.train.training.folded_network import (
+    ANGLES,
     ChargeFeatures,
     FoldedNetwork,
     Layer,
@@ -108,7 +109,27 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     # ONNX would also repeat a single number for all columns, C does not.
     if any(layer.bias.shape != layer.weight.shape[1:] for layer in (*hidden, last, Layer(skip, bias))):
         raise ValueError("expected a bias for each column of the weights")
-    return FoldedNetwork(features, Perceptron(tuple(hidden), last, skip, activation))
+
+    # Part the layers of both perceptrons, from the last to the first. The inputs of the misfit perceptron begin at the
+    # first input with a weight for one of its outputs.
+    contact_layers = []
+    misfit_layers = []
+    width = ANGLES.stop  # number of outputs of a layer that belong to the contact perceptron
+    for weight, bias in (last, *hidden[:0:-1]):
+        input_width = int(weight[:, width:].any(axis=1).argmax())
+        contact_layers.append(Layer(weight[:input_width, :width], bias[:width]))
+        misfit_layers.append(Layer(weight[input_width:, width:], bias[width:]))
+        width = input_width
+    weight, bias = hidden[0]
+    contact_layers.append(Layer(weight[:, :width], bias[:width]))
+    misfit_layers.append(Layer(weight[:, width:], bias[width:]))
+
+    def perceptron(layers: list[Layer], skip: Array) -> Perceptron:
+        """Return the perceptron of layers in the order from the last to the first."""
+        return Perceptron(tuple(layers[:0:-1]), layers[0], skip, activation)
+
+    contact = perceptron(contact_layers, skip[:, : ANGLES.stop])
+    return FoldedNetwork(features, contact, perceptron(misfit_layers, skip[:, ANGLES.stop :]))
 
 
 OutputFunction = Callable[[Array], tuple[Array, ...]]

@@ -4,7 +4,7 @@ The network has three parts:
 
 - The input features are functions of the charges. They are logarithms of positive charges. If the charges can have both
   signs, they are inverse hyperbolic sines of the charges.
-- A perceptron computes a vector from the input features. The entries of this vector are called answers.
+- Two perceptrons compute vectors from the input features. The entries of these vectors are called answers.
 - The output functions convert the answers to position, force, standard deviations, correlations and misfit.
 
 The ONNX graph defines how a network is evaluated. The runtimes of ONNX evaluate the graph, in single precision in a
@@ -18,10 +18,10 @@ For inputs x, the hidden layer l computes h_l = f(h_(l-1) W_l + b_l), where h_0 
 The output layer computes y = h_L V + c + x S from the result h_L of the last hidden layer. The skip layer S maps the
 inputs linearly to the outputs. The hidden layers therefore only need to learn the nonlinear part of the function.
 
-The training makes two perceptrons, for the contact and for the misfit. In a prediction for a single press, the overhead
-of each node of the graph takes more time than the arithmetic. Both perceptrons are therefore folded into one, whose
-later layers have block-diagonal weights. The whitening of the features becomes part of its first layer, and the units
-of the answers become part of its last layer.
+A network has two perceptrons with equally many layers, for the contact and for the misfit. The whitening of the
+features becomes part of their first layers, and the units of the answers become part of their last layers. In a
+prediction for a single press, the overhead of each node of the graph takes more time than the arithmetic. In the graph,
+both perceptrons are therefore joined into one, whose later layers have block-diagonal weights.
 
 Correlations
 ------------
@@ -209,13 +209,14 @@ class FoldedNetwork:
 
     Attributes:
         features: Input features.
-        layers: Perceptron that computes the answers from the features. The answers are x and y (2), ln F (1),
-            logarithms of the standard deviations (3), angles of the correlations (8), and the misfit vector
-            (n_electrode).
+        contact: Perceptron whose answers are x and y (2), ln F (1), logarithms of the standard deviations (3), and
+            angles of the correlations (8).
+        misfit: Perceptron whose answers are the misfit vector (n_electrode). It has as many layers as `contact`.
     """
 
     features: ChargeFeatures
-    layers: Perceptron
+    contact: Perceptron
+    misfit: Perceptron
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Estimate contacts.
@@ -260,7 +261,7 @@ class FoldedNetwork:
         n_electrode = self.features.n_electrode
         tensor_type = "double" if number_type is np.float64 else "float"
         features = _add_features(builder, self.features)
-        answers = _add_perceptron(builder, features, self.layers)
+        answers = _add_perceptrons(builder, features, [self.contact, self.misfit])
 
         # Split the answers: x and y, the logarithms of the force and of the three standard deviations, the angles that
         # determine the correlations, and the misfit vector. The exponentials of the limited logarithms are the force
@@ -294,10 +295,10 @@ class FoldedNetwork:
         The answers are logarithms of the standard deviations. Therefore, the logarithms of the factors are added to the
         bias of the last layer.
         """
-        weight, bias = self.layers.last
+        weight, bias = self.contact.last
         bias_change = np.zeros_like(bias)
         bias_change[LOG_STD] = np.log([position_factor, position_factor, force_factor])
-        return replace(self, layers=replace(self.layers, last=Layer(weight, bias + bias_change)))
+        return replace(self, contact=replace(self.contact, last=Layer(weight, bias + bias_change)))
 
 
 def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
@@ -326,26 +327,32 @@ def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
     return builder.add("Sub", builder.add("Asinh", ratio), builder.constant(features.mean))
 
 
-def _add_perceptron(builder: GraphBuilder, inputs: str, perceptron: Perceptron) -> str:
-    """Add nodes that evaluate a perceptron with hidden layers and a skip layer.
+def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[Perceptron]) -> str:
+    """Add nodes that evaluate several perceptrons with the same inputs and activation as one perceptron.
 
-    The operator `Gemm` computes inputs @ weights + bias. The last layer adds the output of the skip layer.
+    The weights of the first layers and of the skip layers stand side by side. Those of the later layers are blocks on
+    the diagonal of a matrix. The operator `Gemm` computes inputs @ weights + bias. The last layer adds the output of
+    the skip layer.
 
     Args:
         builder: Builder of the graph.
         inputs: Name of the tensor with the inputs.
-        perceptron: Weights and biases of the layers, and the activation.
+        perceptrons: Weights and biases of the layers, and the activation.
 
     Returns:
-        Name of the tensor with the outputs.
+        Name of the tensor with the outputs of all perceptrons.
     """
     hidden_outputs = inputs
-    for layer in perceptron.hidden:
-        linear = builder.add("Gemm", hidden_outputs, builder.constant(layer.weight), builder.constant(layer.bias))
-        hidden_outputs = builder.add(perceptron.activation.onnx_operator, linear)
-    output_layer = perceptron.last
-    skip_and_bias = builder.add("Gemm", inputs, builder.constant(perceptron.skip), builder.constant(output_layer.bias))
-    return builder.add("Gemm", hidden_outputs, builder.constant(output_layer.weight), skip_and_bias)
+    for layers in zip(*(perceptron.hidden for perceptron in perceptrons), strict=True):
+        weights, biases = zip(*layers, strict=True)
+        joined_weights = np.hstack(weights) if hidden_outputs is inputs else block_diag(*weights)
+        constants = (builder.constant(joined_weights), builder.constant(np.concatenate(biases)))
+        linear = builder.add("Gemm", hidden_outputs, *constants)
+        hidden_outputs = builder.add(perceptrons[0].activation.onnx_operator, linear)
+    skip = builder.constant(np.hstack([perceptron.skip for perceptron in perceptrons]))
+    weights, biases = zip(*(perceptron.last for perceptron in perceptrons), strict=True)
+    skip_and_bias = builder.add("Gemm", inputs, skip, builder.constant(np.concatenate(biases)))
+    return builder.add("Gemm", hidden_outputs, builder.constant(block_diag(*weights)), skip_and_bias)
 
 
 TURN = slice(6, 9)
@@ -371,43 +378,38 @@ LOG_FORCE_STD = slice(LOG_STD.stop - 1, LOG_STD.stop)
 """Column of the answers with the logarithm of the standard deviation of the force."""
 
 
-def fold(perceptrons: Sequence[Perceptron], mean: Array, matrix: Array, answer_map: Layer) -> Perceptron:
-    """Fold several perceptrons into one perceptron that computes answers from features without whitening.
+def fold(perceptron: Perceptron, mean: Array, matrix: Array, answer_map: Layer) -> Perceptron:
+    """Fold the whitening of the features and a linear map of the outputs into a perceptron.
 
     The whitening of the features becomes part of the first layer and of the skip layer. The linear map from the outputs
     to the answers becomes part of the last layer and of the skip layer.
 
     Args:
-        perceptrons: Perceptrons whose inputs are (features - mean) @ matrix. All perceptrons must have the same number
-            of layers.
+        perceptron: Perceptron whose inputs are (features - mean) @ matrix.
         mean: Mean of the features, shape (n_electrode,).
         matrix: Whitening matrix, shape (n_electrode, n_electrode).
-        answer_map: Linear map from the outputs of all perceptrons, one after the other, to the answers: weight, shape
-            (n_output, n_answer), and bias, shape (n_answer,).
+        answer_map: Linear map from the outputs of the perceptron to the answers: weight, shape (n_output, n_answer),
+            and bias, shape (n_answer,).
 
     Returns:
         Perceptron that computes the answers from the features.
     """
-    first, *later = map(_join, zip(*(perceptron.hidden for perceptron in perceptrons), strict=True))
-    last = _join([perceptron.last for perceptron in perceptrons])
-    # All perceptrons have the same inputs: ((features - mean) @ matrix) @ weight + bias
-    #   = features @ (matrix @ weight) + (bias - mean @ matrix @ weight)
-    inputs_matrix = np.tile(matrix, len(perceptrons))
-    first_weight = inputs_matrix @ first.weight
-    first_bias = first.bias - mean @ first_weight
-    skip = inputs_matrix @ block_diag(*[perceptron.skip for perceptron in perceptrons]) @ answer_map.weight
+    first, *later = perceptron.hidden
+    # ((features - mean) @ matrix) @ weight + bias  =  features @ (matrix @ weight) + (bias - mean @ matrix @ weight)
+    first_weight = matrix @ first.weight
+    skip = matrix @ perceptron.skip @ answer_map.weight
     # The skip layer has no bias. The term - mean @ skip is therefore added to the bias of the last layer.
-    last_bias = last.bias @ answer_map.weight + answer_map.bias - mean @ skip
+    last_bias = perceptron.last.bias @ answer_map.weight + answer_map.bias - mean @ skip
     return Perceptron(
-        hidden=(Layer(first_weight, first_bias), *later),
-        last=Layer(last.weight @ answer_map.weight, last_bias),
+        hidden=(Layer(first_weight, first.bias - mean @ first_weight), *later),
+        last=Layer(perceptron.last.weight @ answer_map.weight, last_bias),
         skip=skip,
-        activation=perceptrons[0].activation,
+        activation=perceptron.activation,
     )
 
 
-def linear_answer_map(domain: Domain, n_electrode: int) -> Layer:
-    """Return the linear map from the outputs of the contact perceptron and the misfit perceptron to the answers.
+def linear_answer_map(domain: Domain) -> Layer:
+    """Return the linear map from the outputs of the contact perceptron to its answers.
 
     The contact perceptron estimates unit coordinates, which the map converts to (x, y, ln F). The perceptron also
     computes the logarithm of the relative standard deviation of the force. The corresponding answer is the logarithm of
@@ -417,10 +419,8 @@ def linear_answer_map(domain: Domain, n_electrode: int) -> Layer:
 
     Args:
         domain: Domain that defines the centre and the scale of the unit coordinates.
-        n_electrode: Number of electrodes, which is also the number of entries of the misfit vector.
     """
-    # The identity matrices leave the logarithms of the standard deviations and the misfit vector unchanged.
-    weight = block_diag(np.eye(TURN.start), ANGLES_TO_COSINE_ARGUMENTS, np.eye(n_electrode))
+    weight = block_diag(np.eye(TURN.start), ANGLES_TO_COSINE_ARGUMENTS)
     bias = np.zeros(weight.shape[1])
 
     # Means: u * scale + centre.
@@ -436,9 +436,3 @@ def linear_answer_map(domain: Domain, n_electrode: int) -> Layer:
     # The perceptron computes the angles minus a right angle.
     bias[ANGLES] = 0.5 * np.pi * ANGLES_TO_COSINE_ARGUMENTS.sum(axis=0)
     return Layer(weight, bias)
-
-
-def _join(layers: Sequence[Layer]) -> Layer:
-    """Join layers with different inputs into one layer. Its weights are a block-diagonal matrix."""
-    weights, biases = zip(*layers, strict=True)
-    return Layer(block_diag(*weights), np.concatenate(biases))

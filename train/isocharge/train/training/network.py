@@ -13,7 +13,6 @@ length is not smooth. Therefore, the perceptron learns the vector instead of the
 several thousand, so it is compressed by the function asinh.
 """
 
-from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -306,16 +305,24 @@ def as_tensor(values: Array) -> Tensor:
 
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
-    """Fold both perceptrons of a trained network into one perceptron. A constant force is part of its last layer."""
-    contact = network.contact.to_numpy()
+    """Fold the whitening and the units of the answers into the perceptrons of a trained network.
+
+    A constant force is part of the last layer of the contact perceptron.
+    """
+    mean = _to_numpy(network.features_mean)
+    matrix = _to_numpy(network.whitening)
     factor = _to_numpy(network.output_factor)
-    offset = _to_numpy(network.output_offset)
-    weight, bias = contact.last
-    contact = replace(contact, last=Layer(weight * factor, bias * factor + offset), skip=contact.skip * factor)
-    perceptrons = [contact, network.misfit_vector.to_numpy()]
-    answer_map = linear_answer_map(network.domain, network.features.n_electrode)
-    layers = fold(perceptrons, _to_numpy(network.features_mean), _to_numpy(network.whitening), answer_map)
-    return FoldedNetwork(network.features, layers)
+    answer_map = linear_answer_map(network.domain)
+    # (outputs * factor + offset) @ weight + bias
+    offset_answers = _to_numpy(network.output_offset) @ answer_map.weight + answer_map.bias
+    contact_map = Layer(factor[:, None] * answer_map.weight, offset_answers)
+    n_electrode = network.features.n_electrode
+    misfit_map = Layer(np.eye(n_electrode), np.zeros(n_electrode))
+    return FoldedNetwork(
+        features=network.features,
+        contact=fold(network.contact.to_numpy(), mean, matrix, contact_map),
+        misfit=fold(network.misfit_vector.to_numpy(), mean, matrix, misfit_map),
+    )
 
 
 def _to_numpy(tensor: Tensor) -> Array:

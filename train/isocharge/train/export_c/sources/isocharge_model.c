@@ -16,7 +16,7 @@ $layers
 /* What the last layer gives, still without the functions of `contact_of`. */
 static void answers_of(const float charge_pC[ISOCHARGE_ELECTRODES], float answers[$answers])
 {
-    float logs[$electrodes], $rows, skipped[$answers];
+    float logs[$electrodes], rows[2][$widest], skipped[$answers];
 
     features(charge_pC, logs);
     $calls
