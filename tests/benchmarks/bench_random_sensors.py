@@ -114,7 +114,7 @@ def measure(sensor: Sensor, probe: Circle, n_sample: int, n_press: int) -> dict[
         "force_over_limit": round(errors.force_rms_percent / limit.force_rms_percent, 3),
         "coverage_68": round(float(np.mean(deviation < 1.0)), 3),
         "training_cpu_s": round(seconds, 1),
-        "cautions": len(fitted.cautions),
+        "cautions": len(fitted.made_with.get("cautions", ())),
     }
 
 

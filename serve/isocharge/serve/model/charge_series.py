@@ -148,14 +148,12 @@ def _derivative(coefficients: Array, axis: int) -> Array:
         axis: Axis of `coefficients` that belongs to the coordinate.
 
     Returns:
-        Coefficients of the derivative, padded with zeros to the shape of `coefficients`.
+        Coefficients of the derivative, of the same shape.
     """
-    derivative = chebyshev.chebder(coefficients, axis=axis)
-    # The derivative of a constant has as many coefficients as the constant. Otherwise, it has one coefficient less.
-    missing_count = coefficients.shape[axis] - derivative.shape[axis]
+    # With one more coefficient, which is zero, the derivative has as many coefficients as the series.
     padding = [(0, 0)] * coefficients.ndim
-    padding[axis] = (0, missing_count)
-    return np.pad(derivative, padding)
+    padding[axis] = (0, 1)
+    return np.asarray(chebyshev.chebder(np.pad(coefficients, padding), axis=axis))
 
 
 MAX_VALUE = 100.0

@@ -1,4 +1,4 @@
-"""Description of a sensor without a sensor file, and checks of its presses before a network is trained on them.
+"""Area of measured presses, and checks of the presses before a network is trained on them.
 
 Without such checks, the loss could become infinite or NaN during the training. The reported errors and misfits of the
 model could also be meaningless.
@@ -30,23 +30,6 @@ LEAST_RANGE = 1.1
 
 LEAST_WIDTH = 1e-3
 """Smallest ratio of the standard deviations of the places across and along their main direction."""
-
-
-@dataclass(frozen=True)
-class MeasuredSensor:
-    """Description of a sensor without a sensor file, for the metadata of a model.
-
-    Attributes:
-        name: Name of the sensor, in whose system of coordinates x and y are given.
-        electrode_names: Names of the channels, in the order of their charges.
-    """
-
-    name: str
-    electrode_names: tuple[str, ...]
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the description for the metadata of a model."""
-        return {"name": self.name, "electrodes": list(self.electrode_names)}
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import DatasetError, PressError, cut, shown
 from isocharge.common.files import sha256_of
+from isocharge.common.structs import Positive, convert
 from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
 from isocharge.train.data.channel_noise import Noise
@@ -119,6 +121,13 @@ def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array
     return np.stack([distance * np.cos(angle), distance * np.sin(angle), force], axis=1)
 
 
+class _Ranges(Struct):
+    """Ranges of the contacts in a manifest."""
+
+    radius_mm: Positive | None = None
+    force_N: tuple[Positive, Positive] | None = None
+
+
 def domain_of(dataset: Dataset) -> Domain:
     """Return the working area and the range of forces of a dataset.
 
@@ -131,19 +140,11 @@ def domain_of(dataset: Dataset) -> Domain:
         DatasetError: If the ranges in the manifest are not numbers or do not contain the samples.
     """
     samples = dataset.samples
-    ranges = dataset.manifest.get("ranges", {})
-    sample_radius = np.hypot(samples.x_mm, samples.y_mm).max()
-    sample_forces = (samples.force_N.min(), samples.force_N.max())
-    try:
-        radius = float(ranges.get("radius_mm", sample_radius))
-        min_force, max_force = (float(force) for force in ranges.get("force_N", sample_forces))
-        if not (0.0 < min_force <= max_force and radius > 0.0):
-            raise ValueError
-    except (AttributeError, TypeError, ValueError) as error:
-        raise DatasetError(
-            f"manifest ranges: expected positive radius_mm and force_N [MIN, MAX], got {ranges!r}"
-        ) from error
-
+    ranges = convert(dataset.manifest.get("ranges", {}), _Ranges, "manifest ranges", DatasetError)
+    sample_radius = float(np.hypot(samples.x_mm, samples.y_mm).max())
+    sample_forces = (float(samples.force_N.min()), float(samples.force_N.max()))
+    radius = ranges.radius_mm or sample_radius
+    min_force, max_force = ranges.force_N or sample_forces
     domain = Domain(radius, (min_force, max_force))
     if not domain.contains(LabelledPresses.of(samples).contact).all():
         raise DatasetError(

@@ -59,7 +59,7 @@ def evaluate(fitted: Fitted) -> dict[str, float]:
     truth = fitted.test.contact
     # Too few presses are measured for the 99th percentiles.
     errors = {name: error for name, error in contact_errors(contact, std, truth).items() if name not in ONLY_SIMULATED}
-    if fitted.is_force_constant:
+    if "constant_force" in fitted.made_with:
         errors = {name: error for name, error in errors.items() if not name.startswith("force_")}
         errors |= _coverages(contact[:, :2], std[:, :2], truth[:, :2])
     return {**errors, HELD_PRESSES: float(len(truth)), **_misfit_percentiles(misfit)}

@@ -4,7 +4,6 @@ import platform
 from dataclasses import dataclass
 from importlib.metadata import version as installed_version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from msgspec import structs
@@ -17,9 +16,8 @@ from isocharge.serve.model.golden import contact_floors
 from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
 from isocharge.serve.model.model_folder import write_model
 from isocharge.serve.model.validity import disk_corners
-from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.channel_noise import misfit_noise
-from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
+from isocharge.train.data.measured_sensor import PressedArea
 from isocharge.train.model_release.evaluate import HELD_PRESSES, evaluate, unnoticed_presses
 from isocharge.train.model_release.onnx_graph import check_graph, write_graph
 from isocharge.train.training.fit import Fitted
@@ -77,7 +75,7 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
         f"| {row.format(metadata.errors[name])} |" for name, row in LISTED_ERRORS.items() if name in metadata.errors
     )
     unnoticed_text = f"{metadata.unnoticed.summary}.\n\n" if metadata.unnoticed is not None else ""
-    cautions_text = "".join(f"- {caution}.\n" for caution in fitted.cautions)
+    cautions_text = "".join(f"- {caution}.\n" for caution in metadata.made_with.get("cautions", ()))
     return f"""# {metadata.name}, version {metadata.version}
 
 Estimates the position and the force of one press from the charges of the sensor `{sensor_name}`.
@@ -198,13 +196,12 @@ def release(
         ModelError: If the folder holds a model with other electrodes.
         TrainingError: If the exported graph and the network disagree.
     """
-    names = fitted.sensor.electrode_names
     package_versions = {name: installed_version(name) for name in ("isocharge", "numpy", "onnx", "onnxruntime")}
     metadata_without_unnoticed = ModelMetadata(
         name=folder.resolve().name,
         version=version,
-        sensor=_sensor_table(fitted),
-        electrodes=names,
+        sensor=dict(fitted.sensor),
+        electrodes=fitted.electrodes,
         working_area_mm=_working_area(fitted.domain),
         probes=fitted.probes,
         force_range_N=fitted.domain.force_range,
@@ -228,13 +225,6 @@ def release(
     card = model_card(complete_metadata, fitted)
     version_folder = write_model(folder, graph, complete_metadata, golden_charges, card, fitted.files)
     return Release(version_folder, complete_metadata)
-
-
-def _sensor_table(fitted: Fitted) -> dict[str, Any]:
-    """Return the description of the sensor for the metadata."""
-    if isinstance(fitted.sensor, MeasuredSensor):
-        return fitted.sensor.to_dict()
-    return sensor_to_dict(fitted.sensor)
 
 
 def _working_area(domain: Domain) -> tuple[tuple[float, float], ...]:

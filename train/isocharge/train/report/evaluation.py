@@ -3,7 +3,7 @@
 Every function in `METHOD_BUILDERS` adds a method to all reports. Models are added by their folders.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import cycle
@@ -367,7 +367,7 @@ def measure_methods(methods: Sequence[Method], presses: LabelledPresses, seconds
     contenders = []
     for method in methods:
         calls = cycle([method.call_for(press_charge) for press_charge in presses.charge[:SINGLE_PRESSES]])
-        contenders.append(Contender(method.name, 1, partial(_call_next, calls)))
+        contenders.append(Contender(method.name, 1, partial(lambda calls: next(calls)(), calls)))
     timings = take_turns(contenders, len(methods) * seconds)
     records = []
     for method, estimate, timing in zip(methods, estimates, timings, strict=True):
@@ -392,8 +392,3 @@ def contact_errors(estimate: Array, truth: Array) -> tuple[float, dict[str, floa
         return 0.0, {}
     statistics = ContactErrorStatistics.of(estimate[has_estimate], truth[has_estimate])
     return float(np.mean(has_estimate)), statistics.rounded()
-
-
-def _call_next(calls: Iterator[Callable[[], object]]) -> None:
-    """Call the next function of an iterator."""
-    next(calls)()

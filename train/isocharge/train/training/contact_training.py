@@ -24,11 +24,11 @@ the target is the contact, and the noise is not enlarged.
 """
 
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.special import chdtr, chdtrc
 from torch import Tensor
 
 from isocharge.simulate import ChargeMap
@@ -140,19 +140,10 @@ def _half_long_tailed_square(deviation: Tensor) -> Tensor:
     largest_square = MAX_NORMAL_ERROR**2
     tail = largest_square * (1.0 + torch.log(squares.clamp(min=largest_square) / largest_square))
     long_tailed_square = torch.where(squares < largest_square, squares, tail)
-    return 0.5 * long_tailed_square.sum(dim=1) / mean_square_of_limited_normal(MAX_NORMAL_ERROR)
-
-
-def mean_square_of_limited_normal(limit: float) -> float:
-    """Return the mean square of a standard normal variable whose absolute value is limited to `limit`.
-
-    The mean square is the integral of the square within the limits, plus the squared limit times the probability beyond
-    the limits.
-    """
-    normal = NormalDist()
-    probability_within = normal.cdf(limit) - normal.cdf(-limit)
-    square_within = probability_within - 2.0 * limit * normal.pdf(limit)  # integration by parts
-    return square_within + limit**2 * (1.0 - probability_within)
+    # The mean square of a limited normal variable is the integral of the square within the limits, which follows from a
+    # chi-squared distribution with three degrees of freedom, plus the squared limit times the probability beyond them.
+    mean_square = float(chdtr(3, largest_square) + largest_square * chdtrc(1, largest_square))
+    return 0.5 * long_tailed_square.sum(dim=1) / mean_square
 
 
 LARGEST_LINEAR_STD = 0.012

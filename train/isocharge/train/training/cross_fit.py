@@ -26,7 +26,7 @@ from isocharge.common.errors import PressError, cut
 from isocharge.serve.presses.measured_presses import MeasuredPresses, presses_text
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
 from isocharge.train.data.contact_errors import rms, rounded
-from isocharge.train.data.measured_sensor import LEAST_RANGE, MeasuredSensor, PressedArea, check_measured_presses
+from isocharge.train.data.measured_sensor import LEAST_RANGE, PressedArea, check_measured_presses
 from isocharge.train.data.presses import (
     FEWEST,
     FEWEST_POSITIONS,
@@ -140,7 +140,16 @@ def fit_presses(
         std=std * [position_factor, position_factor, force_factor],
         misfit=_cross_validated_misfit(labelled, domain, noise, fold_of_press),
     )
-    made_with = _made_with(settings, labelled, (position_factor, force_factor))
+    made_with: dict[str, object] = {
+        "config": settings.to_dict(),
+        "torch": torch.__version__,
+        "measured": {
+            "presses": len(labelled),
+            "places": len(np.unique(labelled.contact[:, :2], axis=0)),
+            "folds": HELD_PARTS,
+            "std_factors": [rounded(position_factor), rounded(force_factor)],
+        },
+    }
     if force_std is not None:
         made_with["constant_force"] = {
             "force_N": rounded(np.exp(domain.centre[2])),
@@ -149,7 +158,8 @@ def fit_presses(
         }
     return Fitted(
         network=fold_network(network.eval()).with_scaled_std(position_factor, force_factor),
-        sensor=MeasuredSensor(name, usable.electrodes),
+        sensor={"name": name, "electrodes": list(usable.electrodes)},
+        electrodes=usable.electrodes,
         probes=probes,
         domain=domain,
         noise=noise,
@@ -158,28 +168,7 @@ def fit_presses(
         made_with=made_with,
         files={PRESSES_FILE: presses_text(usable).encode()},
         cross_validated=cross_validated,
-        is_force_constant=force_std is not None,
     )
-
-
-def _made_with(settings: FitConfig, presses: LabelledPresses, std_factors: tuple[float, float]) -> dict[str, object]:
-    """Return the entries that describe the training in the metadata of the network.
-
-    Args:
-        settings: Settings of the training.
-        presses: Presses on which the network was trained.
-        std_factors: Factors by which the standard deviations of the position and of the force were multiplied.
-    """
-    return {
-        "config": settings.to_dict(),
-        "torch": torch.__version__,
-        "measured": {
-            "presses": len(presses),
-            "places": len(np.unique(presses.contact[:, :2], axis=0)),
-            "folds": HELD_PARTS,
-            "std_factors": [rounded(factor) for factor in std_factors],
-        },
-    }
 
 
 def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:

@@ -9,7 +9,7 @@ import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from threadpoolctl import threadpool_limits
@@ -20,9 +20,9 @@ from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.progress import second_thread
 from isocharge.serve.model.charge_file import FILE as CHARGES_FILE
 from isocharge.serve.model.charge_file import charge_map_bytes
-from isocharge.simulate import Dataset, Domain, Sensor
+from isocharge.simulate import Dataset, Domain
+from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.channel_noise import Noise, misfit_noise
-from isocharge.train.data.measured_sensor import MeasuredSensor
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.config import FitConfig
@@ -54,27 +54,27 @@ class Fitted:
 
     Attributes:
         network: The network in NumPy.
-        sensor: The sensor whose charges are the inputs.
+        sensor: Description of the sensor for the metadata, which contains at least its name.
+        electrodes: Names of the electrodes, in the order of the charges.
         probes: Notations of the probes.
         domain: Contacts for which the network was trained.
         noise: Noise for which the network was trained.
         test: Presses for measuring errors. The network was trained on other presses, unless `cross_validated` is given.
         sha256: Checksum of the training data.
-        made_with: Entries that the metadata of a release contain in addition to the usual entries.
+        made_with: Entries that the metadata of a release contain in addition to the usual entries. Among them may be
+            `cautions`, a list of sentences for users, and `constant_force`, if the network always answers one force.
         files: Contents of additional files in the version folder of a release, by file name.
-        cautions: Sentences that users of the network should read.
         description: Sections in Markdown that the card of a release contains before the errors; empty for none.
         cross_validated: Answers to the charges of `test` by networks that were not trained on these presses; None if
             `network` itself was not trained on them.
         outside: Presses outside the working area; None if they were not simulated.
         yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
             or above the range of forces.
-        is_force_constant: Whether the network always answers the same force, because all presses have this force or no
-            press has a known force.
     """
 
     network: FoldedNetwork
-    sensor: Sensor | MeasuredSensor
+    sensor: Mapping[str, Any]
+    electrodes: tuple[str, ...]
     probes: tuple[str, ...]
     domain: Domain
     noise: Noise
@@ -82,12 +82,10 @@ class Fitted:
     sha256: str
     made_with: Mapping[str, object] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
-    cautions: tuple[str, ...] = ()
     description: str = ""
     cross_validated: Answers | None = None
     outside: OutsidePresses | None = None
     yield_force_N: float | None = None
-    is_force_constant: bool = False
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Estimate contacts.
@@ -163,7 +161,8 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         files[CHARGES_FILE] = charge_map_bytes(split.folded_charges)
     return Fitted(
         network=fold_network(network),
-        sensor=data.sensor,
+        sensor=sensor_to_dict(data.sensor),
+        electrodes=data.sensor.electrode_names,
         probes=data.probes,
         domain=split.domain,
         noise=training.noise_model,
@@ -171,7 +170,6 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         sha256=data.sha256,
         made_with=made_with,
         files=files,
-        cautions=split.cautions,
         outside=outside,
         yield_force_N=data.yield_force_N,
     )
