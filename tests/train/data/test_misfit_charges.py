@@ -6,7 +6,7 @@ from isocharge.simulate import noise_model
 from isocharge.train.data.channel_noise import ChannelNoise
 from isocharge.train.training.misfit_training import draw_charges
 
-NOISE = ChannelNoise.alike(noise_model("reference"), 3)
+NOISE = ChannelNoise.alike(noise_model("reference"))
 
 
 def test_charges_are_drawn_at_all_distances_from_presses():

@@ -203,7 +203,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     notes: list[str] = []
     if fits is False:
         notes += _remedies(position, force)
-    notes += _exclusion_notes(errors, metadata)
+    notes += _exclusion_notes(errors, predictor.validity)
     if is_bad.any():
         bad_lines = row_words(np.array(errors.lines)[is_bad].tolist(), errors.row_noun)
         notes.append(f"{bad_lines}: nothing like the other presses, left out; look at it")
@@ -341,17 +341,16 @@ def _remedies(position: ErrorSummary | None, force: ErrorSummary | None) -> Iter
     )
 
 
-def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
+def _exclusion_notes(errors: PressErrors, validity: Validity) -> Iterator[str]:
     """Yield one note for each reason why presses were excluded from the comparison.
 
     Each note contains the reason, and lists the lines of the presses that were excluded for this reason.
 
     Args:
         errors: Errors of all presses, with the reason why each press was excluded.
-        metadata: Metadata of the model.
+        validity: The working area and the range of forces of the model.
     """
-    min_force_N, max_force_N = metadata.force_range_N
-    validity = Validity.of(metadata)
+    min_force_N, max_force_N = validity.force_range_N
     area = f"{validity.area_text} from the centre" if validity.is_centred else validity.area_text
     domain = (
         f"outside the model's working area ({area}) or forces ({min_force_N:.3g} to {max_force_N:.3g} N); if these "

@@ -138,7 +138,7 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     is_unknown = np.isnan(measured)
     is_complete = np.asarray(np.isfinite(predicted[:, VALUE_COLUMNS]).all(axis=1))
     contacts = Contacts(*predicted.astype(np.float32).T)
-    flags = Validity.of(metadata).batch_flags(contacts)
+    flags = predictor.validity.batch_flags(contacts)
     return PressErrors(
         lines=model_presses.lines,
         row_noun=model_presses.row_noun,
@@ -148,7 +148,7 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
         rig_std=np.where(is_unknown, np.nan, rig_std),
         flags=tuple(words if is_known else () for words, is_known in zip(flags, is_complete, strict=True)),
         has_misfit=contacts.misfit > misfit_limit(metadata),
-        exclusion_reasons=_exclusion_reasons(metadata, model_presses),
+        exclusion_reasons=_exclusion_reasons(predictor.validity, model_presses),
     )
 
 
@@ -177,20 +177,19 @@ def _predicted_contacts(predictor: Predictor, charge_pC: Array) -> Array:
     return predicted
 
 
-def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tuple[str, ...]:
+def _exclusion_reasons(validity: Validity, presses: MeasuredPresses) -> tuple[str, ...]:
     """For each press, return why the press is excluded from the comparison, or an empty text if it is compared.
 
     The model is compared with presses in its domain, which consists of the working area and the range of forces. The
     measured position and the measured force determine whether a press lies in this domain.
 
     Args:
-        metadata: Metadata of the model, which contain the working area and the range of forces.
+        validity: The working area and the range of forces of the model.
         presses: The measured presses, with the charges of the model's electrodes.
     """
     x_mm, y_mm, force_N = presses.contact.T
-    min_force_N, max_force_N = metadata.force_range_N
-    corners_mm = np.array(metadata.working_area_mm)
-    is_outside_area = ~np.isnan(x_mm) & ~inside_polygon(x_mm, y_mm, corners_mm)
+    min_force_N, max_force_N = validity.force_range_N
+    is_outside_area = ~np.isnan(x_mm) & ~inside_polygon(x_mm, y_mm, validity.corners_mm)
     is_outside_forces = (force_N < min_force_N) | (force_N > max_force_N)
     is_contact_unknown = np.isnan(presses.contact).all(axis=1)
     is_charge_unknown = np.isnan(presses.charge_pC).any(axis=1)

@@ -18,7 +18,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, series_size
 from isocharge.serve.presses.measured_presses import CONTACT
-from isocharge.simulate import Domain, ForwardMap, NoiseModel
+from isocharge.simulate import Domain, ForwardMap, NoiseModel, Sweep
 from isocharge.simulate.forward.derivative_maps import NODE_COUNT
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION
@@ -49,10 +49,6 @@ The negative changes are smaller for a film that they would make slack."""
 
 PRESSES = 60_000
 """Number of presses from which the network learns."""
-
-
-OUTSIDE_PRESSES = 16_384
-"""Number of presses outside the working area from which the network learns that they are outside."""
 
 SEED = 3
 """Seed of the contacts and of the drawn films."""
@@ -227,8 +223,5 @@ def _outside_presses(charges: FilmCharges, domain: Domain, executor: Executor | 
     if outermost <= domain.radius:
         return None
     whole_map = whole_film_map(round_map.sensor, round_map.probe, domain.force_range, executor=executor)
-    rng = np.random.default_rng([SEED, 2])
-    contact = draw_contacts(rng, Domain(outermost, domain.force_range), 4 * OUTSIDE_PRESSES)
-    is_outside = np.hypot(contact[:, 0], contact[:, 1]) > domain.radius
-    contact = contact[is_outside][:OUTSIDE_PRESSES]
+    contact = Sweep(domain.radius, domain.force_range, seed=SEED).outside_presses(outermost).contact
     return LabelledPresses(contact, whole_map.charges(contact))

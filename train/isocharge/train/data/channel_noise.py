@@ -62,8 +62,9 @@ class ChannelNoise:
     """A noise model with separate parameters for each channel.
 
     Attributes:
-        white: Constant part of the standard deviation, shape (n_electrode,), pC.
-        gain: Part of the standard deviation that is proportional to the charge, shape (n_electrode,), dimensionless.
+        white: Constant part of the standard deviation, shape (n_electrode,) or (), pC.
+        gain: Part of the standard deviation that is proportional to the charge, shape (n_electrode,) or (),
+            dimensionless.
         name: Name of the noise model.
     """
 
@@ -110,15 +111,9 @@ class ChannelNoise:
         return cls(white, gain)
 
     @classmethod
-    def alike(cls, noise: NoiseModel, electrodes: int) -> "ChannelNoise":
-        """Create a noise model with the same noise on every electrode.
-
-        Args:
-            noise: Noise of each electrode.
-            electrodes: Number of electrodes.
-        """
-        gain = max(noise.gain, LEAST_GAIN)
-        return cls(np.full(electrodes, noise.white), np.full(electrodes, gain), noise.name)
+    def alike(cls, noise: NoiseModel) -> "ChannelNoise":
+        """Create a noise model with the same noise on every electrode, whose parameters have the shape ()."""
+        return cls(np.array(noise.white), np.array(max(noise.gain, LEAST_GAIN)), noise.name)
 
     def sigma(self, charge: Array) -> Array:
         """Return the standard deviation of the noise, pC, of each charge, pC. Both have the shape (n, n_electrode)."""

@@ -110,7 +110,9 @@ def fit_presses(
     force_std = constant_force_std(usable)  # None if the forces vary
     labelled = LabelledPresses(usable.contact, usable.charge_pC)
     domain = PressedArea.of_contacts(labelled.contact)
-    noise = ChannelNoise.estimate(labelled.charge, domain.to_unit(labelled.contact))
+    unit_contact = domain.to_unit(labelled.contact)
+    noise = ChannelNoise.estimate(labelled.charge, unit_contact)
+    level = noise.level(labelled.charge)  # charges on a scale on which the noise has the standard deviation 1
     with threads_and_seed(training.threads, training.seed):
         features = signed_features(labelled.charge, noise.transition_charge(labelled.charge))
         # The first network will be returned. The other networks each belong to one fold of the cross-validation.
@@ -124,22 +126,24 @@ def fit_presses(
             fold_config = structs.replace(training, seed=training.seed + fold_index)
             train_presses = labelled[fold_of_press != fold_index]
             contact_stage(network_of_fold, train_presses, noise.scaled(TRAINING_NOISE_FACTOR), fold_config).run()
-        contact, std = _cross_validated_contact(fold_networks, labelled.charge, fold_of_press)
+        contact, std, misfit = _cross_validated_answers(
+            fold_networks, labelled.charge, unit_contact, level, fold_of_press
+        )
         position_factor, force_factor = std_factors(contact, std, labelled.contact)
         if force_std is not None:
             force_factor = 1.0
 
         # Train the returned network: its contacts on the mean outputs of the other networks, then its misfits.
         distillation = _distillation_stage(network, fold_networks, labelled, noise, training)
-        train_perceptron(distillation, network.contact, settings)
-        examples = _misfit_examples(labelled, domain, noise, training)
-        train_perceptron(misfit_stage(network, examples, training), network.misfit_vector, settings)
+        train_perceptron(distillation, settings)
+        # The charges of contacts are known only at the presses. Near each press, planes approximate their levels.
+        planes = LocalPlanes.fit(unit_contact, level)
+        count = training.sizes(len(usable.electrodes)).misfit_charges
+        drawn_charge = draw_charges(np.random.default_rng(training.seed), labelled.charge, noise, count)
+        examples = np.stack([drawn_charge, planes.residuals(noise.level(drawn_charge))])
+        train_perceptron(misfit_stage(network, examples, training), settings)
 
-    cross_validated = Answers(
-        contact=contact,
-        std=std * [position_factor, position_factor, force_factor],
-        misfit=_cross_validated_misfit(labelled, domain, noise, fold_of_press),
-    )
+    cross_validated = Answers(contact, std * [position_factor, position_factor, force_factor], misfit)
     made_with: dict[str, object] = {
         "config": settings.to_dict(),
         "torch": torch.__version__,
@@ -285,25 +289,30 @@ def _with_defaults_for_measured(config: TrainingConfig) -> TrainingConfig:
     )
 
 
-def _cross_validated_contact(
-    fold_networks: list[InverseNetwork], charge: Array, fold_of_press: Integers
-) -> tuple[Array, Array]:
-    """Estimate the contact of each press with a network that was not trained on this press.
+def _cross_validated_answers(
+    fold_networks: list[InverseNetwork], charge: Array, unit_contact: Array, level: Array, fold_of_press: Integers
+) -> Answers:
+    """Estimate the contact and the misfit of each press without this press and all others of its fold.
+
+    The contact is the answer of a network that was not trained on the press. The misfit is the length of the difference
+    between the level of the press and the level of the most similar contact. Near each press of the other folds, the
+    levels of contacts are approximated by linear functions (planes).
 
     Args:
         fold_networks: Networks, one for each fold, which were trained on the presses of all other folds.
         charge: Charges of all presses, shape (n, n_electrode), pC.
+        unit_contact: Contacts of the presses in unit coordinates, shape (n, 3).
+        level: Charges on a scale on which the noise has the standard deviation 1, shape (n, n_electrode).
         fold_of_press: Index of the fold of each press, shape (n,).
-
-    Returns:
-        Contacts, shape (n, 3), mm and N, and their standard deviations, shape (n, 3).
     """
-    contact = np.empty((len(charge), 3))
-    std = np.empty((len(charge), 3))
+    answers = Answers(np.empty_like(unit_contact), np.empty_like(unit_contact), np.empty((len(charge), 1)))
     for fold_index, network in enumerate(fold_networks):
         is_in_fold = fold_of_press == fold_index
-        contact[is_in_fold], std[is_in_fold], _ = fold_network(network).predict(charge[is_in_fold])
-    return contact, std
+        answers.contact[is_in_fold], answers.std[is_in_fold], _ = fold_network(network).predict(charge[is_in_fold])
+        planes = LocalPlanes.fit(unit_contact[~is_in_fold], level[~is_in_fold])
+        residual = planes.residuals(level[is_in_fold])
+        answers.misfit[is_in_fold] = np.linalg.norm(residual, axis=1, keepdims=True)
+    return answers
 
 
 def _distillation_stage(
@@ -346,63 +355,3 @@ def _distillation_stage(
 
     steps = config.sizes(network.features.n_electrode).steps
     return TrainingStage("contact", network.contact, loss, steps, config.learning_rate, config.seed)
-
-
-def _misfit_examples(
-    presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, config: TrainingConfig
-) -> Array:
-    """Draw charges for the training of the misfit perceptron, and compute their residuals.
-
-    Some of the charges are charges of contacts, and others are charges that no contact causes. The residual of a set of
-    charges is its difference from the charges of the most similar contact. The charges of contacts are known only at
-    the measured presses. Near each press, the charges are therefore approximated by linear functions of the contact.
-    These functions are fitted to neighbouring presses.
-
-    Args:
-        presses: All presses.
-        domain: Area of the presses, which defines the unit coordinates.
-        noise: Noise of the charges.
-        config: Number of charges and seed.
-
-    Returns:
-        Charges, pC, and residuals in standard deviations of the noise, shape (2, n, n_electrode).
-    """
-    rng = np.random.default_rng(config.seed)
-    # Fit the linear functions, which are planes, one for each press. They approximate the levels of the charges. A
-    # level is a charge on a scale on which the noise has the standard deviation 1.
-    planes = LocalPlanes.fit(domain.to_unit(presses.contact), noise.level(presses.charge))
-
-    # Draw charges, which are made from the charges of randomly chosen presses.
-    n_electrode = presses.charge.shape[1]
-    charge = draw_charges(rng, presses.charge, noise, config.sizes(n_electrode).misfit_charges)
-    residual = planes.residuals(noise.level(charge))
-    return np.stack([charge, residual])
-
-
-def _cross_validated_misfit(
-    presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, fold_of_press: Integers
-) -> Array:
-    """Compute the misfit of each press with respect to the presses of all other folds.
-
-    The residual is the difference between the charges of the press and the charges of the most similar contact. The
-    misfit is the length of the residual. Near each press of the other folds, the charges of contacts are approximated
-    by linear functions (planes).
-
-    Args:
-        presses: All presses.
-        domain: Area of the presses, which defines the unit coordinates.
-        noise: Noise of the charges.
-        fold_of_press: Index of the fold of each press, shape (n,).
-
-    Returns:
-        Misfits, shape (n, 1), in standard deviations of the noise.
-    """
-    unit_contact = domain.to_unit(presses.contact)
-    charge_level = noise.level(presses.charge)  # charges on a scale on which the noise has the standard deviation 1
-    misfit = np.empty((len(presses), 1))
-    for fold_index in range(HELD_PARTS):
-        is_in_fold = fold_of_press == fold_index
-        planes = LocalPlanes.fit(unit_contact[~is_in_fold], charge_level[~is_in_fold])
-        residual = planes.residuals(charge_level[is_in_fold])
-        misfit[is_in_fold] = np.linalg.norm(residual, axis=1, keepdims=True)
-    return misfit

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from isocharge.common.errors import TrainingError
 from isocharge.common.progress import report
+from isocharge.train.training.network import TrainablePerceptron
 
 DECAY = 0.95
 """Decay rate of the moving averages of the gradient and of its second moments."""
@@ -125,7 +126,7 @@ class TrainingStage:
     """
 
     name: str
-    network: nn.Module
+    network: TrainablePerceptron
     loss: Callable[[float, torch.Generator], Tensor]
     steps: int
     rate: float

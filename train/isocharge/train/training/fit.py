@@ -30,7 +30,7 @@ from isocharge.train.training.contact_training import LinearTargets, contact_sta
 from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.folded_network import FoldedNetwork
 from isocharge.train.training.misfit_training import misfit_examples, misfit_stage
-from isocharge.train.training.network import InverseNetwork, TrainablePerceptron, fold_network
+from isocharge.train.training.network import InverseNetwork, fold_network
 from isocharge.train.training.training_data import Split, TrainingData
 
 
@@ -141,7 +141,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         def train_misfit() -> None:
             """Train the misfit perceptron on examples from the working area and from the rest of the film."""
             examples = misfit_examples(split, features, outside, training)
-            train_perceptron(misfit_stage(network, examples, training), network.misfit_vector, settings)
+            train_perceptron(misfit_stage(network, examples, training), settings)
 
         # Second thread: train the misfit perceptron. This thread: train the contact perceptron
         misfit_training = executor.submit(train_misfit)
@@ -150,7 +150,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         if has_many_electrodes and training.noise_model.white > 0.0:
             linear_targets = LinearTargets.compute(split.train, split.field, training.noise_model)
         stage = contact_stage(network, split.train, training.noise_model, training, linear_targets=linear_targets)
-        train_perceptron(stage, network.contact, settings)
+        train_perceptron(stage, settings)
         misfit_training.result()
 
     made_with: dict[str, object] = {"config": settings.to_dict(), "torch": torch.__version__}
@@ -198,21 +198,20 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
         torch.set_num_threads(previous_count)
 
 
-def train_perceptron(stage: TrainingStage, perceptron: TrainablePerceptron, config: FitConfig) -> None:
+def train_perceptron(stage: TrainingStage, config: FitConfig) -> None:
     """Train a perceptron. If the configuration requires it, also round the hidden weights to 8 bits.
 
     After the rounding, the other weights are trained further, with the loss of the last step.
 
     Args:
-        stage: Loss and number of steps.
-        perceptron: The perceptron of the stage.
+        stage: The perceptron, its loss and the number of steps.
         config: Form of the weights.
     """
     stage.run()
     if config.network.weights != "int8":
         return
 
-    perceptron.round_hidden_matrices()
+    stage.network.round_hidden_matrices()
 
     def last_loss(_: float, random: torch.Generator) -> Tensor:
         """Return the loss at the end of the training."""

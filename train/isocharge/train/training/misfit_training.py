@@ -82,7 +82,7 @@ def misfit_examples(
         contact, in standard deviations of the noise.
     """
     rng = np.random.default_rng(config.seed)
-    noise = ChannelNoise.alike(misfit_noise(config.noise_model), features.n_electrode)
+    noise = ChannelNoise.alike(misfit_noise(config.noise_model))
     count = config.sizes(features.n_electrode).misfit_charges
     outside_charge = np.empty((0, features.n_electrode))
     if outside is not None:

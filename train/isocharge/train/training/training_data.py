@@ -199,7 +199,7 @@ class Split:
         has_both_signs = self.train.signed or self.test.signed
         if not has_both_signs:
             return logarithmic_features(charge)
-        channel_noise = ChannelNoise.alike(noise, charge.shape[1])
+        channel_noise = ChannelNoise.alike(noise)
         # The typical charge of a channel is the charge above which the noise would be proportional to the charge if the
         # white noise were multiplied by `SIGNED_FEATURE_SCALE`.
         smaller_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
