@@ -156,7 +156,7 @@ def train(case: Case, steps: int | None, change: AbstractContextManager[object] 
 def predictor(network: InverseNetwork) -> Predict:
     """Return the contacts of a network as a function of charges."""
     folded = fold_network(network)
-    return lambda charge: folded.predict(charge)[0]
+    return lambda charge: folded.outputs(charge)[0]
 
 
 REGRESSORS = {

@@ -12,6 +12,7 @@ from isocharge.train.training.contact_training import (
     LARGEST_LINEAR_STD,
     MAX_NOISE_FACTOR,
     LinearTargets,
+    fresh_noise,
 )
 
 DOMAIN = Domain(10.0, (0.1, 2.0))
@@ -33,6 +34,14 @@ def targets_of(noise, contact=CONTACT):
     return LinearTargets.compute(LabelledPresses(contact, bell_charges(contact)), CHARGE_MAP, noise)
 
 
+def draw(targets, noise, rows, seed):
+    """Return the enlarged noise of presses, pC, and the changes of their targets, in double precision."""
+    charge = torch.tensor(bell_charges(CONTACT)).float()[rows]
+    drawn = fresh_noise(charge, noise, torch.Generator().manual_seed(seed))
+    enlarged, change, _ = targets.enlarge(drawn, rows)
+    return enlarged.double().numpy(), change.double().numpy()
+
+
 def nonlinear_estimate(charge, noise_std):
     """Return the contact in unit coordinates with the smallest sum of squared residuals, found by SciPy."""
 
@@ -47,12 +56,13 @@ def nonlinear_estimate(charge, noise_std):
 def test_targets_are_the_least_squares_estimates_of_the_charges_with_noise(gain):
     noise = NoiseModel("small", white=1.0, gain=gain)
     targets = targets_of(noise)
-    batch = targets.draw(torch.arange(len(CONTACT)), torch.Generator().manual_seed(3))
+    enlarged, target_change = draw(targets, noise, torch.arange(len(CONTACT)), seed=3)
     noise_std = noise.sigma(bell_charges(CONTACT))
-    estimates = [nonlinear_estimate(charge, std) for charge, std in zip(batch.charge.numpy(), noise_std, strict=True)]
+    noisy = bell_charges(CONTACT) + enlarged
+    estimates = [nonlinear_estimate(charge, std) for charge, std in zip(noisy, noise_std, strict=True)]
     change = np.array(estimates) - DOMAIN.to_unit(CONTACT)
     assert np.abs(change).max() > 1e-3  # the noise changes the estimates clearly
-    np.testing.assert_allclose(batch.target - targets.contact, change, rtol=0.05, atol=2e-5)
+    np.testing.assert_allclose(target_change, change, rtol=0.05, atol=2e-5)
 
 
 def test_the_noise_is_enlarged_until_the_contact_would_be_too_uncertain_for_a_linear_estimate():
@@ -62,13 +72,11 @@ def test_the_noise_is_enlarged_until_the_contact_would_be_too_uncertain_for_a_li
     factor = targets.noise_factor.numpy()[:, 0]
     assert np.all((factor > 1.0) & (factor <= MAX_NOISE_FACTOR))
     rows = torch.arange(len(CONTACT)).repeat(20_000)
-    batch = targets.draw(rows, torch.Generator().manual_seed(4))
-    drawn_noise = (batch.charge - targets.charge[rows]).double().numpy().reshape(-1, *targets.charge.shape)
+    enlarged, target_change = draw(targets, noise, rows, seed=4)
     expected_std = factor[:, None] * noise.sigma(bell_charges(CONTACT))
-    np.testing.assert_allclose(drawn_noise.std(axis=0), expected_std, rtol=0.02)
+    np.testing.assert_allclose(enlarged.reshape(-1, *expected_std.shape).std(axis=0), expected_std, rtol=0.02)
 
-    changes = (batch.target - targets.contact[rows]).double().numpy().reshape(-1, len(CONTACT), 3)
-    largest_std = changes.std(axis=0).max(axis=1)
+    largest_std = target_change.reshape(-1, len(CONTACT), 3).std(axis=0).max(axis=1)
     assert np.all(largest_std < 1.02 * LARGEST_LINEAR_STD)
     is_limited = factor < MAX_NOISE_FACTOR
     assert np.any(is_limited)
@@ -79,6 +87,6 @@ def test_a_press_with_an_uncertain_contact_keeps_its_contact_as_the_target_and_i
     noise = NoiseModel("very large", white=2_000.0, gain=0.0)
     targets = targets_of(noise)
     assert torch.all(targets.noise_factor == 1.0)
-    batch = targets.draw(torch.tensor([2, 0]), torch.Generator().manual_seed(5))
-    assert torch.equal(batch.target, targets.contact[[2, 0]])
-    assert not torch.equal(batch.charge, targets.charge[[2, 0]])
+    enlarged, target_change = draw(targets, noise, torch.tensor([2, 0]), seed=5)
+    assert not target_change.any()
+    assert enlarged.any()

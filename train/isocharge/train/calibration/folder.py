@@ -388,7 +388,7 @@ def with_guarantee(fitted: Fitted, held_out: MeasuredPresses) -> Fitted:
         fitted: The network.
         held_out: Presses that `usable_held_out` returned.
     """
-    contact, std, _ = fitted.network.predict(held_out.charge_pC)
+    contact, std, _ = fitted.predict(held_out.charge_pC)
     std_factor = StdFactor.from_errors(contact - held_out.contact, std)
     return replace(
         fitted,

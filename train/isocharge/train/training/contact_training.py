@@ -24,7 +24,6 @@ the target is the contact, and the noise is not enlarged.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -156,39 +155,19 @@ MAX_NOISE_FACTOR = 5.0
 """Largest factor by which the noise of a press is enlarged, dimensionless."""
 
 
-class TargetBatch(NamedTuple):
-    """Charges with noise, and the targets that the network learns from these charges.
-
-    Attributes:
-        charge: Charges with noise, shape (n, n_electrode), pC.
-        target: Unit coordinates that the mean of the network should have, shape (n, 3).
-        noise_factor: Factor by which the noise was enlarged, shape (n, 1).
-    """
-
-    charge: Tensor
-    target: Tensor
-    noise_factor: Tensor
-
-
 @dataclass(frozen=True)
 class LinearTargets:
-    """Presses without noise, and matrices that determine how the targets change with the noise that is added later.
+    """Matrices that determine how the targets of presses change with the noise that is added to the charges.
 
     Attributes:
-        charge: Charges without noise, shape (n, n_electrode), pC.
-        contact: Contacts in unit coordinates, shape (n, 3).
         noise_response: Matrices, shape (n, 3, n_electrode), 1/pC. The matrix of a press times the vector of its noise
             is the change of its estimated contact. The matrix is zero if the estimated contact of a press is not linear
             in the noise.
         noise_factor: Factor by which the noise of each press is enlarged, shape (n, 1).
-        noise: Noise of the charges.
     """
 
-    charge: Tensor
-    contact: Tensor
     noise_response: Tensor
     noise_factor: Tensor
-    noise: Noise
 
     @classmethod
     def compute(cls, presses: LabelledPresses, charge_map: ChargeMap, noise: Noise) -> "LinearTargets":
@@ -221,25 +200,24 @@ class LinearTargets:
         noise_response[~is_linear] = 0.0
         noise_factor = np.clip(LARGEST_LINEAR_STD / largest_std, 1.0, MAX_NOISE_FACTOR)
         return cls(
-            charge=as_tensor(presses.charge),
-            contact=as_tensor(domain.to_unit(presses.contact)),
             noise_response=as_tensor(np.asarray(noise_response, dtype=float)),
             noise_factor=as_tensor(np.asarray(noise_factor[:, None], dtype=float)),
-            noise=noise,
         )
 
-    def draw(self, rows: Tensor, random: torch.Generator) -> TargetBatch:
-        """Add new noise to the charges of some presses, and compute the targets for these charges.
+    def enlarge(self, noise: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Enlarge the noise of some presses, and compute the changes of their targets in unit coordinates.
 
         Args:
-            rows: Indices of the presses, shape (n,).
-            random: Random number generator of the noise.
+            noise: Noise of the charges, shape (m, n_electrode), pC.
+            rows: Indices of the presses, shape (m,).
+
+        Returns:
+            The enlarged noise, the changes, shape (m, 3), and the factors of the noise, shape (m, 1).
         """
-        charge = self.charge[rows]
         noise_factor = self.noise_factor[rows]
-        noise = noise_factor * fresh_noise(charge, self.noise, random)
-        contact_change = (self.noise_response[rows] @ noise[:, :, None])[:, :, 0]  # matrix times vector, shape (n, 3)
-        return TargetBatch(charge + noise, self.contact[rows] + contact_change, noise_factor)
+        enlarged_noise = noise_factor * noise
+        contact_change = (self.noise_response[rows] @ enlarged_noise[:, :, None])[:, :, 0]  # matrix times vector
+        return enlarged_noise, contact_change, noise_factor
 
 
 def contact_stage(
@@ -277,17 +255,17 @@ def contact_stage(
             random: Random number generator of the batch and of its noise.
         """
         rows = torch.randint(len(charge), (batch,), generator=random)
+        added_noise = fresh_noise(charge[rows], noise, random)
         contact = unit_contact[rows]
+        target = contact
+        noise_factor = torch.ones(())
         if linear_targets is not None and progress < LINEAR_TARGET_FRACTION:
-            noisy_batch, target, noise_factor = linear_targets.draw(rows, random)
-            posterior = network.posterior(noisy_batch)
-            # The errors are proportional to the noise. The division by the factor gives the errors that charges with
-            # their usual noise would cause.
-            return contact_loss(posterior, target, (contact - posterior.mean) / noise_factor)
-
-        noisy_batch = charge[rows] + fresh_noise(charge[rows], noise, random)
-        posterior = network.posterior(noisy_batch)
-        return contact_loss(posterior, contact, contact - posterior.mean)
+            added_noise, contact_change, noise_factor = linear_targets.enlarge(added_noise, rows)
+            target = contact + contact_change
+        posterior = network.posterior(charge[rows] + added_noise)
+        # The errors are proportional to the noise. The division by the factor gives the errors that charges with their
+        # usual noise would cause.
+        return contact_loss(posterior, target, (contact - posterior.mean) / noise_factor)
 
     sizes = config.sizes(network.features.n_electrode)
     rate = config.learning_rate * sizes.rate_factor

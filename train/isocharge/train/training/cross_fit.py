@@ -308,7 +308,9 @@ def _cross_validated_answers(
     answers = Answers(np.empty_like(unit_contact), np.empty_like(unit_contact), np.empty((len(charge), 1)))
     for fold_index, network in enumerate(fold_networks):
         is_in_fold = fold_of_press == fold_index
-        answers.contact[is_in_fold], answers.std[is_in_fold], _ = fold_network(network).predict(charge[is_in_fold])
+        contact, std, *_ = fold_network(network).outputs(charge[is_in_fold])
+        answers.contact[is_in_fold] = contact
+        answers.std[is_in_fold] = std
         planes = LocalPlanes.fit(unit_contact[~is_in_fold], level[~is_in_fold])
         residual = planes.residuals(level[is_in_fold])
         answers.misfit[is_in_fold] = np.linalg.norm(residual, axis=1, keepdims=True)

@@ -87,17 +87,10 @@ class Fitted:
     outside: OutsidePresses | None = None
     yield_force_N: float | None = None
 
-    def predict(self, charge: Array) -> tuple[Array, Array, Array]:
-        """Estimate contacts.
-
-        Args:
-            charge: Charges, shape (n, n_electrode), pC.
-
-        Returns:
-            Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3). Misfits,
-            shape (n, 1).
-        """
-        return self.network.predict(charge)
+    def predict(self, charge: Array) -> Answers:
+        """Estimate the contacts of presses from their charges, shape (n, n_electrode), pC."""
+        contact, std, _, misfit = self.network.outputs(charge)
+        return Answers(contact, std, misfit)
 
 
 _log = logging.getLogger(__name__)

@@ -218,19 +218,6 @@ class FoldedNetwork:
     contact: Perceptron
     misfit: Perceptron
 
-    def predict(self, charge: Array) -> tuple[Array, Array, Array]:
-        """Estimate contacts.
-
-        Args:
-            charge: Charges, shape (n, n_electrode), pC.
-
-        Returns:
-            Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3). Misfits,
-            shape (n, 1).
-        """
-        contact, std, _, misfit = self.outputs(charge)
-        return contact, std, misfit
-
     def outputs(self, charge: Array) -> tuple[Array, Array, Array, Array]:
         """Compute the outputs of the graph in double precision.
 
@@ -238,8 +225,8 @@ class FoldedNetwork:
             charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
-            Contacts and standard deviations, as `predict` returns them. Correlations, shape (n, 3). Misfits, shape
-            (n, 1).
+            Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3). Correlations,
+            shape (n, 3). Misfits, shape (n, 1), in standard deviations of the noise.
         """
         outputs: Any = ReferenceEvaluator(self.onnx_model(np.float64)).run(None, {INPUT: charge.astype(float)})
         contact, std, correlation, misfit = outputs
