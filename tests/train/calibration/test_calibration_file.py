@@ -57,8 +57,11 @@ def changed(key, value):
 
 
 FAULTS = {
-    "older": (changed("format_version", 4), "format_version: expected 5, got 4: .* calibrate again with its presses"),
-    "no version": (lambda table: table.pop("format_version"), "format_version: expected 5, got None"),
+    "older": (changed("format_version", 4), "format_version: expected 5, got 4; .* calibrate again with its presses"),
+    "no version": (
+        lambda table: table.pop("format_version"),
+        "key 'format_version' is missing; .* calibrate again with its presses",
+    ),
     "sensor": (changed("sensor", "mine"), "sensor: expected four-25um-biaxial, as in this calibration, got mine"),
     "probe": (changed("probe", "circle:2"), "probe: expected circle:1"),
     "radius": (changed("radius_mm", 10.0), "radius_mm: expected 8"),

@@ -33,10 +33,10 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace as replace_setting
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import ModelError, PressError, cut, shown
+from isocharge.common.errors import ModelError, PressError, cut
 from isocharge.common.files import as_output_errors, locked, remove_empty, write_whole
 from isocharge.common.json_values import plain_values
-from isocharge.common.structs import Text, convert, read_json
+from isocharge.common.structs import Text, read_json
 from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.model_folder import check_target
@@ -52,9 +52,6 @@ from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.model_release.release import release
 from isocharge.train.training.config import FitConfig
 from isocharge.train.training.fit import Fitted, fit
-
-FORMAT_VERSION = 5
-"""Version of the file format that this module writes and reads."""
 
 DIGITS = 6
 """Number of decimal digits of a correlation."""
@@ -74,6 +71,7 @@ class _Unknown(Struct, frozen=True):
 class _CalibrationFile(Struct, frozen=True):
     """Entries of calibration.json that `read_film` uses."""
 
+    format_version: Annotated[int, Meta(ge=5, le=5, description="5")]
     sensor: Text
     probe: Text
     radius_mm: Number
@@ -96,7 +94,7 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
     correlations = np.divide(film.covariance, product, out=np.zeros_like(product), where=product > 0.0)
     rounded = np.clip(np.round(correlations, DIGITS), -1.0, 1.0)
     return {
-        "format_version": FORMAT_VERSION,
+        "format_version": 5,  # the version that `_CalibrationFile` reads
         "sensor": problem.sensor.name,
         "probe": problem.probe.notation,
         "radius_mm": problem.radius,
@@ -127,14 +125,11 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
         PressError: If the file does not fit the format, belongs to another sensor, probe or working area, or contains
             numbers that no calibration can have written.
     """
-    table = read_json(path, "the calibration.json of `train calibrate`", PressError, dict[str, Any])
-    version = table.get("format_version")
-    if version != FORMAT_VERSION:
-        raise PressError(
-            f"{path}: format_version: expected {FORMAT_VERSION}, got {shown(version)}: another version of isocharge "
-            "wrote this calibration; calibrate again with its presses"
-        )
-    content = convert(table, _CalibrationFile, str(path), PressError)
+    try:
+        content = read_json(path, "the calibration.json of `train calibrate`", PressError, _CalibrationFile)
+    except PressError as error:
+        advice = "if another version of isocharge wrote this calibration, calibrate again with its presses"
+        raise PressError(f"{error}; {advice}") from error
     _check_same_problem(path, content, problem)
 
     layout = problem.prior.layout
@@ -181,9 +176,8 @@ def _correlations(path: Path, rows: list[list[float]], count: int) -> Array:
             f"got {len(rows)} rows of other lengths; calibrate again"
         )
     matrix = np.eye(count)
-    for index, row in enumerate(rows):
-        matrix[index, :index] = row
-        matrix[:index, index] = row
+    lower = np.tril_indices(count, -1)
+    matrix[lower] = matrix.T[lower] = [number for row in rows for number in row]
     eigenvalues, vectors = np.linalg.eigh(matrix)
     largest_rounding_error = count * 10.0**-DIGITS  # of an eigenvalue, if each correlation was rounded
     if eigenvalues[0] < -largest_rounding_error:

@@ -83,36 +83,18 @@ class PressedArea(Domain):
         """Half widths of the ranges of x, y and ln F, shape (3,), with x and y in mm and F in N."""
         return np.append(0.5 * np.ptp(np.array(self.corners), axis=0), super().scale[2])
 
-    @property
-    def _allowed_positions(self) -> str:
-        """Description of the allowed positions for error messages."""
-        left, bottom = np.min(self.corners, axis=0)
-        right, top = np.max(self.corners, axis=0)
-        return f"a place in the pressed area, x from {left:g} to {right:g} mm and y from {bottom:g} to {top:g} mm,"
-
     def is_outside(self, contact: Array) -> Booleans:
-        """Return whether each contact is outside the area or outside the range of forces.
+        """Return whether each contact lies outside the area or has a force outside the range of forces.
 
         Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts with NaN do not count as outside.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N. A position or a force that is NaN counts as inside.
 
         Returns:
-            Whether each contact is outside, shape (n,).
+            Whether each contact lies outside, shape (n,).
         """
-        is_known = ~np.isnan(contact).any(axis=1)
-        return np.asarray(is_known & ~self.contains(contact))
-
-    def contains(self, contact: Array) -> Booleans:
-        """Return whether each contact lies in the area and in the range of forces.
-
-        Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts with NaN do not lie in the domain.
-
-        Returns:
-            Whether each contact lies in the domain, shape (n,).
-        """
-        has_force = Domain(np.inf, self.force_range).contains(contact)
-        return has_force & inside_polygon(contact[:, 0], contact[:, 1], np.array(self.corners))
+        x, y, _ = contact.T
+        is_off_area = np.isfinite(x + y) & ~inside_polygon(x, y, np.array(self.corners))
+        return np.asarray(is_off_area | Domain(np.inf, self.force_range).is_outside(contact))
 
 
 def _box_middle(corners: Array) -> Array:
@@ -171,9 +153,8 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
         presses: The presses. None of their positions, forces and charges may be unknown.
 
     Raises:
-        PressError: If the charges of a channel hardly vary, if a value is far from all
-            others, if channels depend linearly on each other, or if the positions enclose no area. The message names
-            the channels, or the line and the column.
+        PressError: If the charges of a channel hardly vary, if a value is far from all others, or if channels depend
+            linearly on each other. The message names the channels, or the line and the column.
     """
     channels = dict(zip(presses.electrodes, presses.charge_pC.T, strict=True))
     contact_columns = dict(zip(CONTACT, presses.contact.T, strict=True))
@@ -186,7 +167,6 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
     force = contact_columns["force_N"]
     _check_far_value(presses, "force_N", force, compared_values=1.0 / force)
     _check_independence(channels)
-    PressedArea.of_contacts(presses.contact)  # raises if the positions enclose no area
 
 
 def _check_variation(name: str, charge: Array) -> None:

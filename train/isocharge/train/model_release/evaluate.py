@@ -5,7 +5,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array
 from isocharge.serve.flags import STRESS
 from isocharge.serve.model.contact import Contacts
 from isocharge.serve.model.metadata import ModelMetadata, UnnoticedPresses
@@ -186,25 +186,10 @@ def unnoticed_presses(fitted: Fitted, metadata: ModelMetadata) -> UnnoticedPress
     contact, std, misfit = fitted.predict(presses.noisy(misfit_noise(fitted.noise), seed=11))
     is_value_wrong = np.abs(contact - presses.contact) > WRONG_STDS * std  # for x, y and F, shape (n, 3)
     is_wrong = is_value_wrong.any(axis=1)
-    is_unnoticed = is_wrong & ~is_flagged(metadata, contact, std, misfit)
-    return outside.unnoticed_shares(is_unnoticed)
 
-
-def is_flagged(metadata: ModelMetadata, contact: Array, std: Array, misfit: Array) -> Booleans:
-    """Return whether each answer carries a flag that warns of a wrong answer.
-
-    All flags except `stress` are such warnings. The flag `stress` means that the film may be damaged.
-
-    Args:
-        metadata: Metadata of the model.
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        std: Standard deviations of the contacts, shape (n, 3), mm, mm and N.
-        misfit: Misfits, shape (n, 1).
-
-    Returns:
-        Whether each answer carries such a flag, shape (n,).
-    """
+    # The flag `stress` means that the film may be damaged. All other flags warn of a wrong answer.
     correlation = np.full_like(std, np.nan)  # no flag depends on the correlations
-    fields = np.concatenate([contact, std, misfit, correlation], axis=1).T  # one row for each field of `Contacts`
-    flags = Validity.of(metadata).batch_flags(Contacts(*fields))
-    return np.array([any(flag != STRESS for flag in answer_flags) for answer_flags in flags])
+    contacts = Contacts(*np.concatenate([contact, std, misfit, correlation], axis=1).T)
+    flags = Validity.of(metadata).batch_flags(contacts)
+    is_flagged = np.array([any(flag != STRESS for flag in answer_flags) for answer_flags in flags])
+    return outside.unnoticed_shares(is_wrong & ~is_flagged)

@@ -18,7 +18,7 @@ from isocharge.serve.model.model_folder import write_model
 from isocharge.serve.model.validity import disk_corners
 from isocharge.train.data.channel_noise import misfit_noise
 from isocharge.train.data.measured_sensor import PressedArea
-from isocharge.train.model_release.evaluate import HELD_PRESSES, evaluate, unnoticed_presses
+from isocharge.train.model_release.evaluate import evaluate, unnoticed_presses
 from isocharge.train.model_release.onnx_graph import check_graph, write_graph
 from isocharge.train.training.fit import Fitted
 
@@ -68,7 +68,7 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     """
     electrodes = metadata.electrodes
     sensor_name = metadata.sensor["name"]
-    is_measured = HELD_PRESSES in metadata.errors
+    is_measured = "measured" in metadata.made_with
     noise = zip(electrodes, *metadata.noise.for_each_electrode(len(electrodes)), strict=True)
     noise_text = "; ".join(f"{name} {white:g} pC and {100 * gain:.3g} %" for name, white, gain in noise)
     error_rows = "\n".join(

@@ -178,18 +178,14 @@ class TrainablePerceptron(nn.Module):
         """Return the hidden layers and the output layer, from first to last."""
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
-    def hidden_matrices(self) -> list[Tensor]:
-        """Return the weight matrices between hidden layers, each of shape (n_output, n_input)."""
-        _, *between, _ = self.linear_layers()
-        return [layer.weight for layer in between]
-
     def round_hidden_matrices(self) -> None:
         """Round the weights between hidden layers to 8 bits, and exclude these weights from further training.
 
         Each rounded weight is the product of a scale and an integer from -127 to 127. All weights that lead to the same
         unit have the same scale.
         """
-        for matrix in self.hidden_matrices():
+        _, *between, _ = self.linear_layers()
+        for matrix in (layer.weight for layer in between):
             weights = matrix.detach()  # shares its memory with the matrix, so that `copy_` below changes the matrix
             scale = weights.abs().amax(dim=1, keepdim=True) / LARGEST_INT8  # shape (n_output, 1)
             integers = torch.round(weights / scale.clamp(min=torch.finfo(weights.dtype).tiny))
