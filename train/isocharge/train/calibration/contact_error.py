@@ -21,7 +21,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM
-from isocharge.simulate import Domain
+from isocharge.simulate import Domain, Sweep
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.estimator import PLANNED
@@ -85,7 +85,7 @@ class ContactSensitivity:
             unknowns: Unknowns of the film, shape (n_unknown,).
         """
         domain = problem.domain
-        data, contact = _ideal_presses(problem, charges, unknowns, spread_contacts(domain, N_CONTACTS))
+        data, contact = _ideal_presses(problem, charges, unknowns, spread_contacts(domain))
         linearised = linearise(charges, problem.prior.layout, data, unknowns, contact)
         slopes = linearised.contact_jacobian[:, :-3]
         domain_precision = np.diag(3.0 / domain.scale**2)  # the variance of a uniform distribution from -1 to 1 is 1/3
@@ -184,18 +184,15 @@ def next_presses(
     return proposed
 
 
-def spread_contacts(domain: Domain, count: int) -> Array:
-    """Return contacts (x, y, F) that cover a domain evenly, shape (count, 3), mm and N."""
-    point = sunflower(count) * domain.radius
-    shares = np.random.default_rng(0).permutation((np.arange(count) + 0.5) / count)
-    low, high = np.log(domain.force_range)
-    return np.column_stack([point, np.exp(low + shares * (high - low))])
+def spread_contacts(domain: Domain) -> Array:
+    """Return `N_CONTACTS` contacts (x, y, F) that cover a domain evenly, shape (N_CONTACTS, 3), mm and N."""
+    return Sweep(domain.radius, domain.force_range, N_CONTACTS).contacts()
 
 
 def _candidates(problem: CalibrationProblem) -> Array:
     """Return the presses that are compared, (x, y, F), shape (n, 3)."""
     domain = problem.domain
-    grid_position = np.unique(np.round(spread_contacts(domain, N_CONTACTS)[:, :2] / GRID_MM), axis=0)
+    grid_position = np.unique(np.round(sunflower(N_CONTACTS) * domain.radius / GRID_MM), axis=0)
     position = GRID_MM * grid_position
     position = position[np.hypot(*position.T) <= domain.radius]
     low, high = domain.force_range

@@ -8,7 +8,7 @@ from matplotlib.ticker import MaxNLocator
 
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_layout
-from isocharge.train.calibration.contact_error import N_CONTACTS, spread_contacts
+from isocharge.train.calibration.contact_error import spread_contacts
 from isocharge.train.calibration.result import CalibrationResult
 
 FITTED = "#3a7ca5"
@@ -41,7 +41,7 @@ def _draw_error(axes: Any, result: CalibrationResult) -> None:
         axes: Axes of matplotlib.
         result: The calibration, which defines the contacts.
     """
-    x, y, _ = spread_contacts(result.problem.domain, N_CONTACTS).T
+    x, y, _ = spread_contacts(result.problem.domain).T
     error_mm = result.sensitivity.position_errors_mm(result.film.covariance)
     points = axes.scatter(x, y, c=error_mm, s=60)
     axes.figure.colorbar(points, ax=axes, label="position error by the film, mm")
