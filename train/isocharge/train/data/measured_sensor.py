@@ -83,6 +83,13 @@ class PressedArea(Domain):
         """Half widths of the ranges of x, y and ln F, shape (3,), with x and y in mm and F in N."""
         return np.append(0.5 * np.ptp(np.array(self.corners), axis=0), super().scale[2])
 
+    @property
+    def _allowed_positions(self) -> str:
+        """Description of the allowed positions for error messages."""
+        left, bottom = np.min(self.corners, axis=0)
+        right, top = np.max(self.corners, axis=0)
+        return f"a place in the pressed area, x from {left:g} to {right:g} mm and y from {bottom:g} to {top:g} mm,"
+
     def is_outside(self, contact: Array) -> Booleans:
         """Return whether each contact lies outside the area or has a force outside the range of forces.
 

@@ -110,26 +110,21 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     if any(layer.bias.shape != layer.weight.shape[1:] for layer in (*hidden, last, Layer(skip, bias))):
         raise ValueError("expected a bias for each column of the weights")
 
-    # Part the layers of both perceptrons, from the last to the first. The inputs of the misfit perceptron begin at the
-    # first input with a weight for one of its outputs.
-    contact_layers = []
-    misfit_layers = []
-    width = ANGLES.stop  # number of outputs of a layer that belong to the contact perceptron
-    for weight, bias in (last, *hidden[:0:-1]):
-        input_width = int(weight[:, width:].any(axis=1).argmax())
-        contact_layers.append(Layer(weight[:input_width, :width], bias[:width]))
-        misfit_layers.append(Layer(weight[input_width:, width:], bias[width:]))
-        width = input_width
-    weight, bias = hidden[0]
-    contact_layers.append(Layer(weight[:, :width], bias[:width]))
-    misfit_layers.append(Layer(weight[:, width:], bias[width:]))
+    # In the outputs of each layer, find where those of the misfit perceptron begin, from the last layer to the first.
+    # The inputs of the misfit perceptron begin at the first input with a weight for one of its outputs.
+    starts = [ANGLES.stop]
+    for weight, _ in (last, *hidden[:0:-1]):
+        starts.append(int(weight[:, starts[-1] :].any(axis=1).argmax()))
 
-    def perceptron(layers: list[Layer], skip: Array) -> Perceptron:
-        """Return the perceptron of layers in the order from the last to the first."""
-        return Perceptron(tuple(layers[:0:-1]), layers[0], skip, activation)
+    def perceptron(*columns: slice) -> Perceptron:
+        """Return the perceptron to which some outputs of each layer belong, from the first layer to the last."""
+        rows = (slice(None), *columns)  # both perceptrons have the same inputs
+        parts = zip((*hidden, last), rows, columns, strict=False)
+        *hidden_parts, last_part = (Layer(weight[row, column], bias[column]) for (weight, bias), row, column in parts)
+        return Perceptron(tuple(hidden_parts), last_part, skip[:, columns[-1]], activation)
 
-    contact = perceptron(contact_layers, skip[:, : ANGLES.stop])
-    return FoldedNetwork(features, contact, perceptron(misfit_layers, skip[:, ANGLES.stop :]))
+    contact = perceptron(*(slice(start) for start in reversed(starts)))
+    return FoldedNetwork(features, contact, perceptron(*(slice(start, None) for start in reversed(starts))))
 
 
 OutputFunction = Callable[[Array], tuple[Array, ...]]
