@@ -198,6 +198,27 @@ def test_unknown_channels_are_refused(names, channels, message):
         stage.step(Frame(0, 0, (1.0,) * (len(names) or 3), names=names))
 
 
+@pytest.mark.parametrize(
+    "notation",
+    [
+        "C,A,B: {c},{a},{b}",
+        "C A B {c} {a} {b}",
+        "C/A/B={c}/{a}/{b}",
+        '{{"electrodes": ["C", "A", "B"], "q": [{c}, {a}, {b}]}}',
+        '[{{"name": "C", "q": {c}}}, {{"name": "A", "q": {a}}}, {{"name": "B", "q": {b}}}]',
+        "{c} pC C, {a} pC A, {b} pC B",
+        "electrode,C,charge,{c},electrode,A,charge,{a},electrode,B,charge,{b}",
+        "C,{c},A,{a},B,{b},T,23",
+        "phase A: {a}, {b}, {c}",
+    ],
+)
+def test_names_in_a_line_of_text_are_not_ignored(notation):
+    lines = "".join("\n" + notation.format(a=100.5 + n, b=200.5 + n, c=300.5 + n) for n in range(12))
+    frame = TextParser().feed(lines.encode())[0]
+    Channels(Setup(ELECTRODES)).step(frame)
+    assert frame.sent.tolist() == [100.5, 200.5, 300.5]
+
+
 def test_tare_error_states_the_offset_for_the_device_file():
     stream = ReadingStream(ELECTRODES, device_from_table({"tare": {"frames": 5, "patience": 10}}, "board.toml"))
     frames = [Frame(number, 5000 * number, (2048.0, 2050.5, 2047.0)) for number in range(20)]

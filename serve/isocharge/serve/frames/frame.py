@@ -55,6 +55,7 @@ class Frame:
         values: One value for each channel, in the unit of the device. In the binary frame of isocharge, the unit is pC.
         bits: Flags that the device sends; see `SATURATED_BIT`.
         names: Names of the channels; empty if the format has no names.
+        words: Words in the line of text, in their order; empty for other formats.
         host_s: Time of the host, unix seconds. It is computed from the clock of the device. If the device sends no
             clock, it is computed from the arrival time. The time decreases only if a clock was set.
         device_us: Clock of the device after the wraps were removed, us; None if the device sends no clock.
@@ -85,6 +86,7 @@ class Frame:
     values: tuple[float, ...]
     bits: int = 0
     names: tuple[str, ...] = ()
+    words: tuple[str, ...] = field(default=(), repr=False, compare=False)
     host_s: float = 0.0
     device_us: int | None = None
     dt_s: float = 0.0
@@ -171,6 +173,7 @@ class Columns:
         names: Names of all columns; an empty text for a column without a name.
         scales: Factor by which the numbers of each column are multiplied.
         flags_column: Index of the column with the flags; None if there is no such column.
+        words: Words in the line of text.
 
     Attributes:
         seq_column: Index of the column with the frame counter; None if there is no such column.
@@ -180,7 +183,13 @@ class Columns:
         names: Names of the channels; empty if they have no names.
     """
 
-    def __init__(self, names: Sequence[str], scales: Sequence[float], flags_column: int | None = None) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        scales: Sequence[float],
+        flags_column: int | None = None,
+        words: tuple[str, ...] = (),
+    ) -> None:
         """Use the column names to find the columns of the frame counter, the clock and the channels.
 
         If there are several clocks, the first clock in the order of `TIMES_US` is used, and the other clocks are
@@ -190,7 +199,9 @@ class Columns:
             names: Names of all columns; an empty text for a column without a name.
             scales: Factor by which the numbers of each column are multiplied.
             flags_column: Index of the column with the flags; None if there is no such column.
+            words: Words in the line of text.
         """
+        self._words = words
         self.seq_column = names.index(SEQ) if SEQ in names else None
         self.flags_column = flags_column
 
@@ -226,6 +237,7 @@ class Columns:
             values=tuple([numbers[column] * scale for column, scale in self.channels]),  # faster than a generator
             bits=0 if self.flags_column is None else int(numbers[self.flags_column]),
             names=self.names,
+            words=self._words,
         )
 
 

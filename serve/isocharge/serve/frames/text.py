@@ -72,6 +72,7 @@ class Layout:
         self.example = lines[0]
         self.patterns = [skeleton_pattern(line) for line in lines]
         names = [name for line in lines for name in line.names]
+        self._words = tuple(word for line in lines for word in line.words)
         self.unnamed = [index for index, name in enumerate(names) if not name]
         self.set_names(names)
 
@@ -79,7 +80,7 @@ class Layout:
         """Store the names of all values, and find the columns of the frame counter, the clock and the channels."""
         self.names = tuple(names)
         scales = (1.0,) * len(self.names)  # values in text have no scale
-        self.columns = Columns(self.names, scales)
+        self.columns = Columns(self.names, scales, words=self._words)
 
     def name_unnamed(self, names: Sequence[str]) -> bool:
         """Give names to the values that have none in the lines, and return whether the number of names fits."""

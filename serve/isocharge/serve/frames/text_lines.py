@@ -124,6 +124,7 @@ class Line(NamedTuple):
         starts: Position in the line at which each number begins.
         is_prose: Whether the line resembles a message, such as `Channel 3 is ready`, because it has at least as many
             words as numbers. Keys, and words after a comma or another mark, do not count.
+        words: The keys, words and texts in quotes.
     """
 
     text: str
@@ -132,6 +133,7 @@ class Line(NamedTuple):
     numbers: tuple[str, ...]
     starts: tuple[int, ...]
     is_prose: bool
+    words: tuple[str, ...]
 
 
 def clean_text(text: str) -> str:
@@ -204,7 +206,8 @@ def parse_line(text: str, *, has_header: bool = False) -> Line:
     numbers = tuple(token.content for token in number_tokens)
     starts = tuple(token.start for token in number_tokens)
     is_prose = word_count >= len(numbers)
-    return Line(text, skeleton + _CODES["end"], tuple(names_with_units), numbers, starts, is_prose)
+    words = tuple(token.name for token in tokens if token.kind not in ("mark", *_NUMBER_KINDS))
+    return Line(text, skeleton + _CODES["end"], tuple(names_with_units), numbers, starts, is_prose, words)
 
 
 def _has_decimal_commas(text: str) -> bool:

@@ -22,8 +22,10 @@ class Channels(Stage):
     The section `[channels]` of the device file states the name or the number of the channel of each electrode. If the
     device file has no section `[channels]`, a channel belongs to the electrode whose name is among the words of the
     channel's name, as in `A_pC`, `charge.A` or `electrode a`, or is the part in which the names of the channels differ,
-    as in `chA`, `chB` and `chC`. If no channel has the name of an electrode, the channels are assigned by their order,
-    which requires as many channels as electrodes. If the channels are numbered, the numbers must increase.
+    as in `chA`, `chB` and `chC`. If no channel has the name of an electrode, but all names of the electrodes stand in
+    the line of text, as in `C,A,B: 3,1,2`, the channels are assigned by the order of the names. Otherwise the channels
+    are assigned by their order, which requires as many channels as electrodes. If the channels are numbered, the
+    numbers must increase.
     """
 
     is_required = True
@@ -84,32 +86,39 @@ class Channels(Stage):
     def named_indices(self, frame: Frame) -> tuple[int, ...] | None:
         """Return, for each electrode, the index of the channel with its name in `frame.values`.
 
-        The result is None if no channel has the name of an electrode.
+        The result is None if no channel has the name of an electrode, and the names do not stand in the line of text.
 
         Raises:
             ChargeError: If not exactly one channel has the name of each electrode, or if a channel states a unit other
                 than pC and the gain is not known.
         """
-        names = frame.names
-        if not names:
-            return None
-        advice = "" if self._allows_any_unit else _unit_advice(names)
-        folded_names = [name.casefold() for name in names]
-        words = [
-            {*_words_of(name), distinctive_part}
-            for name, distinctive_part in zip(folded_names, _distinctive_parts(folded_names), strict=True)
-        ]
-        indices = [
-            [index for index, channel_words in enumerate(words) if channel_words.issuperset(electrode_words)]
-            for electrode_words in (_words_of(electrode.casefold()) for electrode in self._electrodes)
-        ]
+        advice = "" if self._allows_any_unit else _unit_advice(frame.names)
+        indices = self._matches(frame.names)
         if all(len(indices_of_electrode) == 1 for indices_of_electrode in indices) and not advice:
             return tuple(indices_of_electrode[0] for indices_of_electrode in indices)
 
         # Names of which some are those of electrodes must not be assigned by their order.
         if any(indices) or advice:
             raise self._assignment_error(frame, advice)
-        return None
+
+        # The names may stand in the line in the order of the values, but not beside the values.
+        places = self._matches(tuple(word for text in frame.words for word in _words_of(text)))
+        has_all_names = all(len(places_of_electrode) == 1 for places_of_electrode in places)
+        if not has_all_names or len(frame.values) != len(self._electrodes):
+            return None
+        return tuple(np.argsort(np.argsort(np.ravel(places))).tolist())  # rank of each electrode in the line
+
+    def _matches(self, names: tuple[str, ...]) -> list[list[int]]:
+        """Return, for each electrode, the indices of the names that contain its name; see the class."""
+        folded_names = [name.casefold() for name in names]
+        words = [
+            {*_words_of(name), distinctive_part}
+            for name, distinctive_part in zip(folded_names, _distinctive_parts(folded_names), strict=True)
+        ]
+        return [
+            [index for index, channel_words in enumerate(words) if channel_words.issuperset(electrode_words)]
+            for electrode_words in (_words_of(electrode.casefold()) for electrode in self._electrodes)
+        ]
 
     def _assignment_error(self, frame: Frame, advice: str = "") -> ChargeError:
         """Return the error for a frame whose channels cannot be assigned to the electrodes.
