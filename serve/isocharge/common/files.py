@@ -124,10 +124,8 @@ def write_whole(path: Path, data: bytes) -> None:
     """
     temporary_path = _temporary_path(path)
     try:
-        with temporary_path.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+        temporary_path.write_bytes(data)
+        flush_to_disk(temporary_path)
         temporary_path.replace(path)
     finally:
         temporary_path.unlink(missing_ok=True)  # a file with the temporary name only exists if an error occurred

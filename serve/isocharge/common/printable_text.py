@@ -7,25 +7,14 @@ text in JSON therefore remains valid JSON.
 """
 
 import json
+import re
 
-IGNORABLE_RANGES = (
-    (0x034F, 0x034F),
-    (0x115F, 0x1160),
-    (0x17B4, 0x17B5),
-    (0x180B, 0x180F),
-    (0x3164, 0x3164),
-    (0xFE00, 0xFE0F),
-    (0xFFA0, 0xFFA0),
-    (0xE0100, 0xE01EF),
-)
-"""Ranges of invisible characters that `str.isprintable` accepts, each as the first and the last code point.
+INVISIBLE = re.compile("[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]")
+"""Invisible characters that `str.isprintable` accepts.
 
 These characters have the property Default_Ignorable_Code_Point (Unicode 15, DerivedCoreProperties.txt). They are
 letters or marks, and `str.isprintable` accepts all letters and marks.
 """
-
-INVISIBLE = frozenset(chr(code) for first, last in IGNORABLE_RANGES for code in range(first, last + 1))
-"""The characters in `IGNORABLE_RANGES`."""
 
 
 def is_printable(text: str) -> bool:
@@ -33,7 +22,7 @@ def is_printable(text: str) -> bool:
 
     The result is False if the text contains a character that a terminal would execute or hide.
     """
-    return text.isprintable() and INVISIBLE.isdisjoint(text)
+    return text.isprintable() and INVISIBLE.search(text) is None
 
 
 def printable(text: str) -> str:

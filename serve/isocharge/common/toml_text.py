@@ -29,10 +29,8 @@ def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
     Raises:
         TypeError: If a value has another type.
     """
-    lines = []
-    for text in comment:
-        comment_lines = text.splitlines() or [""]  # an empty text becomes an empty comment line
-        lines += [f"# {printable(line)}".rstrip() for line in comment_lines]
+    # An empty text becomes an empty comment line.
+    lines = [f"# {printable(line)}".rstrip() for text in comment for line in text.splitlines() or [""]]
     if lines:
         lines.append("")
 

@@ -8,10 +8,10 @@ import errno
 import hmac
 import ipaddress
 import os
+import re
 import resource
 import socket
 import ssl
-import stat
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -149,7 +149,7 @@ def _remove_stale_socket(path: Path) -> None:
     """
     if not path.exists():
         return
-    if not stat.S_ISSOCK(path.stat().st_mode):
+    if not path.is_socket():
         raise ListenError(f"{path}: expected nothing or a left-over socket, found a file; choose another path")
     with socket.socket(socket.AF_UNIX) as client:
         error_number = client.connect_ex(str(path))  # 0 if a server accepts the connection
@@ -204,6 +204,10 @@ class Tls:
         return read_whole(self.key or self.certificate), read_whole(self.certificate)
 
 
+_TOKEN = re.compile(r"(?! )[ -$&-~]+(?<! )")
+"""Printable ASCII characters without blanks at the ends and without the percent sign."""
+
+
 class Token:
     """Secret text that clients must send.
 
@@ -220,9 +224,7 @@ class Token:
         Raises:
             InputError: If the token is empty, or contains characters that a header or a URL cannot contain.
         """
-        is_printable_ascii = token.isascii() and token.isprintable()
-        has_outer_blanks = token != token.strip()
-        if not token or not is_printable_ascii or has_outer_blanks or "%" in token:
+        if not _TOKEN.fullmatch(token):
             raise InputError(
                 "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
                 "meaning in the address of a page; choose another one"

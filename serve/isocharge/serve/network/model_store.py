@@ -12,7 +12,7 @@ are refused, the old version remains available.
 import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -63,8 +63,12 @@ class ModelVersions:
         refused: Reasons why versions were refused or unloaded. New files of a loaded version may be refused.
     """
 
-    loaded: Mapping[int, LoadedVersion] = field(default_factory=dict)
-    refused: Mapping[int, str] = field(default_factory=dict)
+    loaded: Mapping[int, LoadedVersion]
+    refused: Mapping[int, str]
+
+
+NO_VERSIONS = ModelVersions({}, {})
+"""The versions of an unknown model."""
 
 
 class ModelStore:
@@ -198,7 +202,7 @@ class ModelStore:
 
     def _model(self, name: str) -> ModelVersions:
         """Return the versions of a model, which are none if the model is unknown."""
-        return self._models.get(name, ModelVersions())
+        return self._models.get(name, NO_VERSIONS)
 
     def _load_versions(self, name: str, folder: Path) -> Mapping[int, str]:
         """Load every version in the folder of a model, and replace the versions that were loaded before.

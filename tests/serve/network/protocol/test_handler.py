@@ -242,11 +242,6 @@ def test_openapi_describes_request_and_response_of_each_route(ask):
         status, headers, _ = ask(method.upper(), path.format(model="linear", version=1), body)
         assert (status, headers["content-type"].partition(";")[0]) == (200, kind), path
         assert item[method].get("requestBody", {}).get("required", False) == bool(body), path
-    parameters = document["components"]["parameters"]
-    assert {name: of["schema"]["enum"] for name, of in parameters.items()} == {
-        "model": ["linear"],
-        "version": ["1", "2"],
-    }
 
 
 @pytest.mark.parametrize(
@@ -286,7 +281,12 @@ CHECKS = [
 @pytest.fixture
 def operations(handler, start_http):
     """Return the operations of the OpenAPI document, except those that unload models."""
-    api = schemathesis.openapi.from_url(start_http(handler).url + "/openapi.json")
+    document = orjson.loads(handler.answer("GET", "/openapi.json", [], b"").body)
+    parameters = document["components"]["parameters"]
+    parameters["model"]["schema"]["enum"] = ["linear"]
+    parameters["version"]["schema"]["enum"] = ["1", "2"]
+    api = schemathesis.openapi.from_dict(document)
+    api.config.update(base_url=start_http(handler).url)
     return [result.ok() for result in api.exclude(path_regex="unload").get_all_operations()]
 
 

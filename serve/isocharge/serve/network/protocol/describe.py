@@ -89,15 +89,8 @@ def statistics_of(store: ModelStore, name: str = "", version: str = "") -> dict[
     }
 
 
-def openapi_document(store: ModelStore) -> dict[str, Any]:
-    """Return the OpenAPI document of the file `openapi.json`, with the names and versions of the loaded models.
-
-    A parameter without a loaded model has the value "none", because OpenAPI requires at least one.
-    """
+def openapi_document() -> dict[str, Any]:
+    """Return the OpenAPI document of the file `openapi.json` with the version of this package."""
     document: dict[str, Any] = orjson.loads(files(__package__).joinpath("openapi.json").read_bytes())
-    document["info"]["version"] = server_metadata()["version"]
-    loaded_versions = store.loaded_versions()
-    parameters = document["components"]["parameters"]
-    parameters["model"]["schema"]["enum"] = sorted({loaded.metadata.name for loaded in loaded_versions}) or ["none"]
-    parameters["version"]["schema"]["enum"] = sorted({loaded.version for loaded in loaded_versions}) or ["none"]
+    document["info"]["version"] = package_version()
     return document
