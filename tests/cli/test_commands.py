@@ -238,6 +238,7 @@ BAD = [
         2,
         "ConfigError: none.toml: cannot be",
     ),
+    (("simulate", "point", SENSOR, "--force", "1e308"), 2, "beyond small strains"),
     (("train", "fit", "--sensor", SENSOR, "-o", "a b"), 2, "ModelError: model name 'a b'"),
     (
         ("simulate", "sweep", SENSOR, "--samples", "50", "-o", "/proc/x"),

@@ -7,7 +7,6 @@ import pytest
 
 from isocharge.simulate import (
     Circle,
-    Film,
     Polygon,
     Probe,
     Sensor,
@@ -15,7 +14,6 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.solver.error_estimate import estimated_error
 
 RECTANGLE = Polygon.rectangle(4.0, 2.0, 0.4)
 TRIANGLE = Polygon.triangle(4.0, 0.4)
@@ -52,35 +50,3 @@ def test_quarter_turn_of_an_uniaxial_film_swaps_the_coefficients(probe):
     exchanged = replace(sensor, piezo=replace(sensor.piezo, d31=sensor.piezo.d32, d32=sensor.piezo.d31))
     second = charges(exchanged, probe.rotated(0.5 * np.pi), rotated(AT, 90.0))
     np.testing.assert_allclose(second, np.roll(charges(sensor, probe, AT), 1), **EXACT)
-
-
-SCALES = {
-    "smaller and softer": (0.2, 1e-3),
-    "larger and stiffer": (10.0, 1e2),
-}
-
-
-@pytest.mark.parametrize(("length", "modulus"), SCALES.values(), ids=SCALES.keys())
-def test_scaled_press_with_equal_dimensionless_groups_has_scaled_charges(probe, length, modulus):
-    """All lengths are multiplied by one factor, the modulus and the pretension by another, and the force fits them."""
-    sensor = load_sensor("four-25um-uniaxial")
-    film = replace(sensor.film, thickness=0.11, pretension=1.0)
-    other = Film(
-        film.radius * length, film.thickness * length, film.young * modulus, film.poisson, film.pretension * modulus
-    )
-    electrodes = tuple(
-        replace(e, corners=tuple((length * x, length * y) for x, y in e.corners)) for e in sensor.electrodes
-    )
-    wide = (
-        Circle(probe.radius * length)
-        if isinstance(probe, Circle)
-        else Polygon(tuple((length * x, length * y) for x, y in probe.corners), probe.angle)
-    )
-    first = press(film, probe, (4.0, 6.0), 0.5)
-    second = press(other, wide, (4.0 * length, 6.0 * length), 0.5 * modulus * length**2)
-    assert (second.theory, second.iterations) == (first.theory, first.iterations)
-    assert second.mesh.resolution == first.mesh.resolution
-    np.testing.assert_allclose(second.field, first.field, rtol=0.0, atol=1e-9 * np.abs(first.field).max())
-    assert estimated_error(second) == pytest.approx(estimated_error(first), rel=1e-6)
-    charge = touch_charge(replace(sensor, electrodes=electrodes, film=other), second)
-    np.testing.assert_allclose(charge, touch_charge(replace(sensor, film=film), first) * modulus * length**2, rtol=1e-9)

@@ -55,12 +55,6 @@ def test_damaged_line_of_text_is_refused_with_the_reason(text, reason):
         parse_line(clean_text(text))
 
 
-@pytest.mark.parametrize("line", ["\u2212{},1,2", "A:\u2212{},B:1,C:2", ">A:\u2212{}"])
-def test_minus_sign_of_unicode_is_a_negative_sign(line):
-    frames = feed("1.5,1,2" if line[0] == "\u2212" else "", *[line.format(f"{number}.5") for number in range(4)])
-    assert [frame.values[0] for frame in frames][-4:] == [-0.5, -1.5, -2.5, -3.5]
-
-
 @pytest.mark.parametrize("text", ["booting v1.2 on ESP32-S3", "{", "ch3,A0", "10.0.0.1", "1_0", ">A"])
 def test_digits_in_words_are_no_numbers(text):
     assert parse_line(text).numbers == ()
@@ -74,6 +68,7 @@ def test_digits_in_words_are_no_numbers(text):
         ("- 3, -4,- 5", (-3.0, -4.0, -5.0)),
         ("(- 3.5; 2)", (-3.5, 2.0)),
         ("A - 3.5 B - 2", (3.5, 2.0)),
+        *((f"{start}\u22121.5,2", (-1.5, 2.0)) for start in ("", "A:")),  # the minus sign of Unicode
     ],
 )
 def test_sign_with_blanks_before_its_number(text, values):

@@ -83,16 +83,6 @@ def test_refused_model_leaves_no_files(film, tmp_path, mistake, error, message):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_keyboard_interrupt_while_writing_leaves_no_files(film, tmp_path, monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("isocharge.serve.model.model_folder.check_golden", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        write(film, tmp_path / "linear")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_golden_vectors_are_checked_before_a_version_appears(film, tmp_path, monkeypatch):
     def wrong(*arguments):
         golden = make_golden(*arguments)

@@ -133,7 +133,6 @@ def test_parquet_with_too_many_rows_is_refused(tmp_path, monkeypatch):
     [
         (None, r"cannot be read \(No such file or directory\); expected a Parquet file"),
         (b"", "not a Parquet file"),
-        (b"PAR1" + bytes(8) + b"PAR1", "not a Parquet file, or a damaged one"),
         (b"PAR1" + b"\xff\xff\xff\x7f" + b"PAR1", "not a Parquet file, or a damaged one"),
     ],
 )
@@ -146,14 +145,8 @@ def test_files_that_are_not_parquet_are_refused(read, content, message, tmp_path
     assert str(caught.value).startswith(str(tmp_path / "p.parquet"))
 
 
-@pytest.mark.parametrize("kind", ["FIFO", "folder", "device"])
-def test_a_fifo_a_folder_or_a_device_is_refused_at_once(kind, tmp_path):
+def test_a_fifo_is_refused_at_once(tmp_path):
     path = tmp_path / "p.parquet"
-    if kind == "FIFO":
-        os.mkfifo(path)
-    elif kind == "folder":
-        path.mkdir()
-    else:
-        path.symlink_to("/dev/zero")
+    os.mkfifo(path)
     with pytest.raises(PressError, match=r"p\.parquet: cannot be read \(not a regular file\); expected a Parquet file"):
         read_presses(path, NAMES)

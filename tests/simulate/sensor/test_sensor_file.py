@@ -152,13 +152,9 @@ def test_error_message_names_the_key_of_the_wrong_type(path):
         (("piezo", "d32"), -2e-4, r"piezo d32: expected pC/N, got -0\.0002 pC/N"),
         (("film", "thickness_um"), -25.0, r"film\.thickness_um: expected a number above 0.*, got -25\.0"),
         (("film", "thickness_um"), 0.025, r"film\.thickness_um: expected at least 0\.1 um, .* 0\.025 mm are 25 um"),
-        (("film", "young_GPa"), 3000, r"film\.young_GPa: expected 0\.001 to 1000 GPa, .* 3000 MPa are 3 GPa"),
         (("film", "young_GPa"), [3.0, 0.2], r"film\.young_GPa, E1 / E2: expected 0\.1 to 10, got 15"),
-        (("film", "pretension_MPa"), [-11, -11, 0], r"film\.pretension_MPa: expected -10 to 300 MPa, got -11 MPa"),
         (("electrodes", "side_mm"), 0.0, "electrodes.side_mm: expected a number above 0"),
         (("calibration", "gain"), {"A": 0.0}, "calibration.gain.A: expected a positive number, got 0.0"),
-        (("calibration", "gain"), {"Z": 1.0}, "calibration gain: no electrode named"),
-        (("surface",), "inside", r"surface: expected one of bottom, middle, top, got 'inside'"),
         (("name",), "", "name: expected a text"),
         (
             ("electrodes", "A"),
@@ -174,11 +170,6 @@ def test_error_message_names_the_key_of_the_wrong_type(path):
             ("electrodes", "A"),
             {"polygon_mm": [[0, 0], [1, 0], [0, 1]], "back_mm": [[0, 0]]},
             r"electrodes\.A\.back_mm\[0\]\[0\]: expected \[x, y\] in mm",
-        ),
-        (
-            ("electrodes", "B"),
-            [25.0, 25.0],
-            r"electrode 'B' lies outside the film: .* film radius 30 mm",
         ),
     ],
 )

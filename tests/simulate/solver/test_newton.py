@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SolveError
-from isocharge.simulate import Circle, Polygon, Resolution, SolveSettings, Theory, load_sensor, press, touch_charge
+from isocharge.simulate import Circle, Polygon, Resolution, SolveSettings, Theory, press
 
 FORCES = (1e-5, 0.1, 10.0)
 MEMBRANE = Theory(bending=False)
@@ -42,16 +42,6 @@ def test_newton_converges_quadratically(film, theory):
         for tolerance in (1e-1, 1e-2, 1e-4)
     ]
     assert residuals[2] < 10.0 * residuals[1] ** 1.5
-
-
-@pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES.keys())
-def test_starting_equilibrium_saves_newton_steps(film, probe):
-    first = press(film, probe, (5.0, 0.0), 1.0)
-    same = SolveSettings(resolution=first.mesh.resolution, layer=first.mesh.layer)
-    near, cold = (press(film, probe, (5.2, 1.0), 1.1, same, start=start) for start in (first, None))
-    assert near.iterations <= 2 < cold.iterations
-    sensor = load_sensor("three-25um-uniaxial")
-    np.testing.assert_allclose(touch_charge(sensor, near), touch_charge(sensor, cold), rtol=1e-6)
 
 
 def test_failed_solve_raises_solve_error_or_returns_status(film, monkeypatch):
