@@ -17,7 +17,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import PressCheckError
 from isocharge.common.printable_text import printable
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.live.steady_press import Press
+from isocharge.serve.live.steady_press import PressWatch
 from isocharge.serve.live.stream import ReadingStream
 from isocharge.serve.port.source import Port
 from isocharge.serve.signal_chain.gain import GainRule
@@ -228,7 +228,7 @@ def _charges_of_press(frames: Iterator[Frame], electrode: str, ask: Callable[[st
         if frame.is_contact:
             begin_s = begin_s if charges else frame.clock_s
             charges.append(frame.charge_pC)
-        elif charges and frame.clock_s - begin_s >= Press.MIN_HELD_S:  # damaged frames are shorter
+        elif charges and frame.clock_s - begin_s >= PressWatch.MIN_HELD_S:  # damaged frames are shorter
             return np.asarray(np.mean(charges, axis=0))
         else:
             charges = []

@@ -205,7 +205,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         has_duplicate_names = len(set(names)) < len(names)
         if has_duplicate_names:
             raise WrongKey("fields", "names that differ", names)
-        if not self.channels:
+        if not self.columns.channels:
             raise WrongKey("fields", "one or more that are channels", names)
 
         checksum_start = len(self.sync) + self.body.size  # position of the checksum, which is at the end of the frame
@@ -231,11 +231,6 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     def fields(self) -> tuple[Field, ...]:
         """Fields of the frame without padding, in their order."""
         return tuple(field for field in self.fields_and_padding if field.type_name != PADDING)
-
-    @cached_property
-    def channels(self) -> tuple[Field, ...]:
-        """The fields that are channels, because they contain neither the frame counter, nor a clock, nor the flags."""
-        return tuple(self.fields[position] for position, _ in self.columns.channels)
 
     @cached_property
     def selected_checksum(self) -> Checksum:

@@ -9,7 +9,6 @@ returned.
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -83,15 +82,15 @@ class WatchResult(NamedTuple):
     press: SteadyPress | None = None
 
 
-class Press:
-    """A touch that may become a steady press.
+class PressWatch:
+    """Finds one steady press in each touch. Each object may be used by only one thread."""
 
-    Attributes:
-        begin_s: Time of the first frame of the touch, s.
-        end_s: Time of its latest frame, s.
-        rest_pC: Mean charges just before the touch, shape (n_electrode,), pC.
-        reason: Reason why the press is not steady yet; empty before the first examined window.
-    """
+    REST_S = 0.3
+    """Duration of the rest before a touch over which the charges at rest are averaged, s."""
+
+    EDGE_S = 0.05
+    """Time just before and just after a press that does not count as rest, s. The probe may already or still touch the
+    film during this time."""
 
     WINDOW_S = 0.5
     """Length of the window, s."""
@@ -127,58 +126,110 @@ class Press:
     DRIFT_SIGMAS = 4.0
     """Number of standard errors of the drift by which the drift may also exceed this limit."""
 
-    def __init__(self, electrodes: tuple[str, ...], begin_s: float, rest_charges_pC: Sequence[Array]) -> None:
-        """Begin without a frame.
+    def __init__(self, electrodes: tuple[str, ...]) -> None:
+        """Create a watch that waits for the tare, which is the charge of the untouched film.
 
         Args:
-            electrodes: Names of the electrodes, which are used in the reasons.
-            begin_s: Time of the first frame of the touch, s.
-            rest_charges_pC: Charges of the frames at rest just before the touch, each of shape (n_electrode,), pC.
+            electrodes: Names of the electrodes, which are used in the reasons why presses are refused.
         """
         self._electrodes = electrodes
-        self.begin_s = begin_s
-        self.end_s = begin_s
-        self.reason = ""
-        self._has_rest = len(rest_charges_pC) >= self.MIN_REST_FRAMES
-        self.rest_pC = np.mean(rest_charges_pC, axis=0) if rest_charges_pC else np.zeros(len(electrodes))
+        self._phase = Phase.taring
+        self._rest_frames: deque[tuple[float, Array]] = deque()  # times and charges of the latest frames without touch
+        self._begin(-math.inf)
+
+    def _begin(self, t_s: float) -> None:
+        """Begin a press.
+
+        Args:
+            t_s: Time of its first frame, s.
+        """
+        self._begin_s = t_s
+        self._end_s = t_s  # time of the latest frame of the press
+        rest_charges_pC = [charge_pC for rest_s, charge_pC in self._rest_frames if rest_s <= t_s - self.EDGE_S]
+        self._rest_frames.clear()
+        self._rest_pC: Array | None = None  # mean charges just before the touch; None without enough frames
+        if len(rest_charges_pC) >= self.MIN_REST_FRAMES:
+            self._rest_pC = np.mean(rest_charges_pC, axis=0)
         self._window: deque[Frame] = deque()  # the latest frames
-        self._last_check_s = begin_s  # time at which the window was last examined
+        self._last_check_s = t_s  # time at which the window was last examined
+        self._reason = ""  # why the press is not steady yet; empty before the first examined window
         self._min_scatter_pC = math.inf  # smallest scatter of all windows
 
-    def add(self, frame: Frame) -> SteadyPress | str:
+    def arm(self) -> None:
+        """Ignore the present press if there is one, and wait for the next press."""
+        if self._phase is Phase.settling:
+            self._phase = Phase.lift
+
+    def feed(self, frame: Frame) -> WatchResult:
+        """Process the next reading, and return the phase of the watch.
+
+        The first phase is `taring`, which ends when the charge of the untouched film has been measured. The phase
+        `waiting` follows until a touch begins. The phase `settling` follows until the press is accepted or refused. The
+        phase `lift` follows until the finger leaves the film. The phase `waiting` then begins again.
+
+        The charges at rest before a press are measured from frames of the time `REST_S`, which ends `EDGE_S` before the
+        touch is detected.
+
+        Args:
+            frame: The frame, after the stages of a `ReadingStream`.
+
+        Returns:
+            The phase and, if a press is refused or not steady yet, the reason. The result contains an accepted press
+            only for the reading with which the press was accepted.
+        """
+        if RECONNECTED in frame.flags or RESTART in frame.flags:
+            # The charges before the interruption cannot be compared with later charges.
+            self._rest_frames.clear()
+            self._phase = Phase.taring
+            return WatchResult(Phase.refused, PORT_LOST)
+        if frame.charge_pC is None:  # there is no tare yet, or the frame is invalid
+            if TARE in frame.flags:  # the tare is being measured
+                self._phase = Phase.taring
+            return WatchResult(self._phase)
+        if not frame.is_contact:
+            return self._process_rest(frame.charge_pC, frame.clock_s)
+
+        # Something touches the film.
+        if self._phase in (Phase.waiting, Phase.taring):
+            self._begin(frame.clock_s)
+            self._phase = Phase.settling
+        if self._phase is Phase.lift:  # the press was accepted or refused before, and the finger is still on the film
+            return WatchResult(self._phase)
+        result = self._process_press(frame)
+        if result.phase is not Phase.settling:
+            self._phase = Phase.lift
+        return result
+
+    def _process_press(self, frame: Frame) -> WatchResult:
         """Add the next frame to the window, and accept or refuse the press if this can be decided.
 
         The press is accepted if it is steady. It is refused if an amplifier is saturated, if the film was not at rest
         before the press, or if the press is not steady within `MAX_HELD_S`.
-
-        Args:
-            frame: The frame.
-
-        Returns:
-            The accepted press, or the reason why the press is refused. The text is empty if neither can be decided.
         """
-        self.end_s = frame.clock_s
-        held_s = self.end_s - self.begin_s
+        self._end_s = frame.clock_s
+        held_s = self._end_s - self._begin_s
         if SATURATED in frame.flags:
-            return "an amplifier is at its limit: press less hard"
-        if not self._has_rest and held_s >= self.MIN_HELD_S:
-            return NO_REST_BEFORE_PRESS
+            return WatchResult(Phase.refused, "an amplifier is at its limit: press less hard")
+        if self._rest_pC is None:
+            is_short = held_s < self.MIN_HELD_S
+            return WatchResult(Phase.settling) if is_short else WatchResult(Phase.refused, NO_REST_BEFORE_PRESS)
         self._window.append(frame)
-        while self._window[0].clock_s < self.end_s - self.WINDOW_S:
+        while self._window[0].clock_s < self._end_s - self.WINDOW_S:
             self._window.popleft()
 
         # The window is examined several times within its length, but not in each frame, which would take too long.
         is_window_full = held_s >= self.WINDOW_S and len(self._window) >= self.MIN_FRAMES
-        if is_window_full and self.end_s - self._last_check_s >= self.WINDOW_S / self.CHECKS_PER_WINDOW:
-            self._last_check_s = self.end_s
-            press = self._examine_window(frame.noise_pC)
+        if is_window_full and self._end_s - self._last_check_s >= self.WINDOW_S / self.CHECKS_PER_WINDOW:
+            self._last_check_s = self._end_s
+            press = self._examine_window(self._rest_pC, frame.noise_pC)
             if press is not None:
-                return press
+                return WatchResult(Phase.taken, press=press)
         if held_s > self.MAX_HELD_S:
-            return f"not steady within {self.MAX_HELD_S:g} s: {self.reason or 'too few frames come'}"
-        return ""
+            reason = self._reason or "too few frames come"
+            return WatchResult(Phase.refused, f"not steady within {self.MAX_HELD_S:g} s: {reason}")
+        return WatchResult(Phase.settling, self._reason)
 
-    def _examine_window(self, noise_pC: Array) -> SteadyPress | None:
+    def _examine_window(self, rest_pC: Array, noise_pC: Array) -> SteadyPress | None:
         """Return the press in the window if the press is steady. Otherwise, return None and store the reason.
 
         A straight line is fitted to each charge in the window. The scatter of a charge is the standard deviation of its
@@ -187,10 +238,11 @@ class Press:
         movement, such as the release, would only describe the movement.
 
         Args:
+            rest_pC: Mean charges just before the touch, shape (n_electrode,), pC.
             noise_pC: Standard deviation of each charge at rest, shape (n_electrode,), pC.
         """
         times_s = np.array([frame.clock_s for frame in self._window])
-        charge_pC = np.array([frame.charge_pC for frame in self._window]) - self.rest_pC  # shape (frames, n_electrode)
+        charge_pC = np.array([frame.charge_pC for frame in self._window]) - rest_pC  # shape (frames, n_electrode)
 
         # The line is fitted by least squares. Its value at the mean time of the frames is the mean charge.
         centred_s = times_s - times_s.mean()
@@ -202,10 +254,10 @@ class Press:
         reason = self._unsteady(mean_pC, scatter_pC, slope_pC_per_s, float(times_s[-1] - times_s[0]), noise_pC)
         if not reason:
             flags = dict.fromkeys(flag for frame in self._window for flag in frame.flags)  # each flag once
-            return SteadyPress(mean_pC, scatter_pC, self.end_s - self.begin_s, len(self._window), tuple(flags))
+            return SteadyPress(mean_pC, scatter_pC, self._end_s - self._begin_s, len(self._window), tuple(flags))
         if scatter_pC.max() <= self._min_scatter_pC:
             self._min_scatter_pC = float(scatter_pC.max())
-            self.reason = reason
+            self._reason = reason
         return None
 
     def _unsteady(
@@ -243,100 +295,25 @@ class Press:
             "leak of the amplifiers with isocharge serve doctor"
         )
 
-
-class PressWatch:
-    """Finds one steady press in each touch. Each object may be used by only one thread."""
-
-    REST_S = 0.3
-    """Duration of the rest before a touch over which the charges at rest are averaged, s."""
-
-    EDGE_S = 0.05
-    """Time just before and just after a press that does not count as rest, s. The probe may already or still touch the
-    film during this time."""
-
-    def __init__(self, electrodes: tuple[str, ...]) -> None:
-        """Create a watch that waits for the tare, which is the charge of the untouched film.
-
-        Args:
-            electrodes: Names of the electrodes, which are used in the reasons why presses are refused.
-        """
-        self._electrodes = electrodes
-        self._phase = Phase.taring
-        self._rest_frames: deque[tuple[float, Array]] = deque()  # times and charges of the latest frames without touch
-        self._press = Press(electrodes, -math.inf, ())  # the present or latest press
-
-    def arm(self) -> None:
-        """Ignore the present press if there is one, and wait for the next press."""
-        if self._phase is Phase.settling:
-            self._phase = Phase.lift
-
-    def feed(self, frame: Frame) -> WatchResult:
-        """Process the next reading, and return the phase of the watch.
-
-        The first phase is `taring`, which ends when the charge of the untouched film has been measured. The phase
-        `waiting` follows until a touch begins. The phase `settling` follows until the press is accepted or refused. The
-        phase `lift` follows until the finger leaves the film. The phase `waiting` then begins again.
-
-        The charges at rest before a press are measured from frames of the time `REST_S`, which ends `EDGE_S` before the
-        touch is detected.
-
-        Args:
-            frame: The frame, after the stages of a `ReadingStream`.
-
-        Returns:
-            The phase and, if a press is refused or not steady yet, the reason. The result contains an accepted press
-            only for the reading with which the press was accepted.
-        """
-        t_s = frame.clock_s
-        if RECONNECTED in frame.flags or RESTART in frame.flags:
-            # The charges before the interruption cannot be compared with later charges.
-            self._rest_frames.clear()
-            self._phase = Phase.taring
-            return WatchResult(Phase.refused, PORT_LOST)
-        if frame.charge_pC is None:  # there is no tare yet, or the frame is invalid
-            if TARE in frame.flags:  # the tare is being measured
-                self._phase = Phase.taring
-            return WatchResult(self._phase)
-        if not frame.is_contact:
-            return self._process_rest(frame.charge_pC, t_s)
-
-        # Something touches the film.
-        if self._phase in (Phase.waiting, Phase.taring):
-            rest_end_s = t_s - self.EDGE_S
-            rest_charges_pC = [charge_pC for rest_s, charge_pC in self._rest_frames if rest_s <= rest_end_s]
-            self._press = Press(self._electrodes, t_s, rest_charges_pC)
-            self._rest_frames.clear()
-            self._phase = Phase.settling
-        if self._phase is Phase.lift:  # the press was accepted or refused before, and the finger is still on the film
-            return WatchResult(self._phase)
-        decision = self._press.add(frame)
-        if not decision:
-            return WatchResult(self._phase, self._press.reason)
-        self._phase = Phase.lift
-        if isinstance(decision, SteadyPress):
-            return WatchResult(Phase.taken, press=decision)
-        return WatchResult(Phase.refused, decision)
-
     def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
         """Store a frame in which nothing touches the film, and refuse a press that has ended without becoming steady.
 
-        Frames within `EDGE_S` after a press are not stored. A touch shorter than `Press.MIN_HELD_S` is ignored.
+        Frames within `EDGE_S` after a press are not stored. A touch shorter than `MIN_HELD_S` is ignored.
 
         Args:
             charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
             t_s: Time of the frame, s.
         """
-        press = self._press
         is_press_unfinished = self._phase is Phase.settling
         self._phase = Phase.waiting
-        if t_s > press.end_s + self.EDGE_S:
+        if t_s > self._end_s + self.EDGE_S:
             self._rest_frames.append((t_s, charge_pC))
         oldest_rest_s = t_s - self.EDGE_S - self.REST_S
         while self._rest_frames and self._rest_frames[0][0] < oldest_rest_s:
             self._rest_frames.popleft()
 
-        held_s = press.end_s - press.begin_s
-        if is_press_unfinished and held_s >= Press.MIN_HELD_S:
-            reason = press.reason or "hold it longer"
+        held_s = self._end_s - self._begin_s
+        if is_press_unfinished and held_s >= self.MIN_HELD_S:
+            reason = self._reason or "hold it longer"
             return WatchResult(Phase.refused, f"released after {held_s:.1f} s, before it was steady: {reason}")
         return WatchResult(Phase.waiting)
