@@ -67,6 +67,7 @@ BASE_TESTS = (
     "tests/serve/record",
     "tests/serve/signal_chain",
     "tests/simulate/sensor",
+    "tests/test_structs.py",
 )
 """Tests that run with the lower bounds of all packages. They need only the extra `all` and `TEST_PACKAGES`."""
 

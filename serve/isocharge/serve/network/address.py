@@ -86,10 +86,13 @@ class Address:
         if self.uds:
             return f"unix:{self.uds}"
         scheme = "https" if secure else "http"
-        is_ipv6 = ":" in self.host
-        host = f"[{self.host}]" if is_ipv6 else self.host
         _, port, *_ = listening.getsockname()  # the actual port, even if the system has chosen it
-        return f"{scheme}://{host}:{port}"
+        return f"{scheme}://{url_host(self.host)}:{port}"
+
+
+def url_host(host: str) -> str:
+    """Return a host name or an address as it is written in a URL, where an IPv6 address is in square brackets."""
+    return f"[{host}]" if ":" in host else host
 
 
 def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

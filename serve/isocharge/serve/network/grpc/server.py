@@ -14,7 +14,7 @@ import grpc.aio
 import uvloop
 
 from isocharge.common.errors import ListenError
-from isocharge.serve.network.address import ServerLimits, Tls
+from isocharge.serve.network.address import ServerLimits, Tls, url_host
 from isocharge.serve.network.grpc.service import Service
 from isocharge.serve.network.protocol import Handler
 
@@ -48,13 +48,11 @@ def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) 
         ListenError: If the address is in use or cannot be used.
         InputError: If a TLS file cannot be used.
     """
-    is_ipv6 = ":" in host
-    url_host = f"[{host}]" if is_ipv6 else host
     scheme = "grpcs" if tls else "grpc"
     with _event_loop() as loop:
-        server, actual_port = _run_in(loop, _start(handler, f"{url_host}:{port}", tls))
+        server, actual_port = _run_in(loop, _start(handler, f"{url_host(host)}:{port}", tls))
         try:
-            yield f"{scheme}://{url_host}:{actual_port}"
+            yield f"{scheme}://{url_host(host)}:{actual_port}"
         finally:
             _run_in(loop, server.stop(handler.limits.grace_seconds))
 

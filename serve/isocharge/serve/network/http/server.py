@@ -187,8 +187,8 @@ class Connection(HttpToolsProtocol):
 class HttpServer:
     """HTTP server of an ASGI application.
 
-    The server begins to listen when it is created, and answers requests while the method `run` or the coroutine `serve`
-    is executed. The method `close` releases the address of the server.
+    The server begins to listen when it is created, and answers requests while the method `run` is executed. The method
+    `close` releases the address of the server.
 
     Attributes:
         url: URL that clients use.
@@ -248,11 +248,7 @@ class HttpServer:
     def run(self) -> None:
         """Answer requests until `stop` is called, and then finish the requests that have already begun."""
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-            runner.run(self.serve())
-
-    async def serve(self) -> None:
-        """Answer requests in the running event loop, as `run` does."""
-        await self._server.serve([self._socket])
+            runner.run(self._server.serve([self._socket]))
 
     def stop(self) -> None:
         """End the method `run` as soon as the open requests are finished or, if called again, without finishing them.
