@@ -27,7 +27,7 @@ def encode_layout(layout, frame):
     """Return the bytes of a frame, without byte stuffing and without a delimiter."""
     values = {SEQ: frame.seq or 0, FLAGS: frame.bits}
     values |= {name: (frame.t_us or 0) / unit_us for name, unit_us in TIMES_US.items()}
-    values |= {channel.name: value for channel, value in zip(layout.channels, frame.values, strict=True)}
+    values |= dict(zip(layout.columns.names, frame.values, strict=True))
     numbers = [packed_number(field, values[field.name], layout.byte_order) for field in layout.fields]
     data = bytearray(layout.sync + layout.body.pack(*numbers))
     for position, constant in layout.constants:

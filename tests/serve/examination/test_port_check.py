@@ -173,13 +173,16 @@ def test_line_that_is_not_read_is_shown():
         ("c b a", {"A": "a", "B": "b", "C": "c"}, ""),
         ("A B z", None, "('A', 'B', 'z')"),
         ("x y z", {"A": "x", "B": "y", "C": "z"}, ""),
+        ("ch3 ch2 ch1", None, "('ch3', 'ch2', 'ch1')"),
+        ("1,B A C", None, "a frame has 4"),  # it is not clear whether the name stands before or behind its value
     ],
 )
 def test_channels_are_proposed_by_their_names(names, channels, message):
     rng = np.random.default_rng(0)
+    mark = "," if "," in names else ":"
 
     def board(_):
-        return ",".join(f"{name}:{rng.normal():.3f}" for name in names.split()).encode() + b"\n"
+        return ",".join(f"{name}{mark}{rng.normal():.3f}" for name in names.split()).encode() + b"\n"
 
     report = examine_received(received(board), electrodes=("A", "B", "C"))
     assert (report.device.get("channels"), not report.missing) == (channels, not message)

@@ -81,7 +81,7 @@ def test_frames_of_sensors_as_their_makers_describe_them(name, data, seq, t_us, 
     (frame,) = SyncParser(LAYOUTS[name]).feed(data)
     assert (frame.seq, frame.t_us) == (seq, t_us)
     assert frame.values == pytest.approx(values)
-    assert frame.names == tuple(field.name for field in LAYOUTS[name].channels)
+    assert frame.names == LAYOUTS[name].columns.names
 
 
 COUNTS = st.lists(st.integers(-32768, 32767), min_size=7, max_size=7)
@@ -90,7 +90,7 @@ COUNTS = st.lists(st.integers(-32768, 32767), min_size=7, max_size=7)
 def encoded(name, counts):
     """Return the bytes of a frame whose channels have these values before the scaling."""
     layout = LAYOUTS[name]
-    values = [count * field.scale for count, field in zip(counts, layout.channels, strict=False)]
+    values = [count * scale for count, (_, scale) in zip(counts, layout.columns.channels, strict=False)]
     return encode_layout(layout, Frame(abs(counts[0]), abs(counts[1]), tuple(values)))
 
 

@@ -173,7 +173,7 @@ def channel_count_sentences(
     if set(electrodes) <= set(device.channels):  # also without a model
         return
     try:
-        Channels(Setup(electrodes, reader="the model"), any_unit=True).named_indices(capture.frames[-1])
+        Channels(Setup(electrodes, reader="the model"), any_unit=True).indices_by_name_or_order(capture.frames[-1])
     except ChargeError as error:
         yield str(error)
         return

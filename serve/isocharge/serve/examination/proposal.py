@@ -99,9 +99,10 @@ def _choose_channels(
 ) -> dict[str, int]:
     """Choose the channel of each electrode.
 
-    If there are channels with the names of the electrodes, these channels are chosen. If the channels have other names,
-    the electrodes are assigned, in their order, to the channels whose values vary. If there are more such channels, the
-    adjacent channels with the most similar noise are chosen. Without a model, each varying channel is an electrode.
+    If there are channels with the names of the electrodes, or as many channels as electrodes, the channels are chosen
+    as in a stream. Otherwise the electrodes are assigned, in their order, to the channels whose values vary. If there
+    are more such channels, the adjacent channels with the most similar noise are chosen. Without a model, each varying
+    channel is an electrode.
 
     Args:
         capture: The frames.
@@ -121,13 +122,11 @@ def _choose_channels(
         electrodes = tuple(ELECTRODES[: len(candidates)])  # A, B, C, ...
     try:
         # A unit in the names does not matter, because the gain is requested if it is missing.
-        named_positions = Channels(Setup(electrodes), any_unit=True).named_indices(capture.frames[-1])
+        positions = Channels(Setup(electrodes), any_unit=True).indices_by_name_or_order(capture.frames[-1])
     except ChargeError:  # the names are nearly those of electrodes, which is reported later
         return {}
-    if named_positions is not None:
-        return dict(zip(electrodes, named_positions, strict=True))
-    if values.shape[1] == len(electrodes):
-        candidates = list(range(len(electrodes)))  # with a channel that never changes, which is reported later
+    if positions is not None:  # perhaps with a channel that never changes, which is reported later
+        return dict(zip(electrodes, positions, strict=True))
     first = 0
     if len(candidates) > len(electrodes):
         # Compare the groups of adjacent channels by their largest noise over the smallest one, in powers of ten.

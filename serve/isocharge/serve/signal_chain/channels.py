@@ -76,37 +76,42 @@ class Channels(Stage):
         """
         if self._channels:
             return tuple(self._assigned_index(electrode, frame) for electrode in self._electrodes)
-        indices = self.named_indices(frame)
-        if indices is not None:
-            return indices
-        if len(frame.values) != len(self._electrodes) or not _are_in_order(frame.names):
+        indices = self.indices_by_name_or_order(frame)
+        if indices is None:
             raise self._assignment_error(frame)
-        return tuple(range(len(self._electrodes)))
+        return indices
 
-    def named_indices(self, frame: Frame) -> tuple[int, ...] | None:
-        """Return, for each electrode, the index of the channel with its name in `frame.values`.
+    def indices_by_name_or_order(self, frame: Frame) -> tuple[int, ...] | None:
+        """Return, for each electrode, the index of its channel in `frame.values` without the section `[channels]`.
 
-        The result is None if no channel has the name of an electrode, and the names do not stand in the line of text.
+        The result is None if no channel has the name of an electrode, and there are more or fewer channels than
+        electrodes.
 
         Raises:
-            ChargeError: If not exactly one channel has the name of each electrode, or if a channel states a unit other
-                than pC and the gain is not known.
+            ChargeError: If not exactly one channel has the name of each electrode, if a channel states a unit other
+                than pC and the gain is not known, if it is not clear to which values the names in a line of text
+                belong, or if the numbers in the names of the channels do not increase.
         """
         advice = "" if self._allows_any_unit else _unit_advice(frame.names)
         indices = self._matches(frame.names)
         if all(len(indices_of_electrode) == 1 for indices_of_electrode in indices) and not advice:
             return tuple(indices_of_electrode[0] for indices_of_electrode in indices)
 
-        # Names of which some are those of electrodes must not be assigned by their order.
-        if any(indices) or advice:
-            raise self._assignment_error(frame, advice)
-
-        # The names may stand in the line in the order of the values, but not beside the values.
+        # The names may stand in the line of text in the order of the values, but not beside the values.
         places = self._matches(tuple(word for text in frame.words for word in _words_of(text)))
         has_all_names = all(len(places_of_electrode) == 1 for places_of_electrode in places)
-        if not has_all_names or len(frame.values) != len(self._electrodes):
+        has_other_count = len(frame.values) != len(self._electrodes)
+
+        # Names of which some are those of electrodes must not be assigned by their order.
+        if any(indices) or advice or (has_all_names and has_other_count):
+            raise self._assignment_error(frame, advice)
+        if has_other_count:
             return None
-        return tuple(np.argsort(np.argsort(np.ravel(places))).tolist())  # rank of each electrode in the line
+        if has_all_names:
+            return tuple(np.argsort(np.argsort(np.ravel(places))).tolist())  # rank of each electrode in the line
+        if not _are_in_order(frame.names):
+            raise self._assignment_error(frame)
+        return tuple(range(len(self._electrodes)))
 
     def _matches(self, names: tuple[str, ...]) -> list[list[int]]:
         """Return, for each electrode, the indices of the names that contain its name; see the class."""
