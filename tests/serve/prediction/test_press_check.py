@@ -103,6 +103,7 @@ def test_presses_with_only_positions_or_only_forces(predictor, measure, known, d
     wrong = check_presses(predictor, measure(20, known=known, noise=8.0, force_scale=1.1))
     assert wrong.fits is False
     assert ("mm" in wrong.verdict, "%" in wrong.verdict) == known
+    assert any(note.startswith("forces are 1.") for note in wrong.notes) == known[1], wrong.notes
 
 
 @pytest.mark.parametrize(("count", "fits"), [(1, None), (2, None), (3, True)])
