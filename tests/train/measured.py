@@ -1,5 +1,7 @@
 """Measured presses for tests, with the same standard deviations for all presses."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from isocharge.serve import MeasuredPresses
@@ -16,3 +18,8 @@ def measured_presses(contact, charge, names=("A", "B", "C")):
         electrodes=names,
         lines=tuple(range(2, count + 2)),
     )
+
+
+def with_samples(dataset, **columns):
+    """Return a dataset with other values in some columns of its samples."""
+    return replace(dataset, samples=replace(dataset.samples, **columns))

@@ -103,7 +103,12 @@ def test_http_command_refuses_wrong_options_and_models(command, models, tmp_path
             (models, ("--tls-key", "x"), 2, "InputError: --tls-key: expected --tls-cert too"),
             (models, ("--tls-cert", tmp_path / "cert.pem"), 2, f"InputError: {tmp_path}/cert.pem: not a certificate"),
             (tmp_path / "empty", (), 2, f"ModelError: {tmp_path}/empty: expected models"),
-            (tmp_path / "damaged", (), 2, f"ModelError: no model can be served: {tmp_path}/damaged/linear/1/golden.json: "),
+            (
+                tmp_path / "damaged",
+                (),
+                2,
+                f"ModelError: no model can be served: {tmp_path}/damaged/linear/1/golden.json: ",
+            ),
         ]
         for folder, words, code, message in cases:
             got, out, error = command("serve", "http", "--models", folder, *words)

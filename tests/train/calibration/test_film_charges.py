@@ -114,33 +114,37 @@ def calibrated(problem, sensor, probe, path, count=15, seed=3):
     return result, position_error(estimate, contact[count:]), estimate[:, 2] / contact[count:, 2] - 1.0
 
 
-@pytest.mark.slow
-def test_uneven_film_is_calibrated_and_its_model_finds_contacts(problem, tmp_path):
-    """The film has T1 / T2 = 1.7 and E1 / E2 = 1.3."""
-    prior = problem.prior.layout.prior
-    values = prior.mean.copy()
-    for name, value in (("pretension", 1.0), ("tension_difference", 0.25), ("stiffness_xy", 0.26), ("d31", 0.2)):
-        values[prior.index(name)] = value
-    result, distance, force_error = calibrated(problem, *prior.film(values), tmp_path / "film")
-    for name in ("pretension", "tension_difference", "d31"):
-        assert abs(result.film.value(name) - values[prior.index(name)]) < 4.0 * result.film.std(name)
-    assert np.sqrt(np.mean(distance**2)) < 0.3
-    assert np.sqrt(np.mean(force_error**2)) < 0.03
-
-
-@pytest.mark.slow
-def test_own_layout_with_five_electrodes_and_a_rectangle_is_calibrated(tmp_path):
+def five_electrodes():
+    """Return the problem of a layout of one's own, which is pressed with a rectangle."""
     table = sensor_to_dict(load_sensor("four-25um-biaxial"))
     table["electrodes"]["E"] = [7.5, 7.5]
     sensor = sensor_from_dict(table | {"name": "five"})
-    probe = parse_probe("rectangle:4.0x2.0")
-    problem = CalibrationProblem(sensor, probe, radius=5.0, force_range=(0.2, 1.5))
+    return CalibrationProblem(sensor, parse_probe("rectangle:4.0x2.0"), radius=5.0, force_range=(0.2, 1.5))
+
+
+FILMS = {
+    "T1 / T2 = 1.7 and E1 / E2 = 1.3": (
+        lambda: CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0)),
+        {"pretension": 1.0, "tension_difference": 0.25, "stiffness_xy": 0.26, "d31": 0.2},
+        ("pretension", "tension_difference", "d31"),
+    ),
+    "five electrodes": (five_electrodes, {"pretension": 1.2, "shift_x": 0.3}, ("shift_x",)),
+}
+"""Problems, properties that differ from the described film, and the properties of them that the presses determine."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("film", FILMS)
+def test_film_is_calibrated_and_its_model_finds_contacts(film, tmp_path):
+    make_problem, changes, determined = FILMS[film]
+    problem = make_problem()
     prior = problem.prior.layout.prior
     values = prior.mean.copy()
-    values[prior.index("pretension")] = 1.2
-    values[prior.index("shift_x")] = 0.3
+    for name, value in changes.items():
+        values[prior.index(name)] = value
     result, distance, force_error = calibrated(problem, *prior.film(values), tmp_path / "film")
-    assert abs(result.film.value("shift_x") - 0.3) < 4.0 * result.film.std("shift_x")
+    for name in determined:
+        assert abs(result.film.value(name) - changes[name]) < 4.0 * result.film.std(name)
     assert np.sqrt(np.mean(distance**2)) < 0.3
     assert np.sqrt(np.mean(force_error**2)) < 0.03
 

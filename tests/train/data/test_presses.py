@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.train.measured import measured_presses
+from tests.train.measured import measured_presses, with_samples
 
+from drawn_contacts import draw_contacts
 from isocharge.common.errors import DatasetError, PressError
 from isocharge.simulate import Circle, Domain, parse_probe
 from isocharge.train.data.presses import (
@@ -20,11 +21,6 @@ from isocharge.train.data.presses import (
     split_by_position,
 )
 from isocharge.train.training.training_data import TrainingData
-
-
-def with_samples(dataset, **columns):
-    """Return a dataset with other values in some columns of its samples."""
-    return replace(dataset, samples=replace(dataset.samples, **columns))
 
 
 def positions_of(contact):
@@ -80,16 +76,10 @@ def test_a_measured_dataset_is_refused_where_simulated_presses_are_expected(data
         TrainingData.of(replace(dataset, manifest={}))
 
 
-def random_contacts(count: int, seed: int) -> np.ndarray:
-    """Return random contacts (x, y, F), shape (count, 3), mm and N."""
-    rng = np.random.default_rng(seed)
-    return np.column_stack([rng.uniform(-6, 6, (count, 2)), rng.uniform(0.05, 2.0, count)])
-
-
 @given(count=st.integers(50, 300), seed=st.integers(0, 999), forces=st.integers(1, 5))
 @settings(max_examples=40, deadline=None)
 def test_split_keeps_positions_together_and_does_not_depend_on_the_order_or_on_other_presses(count, seed, forces):
-    contact = np.repeat(random_contacts(count, seed), forces, axis=0)
+    contact = np.repeat(draw_contacts(seed, count, 8.0, (0.05, 2.0)), forces, axis=0)
     presses = LabelledPresses(contact, np.ones((len(contact), 3)))
     first, second = split_by_position(presses, 0.2)
     assert len(first) + len(second) == len(presses)
@@ -106,7 +96,7 @@ def test_split_keeps_positions_together_and_does_not_depend_on_the_order_or_on_o
 
 
 def test_measured_presses_keep_the_orientation_of_their_probe(sensor):
-    presses = measured_presses(random_contacts(60, 2), np.ones((60, 3)))
+    presses = measured_presses(draw_contacts(2, 60, 8.0, (0.05, 2.0)), np.ones((60, 3)))
     probe = parse_probe("rectangle:4x2@30")
     dataset = dataset_of(presses, sensor, probe)
     assert is_measured(dataset)
@@ -117,7 +107,7 @@ def test_measured_presses_keep_the_orientation_of_their_probe(sensor):
 
 
 def test_presses_with_unknown_places_forces_or_charges_are_left_out(sensor):
-    contact = random_contacts(55, 3)
+    contact = draw_contacts(3, 55, 8.0, (0.05, 2.0))
     charge = np.ones((55, 3))
     contact[0, 2] = np.nan
     charge[1, 0] = np.nan

@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from tests.train.measured import measured_presses
+from tests.train.measured import measured_presses, with_samples
 
 from isocharge.cli.train import report as report_module
 from isocharge.common.errors import DatasetError, ModelError, OutputExists, PressError
@@ -93,11 +93,6 @@ def test_report_command_prints_the_record_and_the_errors(film, tmp_path, command
     _, out, err = command("train", "report", folder, "-o", tmp_path / "out", "--quick", "--json")
     (section,) = json.loads(out)["datasets"]
     assert all(f"{method['name']}: {method['errors']['position_rms_mm']} mm" in err for method in section["methods"])
-
-
-def with_samples(dataset, **columns):
-    """Return a dataset with other values in some columns of its samples."""
-    return replace(dataset, samples=replace(dataset.samples, **columns))
 
 
 def with_one_position(dataset):
