@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from isocharge.common.errors import OutputError, PressError
 from isocharge.serve import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.presses import measured_presses
-from isocharge.serve.presses.measured_presses import PRESS_RULES, presses_text, read_press_list
+from isocharge.serve.presses.csv_table import csv_text
+from isocharge.serve.presses.measured_presses import PRESS_RULES, read_press_list
 from isocharge.serve.presses.number_table import LARGEST
 
 NAMES = ("A", "B", "C")
@@ -225,7 +226,7 @@ def test_a_charge_that_would_not_be_read_is_refused():
 
 
 def test_a_written_file_is_plain_csv(read):
-    text = presses_text(read(f"{HEADER}\n1,2,,10,,30\n"))
+    text = csv_text(read(f"{HEADER}\n1,2,,10,,30\n").columns)
     assert list(csv.DictReader(text.splitlines())) == [
         {"x_mm": "1.0", "y_mm": "2.0", "force_N": "", "A": "10.0", "B": "", "C": "30.0"}
         | {"position_std_mm": "0.1", "force_std": "0.01"}

@@ -18,7 +18,7 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.model.contact import Contacts
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.model.session import N_WITHOUT_CORRELATION
+from isocharge.serve.model.session import COLUMNS, N_WITHOUT_CORRELATION
 from isocharge.serve.model.validity import MISFIT_LIMIT, Validity, inside_polygon
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 
@@ -29,12 +29,6 @@ NOT_TRAINED = "not trained for"
 
 FORCE = 2
 """Column of the force in the errors and standard deviations of `PressErrors`. The columns before it are x and y."""
-
-VALUE_COLUMNS = slice(0, 3)
-"""Columns of x, y and the force in an array of contacts with one column for each attribute of `Contact`."""
-
-STD_COLUMNS = slice(3, 6)
-"""Columns of the standard deviations of x, y and the force in an array of contacts."""
 
 
 @dataclass(frozen=True)
@@ -136,15 +130,15 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     position_std_mm = model_presses.position_std_mm
     rig_std = np.column_stack([position_std_mm, position_std_mm, model_presses.force_std])
     is_unknown = np.isnan(measured)
-    is_complete = np.asarray(np.isfinite(predicted[:, VALUE_COLUMNS]).all(axis=1))
+    is_complete = np.asarray(np.isfinite(predicted[:, COLUMNS["contact"]]).all(axis=1))
     contacts = Contacts(*predicted.astype(np.float32).T)
     flags = predictor.validity.batch_flags(contacts)
     return PressErrors(
         lines=model_presses.lines,
         row_noun=model_presses.row_noun,
         predicted=predicted,
-        error=(predicted[:, VALUE_COLUMNS] - measured) / divisor,
-        noise_std=np.where(is_unknown, np.nan, predicted[:, STD_COLUMNS] / divisor),
+        error=(predicted[:, COLUMNS["contact"]] - measured) / divisor,
+        noise_std=np.where(is_unknown, np.nan, predicted[:, COLUMNS["contact_std"]] / divisor),
         rig_std=np.where(is_unknown, np.nan, rig_std),
         flags=tuple(words if is_known else () for words, is_known in zip(flags, is_complete, strict=True)),
         has_misfit=contacts.misfit > misfit_limit(metadata),

@@ -20,7 +20,6 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError, cut, error_prefix, shown
-from isocharge.serve.presses.csv_table import csv_text
 from isocharge.serve.presses.number_table import (
     CHARGE_RULE,
     MAX_COLUMNS,
@@ -329,11 +328,6 @@ def write_presses(path: Path, presses: MeasuredPresses) -> None:
     if not 0 < len(presses) <= MAX_ROWS:
         raise PressError(f"{path}: expected 1 to {MAX_ROWS:,} presses to write, got {len(presses):,}")
     write_columns(Path(path), presses.columns)
-
-
-def presses_text(presses: MeasuredPresses) -> str:
-    """Return the text that `write_presses` writes to a CSV file."""
-    return csv_text(presses.columns)
 
 
 def row_words(rows: Sequence[int], row_noun: str) -> str:

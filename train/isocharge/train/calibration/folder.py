@@ -41,7 +41,8 @@ from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.model_folder import check_target
 from isocharge.serve.model.model_search import version_folders
-from isocharge.serve.presses.measured_presses import MeasuredPresses, presses_text
+from isocharge.serve.presses.csv_table import csv_text
+from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor
 from isocharge.simulate import Domain, NoiseModel
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
@@ -338,7 +339,7 @@ def write_calibration(
         RESULT: json_text(result_table(result)).encode(),
         SENSOR: sensor_to_toml(sensor).encode(),
         PICTURE: picture_bytes(calibration_picture(result)),
-        PRESSES: presses_text(result.presses).encode(),
+        PRESSES: csv_text(result.presses.columns).encode(),
     }
     description = _film_section(result, fitted.made_with)
     released_model = release(

@@ -144,7 +144,7 @@ def fit_film_series(
     """
     # The fit treats the electrodes of all nodes as electrodes of one film.
     presses = LabelledPresses(contact, node_charge.reshape(len(contact), -1))
-    names = tuple(f"{node:g} {electrode}" for node in node_MPa for electrode in electrodes)
+    names = electrodes * node_MPa.size
     is_validation = np.arange(len(contact)) % 10 == 0
     all_nodes = fit_charge_series(domain, names, presses[~is_validation], presses[is_validation])
     by_node = all_nodes.coefficients[0].reshape(*all_nodes.coefficients.shape[1:4], node_MPa.size, len(electrodes))

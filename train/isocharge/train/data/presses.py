@@ -168,6 +168,11 @@ def split_by_position(presses: LabelledPresses, share: float) -> tuple[LabelledP
     return presses[~is_in_second], presses[is_in_second]
 
 
+def place_count(contact: Array) -> int:
+    """Count the places of contacts (x, y, F), shape (n, 3). Places within a micrometre count as the same place."""
+    return len(np.unique(np.round(contact[:, :2], 3), axis=0))
+
+
 def position_ranks(contact: Array) -> Array:
     """Order the positions of presses, and return the rank of the position of each press.
 
@@ -212,8 +217,7 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
             f"{presses.contact[row].tolist()} (mm, mm, N) and {presses.charge[row].tolist()} pC"
         )
 
-    rounded_positions_mm = np.round(presses.contact[:, :2], 3)  # positions within a micrometre count as the same
-    n_position = len(np.unique(rounded_positions_mm, axis=0))
+    n_position = place_count(presses.contact)
     fewest_positions = min(fewest, FEWEST_POSITIONS)  # a few presses cannot have more positions than presses
     if len(presses) < fewest or n_position < fewest_positions:
         raise DatasetError(

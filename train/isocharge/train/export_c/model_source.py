@@ -311,28 +311,19 @@ def self_test(golden: Golden, metadata: ModelMetadata) -> str:
 def _features_source(features: ChargeFeatures) -> str:
     """Return the text of the C function `features`, which computes the inputs of the first layer from the charges.
 
-    Logarithmic features have the same limits for all electrodes. Features of charges of both signs have limits and a
-    mean for each electrode.
-
     Args:
         features: Typical charges, limits and means of the features.
     """
-    factor = _to_single_precision(1.0 / features.typical_pC)
-    if features.mean is None:
-        return source_text(
-            "features.c",
-            arrays=c_array("FACTOR", factor),
-            electrodes=features.n_electrode,
-            low=c_float(features.low_pC.item()),
-            high=c_float(features.high_pC.item()),
-        )
-    arrays = [
-        c_array("FACTOR", factor),
-        c_array("LOW", _to_single_precision(features.low_pC)),
-        c_array("HIGH", _to_single_precision(features.high_pC)),
-        c_array("MEAN", _to_single_precision(features.mean)),
+    arrays = {"FACTOR": 1.0 / features.typical_pC, "LOW": features.low_pC, "HIGH": features.high_pC}
+    template = "features.c"
+    if features.mean is not None:
+        arrays["MEAN"] = features.mean
+        template = "features_signed.c"
+    n_electrode = features.n_electrode
+    texts = [
+        c_array(name, np.broadcast_to(_to_single_precision(values), n_electrode)) for name, values in arrays.items()
     ]
-    return source_text("features_signed.c", arrays="\n".join(arrays), electrodes=features.n_electrode)
+    return source_text(template, arrays="\n".join(texts), electrodes=n_electrode)
 
 
 def _to_single_precision(values: Array) -> Singles:

@@ -23,7 +23,8 @@ from torch import Tensor
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import PressError, cut
-from isocharge.serve.presses.measured_presses import MeasuredPresses, presses_text
+from isocharge.serve.presses.csv_table import csv_text
+from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
 from isocharge.train.data.contact_errors import rms, rounded
 from isocharge.train.data.measured_sensor import LEAST_RANGE, PressedArea, check_measured_presses
@@ -34,6 +35,7 @@ from isocharge.train.data.presses import (
     LabelledPresses,
     check_known_columns,
     complete,
+    place_count,
     position_ranks,
     presses_sha256,
 )
@@ -149,7 +151,7 @@ def fit_presses(
         "torch": torch.__version__,
         "measured": {
             "presses": len(labelled),
-            "places": len(np.unique(labelled.contact[:, :2], axis=0)),
+            "places": place_count(labelled.contact),
             "folds": HELD_PARTS,
             "std_factors": [rounded(position_factor), rounded(force_factor)],
         },
@@ -170,7 +172,7 @@ def fit_presses(
         test=labelled,
         sha256=presses_sha256(usable),
         made_with=made_with,
-        files={PRESSES_FILE: presses_text(usable).encode()},
+        files={PRESSES_FILE: csv_text(usable.columns).encode()},
         cross_validated=cross_validated,
     )
 
@@ -206,12 +208,11 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     check_known_columns(presses)
     is_complete = complete(presses)  # whether the place, the force and all charges of each press are known
     usable = presses[is_complete]
-    rounded_places_mm = np.round(usable.contact[:, :2], 3)  # places within a micrometre count as the same place
-    place_count = len(np.unique(rounded_places_mm, axis=0))
-    if len(usable) < FEWEST or place_count < FEWEST_POSITIONS:
+    usable_places = place_count(usable.contact)
+    if len(usable) < FEWEST or usable_places < FEWEST_POSITIONS:
         raise PressError(
             f"expected at least {FEWEST} presses at {FEWEST_POSITIONS} places with known place, force and charges, got "
-            f"{len(usable)} at {place_count}; measure more, or describe the sensor in a file and use "
+            f"{len(usable)} at {usable_places}; measure more, or describe the sensor in a file and use "
             "`isocharge train calibrate`, which needs only a few"
         )
     check_measured_presses(usable)

@@ -11,7 +11,7 @@ $arrays
 static void features(const float charge_pC[$electrodes], float logs[$electrodes])
 {
     for (int i = 0; i < $electrodes; ++i)
-        logs[i] = clip(charge_pC[i], $low, $high) * FACTOR[i];
+        logs[i] = clip(charge_pC[i], LOW[i], HIGH[i]) * FACTOR[i];
     for (int i = 1; i < $electrodes; ++i)
         logs[i] = log_ratio(logs[i], logs[0]);
     logs[0] = logf(logs[0]);
