@@ -118,11 +118,17 @@ class Contacts(NamedTuple):
             covariance: Covariance of the additional error of x, y and the force, shape (n, 3, 3), mm and N.
         """
         std = np.stack([self.x_std_mm, self.y_std_mm, self.force_std_N], axis=1).astype(float)
+        correlation = np.stack([self.xy_correlation, self.xF_correlation, self.yF_correlation], axis=1)
         total_std = np.sqrt(std**2 + np.diagonal(covariance, axis1=1, axis2=2))
-        correlations = {"xy_correlation": (0, 1), "xF_correlation": (0, 2), "yF_correlation": (1, 2)}
-        total_correlations: dict[str, Singles] = {}
-        for name, (i, j) in correlations.items():
-            total = getattr(self, name) * std[:, i] * std[:, j] + covariance[:, i, j]
-            total_correlations[name] = (total / (total_std[:, i] * total_std[:, j])).astype(np.float32)
+        i, j = [0, 0, 1], [1, 2, 2]  # the pairs (x, y), (x, F) and (y, F)
+        total = correlation * std[:, i] * std[:, j] + covariance[:, i, j]
         x_std_mm, y_std_mm, force_std_N = total_std.T.astype(np.float32)
-        return self._replace(x_std_mm=x_std_mm, y_std_mm=y_std_mm, force_std_N=force_std_N, **total_correlations)
+        xy, xF, yF = (total / (total_std[:, i] * total_std[:, j])).T.astype(np.float32)
+        return self._replace(
+            x_std_mm=x_std_mm,
+            y_std_mm=y_std_mm,
+            force_std_N=force_std_N,
+            xy_correlation=xy,
+            xF_correlation=xF,
+            yF_correlation=yF,
+        )

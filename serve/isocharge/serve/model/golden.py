@@ -99,7 +99,11 @@ class Golden:
 
 
 def make_golden(
-    session: ort.InferenceSession, onnx_model: bytes, charge_pC: Singles, contact_floor: tuple[float, float, float]
+    session: ort.InferenceSession,
+    onnx_model: bytes,
+    charge_pC: Singles,
+    contact_floor: tuple[float, float, float],
+    companion_files: Mapping[str, bytes],
 ) -> Golden:
     """Compute the golden vectors of a new model, which are the given charges and the outputs for these charges.
 
@@ -108,6 +112,7 @@ def make_golden(
         onnx_model: Content of `model.onnx`, whose checksum is stored.
         charge_pC: Input charges, shape (n, electrodes), pC.
         contact_floor: Floors of x (mm), y (mm) and the force (N) for the comparison of outputs, from `contact_floors`.
+        companion_files: Contents of companion files by file name, whose checksums are stored.
 
     Raises:
         ModelError: If an output is not finite.
@@ -127,6 +132,7 @@ def make_golden(
         outputs=outputs,
         relative_tolerance=RELATIVE_TOLERANCE,
         floors=FLOORS | {"contact": contact_floor, "contact_std": contact_floor},
+        companion_sha256={name: sha256_of(content) for name, content in companion_files.items()},
     )
 
 

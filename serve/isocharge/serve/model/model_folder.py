@@ -11,7 +11,7 @@ therefore never see an incomplete version.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -154,11 +154,7 @@ def write_model(
     session = open_session(onnx_model, where)
     check_interface(session, len(metadata.electrodes), where)
     charges = as_batch(golden_charge_pC, metadata.electrodes)
-    golden_without_files = make_golden(session, onnx_model, charges, contact_floors(metadata))
-    golden = replace(
-        golden_without_files,
-        companion_sha256={name: sha256_of(content) for name, content in companion_files.items()},
-    )
+    golden = make_golden(session, onnx_model, charges, contact_floors(metadata), companion_files)
 
     # Write the version under a temporary name. `new_folder` renames it to `target` after the check has succeeded.
     with new_folder(target) as draft:

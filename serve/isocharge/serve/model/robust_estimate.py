@@ -275,20 +275,13 @@ class _Problem:
         contact_shift = solution[:, :, 0]
         contact_by_state = solution[:, :, 1:]
 
-        # Schur complement: subtract the part that the contacts explain, and add the prior.
-        weighted = point.weights[:, None, None] * point.by_state
-        weighted_mixed = point.weights[:, None, None] * mixed
+        # Schur complement: the parts of the derivatives and of the residuals that no change of the contacts explains
         n_state = point.state.size
-        normal_matrix = (
-            self._precision
-            + weighted.reshape(-1, n_state).T @ point.by_state.reshape(-1, n_state)
-            - weighted_mixed.reshape(-1, n_state).T @ contact_by_state.reshape(-1, n_state)
-        )
-        gradient = (
-            self._precision @ (self._prior.mean - point.state)
-            + weighted.reshape(-1, n_state).T @ point.residual.ravel()
-            - weighted_mixed.reshape(-1, n_state).T @ contact_shift.ravel()
-        )
+        remaining_slopes = (point.by_state - point.by_contact @ contact_by_state).reshape(-1, n_state)
+        remaining_residual = point.residual - (point.by_contact @ contact_shift[:, :, None])[:, :, 0]
+        weighted = (point.weights[:, None, None] * point.by_state).reshape(-1, n_state)
+        normal_matrix = self._precision + weighted.T @ remaining_slopes
+        gradient = self._precision @ (self._prior.mean - point.state) + weighted.T @ remaining_residual.ravel()
         symmetric = 0.5 * (normal_matrix + normal_matrix.T)
         return symmetric, gradient, contact_shift, contact_by_state
 
