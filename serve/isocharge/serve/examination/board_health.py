@@ -89,15 +89,14 @@ def measure_channel_health(
     # The columns of the design matrix are a constant, the time, and the cosine and the sine of each hum. In a short
     # time, a hum cannot be distinguished from a drift. At a low frame rate, it cannot be sampled.
     columns = [np.ones_like(usable_times_s), usable_times_s]
-    hum_columns: dict[float, int] = {}  # first column of each hum
-    for hum_Hz in MAINS_HZ:
-        if usable_times_s[-1] > min_hum_time_s and rate_Hz > min_samples_per_period * hum_Hz:
-            hum_columns[hum_Hz] = len(columns)
-            phase = 2.0 * np.pi * hum_Hz * usable_times_s
-            columns += [np.cos(phase), np.sin(phase)]
+    is_long = usable_times_s[-1] > min_hum_time_s
+    fitted_Hz = [hum_Hz for hum_Hz in MAINS_HZ if is_long and rate_Hz > min_samples_per_period * hum_Hz]
+    for hum_Hz in fitted_Hz:
+        phase = 2.0 * np.pi * hum_Hz * usable_times_s
+        columns += [np.cos(phase), np.sin(phase)]
     design_matrix = np.column_stack(columns)
     coefficients = np.linalg.lstsq(design_matrix, usable_pC, rcond=None)[0]
-    hum_pC = {hum_Hz: math.hypot(*coefficients[column : column + 2]) for hum_Hz, column in hum_columns.items()}
+    hum_pC = dict(zip(fitted_Hz, np.hypot(coefficients[2::2], coefficients[3::2]).tolist(), strict=True))
     return ChannelHealth(
         name,
         offset_pC=float(usable_pC.mean()),

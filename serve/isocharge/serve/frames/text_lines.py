@@ -81,7 +81,7 @@ def _token_pattern(number: str) -> re.Pattern[str]:
     return re.compile(
         rf"(?P<time>(?<![\w.:]){_TIME}(?![\w:]))"
         r"|(?P<uptime>(?<=\b[EWIDV]\s\()[0-9]+(?=\)))"
-        rf"|(?P<key>(?<=^>)[^:]+(?=:)|(?<=^\$)\w+|(?:{key}|{_QUOTED})(?=\s*[:=]))"
+        rf"|(?P<key>(?<=^\$)\w+|(?:{key}|{_QUOTED})(?=\s*[:=]))"
         rf"|(?P<quoted>{_QUOTED})"
         r"|(?P<hexadecimal>(?<![\w.])[-+]?0[xX][0-9A-Fa-f]{1,16}(?!\w))"
         rf"|(?P<number>(?<![\w.]){number}(?!\.[0-9])(?=[^\W\d_]*(?!\w)))"
@@ -139,7 +139,8 @@ class Line(NamedTuple):
 def clean_text(text: str) -> str:
     """Return the part of a line that may contain numbers; empty for a blank line, a comment or a text of Teleplot.
 
-    A Teleplot line has the form `>name:time:value;time:value§unit|flags`. Only its latest value is returned. A sentence
+    A Teleplot line has the form `>name:time:value;time:value§unit|flags`. Only its latest value is returned, as in
+    `t_ms:1000;"name":801.2§unit`. A sentence
     in the style of NMEA 0183 has the form `$NAME,1.5,2.5*3A`. Its checksum is the exclusive or of all bytes between `$`
     and `*`.
 
@@ -154,10 +155,11 @@ def clean_text(text: str) -> str:
     text = text.strip().replace("\N{MINUS SIGN}", "-")  # programs with some locales, such as Swedish, write this sign
     text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text)  # a sign apart from its number, as in `A: - 3.5`
     if text[:1] == ">":
-        content, _, flags = text.partition("|")
+        content, _, flags = text[1:].partition("|")
         name, _, values = content.partition(":")
-        latest_value = values.rstrip("; ").rpartition(";")[2]
-        return "" if "t" in flags or "xy" in flags else f"{name}:{latest_value}"
+        time, _, value = values.rstrip("; ").rpartition(";")[2].rpartition(":")
+        named_time = f"t_ms:{time};" if time else ""
+        return "" if "t" in flags or "xy" in flags else f'{named_time}"{name}":{value}'
     if text[:1] == "$" and "*" in text:
         content, _, checksum = text.partition("*")
         if len(checksum) != 2 or int(checksum, 16) != reduce(xor, content[1:].encode(), 0):
@@ -291,8 +293,6 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     is_single = len(channels) > 1 and len(named) == 1 and names[named[0]] != SEQ
     if is_single and (named[0] == channels[0] or names[named[0]] in words):
         names[named[0]] = ""
-    if tokens and tokens[0].content == ">" and len(names) == 2:  # `>name:time:value`
-        names = [_NAMES_OF_TIMES["uptime"], next((token.content for token in tokens if token.kind == "key"), "")]
     alternating_names = (token.name for token in tokens if token.kind == "name")
     if any(token.kind == "name" for token in tokens):
         names = [_NAMES_OF_TIMES.get(kind) or next(alternating_names) for kind in kinds]
