@@ -8,7 +8,6 @@ command line.
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from importlib import import_module
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -107,8 +106,8 @@ def load_command(command: LazyCommand) -> TyperCommand:
     """
     module_name, _colon, function_name = command.function_path.partition(":")
     # A missing package of the extra raises MissingExtra, whose message names the install command.
-    import_context = require(command.extra) if command.extra else nullcontext()
-    with import_context:
+    extras = [command.extra] if command.extra else []
+    with require(*extras):
         command_function = getattr(import_module(module_name), function_name)
 
     # Typer makes a command only from an app. An app with a single function becomes one command without subcommands.

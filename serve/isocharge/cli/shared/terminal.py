@@ -339,8 +339,7 @@ def _progress_bars() -> Iterator[Listener]:
         def update_bar(title: str, done: int, total: int, note: str) -> None:
             """Show in the bar with the given title that `done` of `total` steps are complete.
 
-            If there is no bar with this title, create it. If fewer steps are complete than before, the work has started
-            again. The bar then also starts again.
+            If there is no bar with this title, create it.
 
             Args:
                 title: Title of the work, which identifies its bar.
@@ -353,10 +352,6 @@ def _progress_bars() -> Iterator[Listener]:
             if shown_title not in bar_of_title:
                 bar_of_title[shown_title] = bars.add_task(shown_title, total=total, note=shown_note)
 
-            bar = bar_of_title[shown_title]
-            has_restarted = done < bars.tasks[bar].completed
-            if has_restarted:
-                bars.reset(bar)  # the elapsed time starts again, too
-            bars.update(bar, completed=done, total=total, note=shown_note)
+            bars.update(bar_of_title[shown_title], completed=done, total=total, note=shown_note)
 
         yield update_bar
