@@ -1,7 +1,5 @@
 """Tests of the signal chain: tare, detection of touches, and invalid frames."""
 
-import math
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -80,18 +78,26 @@ THRESHOLD_PC = np.sqrt(3.0) + 6.0 / np.sqrt(2.0) + 10.0 / np.sqrt(3.0)
 """Touch threshold of a charge on one of three electrodes with a noise of 1 pC, pC."""
 
 
-def touch_stage():
+def touch_stage(*, has_any_sign=False):
     """Return a stage that detects touches, with its default settings."""
-    return Touch(Setup(("A", "B", "C"), Device(rules={TouchRule: TouchRule()})))
+    return Touch(Setup(("A", "B", "C"), Device(rules={TouchRule: TouchRule()}), has_any_sign=has_any_sign))
 
 
-def detect(touch, charge_pC, noise_pC, base_relax_s=math.inf):
-    """Return whether a stage detects a touch in a frame of 1 s with a charge on an electrode and a noise, pC."""
-    frame = Frame(None, None, (), dt_s=1.0, base_relax_s=base_relax_s)
-    frame.charge_pC = np.array([charge_pC, 0.0, 0.0])
+def detect(touch, charge_pC, noise_pC=ONE_PC, dt_s=1.0, **settings):
+    """Return a frame in which a stage has looked for a touch.
+
+    Args:
+        touch: The stage.
+        charge_pC: Charge of the first electrode, or of all electrodes, pC.
+        noise_pC: Noise of each electrode, pC.
+        dt_s: Time since the previous frame, s.
+        settings: Other attributes of the frame.
+    """
+    frame = Frame(None, None, (), dt_s=dt_s, **settings)
+    frame.charge_pC = charge_pC * np.array([1.0, 0.0, 0.0]) if np.ndim(charge_pC) == 0 else charge_pC
     frame.noise_pC = noise_pC
     touch.step(frame)
-    return frame.is_contact
+    return frame
 
 
 @pytest.mark.parametrize(
@@ -110,7 +116,7 @@ def detect(touch, charge_pC, noise_pC, base_relax_s=math.inf):
 )
 def test_touches_begin_and_end(totals, noise, expected):
     touch = touch_stage()
-    assert [detect(touch, total_pC, noise) for total_pC in totals] == expected
+    assert [detect(touch, total_pC, noise).is_contact for total_pC in totals] == expected
 
 
 def false_touch_probability(n_electrode):
@@ -127,35 +133,26 @@ def test_noise_exceeds_the_touch_threshold_rarely_with_any_number_of_electrodes(
 @pytest.mark.parametrize("ratios", [(1.0, -1.0, 0.0), (-1.0, 0.8, -0.3), (-1.0, -1.0, -1.0)])
 def test_touch_is_detected_from_charges_of_any_sign(ratios):
     """The charges of a sensor without a film may have any sign, and their sum may be zero or negative."""
-    touch = Touch(Setup(("A", "B", "C"), Device(rules={TouchRule: TouchRule()}), has_any_sign=True))
-    contacts = []
-    for force in (0.0, 0.0, 100.0, 100.0, 0.0, 0.0, 0.0, -100.0, 0.0):
-        frame = Frame(None, None, (), dt_s=0.1)
-        frame.charge_pC = force * np.array(ratios)
-        frame.noise_pC = ONE_PC
-        touch.step(frame)
-        contacts.append(frame.is_contact)
+    touch = touch_stage(has_any_sign=True)
+    forces = (0.0, 0.0, 100.0, 100.0, 0.0, 0.0, 0.0, -100.0, 0.0)
+    contacts = [detect(touch, force * np.array(ratios), dt_s=0.1).is_contact for force in forces]
     assert contacts == [0, 0, 1, 1, 0, 0, 0, 1, 0]
 
 
 @pytest.mark.parametrize("has_any_sign", [False, True])
 def test_end_of_a_long_press_with_a_leak_is_no_touch(has_any_sign):
     """A press of 5 s loses 39 % of its charge (tau = 10 s), and the release leaves the lost charge with a minus."""
-    touch = Touch(Setup(("A", "B", "C"), Device(rules={TouchRule: TouchRule()}), has_any_sign=has_any_sign))
+    touch = touch_stage(has_any_sign=has_any_sign)
     dt_s = 1.0 / RATE_HZ
     output_pC = np.zeros(3)
-    contacts, flags = [], []
+    frames = []
     for number in range(4000):
         charge = np.array([900.0, 300.0, 100.0]) if 200 <= number < 1200 else np.zeros(3)
         previous = np.array([900.0, 300.0, 100.0]) if 200 < number <= 1200 else np.zeros(3)
         output_pC = output_pC * np.exp(-dt_s / 10.0) + charge - previous
-        frame = Frame(None, None, (), dt_s=dt_s, base_relax_s=2.0, is_base_held=True)
-        frame.charge_pC, frame.noise_pC = output_pC, ONE_PC
-        touch.step(frame)
-        contacts.append(frame.is_contact)
-        flags.append(frame.flags)
-    assert contacts == [200 <= number < 1200 for number in range(4000)]
-    assert flags[1300] == ["negative"]
+        frames.append(detect(touch, output_pC, dt_s=dt_s, base_relax_s=2.0, is_base_held=True))
+    assert contacts_of(frames) == [200 <= number < 1200 for number in range(4000)]
+    assert frames[1300].flags == ["negative"]
 
 
 def contacts_of(readings):
