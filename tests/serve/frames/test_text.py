@@ -183,7 +183,7 @@ def test_numbers_are_taken_out_of_any_text(notation, rows, line_end):
 @settings(derandomize=True, max_examples=20)
 @given(
     st.lists(LEVELS, min_size=12, max_size=12),
-    st.sampled_from(["{a};{b};{c}", "{a} {b}\t{c}", "A: {a}, B: {b}, C: {c}"]),
+    st.sampled_from(["{a};{b};{c}", "{a} {b}\t{c}", "A: {a}, B: {b}, C: {c}", "(A: {a}; B: {b}; C: {c})"]),
 )
 def test_decimal_commas(rows, notation):
     lines = [notation.format(a=a, b=b, c=c).replace(".", ",") for a, b, c in rows]

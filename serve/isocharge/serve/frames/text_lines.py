@@ -216,17 +216,20 @@ def _has_decimal_commas(text: str) -> bool:
     """Return whether the commas between digits are decimal commas, as in `3,1;-2,0` and `A: 3,1 pC, B: -2,0 pC`.
 
     They are separators if a number has a decimal point or two commas, if a comma stands before a sign, beside a blank
-    or before a name, if the line has brackets, or if nothing else separates two numbers. In `A:4,3`, the comma is a
-    decimal comma, because a name belongs to one number.
+    or before a name, if nothing else separates two numbers, or if the line has brackets and a colon or an equals sign
+    does not stand before each number. In `A:4,3`, the comma is a decimal comma, because a name belongs to one number.
     """
     runs = re.findall(r"[0-9]+(?:[.,][0-9]+)*", re.sub(_TIME, "", text))
     are_decimal = all("." not in run and run.count(",") <= 1 for run in runs)
+    named_runs = re.findall(r"[:=]\s*[-+]?[0-9]+,", text)
+    are_named = 1 < sum("," in run for run in runs) == len(named_runs)
     has_one_name = re.fullmatch(r"[^:=]+[:=]\s*[-+]?[0-9]+,[0-9]+\D*", text) is not None
     return (
         are_decimal
         and (len(runs) > 1 or has_one_name)
         and any("," in run for run in runs)
-        and re.search(r"[\[({]|[0-9],[-+.]|,[0-9]+\s*[:=]|,0[xX]|[0-9]\s*,\s+[-+.0-9]|[0-9]\s+,", text) is None
+        and (are_named or re.search(r"[\[({]", text) is None)
+        and re.search(r"[0-9],[-+.]|,[0-9]+\s*[:=]|,0[xX]|[0-9]\s*,\s+[-+.0-9]|[0-9]\s+,", text) is None
     )
 
 
