@@ -114,7 +114,6 @@ def test_version_with_other_electrodes_in_the_same_model_folder_is_refused(film,
         lambda data: data.replace(b'["A"', b'[\xff\xff"'),
         lambda data: data.replace(b"misfit", b"misfi\xff"),
     ],
-    ids=["empty", "truncated", "metadata are not UTF-8", "name of an output is not UTF-8"],
 )
 def test_file_that_is_not_an_onnx_model_is_refused_with_its_cause(own_model, damage):
     path = own_model / "model.onnx"
@@ -133,7 +132,6 @@ def test_file_that_is_not_an_onnx_model_is_refused_with_its_cause(own_model, dam
         (lambda _: "[]", "golden.json: expected a table"),
         (lambda table: json.dumps(table | {"inputs": {"charge_pC": [[1.0, 2.0]]}}), r"charges of shape \(n, 3\)"),
     ],
-    ids=["truncated", "missing key", "list", "two electrodes"],
 )
 def test_damaged_golden_json_is_refused(own_model, damage, message):
     golden = own_model / "golden.json"
@@ -149,7 +147,6 @@ def test_damaged_golden_json_is_refused(own_model, damage, message):
         ({"renamed": {"charge_pC": "x"}}, "expected the tensors .*'x'"),
         ({"batch": 1}, "expected the tensors .*1, 3"),
     ],
-    ids=["renamed output", "renamed input", "fixed batch size"],
 )
 def test_graph_with_other_inputs_or_outputs_is_refused(film, own_model, changes, message):
     data = film.onnx(film.metadata().to_props(), **changes)

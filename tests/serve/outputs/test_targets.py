@@ -15,6 +15,8 @@ from isocharge.serve.outputs.targets import Outputs, output_kind
 
 ELECTRODES = ("A", "B")
 
+live_and_replayed = pytest.mark.parametrize("is_live", [True, False], ids=["live", "replay"])
+
 
 def context(**changes):
     return OutputContext(**({"electrodes": ELECTRODES} | changes))
@@ -55,7 +57,7 @@ def test_repeated_target_is_refused():
         Outputs(["a.csv", "a.csv"], context())
 
 
-@pytest.mark.parametrize("is_live", [True, False], ids=["live", "replay"])
+@live_and_replayed
 def test_same_records_go_to_every_output(record, tmp_path, is_live):
     records = [record(seq=number, charge_pC={"A": 1.0, "B": 2.0}) for number in range(50)]
     printed = []
@@ -71,7 +73,7 @@ def test_same_records_go_to_every_output(record, tmp_path, is_live):
     assert outputs.not_written == {}
 
 
-@pytest.mark.parametrize("is_live", [True, False], ids=["live", "replay"])
+@live_and_replayed
 def test_a_stream_that_is_stopped_keeps_its_files_and_a_replay_leaves_none(record, tmp_path, is_live):
     names = ["a.jsonl", "b.csv", "c.mcap"]
     outputs = Outputs([str(tmp_path / name) for name in names], context(is_live=is_live)).__enter__()
@@ -132,7 +134,7 @@ def failing(add_kind):
     add_kind("broken".__eq__, Failing())
 
 
-@pytest.mark.parametrize("is_live", [True, False], ids=["live", "replay"])
+@live_and_replayed
 def test_added_output_that_cannot_be_closed_spoils_no_other_output(record, tmp_path, add_kind, caplog, is_live):
     add_kind("mine".__eq__, Added(raise_error))
     path = tmp_path / "touch.jsonl"
@@ -158,7 +160,7 @@ def test_ctrl_c_while_an_output_closes_spoils_no_other_output(record, tmp_path, 
     assert outputs.not_written == {"mine": None}  # the command must not report success
 
 
-@pytest.mark.parametrize("is_live", [True, False], ids=["live", "replay"])
+@live_and_replayed
 def test_added_output_that_never_closes_is_named(add_kind, caplog, monkeypatch, is_live):
     monkeypatch.setattr("isocharge.serve.outputs.output.END_TIMEOUT_s", 0.05)
     add_kind("mine".__eq__, Added(Event().wait))

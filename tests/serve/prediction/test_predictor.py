@@ -74,17 +74,6 @@ def test_predict_takes_any_kind_of_numbers(predictor, kind):
         ([1.0, 2.0, 1e39], r"'C' \(1e\+39\)"),
         ((q for q in (1.0, 2.0, math.nan)), "as numbers"),
     ],
-    ids=[
-        "four charges",
-        "no charges",
-        "number",
-        "dict",
-        "None",
-        "NaN",
-        "infinity",
-        "beyond float32",
-        "generator with NaN",
-    ],
 )
 def test_predict_refuses_wrong_charges(predictor, charge_pC, message):
     with pytest.raises(ChargeError, match=message):
@@ -98,7 +87,6 @@ def test_predict_refuses_wrong_charges(predictor, charge_pC, message):
         ([[1.0, 2.0, 3.0], [1.0, 2.0]], "in each row"),
         ([[1.0, 2.0, 3.0], [1.0, math.nan, math.inf]], r"in row 1 .* for electrode 'B' \(nan\), 'C' \(inf\)"),
     ],
-    ids=["four columns", "rows of different lengths", "NaN and infinity"],
 )
 def test_predict_batch_refuses_wrong_charges(predictor, charge_pC, message):
     with pytest.raises(ChargeError, match=message):
@@ -121,12 +109,6 @@ def test_predict_into_fills_an_array(film, predictor, plain_session, gap):
         (np.ones(4, np.float32), np.zeros(10, np.float32), r"\('A', 'B', 'C'\) .* got float32 of shape \(4,\)"),
         (np.ones(3, np.float32), np.zeros(10), r"and float64 of shape \(10,\)"),
         (np.ones(3, np.float32), np.broadcast_to(np.float32(0.0), 10), "read-only"),
-    ],
-    ids=[
-        "float64 charges",
-        "four charges",
-        "float64 output",
-        "read-only output",
     ],
 )
 def test_predict_into_refuses_arrays_of_a_wrong_type_or_shape(predictor, charge_pC, out, message):

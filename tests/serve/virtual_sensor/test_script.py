@@ -29,7 +29,6 @@ def test_wander_stays_inside_radius_and_forces(script):
         *(
             (partial(wander, seed=0, **wrong), "wander: expected 0 < smallest")
             for wrong in (
-                {"force_range_N": (0.0, 2.0)},
                 {"force_range_N": (2.0, 1.0)},
                 {"radius_mm": 0.0},
                 {"rate_Hz": 0.0},

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate import Circle, Ellipse, Film, Polygon, Probe, Resolution, SolveSettings, Theory
+from isocharge.simulate import Circle, Ellipse, Film, Polygon, Probe, SolveSettings, Theory
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.point_location import locate_points
@@ -41,8 +41,8 @@ def probes(draw) -> Probe:
 
 
 @st.composite
-def presses(draw) -> tuple[Probe, tuple[float, float], Resolution, float]:
-    """Generate accepted presses up to the rim: probe, position, resolution and layer."""
+def presses(draw):
+    """Generate accepted presses up to the rim: probe, position, template and placed mesh."""
     probe = draw(probes())
     layer = 10.0 ** draw(st.floats(-3.0, -1.0))
     share = draw(st.one_of(st.floats(0.0, 0.97), st.floats(0.9, 0.999)))
@@ -54,7 +54,7 @@ def presses(draw) -> tuple[Probe, tuple[float, float], Resolution, float]:
         resolution = choose_mesh(case).resolution
     except SceneError:
         assume(False)
-    return probe, at, resolution, layer
+    return probe, at, template_for(probe, resolution), place(FILM, probe, at, resolution, layer)
 
 
 def exact_points(placement: Placement, mesh: Template, xi: np.ndarray, eta: np.ndarray) -> np.ndarray:
@@ -86,9 +86,8 @@ def accuracy(film: np.ndarray, placement: Placement) -> np.ndarray:
 @COMMON
 def test_locate_is_the_inverse_of_the_element_map(scene, seed):
     """The points lie all over the film, on the rim, at the nodes and on the edge of the footprint."""
-    probe, at, resolution, layer = scene
-    placement = place(FILM, probe, at, resolution, layer).placement
-    mesh = template_for(probe, resolution)
+    probe, _, mesh, placed = scene
+    placement = placed.placement
     rng = np.random.default_rng(seed)
     disk = np.sqrt(rng.random(120)) * np.exp(2j * np.pi * rng.random(120))
     near = placement.corners.mean() + 3.0 * probe.reach / RADIUS * disk[:100]
@@ -103,9 +102,8 @@ def test_locate_is_the_inverse_of_the_element_map(scene, seed):
 @COMMON
 def test_accepted_presses_have_no_folded_elements(scene):
     """The Jacobian is positive at every integration point and node, and the total area is that of the film."""
-    probe, at, resolution, layer = scene
-    mesh = template_for(probe, resolution)
-    geometry = place(FILM, probe, at, resolution, layer).geometry
+    _, _, mesh, placed = scene
+    geometry = placed.geometry
     assert geometry.weights.min() > 0.0
     assert geometry.mass.min() > 0.0
     assert mesh.copies * geometry.weights.sum() == pytest.approx(np.pi, rel=3e-3)
@@ -115,10 +113,8 @@ def test_accepted_presses_have_no_folded_elements(scene):
 @COMMON
 def test_footprint_elements_have_the_area_centroid_and_load_of_the_probe(scene):
     """Area, centroid and load are exact for polygons, and accurate to the mesh error for curved probes."""
-    probe, at, resolution, layer = scene
-    mesh = template_for(probe, resolution)
+    probe, at, mesh, placed = scene
     distance = float(np.hypot(*at)) / RADIUS
-    placed = place(FILM, probe, at, resolution, layer)
     geometry = placed.geometry
     exact = 1e-9 if isinstance(probe, Polygon) else 1e-4
     inner = geometry.weights[mesh.footprint]

@@ -64,7 +64,6 @@ def with_one_charge(dataset, value):
         ),
         (lambda d: with_one_charge(d, np.nan), r"sample 17: expected finite numbers .*nan.* pC"),
     ],
-    ids=["few presses", "one position", "two electrodes", "negative forces", "dead electrode", "NaN"],
 )
 def test_dataset_that_a_network_cannot_be_trained_on_is_refused(dataset, change, message):
     with pytest.raises(DatasetError, match=message):
