@@ -36,15 +36,6 @@ def test_gradients_equal_differences_of_the_charges(near_spline):
         np.testing.assert_allclose(gradients[..., axis], slope, atol=1e-5 * np.abs(slope).max())
 
 
-def test_stress_charges_for_all_forces_equal_the_charges_of_the_map(near_map):
-    """The charges for all forces come from fields in single precision."""
-    position = spread(40)[:, :2]
-    together = near_map.stress_charges_by_force(position)
-    for number, force in enumerate(near_map.family.force.tolist()):
-        single = near_map.charges(np.column_stack([position, np.full(40, force)]))
-        np.testing.assert_allclose(together[:, number], single, atol=2e-6 * np.abs(single).max())
-
-
 def test_spline_includes_the_charge_of_contact_pressure(near_map):
     """The charges of d33 are proportional to the force, while those of the stress depend on the squared amplitude.
 

@@ -64,27 +64,6 @@ def test_points_off_the_film_raise_scene_error(made_up, read):
     read(solved, np.array([(0.0, 45.0)]))
 
 
-def test_vertical_forces_balance_round_the_probe(film):
-    """The stress on a circle around the probe balances the force, F = integral of (S grad w) . n h ds.
-
-    The test uses only the stress and the deflection of the result. It does not depend on the residual of the solver.
-    """
-    probe = Polygon.rectangle(4.0, 2.0, 0.3)
-    at = (6.0, -5.0)
-    radius = 5.0
-    step = 1e-3
-    solved = press(film, probe, at, 1.0, SolveSettings(theory=MEMBRANE, resolution=Resolution(6, 8, 6)))
-    angle = 2.0 * np.pi * np.arange(64) / 64
-    normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    points = at + radius * normal
-    s11, s22, s12 = touch_stress(solved, points).T
-    traction = np.stack([s11 * normal[:, 0] + s12 * normal[:, 1], s12 * normal[:, 0] + s22 * normal[:, 1]], axis=1)
-    slope = [(deflection(solved, points + e) - deflection(solved, points - e)) / (2 * step) for e in step * np.eye(2)]
-    force_per_area = -np.sum(traction * np.stack(slope, axis=1), axis=1)
-    area = 2.0 * np.pi * radius * film.thickness
-    assert force_per_area.mean() * area == pytest.approx(1.0, rel=1e-5)
-
-
 def test_compression_near_the_rim_gives_a_warning(film):
     """A press at half the radius gives no warning about wrinkles. A press at three quarters does."""
     for distance, taut in ((0.5, True), (0.75, False)):
