@@ -6,6 +6,7 @@ session.
 """
 
 import math
+import re
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -16,7 +17,6 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.serve.presses.number_table import parse_number
 from isocharge.train.calibration.calibrate import calibrate, solve_even
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.estimator import FEW_PRESSES
@@ -40,6 +40,10 @@ Reply = Literal["take", "undo", "quit"]
 
 REPLIES: dict[str, Reply] = {"": "take", "take": "take", "u": "undo", "undo": "undo", "q": "quit", "quit": "quit"}
 """Actions by the word that a person types to request the action."""
+
+
+_CELL = re.compile(r"\??|[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[-+]?[0-9]{1,2})?")
+"""Number, question mark or empty text for one value of a contact."""
 
 
 class Answer(NamedTuple):
@@ -67,20 +71,14 @@ def read_answer(text: str) -> Answer:
     normalised_text = text.strip().lower()
     if normalised_text in REPLIES:
         return Answer(REPLIES[normalised_text])
-    if normalised_text == "?":  # a press with an unknown place and an unknown force
-        return Answer("take", np.full(len(CONTACT), np.nan))
-
+    # A question mark alone stands for an unknown place and an unknown force.
     separator = "," if "," in normalised_text else None  # None: any blanks
-    cells = [cell.strip() for cell in normalised_text.split(separator)]
-    try:
-        contact = np.array([math.nan if cell in ("", "?") else parse_number(cell) for cell in cells])
-    except ValueError:
-        contact = np.empty(0)
-    has_written_nan = any("nan" in cell for cell in cells)
-    if len(contact) != len(CONTACT) or np.isinf(contact).any() or has_written_nan:
+    values = "? ? ?" if normalised_text == "?" else normalised_text
+    cells = [cell.strip() for cell in values.split(separator)]
+    if len(cells) != len(CONTACT) or not all(map(_CELL.fullmatch, cells)):
         # The message repeats at most 60 characters of the text.
         raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")
-    return Answer("take", contact)
+    return Answer("take", np.array([float(cell.strip("?") or "nan") for cell in cells]))
 
 
 class PressSession:

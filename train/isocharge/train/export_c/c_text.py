@@ -1,5 +1,6 @@
 """Numbers, arrays and texts in the syntax of C99."""
 
+import re
 from collections.abc import Iterable
 from importlib import resources
 from string import Template
@@ -62,15 +63,8 @@ def c_string(text: str) -> str:
     Args:
         text: Text of the literal.
     """
-
-    def escape(byte: int) -> str:
-        """Return one byte of the encoded text as a character or as an octal code."""
-        character = chr(byte)
-        is_plain = character == " " or (character.isascii() and character.isalnum())
-        return character if is_plain else f"\\{byte:03o}"
-
-    escaped = "".join(escape(byte) for byte in text.encode())
-    return f'"{escaped}"'
+    escaped = re.sub(rb"[^A-Za-z0-9 ]", lambda match: b"\\%03o" % match[0][0], text.encode())
+    return f'"{escaped.decode()}"'
 
 
 def c_comment(text: str) -> str:
@@ -78,9 +72,4 @@ def c_comment(text: str) -> str:
 
     Characters that could end the comment or begin another comment are replaced by `_`.
     """
-
-    def is_allowed(character: str) -> bool:
-        """Return whether a character can remain in the comment."""
-        return character.isascii() and (character.isalnum() or character in " ._-,:()=/")
-
-    return "".join(character if is_allowed(character) else "_" for character in text)
+    return re.sub(r"[^A-Za-z0-9 ._,:()=/-]", "_", text)
