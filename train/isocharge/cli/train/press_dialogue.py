@@ -376,10 +376,5 @@ def _count_rows_made(session: PressSession, contacts: Array) -> int:
     """
     if len(session) == 0:
         return 0
-    last_contact = session.presses.contact[-1]
-    is_equal = np.isclose(contacts, last_contact, equal_nan=True)
-    equal_rows = np.flatnonzero(is_equal.all(axis=1))  # x, y and F are equal
-    if equal_rows.size == 0:
-        return 0
-    last_row = int(equal_rows[-1])
-    return last_row + 1
+    is_equal = np.isclose(contacts, session.presses.contact[-1], equal_nan=True).all(axis=1)  # x, y and F are equal
+    return int(np.flatnonzero(is_equal).max(initial=-1)) + 1

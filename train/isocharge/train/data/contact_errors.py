@@ -80,15 +80,17 @@ class ContactErrorStatistics:
         """
         position_mm = position_error(contact, truth)
         force_percent = np.abs(force_error_percent(contact, truth))
+        position_median_mm, position_p95_mm, position_p99_mm = np.percentile(position_mm, [50, 95, 99]).tolist()
+        force_median_percent, force_p99_percent = np.percentile(force_percent, [50, 99]).tolist()
         return cls(
             presses=len(truth),
-            position_median_mm=float(np.median(position_mm)),
+            position_median_mm=position_median_mm,
             position_rms_mm=rms(position_mm),
-            position_p95_mm=float(np.percentile(position_mm, 95)),
-            position_p99_mm=float(np.percentile(position_mm, 99)),
-            force_median_percent=float(np.median(force_percent)),
+            position_p95_mm=position_p95_mm,
+            position_p99_mm=position_p99_mm,
+            force_median_percent=force_median_percent,
             force_rms_percent=rms(force_percent),
-            force_p99_percent=float(np.percentile(force_percent, 99)),
+            force_p99_percent=force_p99_percent,
         )
 
     def rounded(self) -> dict[str, float]:

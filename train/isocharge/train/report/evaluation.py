@@ -18,6 +18,7 @@ from isocharge.serve.benchmark import Contender, take_turns
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
+from isocharge.serve.model.session import COLUMNS
 from isocharge.serve.model.validity import inside_polygon
 from isocharge.simulate import ChargeMap, Dataset, NoiseModel, Triangulation, limits_at, noise_model
 from isocharge.simulate.identifiability.nearest_contact import search
@@ -119,8 +120,7 @@ def model_method(folder: Path) -> Method:
 
     def estimate(charge: Array) -> Array:
         """Estimate contacts (x, y, F), shape (n, 3), mm and N."""
-        answers = predictor.predict_batch(charge)
-        return np.stack([answers.x_mm, answers.y_mm, answers.force_N], axis=1).astype(float)
+        return np.asarray(predictor.predict_batch(charge), float)[:, COLUMNS["contact"]]
 
     def single_call(charge: Array) -> Callable[[], object]:
         """Return a function that computes the complete answer to one press."""
