@@ -115,10 +115,10 @@ def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array
         Contacts (x, y, F), shape (count, 3), mm and N.
     """
     distance = domain.radius * np.sqrt(rng.random(count))
-    angle = 2.0 * np.pi * rng.random(count)
+    place = distance * np.exp(2j * np.pi * rng.random(count))  # x + i y
     min_log_force, max_log_force = np.log(domain.force_range)
     force = np.exp(rng.uniform(min_log_force, max_log_force, count))
-    return np.stack([distance * np.cos(angle), distance * np.sin(angle), force], axis=1)
+    return np.column_stack([place.real, place.imag, force])
 
 
 class _Ranges(Struct):
