@@ -6,7 +6,7 @@ A TOML file with the tables `network` and `training` can replace the default val
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from msgspec import Meta, to_builtins
+from msgspec import Meta, json
 from msgspec.structs import replace
 
 from isocharge.common.defaults import FEW_ELECTRODES
@@ -168,8 +168,7 @@ class FitConfig(Settings, frozen=True):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as nested dictionaries that can be written to JSON."""
-        values: dict[str, Any] = to_builtins(self)
-        return values
+        return json.decode(json.encode(self), type=dict[str, Any])
 
     def checked(self) -> "FitConfig":
         """Check the ranges of all settings as for settings from a file, and return a copy of the settings.
