@@ -271,7 +271,7 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
         "fit": lambda *_: None,
         "release": lambda _, folder, **__: load_model(shutil.copytree(released, folder / "1")),
         "save_picture": lambda figure, _: figures.append(figure),
-        **dict.fromkeys(("press", "draw_deflection"), lambda *_: None),
+        **dict.fromkeys(("press", "draw_deflection", "draw_section", "draw_charge_map"), lambda *_: None),
     }.items():
         monkeypatch.setattr(f"isocharge.cli.demo.full_demo.{name}", stub)
     run_demo(out, 2.0)
@@ -287,7 +287,7 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     assert np.all(np.abs(np.log(ratios)) < [1e-3, 1e-3, 1.1, 1.1, 1e-3, 1e-3])  # live, there is one press only
     seconds = re.findall(r"(?:simulate|train|serve|show) ([0-9.]+)", table)
     assert 2.0 <= sum(map(float, seconds)) < 60.0
-    pressed, felt = figures[0].axes[1].lines[:2]
+    pressed, felt = figures[0].axes[2].lines[:2]
     assert (pressed.get_label(), felt.get_label(), (out / "presses").is_dir()) == ("pressed", "estimated", True)
     np.testing.assert_allclose(felt.get_xydata(), pressed.get_xydata(), atol=0.5)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from isocharge.simulate import Calibration, Circle, Electrode, load_sensor, press
-from isocharge.simulate.plots.film import draw_electrodes, draw_section
+from isocharge.simulate import Calibration, Circle, Domain, Electrode, FunctionMap, load_sensor, press
+from isocharge.simulate.plots.film import draw_charge_map, draw_electrodes, draw_section
 
 
 def test_draw_electrodes_draws_front_and_back_at_their_positions():
@@ -22,6 +22,14 @@ def test_draw_electrodes_draws_front_and_back_at_their_positions():
         np.testing.assert_allclose(drawn, polygon)
     assert [patch.get_linestyle() for patch in axes.patches] == ["-", "-", "--"]
     assert [(text.get_text(), *text.xy) for text in axes.texts] == [("A", *np.add(electrode.centre, [1.0, 0.0]))]
+
+
+def test_draw_charge_map_covers_the_whole_disk():
+    """The shaded area extends to the edge of the domain on all sides."""
+    charge_map = FunctionMap(lambda contact: contact[:, :1], ("A",), Domain(8.0, (0.1, 1.0)))
+    axes = Figure().subplots()
+    draw_charge_map(axes, charge_map, 0)
+    assert axes.dataLim.extents == pytest.approx([-8.0, -8.0, 8.0, 8.0], abs=0.02)
 
 
 @pytest.mark.parametrize(("at", "distance"), [((3.0, -4.0), 5.0), ((0.0, 0.0), 0.0)])

@@ -1,4 +1,4 @@
-"""Functions that draw parts of a film to scale, such as electrodes and deflections."""
+"""Functions that draw parts of a film to scale, such as electrodes, charge maps and deflections."""
 
 import cmath
 from typing import Any
@@ -8,6 +8,8 @@ from matplotlib.patches import Circle as Disk
 from matplotlib.patches import Polygon as Patch
 from matplotlib.patheffects import withStroke
 
+from isocharge.common.arrays import Array
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.plots.figure import FELT, INK
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
@@ -78,7 +80,7 @@ def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> Non
     axes.set(xlim=limits, ylim=limits, xlabel="x, mm", ylabel="y, mm", aspect="equal", title=title)
 
 
-def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "") -> None:
+def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "", highlight: str = "") -> None:
     """Draw the electrodes and the working area of a sensor, and scale the axes.
 
     Args:
@@ -86,10 +88,32 @@ def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "") -> No
         sensor: Sensor whose electrodes are drawn.
         radius: Radius of the working area, mm.
         title: Title of the axes.
+        highlight: Name of an electrode that is drawn in another colour; empty for none.
     """
-    draw_electrodes(axes, sensor)
+    draw_electrodes(axes, sensor, highlight)
     draw_working_area(axes, radius)
     frame_film(axes, sensor, radius, title)
+
+
+def draw_charge_map(axes: Any, charge_map: ChargeMap, electrode: int, force: float = 1.0, count: int = 81) -> None:
+    """Draw the charge of one electrode as a function of the position of a press.
+
+    The charge is shown by shades and by labelled contours.
+
+    Args:
+        axes: Axes of matplotlib.
+        charge_map: Map that computes the charges of contacts.
+        electrode: Index of the electrode in the order of the charges.
+        force: Force of the presses, N.
+        count: Number of points on each ring of the polar grid on which the charge is computed.
+    """
+    # The grid has half as many rings as angles.
+    x, y = _polar_grid(charge_map.domain.radius, rings=count // 2, angles=count)
+    contact = np.stack([x.ravel(), y.ravel(), np.full(x.size, force)], axis=1)
+    charge = charge_map.charges(contact)[:, electrode].reshape(x.shape)
+    axes.contourf(x, y, charge, levels=30, cmap="YlGnBu")
+    contour_lines = axes.contour(x, y, charge, levels=12, colors=INK, linewidths=0.8)
+    axes.clabel(contour_lines, fmt="%.0f", fontsize=7)
 
 
 def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
@@ -100,12 +124,10 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
         equilibrium: Equilibrium of the film under a press.
     """
     radius = equilibrium.film.radius
-    # The deflection is computed on a polar grid. The areas between neighbouring rings are equal.
-    distance = equilibrium.film.inner_radius * np.sqrt(np.linspace(0.0, 1.0, 240))
-    grid = np.outer(distance, np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 361)))
-    points = np.stack([grid.real.ravel(), grid.imag.ravel()], axis=1)
-    depth = deflection(equilibrium, points).reshape(grid.shape)
-    shades = axes.contourf(grid.real, grid.imag, depth, levels=24, cmap="viridis_r")
+    x, y = _polar_grid(equilibrium.film.inner_radius, rings=240, angles=361)
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    depth = deflection(equilibrium, points).reshape(x.shape)
+    shades = axes.contourf(x, y, depth, levels=24, cmap="viridis_r")
     axes.figure.colorbar(shades, ax=axes, shrink=0.8, label="deflection, mm")
     draw_circle(axes, radius, color=INK)
     axes.set(title=f"the film under {equilibrium.force:g} N", xlabel="x, mm", ylabel="y, mm", aspect="equal")
@@ -139,3 +161,20 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
         xlabel="along the cut, mm",
         ylabel="-deflection, mm (stretched)",
     )
+
+
+def _polar_grid(radius: float, rings: int, angles: int) -> tuple[Array, Array]:
+    """Return the points of a polar grid on a disk. The areas between neighbouring rings are equal.
+
+    Args:
+        radius: Radius of the disk, mm.
+        rings: Number of rings, including the centre.
+        angles: Number of points on each ring.
+
+    Returns:
+        Coordinates x and y, each of shape (rings, angles), mm.
+    """
+    distance = radius * np.sqrt(np.linspace(0.0, 1.0, rings))
+    angle = np.linspace(0.0, 2.0 * np.pi, angles)
+    points = np.outer(distance, np.exp(1j * angle))
+    return points.real, points.imag
