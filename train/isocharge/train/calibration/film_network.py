@@ -102,7 +102,7 @@ def _nodes(film: FilmEstimate) -> Array:
     """Return the changes of the pretension at the nodes, of which none makes the film slack, shape (n_node,), MPa."""
     node_MPa = np.array(NODES_MPa)
     lowest_MPa = -0.95 * film.value(PRETENSION.name)
-    reach = min(1.0, lowest_MPa / node_MPa.min())
+    reach = min(1.0, lowest_MPa / node_MPa.min()) if node_MPa.min() < 0.0 else 1.0
     return np.unique(np.where(node_MPa < 0.0, reach * node_MPa, node_MPa))
 
 
