@@ -151,7 +151,7 @@ def test_predict_works_from_any_folder(base, tmp_path):
     assert predicted(base, tmp_path) == pytest.approx([3.0, -2.0, 1.0], abs=0.06)
 
 
-@pytest.mark.parametrize(("page", "number"), [("README.md", 0), ("serve/README.md", 0), ("serve/docs/tutorial.md", 1)])
+@pytest.mark.parametrize(("page", "number"), [("README.md", 0), ("serve/docs/tutorial.md", 1)])
 def test_examples_of_the_base_install_work_from_any_folder(base, tmp_path, page, number):
     """The examples print what their comments say in an installation without extras."""
     example = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)[number]
