@@ -1,5 +1,6 @@
 """Every file that is read, truncated at each byte, with faults, with junk in its tables, and with what is no file."""
 
+import io
 import json
 import re
 import shutil
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from attacks.companions import ELECTRODES, charge_arrays
 from attacks.faults import mutated, with_junk
 from isocharge.common.files import sha256_of
 from isocharge.serve import (
@@ -16,22 +18,24 @@ from isocharge.serve import (
     Recording,
     check_golden,
     device_from_table,
+    find_labelled_model,
     find_model,
     load_device,
     load_model,
     read_charges,
 )
 from isocharge.serve.live.device import create_stages
+from isocharge.serve.model.charge_file import FILE, read_charge_map
 from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.virtual_sensor.script import load_script
-from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, read_dataset, write_dataset
+from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import CalibrationProblem, FilmEstimate, read_earlier
 from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.folder import film_table, json_text
 from isocharge.train.training.config import load_config
-from model_files import put_graph
 
 ROOT = Path(__file__).parents[2]
 
@@ -193,12 +197,35 @@ def model(tmp_path):
     return folder / "1"
 
 
+LABEL_PARTS = ("three-25um-biaxial", "1", "outside", "..", ".", "/", "//", "~", "\\", "\n", "\0", "%2e", "")
+
+
+def test_labels_of_recordings_choose_no_path(tmp_path, attack):
+    """Whatever a recording names as its model, a folder outside the repositories is never found."""
+    repository = tmp_path / "models"
+    shutil.copytree(find_model("three-25um-biaxial").parent, repository / "three-25um-biaxial")
+    shutil.copytree(repository / "three-25um-biaxial", tmp_path / "outside")
+    shutil.copytree(repository / "three-25um-biaxial", tmp_path / "outside" / "outside")
+
+    def random_label(rng):
+        parts = [rng.choice(LABEL_PARTS) for _ in range(rng.choice((1, 2, 3, 4)))]
+        return rng.choice(("", "/", f"{tmp_path}/")) + "/".join(parts)
+
+    def find(label):
+        assert find_labelled_model(label, repository).is_relative_to(repository)
+
+    find("three-25um-biaxial/1")
+    attack("labels of recordings", find, random_label, 20_000)
+
+
 def test_a_model_with_faults(model, attack):
     """The checksum fits: what is refused is refused by the graph, its interface or its answers."""
-    good = (model / "model.onnx").read_bytes()
+    graph, golden = model / "model.onnx", json.loads((model / "golden.json").read_text())
+    good = graph.read_bytes()
 
     def read(data):
-        put_graph(model, data)
+        graph.write_bytes(data)
+        (model / "golden.json").write_text(json.dumps(golden | {"sha256": sha256_of(data)}))
         check_golden(load_model(model))
 
     head = 4000  # nodes and metadata; most of the rest is numbers
@@ -236,6 +263,53 @@ def test_calibrations_with_faults(tmp_path, attack):
     attack("calibration numbers", read, lambda rng: number_bomb(rng, text).encode(), 500)
 
 
+def test_loads_of_half_copied_versions(tmp_path, attack):
+    """Whatever lies in the folder of a newer version, the old version of a model goes on serving after a load."""
+    folder = tmp_path / "models" / "three-25um-biaxial"
+    shutil.copytree(find_model("three-25um-biaxial").parent, folder)
+    store = open_model_store(folder.parent)
+    charge_pC = np.full((1, 3), 500.0, np.float32)
+    names = ("model.onnx", "golden.json", "card.md")
+    contents = {name: (folder / "1" / name).read_bytes() for name in names}
+
+    def half_copied(rng):
+        """Some files of a version, cut or with faults."""
+        chosen = rng.sample(names, rng.randrange(len(names) + 1))
+        return {name: contents[name][: rng.randrange(len(contents[name]))] for name in chosen}
+
+    def load(files):
+        newer = folder / "2"
+        newer.mkdir()
+        for name, data in files.items():
+            (newer / name).write_bytes(data)
+        try:
+            store.load("three-25um-biaxial")
+        finally:
+            shutil.rmtree(newer)
+            outputs = store.get("three-25um-biaxial").model.session.run(None, {"charge_pC": charge_pC})
+            assert np.isfinite(outputs[0]).all()
+
+    attack("half-copied versions", load, half_copied, 1_000)
+
+
+def test_charge_maps_with_faults(model, attack):
+    """A file is accepted only with the checksum that `golden.json` contains."""
+    file = io.BytesIO()
+    np.savez_compressed(file, **charge_arrays())
+    good = file.getvalue()
+    golden = json.loads((model / "golden.json").read_text("utf-8"))
+    golden["files"] = {FILE: sha256_of(good)}
+    (model / "golden.json").write_text(json.dumps(golden), "utf-8")
+
+    def read(data):
+        (model / FILE).write_bytes(data)
+        read_charge_map(model, ELECTRODES)
+        assert data == good
+
+    read(good)
+    attack("charges.npz bytes", read, lambda rng: mutated(rng, good), 3_000)
+
+
 def test_a_dataset_with_faults(dataset, attack):
     path, shard = dataset / "manifest.json", dataset / "shard-00000.npz"
     good, good_shard = path.read_bytes(), shard.read_bytes()
@@ -255,3 +329,22 @@ def test_a_dataset_with_faults(dataset, attack):
     attack("manifest", read_manifest, lambda rng: json.dumps(with_junk(rng, json.loads(good))).encode(), 5_000)
     path.write_bytes(good)
     attack("shard", read_shard, lambda rng: mutated(rng, good_shard), 5_000)
+
+
+NOTATIONS = (
+    "circle:1.0",
+    "growing-finger:6.0",
+    "rectangle:4.0x2.0@30",
+    "triangle:4.0@-3",
+    "ellipse:4.0x2.0@30",
+    "polygon:0,0;1,0;1,1;0,1",
+)
+
+
+def test_probes_with_faults(attack):
+    attack(
+        "probes",
+        parse_probe,
+        lambda rng: mutated(rng, rng.choice(NOTATIONS).encode()).decode("utf-8", "replace"),
+        30_000,
+    )

@@ -15,11 +15,18 @@ from isocharge.common.errors import IsochargeError
 from isocharge.serve import (
     Chunk,
     Predictor,
+    Recorder,
+    Recording,
     TouchStream,
     device_from_table,
+    load_model,
+    read_charges,
 )
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.model_search import find_model
+from isocharge.serve.record.formats import csv_header
 
 HARMFUL_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 
@@ -143,3 +150,51 @@ def test_names_of_a_board_through_the_stream(notation, attack):
             logging.getLogger("isocharge.serve").warning("%s", names)
 
     attack(f"stream {notation}", read, foreign_names, 2_000)
+
+
+def test_device_files_with_foreign_keys(attack):
+    def read(names):
+        with checked_terminal():
+            device_from_table({"name": names[0], names[1]: {names[2]: names[0]}, "frames": {"format": names[2]}}, "f")
+
+    attack("foreign device file", read, foreign_names, 2_000)
+
+
+def test_metadata_of_models(attack):
+    good = load_model(find_model("three-25um-biaxial")).metadata.to_props()
+
+    def read(names):
+        key = ("electrodes", "sensor", "probes", "name", "noise")[len(names[0]) % 5]
+        content = {"electrodes": names, "sensor": {"name": names[0]}, "probes": names, "noise": {names[0]: names[1]}}
+        with checked_terminal():
+            props = good | {key: json.dumps(content.get(key, names[0]))}
+            metadata = ModelMetadata.from_props(props, names[2])
+            show(metadata.label)
+            print(csv_header(metadata.electrodes))
+            print(metadata.frame_id)
+
+    attack("foreign metadata", read, foreign_names, 2_000)
+
+
+def test_headers_of_csv_files(attack):
+    def read(names):
+        with checked_terminal():
+            header = ",".join(["A", "B", "C", *names])
+            read_charges([header, "1,2,3,4,5,6"], ("A", "B", "C"), names[0], say)
+
+    attack("foreign csv", read, foreign_names, 2_000)
+
+
+def test_recordings(attack, tmp_path):
+    path = tmp_path / "foreign.rec"
+
+    def read(names):
+        path.unlink(missing_ok=True)
+        with checked_terminal():
+            with Recorder(path, names[0], {"name": names[1]}, names[2]):
+                pass
+            recording = Recording(path)
+            print(recording.name)
+            device_from_table(recording.device, recording.model)
+
+    attack("foreign recording", read, foreign_names, 1_000)
