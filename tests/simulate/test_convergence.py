@@ -10,7 +10,9 @@ import pytest
 from isocharge.simulate import (
     Circle,
     Equilibrium,
+    Film,
     Polygon,
+    Probe,
     Resolution,
     SolveSettings,
     Theory,
@@ -79,3 +81,38 @@ def test_charge_converges_exponentially_with_the_order(solves, name, readout):
 
 
 # Convergence with the size of the elements
+
+
+def refined(film: Film, probe: Probe, theory: Theory, order: int, times: int) -> Equilibrium:
+    """Solve a press on a mesh whose elements are divided by a factor in both directions.
+
+    The depth of the ring of elements next to the footprint does not change, so the factor must remain small.
+    """
+    resolution = Resolution(order, 8 * times, 3 * times)
+    return press(film, probe, (6.0, 3.0), 1.0, SolveSettings(theory=theory, resolution=resolution, layer=0.1))
+
+
+SMALL = Polygon.rectangle(2.0, 1.0, 0.5)
+ROUND = Circle(1.0)
+
+
+@pytest.mark.parametrize(
+    ("probe", "order", "name"),
+    [(SMALL, 2, "membrane"), (ROUND, 3, "membrane"), (ROUND, 2, "membrane + bending")],
+)
+def test_charge_converges_with_the_order_of_the_elements(film, probe, order, name):
+    """Elements of half the size divide the error of the charge by at least 2^order.
+
+    This is the rate for a linear functional of the gradient.
+    """
+    theory = THEORIES[name][1]
+    film = replace(film, thickness=0.3) if theory.bending else film
+    sensor = replace(load_sensor("four-25um-uniaxial"), film=film)
+    finest = press(
+        film, probe, (6.0, 3.0), 1.0, SolveSettings(theory=theory, resolution=Resolution(8, 8, 6), layer=0.1)
+    )
+    reference = touch_charge(sensor, finest)
+    coarse, fine = (
+        np.abs(touch_charge(sensor, refined(film, probe, theory, order, k)) - reference).max() for k in (1, 2)
+    )
+    assert np.log2(coarse / fine) > order

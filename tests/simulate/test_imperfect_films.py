@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     Circle,
     Film,
@@ -75,6 +76,12 @@ def test_presses_near_the_rim_of_an_oval_film_are_solved(at):
     """The half axes are 45.9 and 44.1 mm."""
     film = replace(SENSOR.film, pretension=1.0, oval=0.02)
     assert press(film, PROBE, at, 0.1).status == "converged"
+
+
+@pytest.mark.parametrize("at", [(0.0, 43.5), (45.2, 0.0)])
+def test_presses_beyond_the_rim_of_an_oval_film_raise_error(at):
+    with pytest.raises(SceneError, match="probe off the film"):
+        press(replace(SENSOR.film, pretension=1.0, oval=0.02), PROBE, at, 0.1)
 
 
 def test_crosstalk_adds_a_share_of_the_charges_of_the_other_electrodes():

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from headless_chromium import start_chromium
 from isocharge.common.errors import InputError, OriginError
+from isocharge.serve.network.address import Token
 from isocharge.serve.network.browser_check import AccessCheck, host_name
 from isocharge.serve.network.protocol import Handler
 
@@ -107,6 +108,13 @@ def test_no_name_but_localhost_is_served(name):
     if name.partition(":")[0] != "localhost":
         with pytest.raises(OriginError, match="Host"):
             AccessCheck().check("GET", {b"host": name.encode()})
+
+
+def test_with_a_token_any_host_name_is_served(store):
+    handler = Handler(store, access=AccessCheck(token=Token("sesame")))
+    headers = [(b"host", b"inference.cluster.local"), (b"authorization", b"Bearer sesame")]
+    assert handler.answer("GET", "/v2", headers, b"").status == 200
+    assert handler.answer("GET", "/v2", [*headers, (b"origin", b"http://evil.example")], b"").status == 403
 
 
 ATTACK = """<!doctype html><title>attack</title><iframe name="result"></iframe>

@@ -9,6 +9,8 @@ from isocharge.serve import Predictor, find_model
 from isocharge.serve.flags import MISFIT
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.validity import Validity
+from isocharge.serve.network.address import Token
+from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 
@@ -91,3 +93,16 @@ def test_metrics_list_loaded_and_refused_versions(film, tmp_path):
     metadata: ModelMetadata = store.get("linear", "2").metadata
     facts = {"sensor": metadata.frame_id, "sha256": store.get("linear", "2").model.golden.sha256}
     assert value(samples, "model_info", model="linear", version="2", **facts) == 1
+
+
+def test_metrics_need_the_token(store):
+    handler = Handler(store, access=AccessCheck(token=Token("yes")))
+    for headers, status in (([], 401), ([(b"authorization", b"Bearer no")], 401), (BEARER, 200)):
+        answer = handler.answer("GET", "/metrics", headers, b"")
+        assert (answer.status, b"isocharge_requests" in answer.body) == (status, status == 200)
+        assert dict(answer.headers).get(b"www-authenticate") == (b"Bearer" if status == 401 else None)
+    again = handler.answer("GET", "/metrics", BEARER, b"").body
+    assert b'isocharge_requests_total{route="/metrics",status="401",transport="http"} 2.0' in again
+
+
+BEARER = [(b"authorization", b"Bearer yes")]

@@ -53,6 +53,11 @@ def test_integral_of_currents_is_the_charge_and_detects_touches(tau_s):
     assert correlation > 0.99
 
 
+def test_noise_of_currents_gives_no_touch():
+    values = currents(np.zeros((len(T_S), 3)))
+    assert not any(frame.is_contact for frame in run(values))
+
+
 def test_currents_are_refused_in_c():
     with pytest.raises(DeviceError, match="b: front_end: this stage does not exist in the signal chain in C"):
         device_header(device_from_table({"front_end": "current"}, "b"), ("A", "B", "C"))

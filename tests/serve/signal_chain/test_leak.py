@@ -84,6 +84,15 @@ def test_inflow_is_learned_out_of_contact():
     assert without_estimate[end_of_press, 0] > 340.0
 
 
+def test_two_presses_in_a_row_do_not_spoil_each_other():
+    charge_pC, contact = correct_leak(amplifier_output(touch_charge((3.0, 4.0, 400.0), (7.3, 4.0, 200.0))))
+    np.testing.assert_allclose(charge_pC[1300, 0], 400.0, atol=0.5)
+    # The charge before the detection of the second touch decays with the base, so the tolerance is larger.
+    np.testing.assert_allclose(charge_pC[2200, 0], 200.0, atol=4.0)
+    touch_count = np.count_nonzero(np.diff(contact.astype(int)) == 1)
+    assert touch_count == 2
+
+
 def test_lost_frames_hardly_change_the_charge():
     """Every second frame is lost. The correction uses the time since the previous frame that has arrived."""
     charge_pC, _ = correct_leak(amplifier_output(touch_charge((3.0, 8.0, 400.0))), every=2)
@@ -99,6 +108,14 @@ def test_error_of_tau_has_the_theoretical_effect(error):
     charge_pC, _ = correct_leak(amplifier_output(touch_charge((3.0, 8.0, 400.0))), tau_s=TAU_S * (1 + error))
     expected_pC = 400.0 * (1 + (1 / (1 + error) - 1) * (1 - np.exp(-7.0 / TAU_S)))
     assert charge_pC[2000, 0] == pytest.approx(expected_pC, abs=1.0)
+
+
+def test_slow_common_warming_is_no_touch():
+    warming_pC_per_s = 3.0
+    output_pC = amplifier_output(warming_pC_per_s * np.arange(4000) / RATE_HZ)
+    charge_pC, contact = correct_leak(output_pC)
+    assert not contact.any()
+    assert np.abs(charge_pC[1000:]).max() < 4.0
 
 
 def test_learning_pauses_after_a_release():

@@ -143,3 +143,16 @@ def test_forward_map_of_a_film_with_a_closed_back_equals_direct_solves():
     forward_map = ForwardMap.build(sensor, Circle(1.0), 4.0, (0.3, 0.5))
     charge = touch_charge(sensor, press(sensor.film, Circle(1.0), (-2.0, 3.2), 0.35))
     np.testing.assert_allclose(forward_map.charges(np.array([[-2.0, 3.2, 0.35]]))[0], charge, rtol=1e-3)
+
+
+@pytest.mark.first_cases(1)
+@pytest.mark.parametrize("at", [(12.0, -5.0), (20.0, 8.0)])
+def test_estimated_error_holds_for_a_closed_back_off_the_centre(at):
+    sensor = sensor_with(back_volume=CAVITY)
+    solved = press(sensor.film, Circle(1.0), at, 1.0)
+    resolution = solved.mesh.resolution
+    fine = SolveSettings(theory=solved.theory, resolution=replace(resolution, order=resolution.order + 2))
+    charge = touch_charge(sensor, solved)
+    fine_charge = touch_charge(sensor, press(sensor.film, Circle(1.0), at, 1.0, fine))
+    relative_error = np.abs(charge - fine_charge).max() / np.abs(fine_charge).max()
+    assert relative_error <= mesh_error(solved) <= 1e-3
