@@ -11,6 +11,7 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 from filelock import FileLock
 
 ROOT = Path(__file__).parents[1]
@@ -27,7 +28,8 @@ SOURCES = {
 def kept(make, *arguments, **options):
     """Return `make(*arguments, **options)`, computed now or stored by an earlier call.
 
-    A stored result is used if the arguments, the source of `make` and the source of the packages are the same.
+    A stored result is used if the arguments, the source of `make`, the source of the packages and the version of NumPy are
+    the same.
 
     Args:
         make: Function of simulate, train or their tests. Its result can be pickled.
@@ -36,7 +38,9 @@ def kept(make, *arguments, **options):
     """
     where = Path(inspect.getsourcefile(make)).relative_to(ROOT).parts
     folder = FOLDER / _code("simulate" if "simulate" in where else "train")
-    key = pickle.dumps((inspect.getsource(make), *map(_fields, (arguments, tuple(sorted(options.items()))))))
+    key = pickle.dumps(
+        (np.__version__, inspect.getsource(make), *map(_fields, (arguments, tuple(sorted(options.items())))))
+    )
     path = folder / f"{make.__name__}-{hashlib.sha256(key).hexdigest()[:16]}.pickle"
     FOLDER.mkdir(parents=True, exist_ok=True)
     with FileLock(FOLDER / f"{path.name}.lock"):
