@@ -28,8 +28,8 @@ SOURCES = {
 def kept(make, *arguments, **options):
     """Return `make(*arguments, **options)`, computed now or stored by an earlier call.
 
-    A stored result is used if the arguments, the source of `make`, the source of the packages and the version of NumPy are
-    the same.
+    A stored result is used if the arguments, the source of `make`, the source of the packages and the version of NumPy
+    are the same.
 
     Args:
         make: Function of simulate, train or their tests. Its result can be pickled.
