@@ -45,7 +45,9 @@ def written(problem, synthetic, tmp_path_factory):
 
 def test_model_of_the_folder_finds_contacts_on_the_film(written, problem, synthetic):
     _, contact, presses = rig(problem, synthetic, 500, seed=32, values=written.values)
-    answers = Predictor(written.path).predict_batch(presses.charge_pC)
+    predictor = Predictor(written.path)
+    assert predictor.metadata.probes == ("circle:1.0",)
+    answers = predictor.predict_batch(presses.charge_pC)
     error = np.hypot(answers.x_mm - contact[:, 0], answers.y_mm - contact[:, 1])
     assert np.median(error) < 0.3
     assert np.median(np.abs(answers.force_N / contact[:, 2] - 1.0)) < 0.03

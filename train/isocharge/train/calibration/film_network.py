@@ -193,7 +193,7 @@ def training_data(
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(
         sensor=sensor,
-        probes=(str(charges.prior.probe),),
+        probes=(charges.prior.probe.notation,),
         domain=domain,
         presses=LabelledPresses(contact, charge),
         sha256=hashlib.sha256(charge.tobytes()).hexdigest(),
