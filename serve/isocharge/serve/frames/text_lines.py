@@ -140,9 +140,8 @@ def clean_text(text: str) -> str:
     """Return the part of a line that may contain numbers; empty for a blank line, a comment or a text of Teleplot.
 
     A Teleplot line has the form `>name:time:value;time:value§unit|flags`. Only its latest value is returned, as in
-    `t_ms:1000;"name":801.2§unit`. A sentence
-    in the style of NMEA 0183 has the form `$NAME,1.5,2.5*3A`. Its checksum is the exclusive or of all bytes between `$`
-    and `*`.
+    `t_ms:1000;"name":801.2§unit`. A sentence in the style of NMEA 0183 has the form `$NAME,1.5,2.5*3A`. Its checksum is
+    the exclusive or of all bytes between `$` and `*`.
 
     Args:
         text: The line.

@@ -21,6 +21,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.charge_map import ChargeMap, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.forward.readout import contact_charges
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.numerics.disk import onto_disk, sunflower
 from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
@@ -299,7 +300,7 @@ class _ScaledCharges:
         # Add the charge of the contact pressure.
         for index, force in enumerate(self.force.tolist()):
             contact = np.column_stack([position, np.full(len(position), force)])
-            pressure_charge = forward_map.pressure_charges(contact, np.zeros(len(position)))
+            pressure_charge = contact_charges(forward_map.sensor, forward_map.probe, contact, np.zeros(len(position)))
             scaled_charge[:, index] += pressure_charge / amplitude_squared(film, force)
         return np.asarray(scaled_charge)
 

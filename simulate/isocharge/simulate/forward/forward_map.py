@@ -38,8 +38,7 @@ from isocharge.simulate.forward.readout import (
     PieceRule,
     PressChunk,
     PressMeshes,
-    contact_charge,
-    relative_distances,
+    contact_charges,
 )
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.theory import Theory
@@ -367,7 +366,7 @@ class ForwardMap:
             Charges, shape (n, n_electrode), pC.
         """
         charge: Array = self.field_charges(contact, EVEN_FIELD, orientation)[..., 0]
-        charge += self.pressure_charges(contact, orientation)
+        charge += contact_charges(self.sensor, self.probe, contact, orientation)
         return self.sensor.calibration.read(charge)
 
     def field_charges(
@@ -380,8 +379,7 @@ class ForwardMap:
         """Compute the charges of each stress field in the table.
 
         The result includes neither the crosstalk nor the charges that the contact pressure causes. The presses are
-        evaluated in chunks, which limits the required memory. If the footprint grows with the force, so does the mesh,
-        so that not the stress but the scaled charges are interpolated between the forces.
+        evaluated in chunks, which limits the required memory.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -396,15 +394,7 @@ class ForwardMap:
             Charges, shape (n, n_electrode, n_field), pC.
         """
         if self.probe.grows:
-            squared_amplitude = partial(amplitude_squared, self.sensor.film)
-            weights = lagrange_values(np.log(self.family.force), np.log(contact[:, 2]))
-            weights *= squared_amplitude(contact[:, 2])[:, None] / squared_amplitude(self.family.force)
-            charges_by_force = [
-                one.field_charges(np.column_stack([contact[:, :2], np.full(len(contact), force)]), is_odd)
-                for one, force in zip(self._maps_by_force, self.family.force.tolist(), strict=True)
-            ]
-            return np.asarray(np.einsum("nk,knef->nef", weights, charges_by_force))
-
+            return self._field_charges_of_growing_footprint(contact, is_odd)
         position = contact[:, 0] + 1j * contact[:, 1]
         if orientation is None:
             orientation = np.zeros(len(contact))
@@ -419,32 +409,30 @@ class ForwardMap:
                 )
         return charges
 
-    def pressure_charges(self, contact: Array, orientation: Array) -> Array:
-        """Compute the charges that the contact pressure causes.
+    def _field_charges_of_growing_footprint(self, contact: Array, is_odd: Booleans) -> Array:
+        """Compute the charges of each stress field for a probe whose footprint grows with the force.
 
-        Crosstalk is omitted.
+        The mesh depends on the footprint. Therefore, the charges are computed at each force of the family, for the
+        footprint under this force. The charges are divided by the squared amplitude, and interpolated between the
+        forces.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
-            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
+            is_odd: See `field_charges`.
 
         Returns:
-            Charges, shape (n, n_electrode), pC.
+            Charges, shape (n, n_electrode, n_field), pC.
         """
-        charge = np.zeros((len(contact), len(self.electrodes)))
-        if self.sensor.piezo.d33 == 0.0:
-            return charge
-
-        # The contact pressure acts only on electrodes under the probe. Presses far from all electrodes cause no charge.
-        position = contact[:, 0] + 1j * contact[:, 1]
-        largest_reach = self.probe.under(float(contact[:, 2].max(initial=0.0))).reach
-        distances = relative_distances(self.sensor.part_circles, largest_reach, position)
-        presses_near_electrodes = np.flatnonzero((distances < 1.0).any(axis=1))
-        for press_index in presses_near_electrodes:
-            x, y, force = contact[press_index].tolist()
-            probe = self.probe.under(force).rotated(float(orientation[press_index]))
-            charge[press_index] = contact_charge(self.sensor, probe, (x, y), force)
-        return charge
+        film, force = self.sensor.film, self.family.force
+        weights = lagrange_values(np.log(force), np.log(contact[:, 2]))
+        weights *= amplitude_squared(film, contact[:, 2])[:, None] / amplitude_squared(film, force)
+        charges_by_force = []
+        for index, forward_map in enumerate(self._maps_by_force):
+            contact_at_force = contact.copy()
+            contact_at_force[:, 2] = force[index]
+            charges_by_force.append(forward_map.field_charges(contact_at_force, is_odd))
+        # Sum over the forces of the family (index k), for each press (n), electrode (e) and field (f).
+        return np.asarray(np.einsum("nk,knef->nef", weights, charges_by_force))
 
     def integrate_fields(
         self,

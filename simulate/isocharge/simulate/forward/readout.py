@@ -288,6 +288,34 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     return np.asarray(-0.5 * sensor.piezo.d33 * force * sensor.gains * np.array(force_shares))
 
 
+def contact_charges(sensor: Sensor, probe: Probe, contact: Array, orientation: Array) -> Array:
+    """Compute the charges that the contact pressure of several presses induces on the electrodes; see `contact_charge`.
+
+    Args:
+        sensor: Sensor with the electrodes.
+        probe: Probe that presses the film.
+        contact: Presses (x, y, F), shape (n, 3), mm and N.
+        orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
+
+    Returns:
+        Charges without crosstalk, shape (n, n_electrode), pC.
+    """
+    charge = np.zeros((len(contact), len(sensor.electrodes)))
+    if sensor.piezo.d33 == 0.0:
+        return charge
+
+    # The contact pressure acts only on electrodes under the probe. Presses far from all electrodes cause no charge.
+    position = contact[:, 0] + 1j * contact[:, 1]
+    largest_reach = probe.under(float(contact[:, 2].max(initial=0.0))).reach
+    distances = relative_distances(sensor.part_circles, largest_reach, position)
+    presses_near_electrodes = np.flatnonzero((distances < 1.0).any(axis=1))
+    for press_index in presses_near_electrodes:
+        x, y, force = contact[press_index].tolist()
+        pressed_probe = probe.under(force).rotated(float(orientation[press_index]))
+        charge[press_index] = contact_charge(sensor, pressed_probe, (x, y), force)
+    return charge
+
+
 def thermal_charge(sensor: Sensor, step: float) -> Array:
     """Compute the pyroelectric charge that a uniform change of the temperature causes.
 

@@ -1,20 +1,20 @@
 """Directions and rotations of the solved presses of a family, and interpolation between them.
 
 On a film that is not axisymmetric, the stress depends on the direction from the centre of the film to the press. Under
-a probe that is not axisymmetric, it also depends on the rotation of the probe. In a frame that rotates with the probe,
-let t be the angle of the axes of the film, and r the angle of the direction to the centre of the film. The stress at a
-node of the mesh is the Fourier series
+a probe that is not axisymmetric, it also depends on the rotation of the probe relative to this direction. A turn is a
+pair of both angles. In a frame that rotates with the probe, the stress at a node of the mesh is the Fourier series
 
-    sum c_mk exp(i (2 m t + k r)),
+    sum c_mk exp(i (2 m d + k r)),
 
-with even harmonics of t, because the film is the same after half a turn. The coefficients decrease like a power of the
-unevenness of the film if |m| increases, and like a power of the size of the probe divided by its distance from the rim
-if |k| increases. If both increase, the coefficients decrease like the product of both powers. The series is therefore
-cut off at a smaller |k| if |m| is larger, so that it has about a third of the terms that all pairs would have.
+where r is the rotation, and d is the direction plus the rotation. The film is the same after half a turn about its
+centre, so only the even harmonics of d occur. If |m| increases, the coefficients decrease like a power of the
+unevenness of the film. If |k| increases, they decrease like a power of the size of the probe divided by its distance
+from the rim. If both increase, they decrease like the product of both powers. Therefore the series is cut off at a
+smaller |k| if |m| is larger.
 
-The presses are solved at the points of a lattice of rank one: the rotations r are evenly spaced over a full turn, and
-each of them has a single angle t, which increases by the same step from one rotation to the next. The step is chosen
-such that no two terms of the series have the same values at all points. The series is then the interpolant.
+The presses are solved at the points of a lattice of rank one: the rotations r are evenly spaced over a full turn, and d
+increases by the same step from each rotation to the next. The step is chosen such that no two terms of the series have
+the same values at all points. The values at the points then determine all coefficients.
 """
 
 import math
@@ -50,21 +50,20 @@ class Turns:
 
     @classmethod
     def spread(cls, film: Film, probe: Probe, largest_harmonics: tuple[int, ...]) -> "Turns":
-        """Choose the turns from which the terms of a Fourier series follow.
+        """Choose the turns at which presses are solved, as few as determine the coefficients of a Fourier series.
 
         Args:
             film: Film on which the probe presses.
             probe: Probe that presses the film.
-            largest_harmonics: Largest |k| of the terms for |m| = 0, 1, 2, and so on. An axisymmetric film needs only
-                m = 0, and an axisymmetric probe only k = 0.
+            largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on; see the docstring of
+                the module. For an axisymmetric film, only m = 0 is used. For an axisymmetric probe, only k = 0 is used.
         """
-        harmonics = np.array(
-            [
-                (m, k)
-                for m in _symmetric_range(0 if film.is_axisymmetric else len(largest_harmonics) - 1)
-                for k in _symmetric_range(0 if probe.is_axisymmetric else largest_harmonics[abs(m)])
-            ]
-        )
+        largest_m = 0 if film.is_axisymmetric else len(largest_harmonics) - 1
+        pairs: list[tuple[int, int]] = []  # (m, k) of each term
+        for m in _symmetric_range(largest_m):
+            largest_k = 0 if probe.is_axisymmetric else largest_harmonics[abs(m)]
+            pairs.extend((m, k) for k in _symmetric_range(largest_k))
+        harmonics = np.array(pairs)
         symmetry_order = 1 if probe.is_axisymmetric else round(2.0 * np.pi / probe.period)
         n_turn, step = _lattice(harmonics, symmetry_order)
         turn = np.arange(n_turn)
@@ -106,7 +105,7 @@ def _symmetric_range(largest: int) -> range:
 def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
     """Find the smallest lattice of turns at which no two harmonics have the same values.
 
-    At the turn j of n, the angle of the film is pi s j / n and the rotation of the probe is 2 pi j / n, where s is the
+    At the turn j of n, the angle d is pi s j / n and the rotation of the probe is 2 pi j / n, where s is the
     step. The harmonic (m, k) has the phase 2 pi (m s + k) j / n. Two harmonics therefore have the same values at all
     turns if and only if the remainders of m s + k after the division by n are equal. After one period of the probe,
     both angles must have increased by the period, so that s - 2 is a multiple of the symmetry order.

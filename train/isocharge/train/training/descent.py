@@ -44,19 +44,19 @@ class Soap:
 
     Attributes:
         parameter: The parameter, a vector or a matrix.
-        count: Number of completed steps.
-        mean: Moving average of the gradient.
-        square: Moving average of the squared entries of the gradient in the eigenbasis.
+        step_count: Number of completed steps.
+        mean_gradient: Moving average of the gradient.
+        mean_square: Moving average of the squared entries of the gradient in the eigenbasis.
         moments: Moving averages of G G^T and of G^T G for a matrix; empty for a vector.
         bases: Eigenbases of the moments.
     """
 
     def __init__(self, parameter: Tensor) -> None:
-        """Begin with averages of zero, and with eigenbases that are identity matrices."""
+        """Prepare the first step: all averages are zero, and the eigenbases are identity matrices."""
         self.parameter = parameter
-        self.count = 0
-        self.mean = torch.zeros_like(parameter)
-        self.square = torch.zeros_like(parameter)
+        self.step_count = 0
+        self.mean_gradient = torch.zeros_like(parameter)
+        self.mean_square = torch.zeros_like(parameter)
         sizes = parameter.shape if parameter.ndim == 2 else ()
         self.moments = [torch.zeros(size, size) for size in sizes]
         self.bases = [torch.eye(size) for size in sizes]
@@ -76,19 +76,19 @@ class Soap:
         assert gradient is not None
         new_weight = 1.0 - DECAY
         if self.moments:
-            for moment, square in zip(self.moments, (gradient @ gradient.T, gradient.T @ gradient), strict=True):
-                moment.lerp_(square, new_weight)
-            if self.count % BASIS_PERIOD == 0:
+            for moment, product in zip(self.moments, (gradient @ gradient.T, gradient.T @ gradient), strict=True):
+                moment.lerp_(product, new_weight)
+            if self.step_count % BASIS_PERIOD == 0:
                 pairs = zip(self.moments, self.bases, strict=True)
                 self.bases = [torch.linalg.qr(moment @ basis).Q for moment, basis in pairs]
-        self.count += 1
-        self.mean.lerp_(gradient, new_weight)
-        self.square.lerp_(_rotate(gradient, self.bases) ** 2, new_weight)
+        self.step_count += 1
+        self.mean_gradient.lerp_(gradient, new_weight)
+        self.mean_square.lerp_(_rotate(gradient, self.bases) ** 2, new_weight)
 
         # The moving averages begin at zero. They are therefore divided by the total weight of all gradients so far.
-        total_weight = 1.0 - DECAY**self.count
-        root_mean_square = torch.sqrt(self.square / total_weight) + EPSILON
-        ratio = _rotate(self.mean, self.bases) / (total_weight * root_mean_square)
+        total_weight = 1.0 - DECAY**self.step_count
+        root_mean_square = torch.sqrt(self.mean_square / total_weight) + EPSILON
+        ratio = _rotate(self.mean_gradient, self.bases) / (total_weight * root_mean_square)
         ratio.clamp_(-MAX_RATIO, MAX_RATIO)
         self.parameter.add_(_rotate(ratio, [basis.T for basis in self.bases]), alpha=-rate)
 
