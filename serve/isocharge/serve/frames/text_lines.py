@@ -172,7 +172,7 @@ def parse_line(text: str, *, has_header: bool = False) -> Line:
 
     Args:
         text: The line, as `clean_text` returns it.
-        has_header: Whether a header names the numbers. Words that alternate with the numbers are then no names.
+        has_header: Whether a header names the numbers. Words that alternate with the numbers are not names then.
 
     Raises:
         ValueError: If the line contains characters that are not printable, or a decimal number after a hexadecimal
@@ -310,8 +310,7 @@ def _with_alternating_names(tokens: list[_Token]) -> list[_Token]:
 
     The name of a number is the word that is next to the number, either before each number, as in `C,7,A,3` and
     `C[7] A[3]`, or behind each number, as in `7 C, 3 A`. All names are different, because words that repeat are units
-    or states. Times have no names. If words that are no names are mistaken for names, not every electrode has a channel
-    with its name.
+    or states. Times have no names. Words of another meaning that alternate with the numbers are taken for names, too.
 
     Args:
         tokens: Parts of the line.

@@ -89,8 +89,10 @@ class PressWatch:
     """Duration of the rest before a touch over which the charges at rest are averaged, s."""
 
     EDGE_S = 0.05
-    """Time just before and just after a press that does not count as rest, s. The probe may already or still touch the
-    film during this time."""
+    """Time just before and just after a press that does not count as rest, s.
+
+    The probe may already or still touch the film during this time.
+    """
 
     WINDOW_S = 0.5
     """Length of the window, s."""
