@@ -22,7 +22,7 @@ from isocharge.serve import ModelMetadata, PredictionRecord, Predictor, write_mo
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.session import OUTPUTS
 from isocharge.serve.network.address import Address
-from isocharge.serve.network.http import Application, HttpServer
+from isocharge.serve.network.http import HttpServer
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.record.record import selected_fields
@@ -208,7 +208,7 @@ def start_http(stopping):
     started = []
 
     def start(handler, *, tls=None, uds=None):
-        server = HttpServer(Application(handler), Address(uds=uds), handler.limits, handler.traffic, tls=tls)
+        server = HttpServer(handler, Address(uds=uds), handler.limits, handler.traffic, tls=tls)
         thread = Thread(target=server.run)
         thread.start()
         started.append((server, thread))

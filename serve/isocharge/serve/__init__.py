@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from isocharge.serve.model.model_search import find_labelled_model, find_model
     from isocharge.serve.model.predictor import Predictor
     from isocharge.serve.model.validity import Validity
-    from isocharge.serve.network.http.application import asgi_app
+    from isocharge.serve.network.protocol.handler import asgi_app
     from isocharge.serve.port.file_source import Chunk
     from isocharge.serve.port.recording import Recorder, Recording
     from isocharge.serve.port.source import Port, open_source

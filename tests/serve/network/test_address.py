@@ -9,7 +9,7 @@ import pytest
 
 from isocharge.common.errors import InputError, ListenError, TokenError
 from isocharge.serve.network.address import Address, Tls, Token, check_exposure
-from isocharge.serve.network.http import Application, HttpServer
+from isocharge.serve.network.http import HttpServer
 
 
 @pytest.mark.parametrize("token", ["", " a", "a\n", "a\r\nb: c", "schlüssel", "100%"])
@@ -24,7 +24,7 @@ def test_invalid_tokens_are_refused(token):
 def test_tls_files_that_cannot_be_used(handler, tls_files, certificate, key):
     tls = Tls(tls_files / certificate, key and tls_files / key)
     with pytest.raises(InputError, match=r"pem.*|tls.*: not a certificate and its unencrypted private key"):
-        HttpServer(Application(handler), Address(), tls=tls)
+        HttpServer(handler, Address(), tls=tls)
 
 
 def test_server_on_a_unix_socket_takes_over_a_socket_left_by_a_killed_server(handler, start_http, tmp_path):
@@ -81,7 +81,7 @@ def test_loopback_address_needs_no_token(address):
 
 def test_unix_socket_does_not_replace_a_file(handler, tmp_path):
     path = tmp_path / "touch.sock"
-    server = HttpServer(Application(handler), Address(uds=path))
+    server = HttpServer(handler, Address(uds=path))
     path.unlink()
     path.write_text("mine")
     server.close()
@@ -90,9 +90,9 @@ def test_unix_socket_does_not_replace_a_file(handler, tmp_path):
 
 def test_unix_socket_of_another_server_is_not_replaced(handler, tmp_path):
     path = tmp_path / "touch.sock"
-    first = HttpServer(Application(handler), Address(uds=path))
+    first = HttpServer(handler, Address(uds=path))
     path.rename(tmp_path / "old.sock")  # so that the new one cannot get its number
-    second = HttpServer(Application(handler), Address(uds=path))
+    second = HttpServer(handler, Address(uds=path))
     first.close()
     assert path.is_socket()
     second.close()

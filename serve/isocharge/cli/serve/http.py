@@ -24,7 +24,7 @@ from isocharge.common.errors import IsochargeError
 from isocharge.common.extras import require
 from isocharge.serve.network.address import Address, Tls, check_exposure
 from isocharge.serve.network.browser_check import AccessCheck
-from isocharge.serve.network.http import Application, HttpServer
+from isocharge.serve.network.http import HttpServer
 from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import ModelStore, open_model_store
 from isocharge.serve.network.protocol import Handler
@@ -93,7 +93,7 @@ def http_command(
         for reason in store.refusals():
             log.warning("refused: %s", reason)
         handler = Handler(store, traffic=traffic, access=access)
-        server = HttpServer(Application(handler), address, handler.limits, traffic, tls=tls)
+        server = HttpServer(handler, address, handler.limits, traffic, tls=tls)
         with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:  # empty without gRPC
             _log_loaded_models(store)
             announce(server.url)

@@ -26,16 +26,10 @@ from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, WrongKey, parse_json
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.network.address import Address, ServerLimits, Tls
-from isocharge.serve.network.browser_check import AccessCheck, header_values
-from isocharge.serve.network.http import Application, HttpServer
-from isocharge.serve.network.metrics import Client
-from isocharge.serve.network.protocol.handler import Headers
-from isocharge.serve.network.protocol.response import (
-    Response,
-    error_response,
-    json_response,
-    response_of,
-)
+from isocharge.serve.network.browser_check import AccessCheck
+from isocharge.serve.network.http import HttpServer
+from isocharge.serve.network.protocol.handler import Application
+from isocharge.serve.network.protocol.response import Response, json_response, response_of
 from isocharge.serve.record.record import PredictionRecord
 from isocharge.serve.viewer.tape import (
     FLAG_BITS,
@@ -113,7 +107,7 @@ Action = Tare | Record | Marker
 """Requests that change the stream."""
 
 
-class LivePage:
+class LivePage(Application):
     """Live page of one stream, which stores the samples and answers the requests of browsers.
 
     The thread that reads the stream calls `add`. The thread of the server calls `answer`. Any thread may call `update`.
@@ -175,17 +169,6 @@ class LivePage:
         """Add a marker at a Unix time, s, to the markers that the page shows."""
         self._markers.append((time_s, text))
         self.update(markers=list(self._markers))
-
-    def may_block(self, _path: str) -> bool:
-        """Return whether computing the response for a path may take a long time."""
-        return False
-
-    def answer(self, method: str, path: str, headers: Headers, body: bytes, _client: Client = None) -> Response:
-        """Answer one request; see `Handler.answer` in `isocharge.serve.network.protocol.handler`."""
-        try:
-            return self._check_and_answer(method, path, header_values(headers), body)
-        except Exception as error:  # every error is sent to the client
-            return error_response(error)
 
     def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
         """Check whether a request is allowed, and return the response. The files of the page need no token.
@@ -249,7 +232,7 @@ def serve_page(page: LivePage, address: Address, tls: Tls | None = None) -> Iter
         InputError: If the TLS files cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
-    with closing(page.tape), closing(HttpServer(Application(page), address, page.limits, tls=tls)) as server:
+    with closing(page.tape), closing(HttpServer(page, address, page.limits, tls=tls)) as server:
         thread = Thread(target=server.run, name="live page", daemon=True)
         thread.start()
         try:

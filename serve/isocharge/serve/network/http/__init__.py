@@ -1,9 +1,8 @@
-"""ASGI application of the Open Inference Protocol, and a server on uvicorn that limits its requests."""
+"""Server on uvicorn that limits the requests to an ASGI application."""
 
 from isocharge.common.extras import require
 
 with require("http"):
-    from isocharge.serve.network.http.application import Application
     from isocharge.serve.network.http.server import HttpServer
 
-__all__ = ["Application", "HttpServer"]
+__all__ = ["HttpServer"]

@@ -8,7 +8,9 @@ The two transports, `isocharge.serve.network.http` and `isocharge.serve.network.
 does not import the transports.
 """
 
-from isocharge.serve.network.protocol.handler import Handler
-from isocharge.serve.network.protocol.response import Response
+from isocharge.common.extras import require
 
-__all__ = ["Handler", "Response"]
+with require("http"):
+    from isocharge.serve.network.protocol.handler import Handler
+
+__all__ = ["Handler"]

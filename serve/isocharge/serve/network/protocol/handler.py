@@ -1,27 +1,135 @@
-"""Handler that computes the responses to HTTP requests of the Open Inference Protocol.
+"""ASGI application that answers the HTTP requests of the Open Inference Protocol.
 
 The class `Handler` does not depend on the server that receives the requests. A request consists of method, path,
 headers and body. A response consists of status, headers and body. Any thread may answer requests. Most responses take
 microseconds to compute, and a response to the largest batch takes milliseconds. Some responses take longer, for example
 because a model is loaded. The method `may_block` returns whether computing the response for a path may take a long
 time.
+
+The base class `Application` is a bare ASGI callable without a framework. One table of routes already selects the
+function for a request, derives the OpenAPI document and names the counters, so that a router, request and response
+classes of a framework would only be called in addition.
 """
 
+import asyncio
 import re
 import time
-from collections.abc import Iterable
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 from isocharge.common.errors import UnknownPath, WrongMethod
-from isocharge.serve.network.address import ServerLimits
+from isocharge.serve.network.address import ServerLimits, Token
 from isocharge.serve.network.browser_check import AccessCheck, header_values
 from isocharge.serve.network.metrics import Client, Exchange, Traffic
-from isocharge.serve.network.model_store import ModelStore
+from isocharge.serve.network.model_store import ModelStore, open_model_store
 from isocharge.serve.network.protocol.response import Response, decompress, error_response, json_response
 from isocharge.serve.network.protocol.routes import ROUTES, Request, Route
 
 Headers = Iterable[tuple[bytes, bytes]]
 """Headers of a request. The names are in lower case, and the values are unchanged."""
+
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+
+
+class Application(ABC):
+    """ASGI application: the handler of models or the live page. It can be mounted under any path of another program.
+
+    Attributes:
+        limits: Limits of the requests.
+    """
+
+    limits: ServerLimits
+
+    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
+        """Answer one HTTP request. If the client disconnects before its request is complete, nothing is sent.
+
+        Args:
+            scope: Method, path, headers and client of the request.
+            receive: Function that returns the next part of the request.
+            send: Function that sends a part of the response.
+
+        Raises:
+            ValueError: If the scope is not an HTTP request. A server then knows that there is no ASGI lifespan.
+        """
+        if scope["type"] != "http":
+            raise ValueError(f"expected a scope of the type 'http', got {scope['type']!r}")
+        body = await _read_body(receive, self.limits.body_bytes)
+        if body is None:
+            return
+        path = scope["path"].removeprefix(scope.get("root_path", ""))  # the root path is the path of a mounted program
+        request = (scope["method"], path, scope["headers"], body, scope["client"])
+        if self.may_block(path):
+            response = await asyncio.to_thread(self.answer, *request)
+        else:  # most answers take only microseconds
+            response = self.answer(*request)
+        await send({"type": "http.response.start", "status": response.status, "headers": response.headers})
+        await send({"type": "http.response.body", "body": response.body})
+
+    def may_block(self, path: str) -> bool:  # noqa: ARG002  # other applications may decide by the path
+        """Return whether computing the response for a path may take a long time.
+
+        The application then computes the response in another thread, so that other requests are not delayed.
+        """
+        return False
+
+    def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:  # noqa: ARG002
+        """Answer one request.
+
+        Args:
+            method: Method in capitals.
+            path: Path without the query. Its percent-encoding is already decoded.
+            headers: Headers of the request.
+            body: Body of the request, which may be compressed.
+            client: Address and port of the client, for the log.
+
+        Returns:
+            The response. If an error occurs, it is not raised, but the response contains its status and its message.
+        """
+        try:
+            return self._check_and_answer(method, path, header_values(headers), body)
+        except Exception as error:  # every error is sent to the client
+            return error_response(error)
+
+    @abstractmethod
+    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
+        """Check whether a request is allowed, answer the request, and return the response.
+
+        Args:
+            method: Method in capitals.
+            path: Path without the query.
+            headers: Values of the headers by name.
+            body: Body of the request, which may be compressed.
+
+        Raises:
+            IsochargeError: If the request is refused.
+        """
+
+
+async def _read_body(receive: Receive, max_bytes: int) -> bytes | None:
+    """Read the body of a request, but stop as soon as the body is larger than allowed. The handler then refuses it.
+
+    Args:
+        receive: Function that returns the next part of the request.
+        max_bytes: Largest size of a body, bytes.
+
+    Returns:
+        The body or, if it is too large, its beginning. None if the client has disconnected.
+    """
+    body = bytearray()
+    is_complete = False
+    while not is_complete and len(body) <= max_bytes:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            return None
+        body += message.get("body", b"")
+        is_complete = not message.get("more_body", False)
+    return bytes(body)
+
 
 _PATTERNS = [
     (re.compile(template.format(model="(?P<model>[^/]*)", version="(?P<version>[^/]+)")), route)
@@ -46,8 +154,8 @@ def match_path(path: str) -> tuple[Route | None, str, str]:
     return None, "", ""
 
 
-class Handler:
-    """Handler that answers HTTP requests with the models of a store, and counts and logs the requests."""
+class Handler(Application):
+    """Application that answers HTTP requests with the models of a store, and counts and logs the requests."""
 
     def __init__(
         self,
@@ -72,34 +180,16 @@ class Handler:
         self.traffic = traffic or Traffic()
 
     def may_block(self, path: str) -> bool:
-        """Return whether computing the response for a path may take a long time.
-
-        The server should then compute the response in another thread, so that other requests are not delayed.
-        """
+        """Return whether the route of a path may take a long time."""
         route, _, _ = match_path(path)
         return route is not None and route.may_block
 
     def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
-        """Answer one request, count the request, and log the request if there is a log.
-
-        Args:
-            method: Method in capitals.
-            path: Path without the query. Its percent-encoding is already decoded.
-            headers: Headers of the request.
-            body: Body of the request, which may be compressed.
-            client: Address and port of the client, for the log.
-
-        Returns:
-            The response. If an error occurs, it is not raised, but the response contains its status and its message.
-        """
+        """Answer one request as `Application.answer`, count the request, and log the request if there is a log."""
         start_ns = time.perf_counter_ns()
+        response = super().answer(method, path, headers, body)
         route, model, version = match_path(path)
         label = "unknown" if route is None else route.paths[0]  # all paths of a route are counted under the first path
-        try:
-            request = Request(self.store, self.limits, self.traffic, header_values(headers), body, model, version)
-            response = self._check_and_answer(method, path, route, request)
-        except Exception as error:  # every error is sent to the client
-            response = error_response(error)
         self.traffic.count("http", label, response.status)
         log = self.traffic.log
         if log is not None:  # the properties of the exchange are only determined for the log
@@ -117,19 +207,9 @@ class Handler:
             log.write_exchange(exchange)
         return response
 
-    def _check_and_answer(self, method: str, path: str, route: Route | None, request: Request) -> Response:
-        """Check whether a request is allowed, answer the request, and return the response.
-
-        Args:
-            method: Method in capitals.
-            path: Path without the query, for error messages.
-            route: Route of the path, or None if the server has no route for the path.
-            request: The request, whose body may be compressed.
-
-        Raises:
-            IsochargeError: If the request is refused.
-        """
-        headers = request.headers
+    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
+        """Check a request, and answer it with the function of its route."""
+        route, model, version = match_path(path)
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
         # which paths exist.
         self.access.check(method, headers, needs_token=route is None or route.needs_token)
@@ -139,10 +219,36 @@ class Handler:
         is_head_of_get = method == "HEAD" and route.method == "GET"
         if method != route.method and not is_head_of_get:
             raise WrongMethod(f"{path}: expected the method {route.method}, got {method[:20]}", route.method)
-        self.limits.check_body(len(request.body))
+        self.limits.check_body(len(body))
         encoding = headers.get(b"content-encoding")
         if encoding is not None:
-            plain_body = decompress(request.body, encoding.lower(), self.limits.body_bytes)
-            request = request._replace(body=plain_body)
-        answer = route.respond(request)
+            body = decompress(body, encoding.lower(), self.limits.body_bytes)
+        answer = route.respond(Request(self.store, self.limits, self.traffic, headers, body, model, version))
         return answer if isinstance(answer, Response) else json_response(answer)
+
+
+def asgi_app(models: Path | None = None, *, token: str | None = None, allowed_hosts: Iterable[str] = ()) -> Handler:
+    """Load models, and return an ASGI application that serves them with the Open Inference Protocol.
+
+    The limits of connections belong to the server that runs the program. The application itself limits the size of a
+    request, and checks the token and the headers of browsers.
+
+    Args:
+        models: Folder of the models. By default, all repositories are searched, as `isocharge serve http` does.
+        token: Secret that clients must send as `Authorization: Bearer TOKEN`. By default, requests need no token.
+        allowed_hosts: Host names by which browsers reach the program, in addition to IP addresses and `localhost`. With
+            a token, every host name is accepted.
+
+    Raises:
+        MissingExtra: If the extra `http` is not installed.
+        InputError: If the token or a host name cannot be used.
+        ModelError: If there is no model, or no version passes its checks.
+
+    Example:
+        >>> from starlette.applications import Starlette  # doctest: +SKIP
+        >>> from starlette.routing import Mount  # doctest: +SKIP
+        >>> app = Starlette(routes=[Mount("/touch", asgi_app(token="s3cret"))])  # doctest: +SKIP
+    """
+    secret = None if token is None else Token(token)
+    access = AccessCheck(allowed_hosts=allowed_hosts, token=secret)
+    return Handler(open_model_store(models), access=access)

@@ -1,22 +1,38 @@
 """Routes of the servers. Each route is an element of `ROUTES`.
 
-The servers use `ROUTES` to find the function for a request. The file `openapi.json` describes the same routes.
+The servers use `ROUTES` to find the function for a request. The file `openapi.json` describes the same routes. The
+messages of the gRPC service have the same fields as the JSON objects that the functions return.
 """
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from importlib.resources import files
 from typing import Any, NamedTuple
 
+import orjson
 from prometheus_client import generate_latest
 
 from isocharge.common.errors import ModelError, RequestError
+from isocharge.common.extras import package_version
 from isocharge.common.structs import parse_json
+from isocharge.serve.model.session import INPUT, OUTPUTS
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.metrics import CONTENT_TYPE, Traffic
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
-from isocharge.serve.network.protocol import describe
 from isocharge.serve.network.protocol.inference import IndexBody, answer_inference, read_infer, write_answer
 from isocharge.serve.network.protocol.response import Response, response_of
+
+EXTENSIONS = (
+    "binary_tensor_data",
+    "model_configuration",
+    "model_repository",
+    "model_repository(unload_dependents)",
+    "parameters",
+    "statistics",
+)
+
+PLATFORM = "onnxruntime_onnx"
+"""Triton's name for ONNX models."""
 
 
 class Request(NamedTuple):
@@ -71,6 +87,18 @@ class Route(NamedTuple):
     may_block: bool = False
 
 
+def _show_openapi(_: Request) -> dict[str, Any]:
+    """Return the OpenAPI document of the file `openapi.json` with the version of this package."""
+    document: dict[str, Any] = orjson.loads(files(__package__).joinpath("openapi.json").read_bytes())
+    document["info"]["version"] = package_version()
+    return document
+
+
+def _show_server(_: Request) -> dict[str, Any]:
+    """Return the name and the version of the server, and the extensions of the protocol that it supports."""
+    return {"name": "isocharge", "version": package_version(), "extensions": list(EXTENSIONS)}
+
+
 def _show_metrics(request: Request) -> Response:
     texts = [generate_latest(registry) for registry in (request.store.metrics.registry, request.traffic.registry)]
     return response_of(200, CONTENT_TYPE, b"".join(texts))
@@ -95,7 +123,9 @@ def _show_index(request: Request) -> list[dict[str, str]]:
 def _load(request: Request) -> dict[str, Any]:
     """Read the files of a model again, and return an empty object."""
     if request.object().get("parameters") not in (None, {}):
-        raise RequestError(describe.NO_LOAD_PARAMETERS)
+        raise RequestError(
+            "load: parameters are not supported; put the files into the model's folder and load it again"
+        )
     request.store.load(request.model)
     return {}
 
@@ -104,6 +134,53 @@ def _unload(request: Request) -> dict[str, Any]:
     request.object()  # refuses a body that is not an object
     request.store.unload(request.model)
     return {}
+
+
+def _show_statistics(request: Request) -> dict[str, Any]:
+    """Return the counters of one version of a model, of all its versions, or of all versions of all models."""
+    selected = request.store.loaded_versions()
+    if request.model:
+        _ = request.loaded  # raises ModelNotFound
+        selected = request.store.versions_of(request.model, request.version)
+    rows = [
+        {"name": loaded.metadata.name, "version": loaded.version, **loaded.statistics.to_json()} for loaded in selected
+    ]
+    return {"model_stats": rows}
+
+
+def _show_model(request: Request) -> dict[str, Any]:
+    """Return the metadata of a model, and the names, number types and shapes of its tensors.
+
+    The metadata are under the key `properties`. Each value of the metadata is a JSON text, as in the model file.
+    """
+    metadata = request.loaded.metadata
+    return {
+        "name": metadata.name,
+        "versions": [other.version for other in request.store.versions_of(metadata.name)],
+        "platform": PLATFORM,
+        "inputs": [_tensor(INPUT, len(metadata.electrodes))],
+        "outputs": [_tensor(name, width) for name, width in OUTPUTS.items()],
+        "properties": metadata.to_props(),
+    }
+
+
+def _tensor(name: str, width: int) -> dict[str, Any]:
+    """Return the description of a tensor that has any number of rows and `width` columns."""
+    return {"name": name, "datatype": "FP32", "shape": [-1, width]}
+
+
+def _show_config(request: Request) -> dict[str, Any]:
+    """Return the configuration of a model in the form that Triton uses."""
+    metadata = request.loaded.metadata
+    return {
+        "name": metadata.name,
+        "platform": PLATFORM,
+        "backend": "onnxruntime",
+        "version_policy": {"all": {}},
+        "max_batch_size": request.limits.batch,
+        "input": [{"name": INPUT, "data_type": "TYPE_FP32", "dims": [len(metadata.electrodes)]}],
+        "output": [{"name": name, "data_type": "TYPE_FP32", "dims": [OUTPUTS[name]]} for name in OUTPUTS],
+    }
 
 
 def _infer(request: Request) -> Response:
@@ -139,33 +216,18 @@ def _model_paths(ending: str = "") -> tuple[str, str]:
 
 
 ROUTES = (
-    Route("GET", ("/openapi.json",), lambda _: describe.openapi_document()),
+    Route("GET", ("/openapi.json",), _show_openapi),
     Route("GET", ("/v2/health/live",), lambda _: {"live": True}, ("ServerLive",), needs_token=False),
     Route("GET", ("/v2/health/ready",), _is_ready, ("ServerReady",), needs_token=False),
     Route("GET", ("/metrics",), _show_metrics),
-    Route("GET", ("/v2",), lambda _: describe.server_metadata(), ("ServerMetadata",)),
-    Route(
-        "GET",
-        ("/v2/models/stats", *_model_paths("/stats")),
-        lambda request: describe.statistics_of(request.store, request.model, request.version),
-        ("ModelStatistics",),
-    ),
+    Route("GET", ("/v2",), _show_server, ("ServerMetadata",)),
+    Route("GET", ("/v2/models/stats", *_model_paths("/stats")), _show_statistics, ("ModelStatistics",)),
     Route("POST", ("/v2/repository/index",), _show_index, ("RepositoryIndex",)),
     Route("POST", ("/v2/repository/models/{model}/load",), _load, ("RepositoryModelLoad",), may_block=True),
     Route("POST", ("/v2/repository/models/{model}/unload",), _unload, ("RepositoryModelUnload",), may_block=True),
-    Route(
-        "GET",
-        _model_paths(),
-        lambda request: describe.model_metadata(request.loaded, request.store),
-        ("ModelMetadata",),
-    ),
+    Route("GET", _model_paths(), _show_model, ("ModelMetadata",)),
     Route("GET", _model_paths("/ready"), lambda request: {"ready": bool(request.loaded)}, ("ModelReady",)),
-    Route(
-        "GET",
-        _model_paths("/config"),
-        lambda request: describe.model_config(request.loaded, request.limits),
-        ("ModelConfig",),
-    ),
+    Route("GET", _model_paths("/config"), _show_config, ("ModelConfig",)),
     Route("POST", _model_paths("/infer"), _infer, ("ModelInfer", "ModelStreamInfer")),
 )
 """All routes of the HTTP server. If several templates match a path, the first of them is used."""
