@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from isocharge.common.json_values import plain_values
+from isocharge.common.structs import plain_values
 
 
 def test_nested_values_become_json():

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 
-from isocharge.common.npz import npz_arrays
+from isocharge.common.arrays import npz_arrays
 
 MEBIBYTE = 1 << 20
 

@@ -13,7 +13,7 @@ import grpc
 import pytest
 
 from attacks.faults import mutated, with_junk
-from isocharge.serve.network.grpc.messages import METHODS, SERVICE
+from isocharge.serve.network.grpc.service import METHODS, SERVICE
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 

@@ -1,4 +1,4 @@
-"""Decoding of TOML and JSON into typed structs with msgspec.
+"""Decoding of TOML and JSON into typed structs with msgspec, and conversion of values for JSON.
 
 The attributes of a `Settings` class are the keys of a file. The types and bounds of the attributes define the allowed
 values. If a key is missing, its attribute has the default value. Error messages name the wrong key and state what was
@@ -21,6 +21,7 @@ Error messages have one of the following forms:
 """
 
 import difflib
+import math
 import re
 import sys
 import tomllib
@@ -176,6 +177,26 @@ def convert(value: object, target_type: type[T], where: str, error_class: type[I
         return msgspec.convert(value, target_type)
     except (msgspec.ValidationError, RecursionError) as cause:
         raise error_class(_prefix(where) + _first_mistake(value, target_type, cause)) from cause
+
+
+def finite_or_none(value: float | None) -> float | None:
+    """Convert a number to a float, or to None if the number is NaN, infinite or None."""
+    if value is None or not math.isfinite(value):
+        return None
+    return float(value)
+
+
+def plain_values(value: object) -> Any:
+    """Convert a value to a value that `json.dumps(..., allow_nan=False)` accepts.
+
+    Arrays and tuples become lists. NumPy numbers become Python numbers. Numbers that are not finite become None. The
+    keys of dictionaries become texts. The items of lists and dictionaries are converted in the same way.
+
+    Args:
+        value: Number, text, truth value, None, array, tuple, list or dictionary.
+    """
+    # msgspec calls `enc_hook` for arrays and for NumPy numbers, and writes null for numbers that are not finite.
+    return msgspec.json.decode(msgspec.json.encode(value, enc_hook=lambda item: item.tolist()))
 
 
 def _prefix(where: str) -> str:

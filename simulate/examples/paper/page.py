@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from choices import Choices
 from matplotlib.figure import Figure
 
-from isocharge.common.json_values import plain_values
+from isocharge.common.structs import plain_values
 
 INTRODUCTION = """# Mirbagheri et al. (2007), reproduced
 

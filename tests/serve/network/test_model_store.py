@@ -21,7 +21,7 @@ from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.network.address import Token
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.grpc import grpc_server
-from isocharge.serve.network.grpc.messages import SERVICE
+from isocharge.serve.network.grpc.service import SERVICE
 from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler

@@ -10,8 +10,8 @@ from contextlib import closing
 import pytest
 
 from isocharge.common.errors import InputError
+from isocharge.serve.outputs.output import WriterQueue
 from isocharge.serve.outputs.text_outputs import UdpOutput
-from isocharge.serve.outputs.writer_queue import WriterQueue
 from isocharge.serve.record.formats import csv_header, csv_row
 from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking
 

@@ -28,7 +28,7 @@ from isocharge.serve.network.http import HttpServer
 from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import ModelStore, open_model_store
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.outputs.writer_queue import WriterQueue
+from isocharge.serve.outputs.output import WriterQueue
 
 log = logging.getLogger("isocharge.serve.http")
 log.setLevel(logging.INFO)

@@ -65,7 +65,7 @@ def show(text: str) -> None:
 
 def show_json(value: Any) -> None:
     """Print a result for programs on stdout, as one line of JSON. Numbers that are not finite become null."""
-    from isocharge.common.json_values import plain_values  # imports numpy, which help does not need
+    from isocharge.common.structs import plain_values  # imports msgspec, which help does not need
 
     print(printable(json.dumps(plain_values(value), allow_nan=False)), flush=True)
 
@@ -81,7 +81,7 @@ def show_result(result: Mapping[str, Any], *, json: bool) -> None:
         result: Values by their names, which contain the units. The dictionaries of a table have the same keys.
         json: Whether to print JSON.
     """
-    from isocharge.common.json_values import plain_values  # imports numpy, which help does not need
+    from isocharge.common.structs import plain_values  # imports msgspec, which help does not need
 
     values: Any = plain_values(result)
     if json:

@@ -24,9 +24,9 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.common.arrays import npz_arrays
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError, cut
-from isocharge.common.npz import npz_arrays
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.golden import read_companion_file
 

@@ -13,12 +13,12 @@ from isocharge.serve.outputs.output import (
     Output,
     OutputContext,
     OutputKind,
+    WriterQueue,
     discard,
     is_file_with,
     output_error,
 )
 from isocharge.serve.outputs.text_outputs import CSV_FILE, JSON_FILE, STDOUT_CSV, STDOUT_JSON, UDP
-from isocharge.serve.outputs.writer_queue import WriterQueue
 from isocharge.serve.record.record import PredictionRecord
 
 ROS2_SUFFIX = ".ros2.mcap"

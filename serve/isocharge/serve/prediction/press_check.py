@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.common.json_values import plain_values
+from isocharge.common.structs import plain_values
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.validity import Validity

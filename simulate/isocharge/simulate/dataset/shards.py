@@ -24,10 +24,9 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans, npz_arrays
 from isocharge.common.errors import DatasetError, SensorError, cut, error_prefix, shown
 from isocharge.common.files import new_folder, read_needed, sha256_of, write_whole
-from isocharge.common.npz import npz_arrays
 from isocharge.common.structs import MAX_JSON_BYTES, Positive, Text, convert, parse_json
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict

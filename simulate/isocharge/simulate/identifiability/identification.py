@@ -9,7 +9,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import SceneError, SolveError
-from isocharge.common.json_values import finite_or_none
+from isocharge.common.structs import finite_or_none
 from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.forward_map import ForwardMap

@@ -22,8 +22,7 @@ from isocharge.serve.model.session import OUTPUTS
 from isocharge.serve.network.address import ServerLimits, Tls, Token
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.grpc import grpc_server, server
-from isocharge.serve.network.grpc.messages import METHODS, SERVICE
-from isocharge.serve.network.grpc.service import Service
+from isocharge.serve.network.grpc.service import METHODS, SERVICE, Service
 from isocharge.serve.network.protocol import Handler
 
 PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inference.proto"

@@ -35,8 +35,7 @@ from msgspec.structs import replace as replace_setting
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, PressError, cut
 from isocharge.common.files import as_output_errors, locked, remove_empty, write_whole
-from isocharge.common.json_values import plain_values
-from isocharge.common.structs import Text, read_json
+from isocharge.common.structs import Text, plain_values, read_json
 from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.model_folder import check_target
