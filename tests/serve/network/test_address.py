@@ -8,14 +8,15 @@ import stat
 import pytest
 
 from isocharge.common.errors import InputError, ListenError, TokenError
-from isocharge.serve.network.address import Address, Tls, Token, check_exposure
+from isocharge.serve.network.address import Address, Tls, check_exposure
+from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.http import HttpServer
 
 
 @pytest.mark.parametrize("token", ["", " a", "a\n", "a\r\nb: c", "schlüssel", "100%"])
 def test_invalid_tokens_are_refused(token):
     with pytest.raises(InputError, match="printable ASCII"):
-        Token(token)
+        AccessCheck(token=token)
 
 
 @pytest.mark.parametrize(
@@ -108,15 +109,15 @@ def test_certificate_that_is_a_pipe_is_refused(tmp_path):
 
 @pytest.mark.parametrize("scheme", ["Bearer", "bearer", "BEARER", "bEaReR"])
 def test_scheme_of_the_token_is_case_insensitive(scheme):
-    token = Token("sesame")
-    token.check(f"{scheme} sesame".encode())
-    token.check(f"{scheme}  sesame".encode())
+    access = AccessCheck(token="sesame")
+    access.check_token(f"{scheme} sesame".encode())
+    access.check_token(f"{scheme}  sesame".encode())
     for wrong in ("Sesame", "sesam", "", "sesame "):
         with pytest.raises(TokenError):
-            token.check(f"{scheme} {wrong}".encode())
+            access.check_token(f"{scheme} {wrong}".encode())
 
 
 @pytest.mark.parametrize("header", [b"sesame", b"Basic sesame", b"Bearersesame", b"Bearer", b" Bearer sesame", b""])
 def test_token_without_the_bearer_scheme_is_refused(header):
     with pytest.raises(TokenError, match="`Authorization: Bearer TOKEN`"):
-        Token("sesame").check(header)
+        AccessCheck(token="sesame").check_token(header)

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from headless_chromium import start_chromium
 from isocharge.common.errors import InputError, OriginError
-from isocharge.serve.network.address import Token
 from isocharge.serve.network.browser_check import AccessCheck, host_name
 from isocharge.serve.network.protocol import Handler
 
@@ -111,7 +110,7 @@ def test_no_name_but_localhost_is_served(name):
 
 
 def test_with_a_token_any_host_name_is_served(store):
-    handler = Handler(store, access=AccessCheck(token=Token("sesame")))
+    handler = Handler(store, access=AccessCheck(token="sesame"))
     headers = [(b"host", b"inference.cluster.local"), (b"authorization", b"Bearer sesame")]
     assert handler.answer("GET", "/v2", headers, b"").status == 200
     assert handler.answer("GET", "/v2", [*headers, (b"origin", b"http://evil.example")], b"").status == 403

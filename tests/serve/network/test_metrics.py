@@ -9,7 +9,6 @@ from isocharge.serve import Predictor, find_model
 from isocharge.serve.flags import MISFIT
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.validity import Validity
-from isocharge.serve.network.address import Token
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
@@ -96,7 +95,7 @@ def test_metrics_list_loaded_and_refused_versions(film, tmp_path):
 
 
 def test_metrics_need_the_token(store):
-    handler = Handler(store, access=AccessCheck(token=Token("yes")))
+    handler = Handler(store, access=AccessCheck(token="yes"))
     for headers, status in (([], 401), ([(b"authorization", b"Bearer no")], 401), (BEARER, 200)):
         answer = handler.answer("GET", "/metrics", headers, b"")
         assert (answer.status, b"isocharge_requests" in answer.body) == (status, status == 200)

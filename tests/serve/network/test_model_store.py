@@ -18,7 +18,6 @@ from onnx import helper, numpy_helper
 
 from infer_requests import BODY, INFER
 from isocharge.common.errors import ModelError, ModelNotFound
-from isocharge.serve.network.address import Token
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.grpc.service import SERVICE
@@ -162,7 +161,7 @@ def released(models):
 
 @pytest.fixture
 def app(released, lines):
-    return Handler(released, None, Traffic(RequestLog(lines.append)), AccessCheck(token=Token(SECRET)))
+    return Handler(released, None, Traffic(RequestLog(lines.append)), AccessCheck(token=SECRET))
 
 
 def bearer(token=SECRET):
@@ -197,7 +196,7 @@ any_bytes = st.binary(max_size=60) | any_text.map(lambda text: text.encode("utf-
 @given(any_text, any_text, st.lists(st.tuples(any_bytes, any_bytes)), any_bytes, st.booleans())
 def test_client_cannot_forge_a_log_line_or_log_a_secret(released, method, path, headers, body, knows):
     lines = []
-    handler = Handler(released, None, Traffic(RequestLog(lines.append)), AccessCheck(token=Token(SECRET)))
+    handler = Handler(released, None, Traffic(RequestLog(lines.append)), AccessCheck(token=SECRET))
     handler.answer(method, path, [*headers, *bearer()] if knows else headers, body, ("::1", 1))
     (line,) = lines
     assert len(line) < 500
@@ -226,7 +225,7 @@ def test_log_has_the_messages_of_python_loggers(lines):
 
 
 def test_log_has_a_line_for_each_grpc_call(store, lines):
-    app = Handler(store, None, Traffic(RequestLog(lines.append)), AccessCheck(token=Token(SECRET)))
+    app = Handler(store, None, Traffic(RequestLog(lines.append)), AccessCheck(token=SECRET))
     with_secret = [("authorization", f"Bearer {SECRET}")]
     with (
         grpc_server(app, "127.0.0.1", 0) as url,

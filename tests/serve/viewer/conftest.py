@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from headless_chromium import start_chromium
-from isocharge.serve.network.address import Address, Token
+from isocharge.serve.network.address import Address
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.viewer.film_description import describe_film
 from isocharge.serve.viewer.live_page import LivePage, serve_page
@@ -56,8 +56,7 @@ def start_page(film):
     with ExitStack() as stack:
 
         def start(token=None, **settings):
-            secret = None if token is None else Token(token)
-            access = AccessCheck(token=secret)
+            access = AccessCheck(token=token)
             page = LivePage(describe_film("a film", film.metadata()), access=access, **settings)
             return Client(page, stack.enter_context(serve_page(page, Address())))
 

@@ -20,7 +20,7 @@ from isocharge.common.extras import require
 from isocharge.serve import PredictionRecord, Recorder, TouchStream
 from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.network.address import Address, Tls, Token, check_exposure
+from isocharge.serve.network.address import Address, Tls, check_exposure
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.port import recording
 from isocharge.serve.viewer.film_description import describe_film
@@ -94,17 +94,13 @@ def given_tls(certificate: Path | None, key: Path | None) -> Tls | None:
     return None
 
 
-def given_token(token: str | None) -> Token | None:
+def given_token(token: str | None) -> str | None:
     """Return the token that the option or the environment contains, or None if there is no token.
 
-    If the environment variable `ISOCHARGE_TOKEN` is empty, the token is an empty text, which is refused. Typer alone
-    would treat an empty token as a missing token.
-
-    Raises:
-        InputError: If the token cannot be used.
+    If the environment variable `ISOCHARGE_TOKEN` is empty, the token is an empty text, which `AccessCheck` refuses.
+    Typer alone would treat an empty token as a missing token.
     """
-    text = os.environ.get("ISOCHARGE_TOKEN") if token is None else token
-    return None if text is None else Token(text)
+    return os.environ.get("ISOCHARGE_TOKEN") if token is None else token
 
 
 def page_address(live: str) -> Address:

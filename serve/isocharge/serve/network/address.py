@@ -1,14 +1,12 @@
-"""Addresses, TLS certificates, tokens and limits of the HTTP server and the gRPC server.
+"""Addresses, TLS certificates and limits of the HTTP server and the gRPC server.
 
 By default, a server listens on the loopback address, to which only programs on the same machine can connect.
 """
 
 import contextlib
 import errno
-import hmac
 import ipaddress
 import os
-import re
 import resource
 import socket
 import ssl
@@ -16,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from isocharge.common.defaults import MAX_BATCH
-from isocharge.common.errors import InputError, ListenError, TokenError, TooLarge
+from isocharge.common.errors import InputError, ListenError, TooLarge
 from isocharge.common.files import read_whole
 
 
@@ -54,6 +52,8 @@ class Address:
         _, max_open_files = resource.getrlimit(resource.RLIMIT_NOFILE)
         with contextlib.suppress(ValueError, OSError):  # macOS refuses an unlimited number
             resource.setrlimit(resource.RLIMIT_NOFILE, (max_open_files, max_open_files))
+        if self.uds is not None:
+            _remove_stale_socket(self.uds)
         try:
             if self.uds is not None:
                 return _listen_unix(self.uds, backlog)
@@ -61,8 +61,6 @@ class Address:
             is_ipv6 = ":" in self.host
             family = socket.AF_INET6 if is_ipv6 else socket.AF_INET
             return socket.create_server((self.host, self.port), family=family, backlog=backlog)
-        except ListenError:  # _listen_unix has raised this error, whose message already states what to do
-            raise
         except (OSError, UnicodeError) as error:  # a host name that cannot be encoded causes a UnicodeError
             place = self.uds or f"{self.host}:{self.port}"
             raise ListenError(f"cannot listen on {place}: {error}; choose another address or port") from error
@@ -121,14 +119,12 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
     """Open a listening Unix socket that only its owner can use, and return the socket.
 
     Args:
-        path: Path of the socket. If an earlier server has left a socket there, its file is removed first.
+        path: Path of the socket, where no file exists.
         backlog: Largest number of connections that wait to be accepted.
 
     Raises:
-        ListenError: If the path is another file, or if a server listens on the socket.
         OSError: If the socket cannot be created.
     """
-    _remove_stale_socket(path)
     previous_mask = os.umask(0o177)  # only the owner may read and write the file that `bind` creates
     listening = socket.socket(socket.AF_UNIX)
     try:
@@ -205,53 +201,6 @@ class Tls:
         """
         self.context()  # checks the files
         return read_whole(self.key or self.certificate), read_whole(self.certificate)
-
-
-_TOKEN = re.compile(r"(?! )[ -$&-~]+(?<! )")
-"""Printable ASCII characters without blanks at the ends and without the percent sign."""
-
-
-class Token:
-    """Secret text that clients must send.
-
-    The duration of a comparison does not depend on how many characters of a wrong token are correct. A client therefore
-    cannot use the duration to guess the token character by character.
-    """
-
-    def __init__(self, token: str) -> None:
-        """Check that the token contains only valid characters, and store the token.
-
-        Args:
-            token: The secret text.
-
-        Raises:
-            InputError: If the token is empty, or contains characters that a header or a URL cannot contain.
-        """
-        if not _TOKEN.fullmatch(token):
-            raise InputError(
-                "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
-                "meaning in the address of a page; choose another one"
-            )
-        self._token = token.encode()
-
-    def check(self, authorization: bytes) -> None:
-        """Check the value of an Authorization header.
-
-        Args:
-            authorization: Value of the header, which is empty if the request has no such header. The name `Bearer` may
-                be in upper case or lower case (RFC 9110, 11.1).
-
-        Raises:
-            TokenError: If the header does not contain the token.
-        """
-        scheme, _, token = authorization.partition(b" ")
-        # The time that compare_digest takes does not depend on the number of correct characters.
-        is_correct = hmac.compare_digest(token.lstrip(b" "), self._token)
-        if scheme.lower() != b"bearer" or not is_correct:
-            received = "a wrong one" if authorization else "none"
-            raise TokenError(
-                f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {received}"
-            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,19 +18,24 @@ Programs other than browsers send neither `Origin` nor `Sec-Fetch-Site`. In the 
 therefore checks only the header `Host`.
 """
 
+import hmac
 import re
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from urllib.parse import urlsplit
 
-from isocharge.common.errors import InputError, OriginError, RequestError
-from isocharge.serve.network.address import Token, ip_address
+from isocharge.common.errors import InputError, OriginError, RequestError, TokenError
+from isocharge.serve.network.address import ip_address
 
 TRUSTED_FETCH_SITES = (b"same-origin", b"none")
 """Values of the header `Sec-Fetch-Site` that are accepted.
 
 Browsers send `same-origin` if a page of this server sends the request, and `none` if the user has typed in the address.
 """
+
+
+_TOKEN = re.compile(r"(?! )[ -$&-~]+(?<! )")
+"""Printable ASCII characters without blanks at the ends and without the percent sign."""
 
 
 class AccessCheck:
@@ -44,6 +49,10 @@ class AccessCheck:
             `Host` is accepted. DNS rebinding is then harmless, because a page of another site does not have the token.
         any_host: Whether to accept every value of the header `Host` even without a token. This is harmless if the
             server listens on a Unix socket.
+
+    Raises:
+        InputError: If a host name cannot be used, or if the token is empty or contains characters that a header or a
+            URL cannot contain.
     """
 
     def __init__(
@@ -51,12 +60,17 @@ class AccessCheck:
         host: str = "localhost",
         allowed_hosts: Iterable[str] = (),
         *,
-        token: Token | None = None,
+        token: str | None = None,
         any_host: bool = False,
     ) -> None:
         self._allowed_names = frozenset(map(host_name, allowed_hosts))
         self._host_names = self._allowed_names | {"localhost", host.lower()}
-        self._token = token
+        if token is not None and not _TOKEN.fullmatch(token):
+            raise InputError(
+                "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
+                "meaning in the address of a page; choose another one"
+            )
+        self._token = None if token is None else token.encode()
         self._any_host = any_host or token is not None
 
     def check(self, method: str, headers: Mapping[bytes, bytes], *, needs_token: bool = True) -> None:
@@ -76,9 +90,28 @@ class AccessCheck:
             self.check_token(headers.get(b"authorization", b""))
 
     def check_token(self, authorization: bytes) -> None:
-        """Check the value of an Authorization header; see `Token.check`. Without a token, every value is accepted."""
-        if self._token is not None:
-            self._token.check(authorization)
+        """Check the value of an Authorization header. Without a token, every value is accepted.
+
+        The duration of a comparison does not depend on how many characters of a wrong token are correct. A client
+        therefore cannot use the duration to guess the token character by character.
+
+        Args:
+            authorization: Value of the header, which is empty if the request has no such header. The name `Bearer` may
+                be in upper case or lower case (RFC 9110, 11.1).
+
+        Raises:
+            TokenError: If the header does not contain the token.
+        """
+        if self._token is None:
+            return
+        scheme, _, token = authorization.partition(b" ")
+        # The time that compare_digest takes does not depend on the number of correct characters.
+        is_correct = hmac.compare_digest(token.lstrip(b" "), self._token)
+        if scheme.lower() != b"bearer" or not is_correct:
+            received = "a wrong one" if authorization else "none"
+            raise TokenError(
+                f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {received}"
+            )
 
     def _check_site(self, method: str, headers: Mapping[bytes, bytes]) -> None:
         """Raise an error if a page of another site has sent a request."""

@@ -19,7 +19,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from isocharge.common.errors import InputError
 from isocharge.serve.model.session import OUTPUTS
-from isocharge.serve.network.address import ServerLimits, Tls, Token
+from isocharge.serve.network.address import ServerLimits, Tls
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.grpc import grpc_server, server
 from isocharge.serve.network.grpc.service import METHODS, SERVICE, Service
@@ -115,7 +115,7 @@ def test_message_above_the_size_limit_is_refused(serve):
 
 
 def test_calls_need_the_token(serve):
-    ask = partial(call, serve(token=Token("open sesame"))())
+    ask = partial(call, serve(token="open sesame")())
     assert ask("ServerLive").live
     assert ask("ServerReady").ready
     assert ask("ModelMetadata", metadata=[("authorization", "Bearer open sesame")], name="linear").name == "linear"
@@ -186,7 +186,7 @@ def refusal(call):
 
 def test_stream_without_a_token_is_refused(serve, silent_call):
     """The token is in the metadata, so that a call is refused before its first message."""
-    connect = serve(token=Token("sesame"))
+    connect = serve(token="sesame")
     channel = connect()
     assert [refusal(silent_call(channel, "ModelStreamInfer")) for _ in range(8)] == ["UNAUTHENTICATED"] * 8
     assert [refusal(silent_call(channel, "ModelInfer")) for _ in range(8)] == ["UNAUTHENTICATED"] * 8

@@ -15,7 +15,7 @@ import orjson
 import pytest
 
 from infer_requests import BODY, INFER, infer_request
-from isocharge.serve.network.address import ServerLimits, Tls, Token
+from isocharge.serve.network.address import ServerLimits, Tls
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.protocol import Handler
 
@@ -286,7 +286,7 @@ def test_stop_finishes_requests_that_have_begun(server, slow_load):
 @pytest.mark.parametrize(("certificate", "key"), [("cert.pem", "key.pem"), ("both.pem", None)])
 def test_server_with_tls_and_token(store, start_http, tls_files, trusted, certificate, key):
     tls = Tls(tls_files / certificate, key and tls_files / key)
-    server = start_http(Handler(store, access=AccessCheck(token=Token("sesame"))), tls=tls)
+    server = start_http(Handler(store, access=AccessCheck(token="sesame")), tls=tls)
     assert server.url.startswith("https://127.0.0.1:")
     client = http.client.HTTPSConnection(server.url.removeprefix("https://"), context=trusted, timeout=60)
     for _ in range(2):

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from isocharge.common.errors import UnknownPath, WrongMethod
-from isocharge.serve.network.address import ServerLimits, Token
+from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.browser_check import AccessCheck, header_values
 from isocharge.serve.network.metrics import Client, Exchange, Traffic
 from isocharge.serve.network.model_store import ModelStore, open_model_store
@@ -249,6 +249,5 @@ def asgi_app(models: Path | None = None, *, token: str | None = None, allowed_ho
         >>> from starlette.routing import Mount  # doctest: +SKIP
         >>> app = Starlette(routes=[Mount("/touch", asgi_app(token="s3cret"))])  # doctest: +SKIP
     """
-    secret = None if token is None else Token(token)
-    access = AccessCheck(allowed_hosts=allowed_hosts, token=secret)
+    access = AccessCheck(allowed_hosts=allowed_hosts, token=token)
     return Handler(open_model_store(models), access=access)
