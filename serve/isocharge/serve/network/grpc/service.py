@@ -15,7 +15,6 @@ import asyncio
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from typing import Any
@@ -175,21 +174,6 @@ STREAM = "ModelStreamInfer"
 """Name of the method that receives and sends several messages in one call."""
 
 
-@dataclass
-class _Call:
-    """Properties of a call that are counted and logged.
-
-    Attributes:
-        model: Label `name/version` of the requested model, or None if no loaded model was requested.
-        bytes_in: Total size of the received messages, bytes.
-        bytes_out: Total size of the sent messages, bytes.
-    """
-
-    model: str | None = None
-    bytes_in: int = 0
-    bytes_out: int = 0
-
-
 class Service:
     """gRPC service that answers calls with the models, the token and the limits of a `Handler`."""
 
@@ -224,37 +208,27 @@ class Service:
             _messages: Iterator over the messages. It is not used, because the messages are read from the context.
             context: Context of the call, from which messages are read and to which responses are written.
         """
-        call = _Call()
+        # If the client disconnects, this coroutine is cancelled, and the status is not changed.
+        call = Exchange("grpc", name, "CANCELLED")
         start_ns = time.perf_counter_ns()
-        status = "CANCELLED"  # if the client disconnects, this coroutine is cancelled, and the status is not changed
         message = ""
-        error_type = None
         try:
             await self._answer(name, context, call)
-            status = "OK"
+            call.status = "OK"
         except grpc.aio.InternalError as error:  # no message can be sent or read, as the client has ended the call
             raise asyncio.CancelledError from error
         except Exception as error:  # every error is sent to the client
-            status, message = _status_and_message(error)
-            error_type = type(error).__name__
+            call.status, message = _status_and_message(error)
+            call.error = type(error).__name__
         finally:
-            self._traffic.count_and_log(
-                Exchange(
-                    transport="grpc",
-                    route=name,
-                    status=status,
-                    model=call.model,
-                    error=error_type,
-                    duration_us=(time.perf_counter_ns() - start_ns) / 1000,
-                    bytes_in=call.bytes_in,
-                    bytes_out=call.bytes_out,
-                    client=context.peer() if self._traffic.log else None,  # only the log needs the client
-                )
-            )
+            call.duration_us = (time.perf_counter_ns() - start_ns) / 1000
+            if self._traffic.log is not None:  # only the log needs the client
+                call.client = context.peer()
+            self._traffic.count_and_log(call)
         if message:
-            await context.abort(grpc.StatusCode[status], message)
+            await context.abort(grpc.StatusCode[str(call.status)], message)
 
-    async def _answer(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> None:
+    async def _answer(self, name: str, context: grpc.aio.ServicerContext, call: Exchange) -> None:
         """Check the number of open calls and the token, and answer the messages of a call.
 
         A call of the method `STREAM` may contain any number of messages, and every other call contains one message. The
@@ -288,7 +262,7 @@ class Service:
             if name != STREAM:
                 raise RequestError(f"{name}: expected a message, got none")
 
-    def _respond(self, name: str, data: bytes, call: _Call) -> bytes:
+    def _respond(self, name: str, data: bytes, call: Exchange) -> bytes:
         """Answer one message, and return the serialized response.
 
         Args:

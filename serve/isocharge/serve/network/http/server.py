@@ -158,7 +158,7 @@ class Connection(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         response = refusal(status, message)
-        exchange = Exchange("http", "none", status, None, None, 0, 0, len(response.body), self.client)
+        exchange = Exchange("http", "none", status, bytes_out=len(response.body), client=self.client)
         self._traffic.count_and_log(exchange)
         headers = b"".join(b"%s: %s\r\n" % header for header in response.headers)
         self.transport.write(STATUS_LINE[status] + headers + b"connection: close\r\n\r\n" + response.body)
