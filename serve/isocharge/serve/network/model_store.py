@@ -11,9 +11,9 @@ are refused, the old version remains available.
 
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 from isocharge.common.errors import ModelError, ModelNotFound
@@ -80,22 +80,22 @@ class ModelStore:
         metrics: Metrics of the requests to each version. They also contain versions that are no longer loaded.
     """
 
-    def __init__(self, folders: Callable[[], Mapping[str, Path]]) -> None:
-        """Load all versions of all models in the folders.
+    def __init__(self, roots: Sequence[Path]) -> None:
+        """Load all versions of all models in the repositories.
 
         Args:
-            folders: Function that returns the folder of each model by the name of the model. The methods `load` and
-                `index` call this function again, so that new models are found.
+            roots: Folders of the repositories. If several repositories contain a model, the model in the first of them
+                is used. The methods `load` and `index` search the repositories again, so that new models are found.
 
         Raises:
             ModelError: If there is no model, or no version passes its checks.
         """
-        self._folders = folders
+        self._roots = roots
         self._change_lock = threading.Lock()
         self.metrics = ModelMetrics()
         # The dictionary is sorted by name, and is replaced as a whole, so that no thread reads half of a change.
         self._models: dict[str, ModelVersions] = {}
-        for name, folder in folders().items():
+        for name, folder in self._folders().items():
             self._load_versions(name, folder)
         if not self.loaded_versions():
             raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'no model was found'}")
@@ -200,6 +200,10 @@ class ModelStore:
             self.get(name)  # raises ModelNotFound
             self._replace(name, {}, dict.fromkeys(self._model(name).loaded, "unloaded"))
 
+    def _folders(self) -> Mapping[str, Path]:
+        """Search the repositories for models, and return the folder of each model by the name of the model."""
+        return {name: root / name for root in reversed(self._roots) for name in model_names(root)}
+
     def _model(self, name: str) -> ModelVersions:
         """Return the versions of a model, which are none if the model is unknown."""
         return self._models.get(name, NO_VERSIONS)
@@ -268,21 +272,11 @@ def open_model_store(models: Path | None = None) -> ModelStore:
         ModelError: If `models` is not a folder or contains no model, or if no version passes its checks.
     """
     if models is None:
-        return ModelStore(partial(_find_model_folders, repositories()))
+        return ModelStore(repositories())
     if not model_names(models):
         repositories(models)  # raises an error if the folder itself is missing
         raise ModelError(f"{models}: expected models, <name>/<version>/model.onnx, found none; correct --models")
-    return ModelStore(partial(_find_model_folders, [models]))
-
-
-def _find_model_folders(roots: Sequence[Path]) -> Mapping[str, Path]:
-    """Search repositories for models, and return the folder of each model by the name of the model.
-
-    Args:
-        roots: Folders of the repositories. If several repositories contain a model, its folder in the first of them is
-            returned.
-    """
-    return {name: root / name for root in reversed(roots) for name in model_names(root)}
+    return ModelStore([models])
 
 
 def _refusal_reason(folder: Path, error: Exception) -> str:

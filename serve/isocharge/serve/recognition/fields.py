@@ -180,7 +180,6 @@ def _number_parts(
         return
     is_float = type_name[0] == "f"
     is_unsigned = type_name[0] == "u"
-    is_signed = type_name[0] == "i"
     values = _values(number_bytes, type_name)
     steps = np.diff(values)
     counter_steps = steps  # steps if the number is a counter or a clock, which may overflow
@@ -199,17 +198,13 @@ def _number_parts(
         counter_steps = (steps + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
         magnitude = float(np.median(np.abs(values - half_range)))  # distance from the middle of the range
 
-    # A counter is an unsigned integer of 1, 2 or 4 bytes. A clock is unsigned or floating-point, with 2, 4 or 8 bytes.
-    can_be_counter = is_unsigned and size != 3
-    can_be_clock = not is_signed and size not in (1, 3)
-    if can_be_counter and steady_step(counter_steps) == 1.0:
+    clock = identify_clock(counter_steps, frame_rate_Hz)
+    if steady_step(counter_steps) == 1.0:
         yield Part("seq", type_name, size, 0.0, name="seq")  # the values of a counter need no bits
-    elif can_be_clock:
-        clock = identify_clock(counter_steps, frame_rate_Hz)
-        if clock is not None:
-            name, tick_duration = clock
-            clock_score = _bits(counter_steps - np.median(counter_steps), unit, size)
-            yield Part("clock", type_name, size, clock_score, name=name, scale=tick_duration)
+    elif clock is not None:
+        name, tick_duration = clock
+        clock_score = _bits(counter_steps - np.median(counter_steps), unit, size)
+        yield Part("clock", type_name, size, clock_score, name=name, scale=tick_duration)
 
     # The magnitude is counted as one more step. The score of a type is therefore lower if the values in this type are
     # close to 0 or, for an unsigned type, close to the middle of its range.
@@ -265,20 +260,15 @@ def split_frame(
             rest_score, rest_parts = best_division(position + part.size, part.channel_type)
             score = part.score + rest_score
             if begins_group:
-                score = part.score + Weights.channel_group + rest_score
+                score += Weights.channel_group
             if score < best_score:
                 best_score = score
                 best_parts = (part, *rest_parts)
         return best_score, best_parts
 
-    scored_sync_lengths = []
-    for sync_length in sync_lengths:
-        score, _ = best_division(sync_length, "")
-        if sync_length == 1:  # a sync of a single byte is rare
-            score += Weights.constant
-        scored_sync_lengths.append((score, sync_length))
-    lowest_score, best_sync_length = min(scored_sync_lengths)  # of equal scores, the one with the shortest pattern
-    _, best_parts = best_division(best_sync_length, "")
+    scores = {sync_length: best_division(sync_length, "")[0] for sync_length in sync_lengths}
+    best_sync_length = min(scores, key=scores.__getitem__)  # of equal scores, the one with the shortest pattern
+    lowest_score, best_parts = best_division(best_sync_length, "")
     return lowest_score, best_sync_length, best_parts
 
 
