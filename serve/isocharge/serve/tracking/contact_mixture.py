@@ -136,17 +136,9 @@ class Components(NamedTuple):
         return Components(mean, covariance, log_weight)
 
 
-def film_charges(charges: ChargeSeries, states: Array) -> tuple[Array, Array]:
-    """Compute the charges that the film produces for states, and their derivatives with respect to (x, y, ln F).
-
-    Args:
-        charges: Charges that the film produces for every contact.
-        states: States, shape (n, 6 + n_electrode). Contacts outside the range of forces are allowed.
-
-    Returns:
-        The charges, shape (n, n_electrode), pC, and the derivatives, shape (n, n_electrode, 3).
-    """
-    return charges.linearised(np.column_stack([states[:, POSITION], np.exp(states[:, 2])]))
+def contacts_of(states: Array) -> Array:
+    """Return the contacts (x, y, F), shape (n, 3), of states whose first components are x, y and ln F."""
+    return np.column_stack([states[:, POSITION], np.exp(states[:, 2])])
 
 
 def predict_components(components: Components, dt_s: float) -> Components:
@@ -201,7 +193,7 @@ def update_components(
     states = prior.mean
     n_component, n_state = states.shape
     for iteration in range(iterations + 1):
-        film_charge_pC, film_jacobian = film_charges(charges, states)
+        film_charge_pC, film_jacobian = charges.linearised(contacts_of(states))
         gains = np.exp(states[:, GAINS])
         predicted_pC = film_charge_pC * gains
         jacobian = np.zeros((n_component, charge_pC.size, n_state))
@@ -411,7 +403,7 @@ class ContactMixture:
         Args:
             states: The states, shape (n, 6 + n_electrode).
         """
-        _, jacobians = film_charges(self.charges, states)
+        _, jacobians = self.charges.linearised(contacts_of(states))
         transposed = jacobians.swapaxes(1, 2)[:, np.newaxis]
         return np.asarray(np.linalg.det(transposed @ jacobians) < 0.0)
 

@@ -42,7 +42,7 @@ from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.robust_estimate import ModelValues, Prior, robust_estimate
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.stage import Rule, Setting
-from isocharge.serve.tracking.contact_mixture import GAIN_STD
+from isocharge.serve.tracking.contact_mixture import GAIN_STD, contacts_of
 
 UNUSED_FRAME_FLAGS = frozenset({OUTSIDE, BEYOND, STRESS, GAP, REPEAT})
 """Flags of frames that are not used, although the other frames of the same touch may be used.
@@ -73,11 +73,6 @@ class TouchPeak:
         self._charge_sum_pC: Array = np.zeros(())
         self._is_reliable = True  # whether all flags so far are harmless
 
-    @property
-    def is_usable(self) -> bool:
-        """Whether at least one frame was averaged, and all flags of the touch are harmless."""
-        return self._is_reliable and self._averaged_count > 0
-
     def add_frame(self, contact: Contact, charge_pC: Array, flags: tuple[str, ...] = ()) -> None:
         """Process the next frame of the touch.
 
@@ -103,9 +98,13 @@ class TouchPeak:
             self._charge_sum_pC = charge_pC
 
     @property
-    def mean_charge_pC(self) -> Array:
-        """Average of the touch charges, shape (n_electrode,), pC."""
-        return self._charge_sum_pC / self._averaged_count
+    def mean_charge_pC(self) -> Array | None:
+        """Average of the touch charges, shape (n_electrode,), pC.
+
+        The average is None if no frame was averaged, or if a flag of the touch is not harmless.
+        """
+        is_usable = self._is_reliable and self._averaged_count > 0
+        return self._charge_sum_pC / self._averaged_count if is_usable else None
 
 
 RELATIVE_OFFSET_STD = 0.1
@@ -267,10 +266,10 @@ class FilmFollower:
             assert charge_pC is not None  # a frame with a contact has charges
             self._peak.add_frame(contact, charge_pC, flags)
             return
-        peak = self._peak
+        mean_charge_pC = self._peak.mean_charge_pC
         self.discard_touch()
-        if peak.is_usable:
-            self._observe_touch(peak.mean_charge_pC, clock_s)
+        if mean_charge_pC is not None:
+            self._observe_touch(mean_charge_pC, clock_s)
 
     def _observe_touch(self, charge_pC: Array, clock_s: float) -> None:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
@@ -343,7 +342,7 @@ class FilmFollower:
             contacts: Contacts (x, y, ln F), shape (n, 3), mm and the logarithm of N.
             state: State, shape (n_state,).
         """
-        film = self._series.changes(_with_force(contacts), state[self._film])
+        film = self._series.changes(contacts_of(contacts), state[self._film])
         gains = np.exp(state[self._gains])
         film_charge_pC = film.charge_pC * gains
         by_state = np.zeros((*film_charge_pC.shape, state.size))
@@ -390,7 +389,7 @@ class FilmFollower:
         """
         log_contact = self._log_contact(contact)
         present = self._values(log_contact, state)
-        (calibrated_pC,), (slopes_pC,) = self._series.linearised(_with_force(log_contact))
+        (calibrated_pC,), (slopes_pC,) = self._series.linearised(contacts_of(log_contact))
 
         # An error of the state shifts the contact whose charges are nearest to the converted charges. The norm is that
         # of the noise of the charges.
@@ -399,8 +398,3 @@ class FilmFollower:
         contact_by_state[2] *= contact.force_N  # from ln F to F
         covariance = contact_by_state @ self._applied_covariance @ contact_by_state.T
         return _Conversion(calibrated_pC - present.charge_pC[0], covariance)
-
-
-def _with_force(contacts: Array) -> Array:
-    """Return contacts (x, y, F) for contacts (x, y, ln F), each of shape (n, 3)."""
-    return np.column_stack([contacts[:, :2], np.exp(contacts[:, 2])])
