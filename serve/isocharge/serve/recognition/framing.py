@@ -278,7 +278,9 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     # Number of constant bytes at the beginning of the frames. It is the position of the first False.
     leading_constant_count = int(np.argmin([*is_constant[:MAX_CONSTANT_BYTES], False]))
     for size in (4, 3, 2, 1):  # in bytes
-        if size + 2 > length:  # at least two bytes must remain
+        is_too_wide = size + 2 > length  # at least two bytes must remain
+        last_bytes_are_constant = is_constant[-size:].all()  # a checksum would differ from frame to frame
+        if is_too_wide or last_bytes_are_constant:
             continue
 
         # Try each position for the first covered byte, up to the first byte that is not constant.
