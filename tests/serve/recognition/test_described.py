@@ -124,6 +124,16 @@ def test_frames_are_recognised_in_a_damaged_stream():
     assert board.is_read_by(recognise([stream.tobytes()], FRAMES / RATE_HZ))
 
 
+@pytest.mark.parametrize(("channel", "constant"), [(1, 0), (1, -7), (3, 0)])
+def test_channel_that_never_changes_is_kept_beside_the_others(channel, constant):
+    """The doctor can only report a dead channel that the description contains."""
+    values = np.random.default_rng(0).normal(0.0, 300.0, (FRAMES, 4)).round().astype(int)
+    values[:, channel] = constant
+    data = b"".join(b"\xaa\x55" + struct.pack("<H4h", row, *numbers) for row, numbers in enumerate(values.tolist()))
+    table = recognise([data], FRAMES / RATE_HZ)
+    assert [field["name"] for field in table["fields"]] == ["seq", "ch1", "ch2", "ch3", "ch4"]
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_noise_is_not_recognised(seed):
     table = recognise([np.random.default_rng(seed).bytes(20_000)], 2.0)
