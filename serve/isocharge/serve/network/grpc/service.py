@@ -39,7 +39,6 @@ from isocharge.serve.network.protocol.inference import (
     Rows,
     answer_inference,
     binary_tensor,
-    check_request,
 )
 from isocharge.serve.network.protocol.response import client_message, statuses
 from isocharge.serve.network.protocol.routes import ROUTES, Request
@@ -68,21 +67,17 @@ NUMBER_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
 """Field of the contents of a tensor that contains the numbers, by the type of the numbers."""
 
 
-def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> InferRequest:
-    """Read a ModelInferRequest, and return the charges and the requested outputs.
+def read_request(message: Any) -> tuple[InferBody, bytes]:
+    """Read a ModelInferRequest, and return its content and the charges that are sent as raw contents.
 
-    The message is first converted to the JSON object that the equivalent HTTP request would contain, and is then
-    checked like this object. If the charges are sent as raw contents, so are the outputs of the response.
+    The message is converted to the JSON object that the equivalent HTTP request would contain. If the charges are sent
+    as raw contents, so are the outputs of the response.
 
     Args:
         message: The ModelInferRequest.
-        loaded: Version of the model that is requested.
-        max_presses: Largest number of presses in one request.
 
     Raises:
-        RequestError: If the message is not a request for this model.
-        ChargeError: If a charge is not finite.
-        TooLarge: If the request contains more than `max_presses` presses.
+        RequestError: If the message is not a request for an inference.
     """
     raw_contents = message.raw_input_contents
     if len(raw_contents) > 1:
@@ -94,7 +89,7 @@ def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> Infer
         "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
         "parameters": {"binary_data_output": raw_charges is not None},
     }
-    return check_request(convert(json_object, InferBody, "", RequestError), raw_charges or b"", loaded, max_presses)
+    return convert(json_object, InferBody, "", RequestError), raw_charges or b""
 
 
 def _input_object(tensor: Any, raw_charges: bytes | None) -> dict[str, Any]:
@@ -115,7 +110,7 @@ def _input_object(tensor: Any, raw_charges: bytes | None) -> dict[str, Any]:
     }
     if raw_charges is not None:
         parameters["binary_data_size"] = len(raw_charges)
-    # If the request contains both numbers and raw content, the object contains both. The function `check_request` then
+    # If the request contains both numbers and raw content, the object contains both. The check of the request then
     # refuses the object. It also refuses an unknown number type.
     if tensor.HasField("contents") or raw_charges is None:
         field = NUMBER_FIELDS.get(tensor.datatype, "fp32_contents")
@@ -324,8 +319,7 @@ class Service:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
         loaded = self._store.get(request.model_name, request.model_version)
         # `answer_inference` calls `read` and `write_response`, because it measures the duration of these steps.
-        read = partial(read_request, request, loaded, self._limits.batch)
-        return answer_inference(loaded, read, write_response)
+        return answer_inference(loaded, self._limits.batch, partial(read_request, request), write_response)
 
     def _infer_in_stream(self, request: Any) -> Any:
         """Return the response to one request of a stream.

@@ -98,23 +98,22 @@ class InferRequest(NamedTuple):
     outputs: dict[str, bool]
 
 
-def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, max_presses: int) -> InferRequest:
+def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, bytes]:
     """Read a request for an inference from the body of an HTTP request.
 
     Args:
         body: The body, after it was decompressed.
         header_length: Value of the header Inference-Header-Content-Length, which is the length of the JSON text, bytes.
             None if the request has no such header, because no binary tensor follows.
-        loaded: Version of the model that is requested.
-        max_presses: Largest number of presses in one request.
+
+    Returns:
+        The content of the JSON text, and the bytes that follow the text.
 
     Raises:
-        RequestError: If the body is not a request for this model.
-        ChargeError: If a charge is not finite.
-        TooLarge: If the request contains more than `max_presses` presses.
+        RequestError: If the body is not a request for an inference.
     """
     if header_length is None:
-        return check_request(parse_json(body, "", RequestError, InferBody), b"", loaded, max_presses)
+        return parse_json(body, "", RequestError, InferBody), b""
     # The characters are checked before the conversion, because int() also accepts signs, blanks and underscores, and is
     # slow for long texts.
     is_short_number = header_length.isdigit() and len(header_length) <= len(str(len(body)))
@@ -124,11 +123,10 @@ def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, 
             f"got {header_length.decode('latin-1')!r:.50}"
         )
     json_length = int(header_length)
-    content = parse_json(body[:json_length], "", RequestError, InferBody)
-    return check_request(content, body[json_length:], loaded, max_presses)
+    return parse_json(body[:json_length], "", RequestError, InferBody), body[json_length:]
 
 
-def check_request(body: InferBody, binary: bytes, loaded: LoadedVersion, max_presses: int) -> InferRequest:
+def _check_request(body: InferBody, binary: bytes, loaded: LoadedVersion, max_presses: int) -> InferRequest:
     """Check whether a request fits the requested model, and return the values that the model needs to answer it.
 
     The result contains the charges of the presses as an array, and the names of the outputs that the response contains.
@@ -234,23 +232,26 @@ def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
 
 def answer_inference(
     loaded: LoadedVersion,
-    read: Callable[[], InferRequest],
+    max_presses: int,
+    read: Callable[[], tuple[InferBody, bytes]],
     write: Callable[[LoadedVersion, InferRequest, dict[str, Rows]], ResponseType],
 ) -> ResponseType:
     """Read a request, run the model, and return the response. The request is counted with its duration.
 
     Args:
         loaded: Version of the model that is run.
-        read: Function that returns the request, or raises an error if the request is not valid.
+        max_presses: Largest number of presses in one request.
+        read: Function that returns the content of the request and the binary input, or raises an error if the request
+            cannot be read.
         write: Function that converts the requested outputs to the response.
 
     Raises:
-        IsochargeError: If `read` raises this error, or if the model fails.
+        IsochargeError: If `read` raises this error, if the request does not fit the model, or if the model fails.
     """
     clock_ns = time.perf_counter_ns
     start_ns = clock_ns()
     try:
-        request = read()
+        request = _check_request(*read(), loaded, max_presses)
         outputs = dict[str, Rows](run(loaded.model.session, request.charge_pC))
         if FLAGS in request.outputs:
             outputs[FLAGS] = _flags(loaded, outputs)

@@ -193,8 +193,8 @@ def _infer(request: Request) -> Response:
         raise RequestError("Upgrade: this server reads no body after this header; set the client to HTTP/1.1")
     header_length = request.headers.get(b"inference-header-content-length")
     # `answer_inference` calls `read` and `write_answer`, because it measures the duration of these steps.
-    read = partial(read_infer, request.body, header_length, loaded, request.limits.batch)
-    body, json_length = answer_inference(loaded, read, write_answer)
+    read = partial(read_infer, request.body, header_length)
+    body, json_length = answer_inference(loaded, request.limits.batch, read, write_answer)
 
     # If binary tensors follow the JSON text, a header contains the length of the text.
     content_type = b"application/json" if json_length is None else b"application/octet-stream"
