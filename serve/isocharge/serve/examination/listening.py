@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import compress
 
 import numpy as np
 
@@ -144,15 +143,13 @@ class Capture:
 
     Attributes:
         parser: The parser, with its counters.
-        frames: Good frames.
-        times_s: Time of each frame, s, by the clock of the device if the frames contain a time.
+        frames: Good frames. Their times are those of the clock of the device if the frames contain a time.
         bytes_seen: Number of bytes that were received.
     """
 
     parser: Parser
-    frames: list[Frame] = field(default_factory=list)
-    times_s: list[float] = field(default_factory=list)
-    bytes_seen: int = 0
+    frames: list[Frame]
+    bytes_seen: int
 
     @property
     def intact_share(self) -> float:
@@ -164,8 +161,8 @@ class Capture:
     @property
     def rate_Hz(self) -> float:
         """Frame rate, Hz; 0 if there are fewer than two frames, or if the times of the frames do not increase."""
-        span_s = self.times_s[-1] - self.times_s[0] if self.times_s else 0.0
-        return (len(self.times_s) - 1) / span_s if span_s > 0.0 else 0.0
+        span_s = self.frames[-1].clock_s - self.frames[0].clock_s if self.frames else 0.0
+        return (len(self.frames) - 1) / span_s if span_s > 0.0 else 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -182,9 +179,9 @@ class Capture:
             cannot read in single precision is infinite.
         """
         channel_count = len(self.frames[-1].values)
-        is_used = [len(frame.values) == channel_count for frame in self.frames]
-        values = np.array([frame.values for frame in compress(self.frames, is_used)], dtype=float)
-        times_s = np.array(self.times_s)[is_used]
+        frames = [frame for frame in self.frames if len(frame.values) == channel_count]
+        values = np.array([frame.values for frame in frames], dtype=float)
+        times_s = np.array([frame.clock_s for frame in frames])
         is_too_large = np.abs(values) > LARGEST
         values[is_too_large] = np.copysign(np.inf, values[is_too_large])
         return values, times_s - times_s[0]
@@ -200,13 +197,13 @@ def read_frames(received: ReceivedData, device: Device) -> Capture:
     Returns:
         The frames, their times, and the counters of the parser.
     """
-    capture = Capture(device.parser(), bytes_seen=received.bytes_seen)
+    parser = device.parser()
     clock = DeviceClock()
+    all_frames: list[Frame] = []
     for chunk in received.chunks:
-        frames = capture.parser.feed(chunk.data)
-        clock.stamp(chunk, frames, capture.parser.t_us_modulus)
-        capture.frames += frames
-        capture.times_s += [frame.clock_s for frame in frames]
+        frames = parser.feed(chunk.data)
+        clock.stamp(chunk, frames, parser.t_us_modulus)
+        all_frames += frames
         for frame in frames:
-            capture.parser.sequence_flags(frame.seq)
-    return capture
+            parser.sequence_flags(frame.seq)
+    return Capture(parser, all_frames, received.bytes_seen)

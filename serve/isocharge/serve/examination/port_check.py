@@ -115,23 +115,18 @@ def examine(
         DeviceError: If the gain is not valid, or is stated for other electrodes.
     """
 
-    def has_frames(received_at_baud: ReceivedData) -> bool:
-        return _intact_share(received_at_baud, device) >= INTACT_SHARE
+    def has_frames(received_at_baud: ReceivedData) -> bool:  # a large share shows that the baud rate is right
+        return read_frames(received_at_baud, _board(received_at_baud, device)).intact_share >= INTACT_SHARE
 
     received = listen(url, bauds, seconds, request or device.request, has_frames, wait)
     return examine_received(received, device=device, electrodes=electrodes, gain=gain)
 
 
-def _intact_share(received: ReceivedData, device: Device) -> float:
-    """Return the share of the bytes that belong to frames. A large share shows that the baud rate is right.
-
-    Args:
-        received: The bytes.
-        device: Settings of the board. For `ANY_BOARD`, the format of the frames is recognised from the bytes.
-    """
-    if device is ANY_BOARD:
-        device = device_from_table({"frames": recognised_frames(received)}, "board")
-    return read_frames(received, device).intact_share
+def _board(received: ReceivedData, device: Device) -> Device:
+    """Return the settings of the board. For `ANY_BOARD`, the format of the frames is recognised from the bytes."""
+    if device is not ANY_BOARD:
+        return device
+    return device_from_table({"frames": recognised_frames(received)}, "board")
 
 
 def examine_received(
@@ -159,9 +154,7 @@ def examine_received(
     """
     # Without a device file (`ANY_BOARD`), the format of the frames and the settings are proposed from the bytes.
     is_proposed = device is ANY_BOARD
-    frames = recognised_frames(received) if is_proposed else {}
-    if is_proposed:
-        device = device_from_table({"frames": frames}, "board")
+    device = _board(received, device)
     capture = read_frames(received, device)
     missing = list(transmission_sentences(capture, received.url))
     counts = capture.parser.counts
@@ -188,15 +181,16 @@ def examine_received(
     # If no gain is stated, the values remain as the board sends them. With a gain, they are converted to pC.
     table = dict(device.table)
     if is_proposed:
-        table = propose(capture, values[is_rest], frames, electrodes, gain or {})
+        table = propose(capture, values[is_rest], device.table["frames"], electrodes, gain or {})
         electrodes = electrodes or tuple(table.get("channels", {}))
         device = device_from_table({key: value for key, value in table.items() if gain or key != "gain"}, "board")
         Gain(Setup(electrodes, device))  # raises an error for the numbers of other electrodes
     electrode_at_position = electrodes_by_position(capture, device)
-    unit = "pC" if device.rule(GainRule) is not None else unit_of(capture)
+    unit = unit_of(capture)
     charges = values[is_rest][:, list(electrode_at_position)]  # shape (n, n_electrode)
     gain_rule = device.rule(GainRule)
     if gain_rule is not None:
+        unit = "pC"
         for column, electrode in enumerate(electrode_at_position.values()):
             with np.errstate(over="ignore"):  # an unusable value may become infinite, and is ignored later
                 charges[:, column] = gain_rule.charge_pC(electrode, charges[:, column])
