@@ -22,8 +22,6 @@ from threadpoolctl import ThreadpoolController
 from isocharge.common.errors import InputError, WorkersLost
 from isocharge.common.extras import require
 
-_CONTROLLER = ThreadpoolController()
-
 Job = TypeVar("Job")
 
 Result = TypeVar("Result")
@@ -147,8 +145,14 @@ def single_threaded_blas() -> AbstractContextManager[object]:
     Operations on many small matrices are faster with one thread. Several threads would often wait for each other in
     busy loops. Such waits are long if other processes use the remaining cores.
     """
-    limiter: AbstractContextManager[object] = _CONTROLLER.limit(limits=1, user_api="blas")
+    limiter: AbstractContextManager[object] = _blas_libraries().limit(limits=1, user_api="blas")
     return limiter
+
+
+@lru_cache
+def _blas_libraries() -> ThreadpoolController:
+    """Return the controller of all libraries that are loaded when this function is called first: NumPy and SciPy."""
+    return ThreadpoolController()
 
 
 def cores() -> int:

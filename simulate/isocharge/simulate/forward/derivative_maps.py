@@ -25,18 +25,21 @@ Example:
     side_force_map.friction_charges(contact, 0.2)  # pC, shape (n, n_electrode)
 """
 
+import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared, side_force_unit
 from isocharge.simulate.mechanics.stress import tension_change
-from isocharge.simulate.sensor.film import Surface
+from isocharge.simulate.mesh.conformal_map import distance_coordinate
+from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.solver.equilibrium import Equilibrium
 from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.press_chain import Reading
@@ -51,9 +54,6 @@ from isocharge.simulate.solver.sensitivity import (
     stress_changes,
 )
 
-NODE_COUNT = NodeCount(distances=6, forces=6)
-"""Numbers of distances, forces and directions at which the derivatives are solved."""
-
 TENSION = ("pretension", "tension_difference", "tension_shear")
 """Mean pretension, half of T11 - T22, and T12, MPa."""
 
@@ -62,6 +62,20 @@ STIFFNESS = ("stiffness_x", "stiffness_xy")
 
 OVAL = ("oval_x", "oval_xy")
 """Components of the parameter e of an oval clamp, dimensionless."""
+
+
+def few_nodes(film: Film, domain: Domain) -> NodeCount:
+    """Return the numbers of distances and forces at which derivatives and approximate charges are solved.
+
+    The errors are a few thousandths of the largest value. They depend mainly on the number of forces. Only for presses
+    near the clamp, where the distance coordinate is large, more distances are needed.
+
+    Args:
+        film: The film.
+        domain: Presses for which the derivatives or the charges are needed.
+    """
+    largest_coordinate = float(distance_coordinate(domain.radius / film.radius))
+    return NodeCount(distances=3 + math.ceil(2.0 * largest_coordinate), forces=8)
 
 
 @dataclass(frozen=True)
@@ -327,7 +341,7 @@ def _solve_fields(forward_map: ForwardMap, read: Reading, executor: Executor | N
         forward_map.sensor,
         forward_map.probe,
         forward_map.domain,
-        NODE_COUNT,
+        few_nodes(forward_map.sensor.film, forward_map.domain),
         SolveSettings(theory=forward_map.theory, resolution=forward_map.resolution, layer=forward_map.layer),
         read=read,
         executor=executor,

@@ -4,11 +4,11 @@ from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
+from isocharge.simulate.execution.workers import single_threaded_blas
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.diagnosis import (
     check_channels,
@@ -86,7 +86,7 @@ def calibrate(
             raise PressError(outside_words)
         outside_cautions.append(f"{outside_words}; left out")
         used_presses = ordered_presses[~is_outside]
-    with threadpool_limits(1):  # the matrices are small, so a second thread would only wait
+    with single_threaded_blas():
         charges = start or solve_even(problem, executor)
         if is_outside.mean() > 0.5:
             raise unexplained_error(

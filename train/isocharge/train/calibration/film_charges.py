@@ -14,7 +14,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Probe, Sensor, SolveSettings
-from isocharge.simulate.forward.derivative_maps import NODE_COUNT
+from isocharge.simulate.forward.derivative_maps import few_nodes
 from isocharge.simulate.forward.family import nearest_to_clamp
 from isocharge.simulate.sensor.film_properties import PRETENSION, FilmProperty, changed_film
 from isocharge.simulate.solver.press import needed_resolution
@@ -87,8 +87,9 @@ class FilmCharges:
         def solve(film_values: Array) -> ForwardMap:
             """Solve the axisymmetric film with the given properties under the axisymmetric probe."""
             sensor, probe = prior.film(film_values)
+            nodes = few_nodes(sensor.film, domain)
             return ForwardMap.build_unchecked(
-                axisymmetric(sensor), round_probe(probe), domain, NODE_COUNT, executor=executor
+                axisymmetric(sensor), round_probe(probe), domain, nodes, executor=executor
             )
 
         same_probe = solve(even_values)
@@ -138,7 +139,10 @@ class FilmCharges:
 
     def charges(self, values: Array, contact: Array) -> Array:
         """Compute the charges of presses on a film with given properties, shape (n, n_electrode), pC."""
-        charge, _ = self.linearised(values, contact)
+        sensor = self._electrodes(values)
+        solved_charge = _read(self.film, sensor).charges(contact)
+        stress_derivatives = self._stress_derivatives(sensor, contact, solved_charge)
+        charge, _ = self._changed(values, solved_charge, stress_derivatives)
         return charge
 
     def linearised(self, values: Array, contact: Array) -> tuple[Array, Array]:
@@ -154,18 +158,35 @@ class FilmCharges:
         """
         sensor = self._electrodes(values)
         solved_charge = _read(self.film, sensor).charges(contact)
-        jacobian = self._jacobian(sensor, contact, solved_charge)
+        stress_derivatives = self._stress_derivatives(sensor, contact, solved_charge)
+        charge, factor = self._changed(values, solved_charge, stress_derivatives)
+        jacobian = self._jacobian(sensor, contact, solved_charge, stress_derivatives)
+        return charge, factor[:, :, None] * jacobian
 
-        # First-order change by the mechanical properties. It is applied to the logarithm of a charge, unless the charge
-        # is negative or changes its sign.
-        change = values - self.values
-        change[~self.prior.changes_stress] = 0.0  # their effect is exact
-        charge_change = jacobian @ change
+    def _changed(
+        self, values: Array, solved_charge: Array, stress_derivatives: dict[str, Array]
+    ) -> tuple[Array, Array]:
+        """Apply the first-order change by the properties that change the stress.
+
+        The change is applied to the logarithm of a charge, unless the charge is negative or changes its sign.
+
+        Args:
+            values: Properties of the film, shape (n_property,).
+            solved_charge: Charges of the solved film, shape (n, n_electrode), pC.
+            stress_derivatives: See `_stress_derivatives`.
+
+        Returns:
+            Charges, shape (n, n_electrode), pC, and the factors by which the derivatives change, of the same shape.
+        """
+        change = dict(zip(self.prior.names, (values - self.values).tolist(), strict=True))
+        charge_change = np.zeros_like(solved_charge)
+        for name, derivative in stress_derivatives.items():
+            charge_change += change[name] * derivative
         log_change = np.divide(charge_change, solved_charge, out=np.zeros_like(solved_charge), where=solved_charge > 0)
         is_logarithmic = (solved_charge > 0.0) & (np.abs(log_change) < MAX_LOG_CHANGE)
         factor = np.where(is_logarithmic, np.exp(np.where(is_logarithmic, log_change, 0.0)), 1.0)
         charge = np.where(is_logarithmic, solved_charge * factor, solved_charge + charge_change)
-        return charge, factor[:, :, None] * jacobian
+        return charge, factor
 
     def contact_slopes(self, values: Array, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to (x, y, ln F), shape (n, n_electrode, 3).
@@ -185,19 +206,19 @@ class FilmCharges:
         sensor, _ = self.prior.film(np.where(self.prior.changes_stress, self.values, values))
         return sensor
 
-    def _jacobian(self, sensor: Sensor, contact: Array, charge: Array) -> Array:
+    def _jacobian(self, sensor: Sensor, contact: Array, charge: Array, stress_derivatives: dict[str, Array]) -> Array:
         """Compute the derivatives of the charges with respect to all properties.
 
         Args:
             sensor: Sensor with the electrodes and the coefficients.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             charge: Charges of the solved film at these contacts, shape (n, n_electrode), pC.
+            stress_derivatives: See `_stress_derivatives`.
 
         Returns:
             Derivatives, shape (n, n_electrode, n_property), pC per unit.
         """
-        derivatives = self._mechanical(sensor, contact, charge)
-        derivatives["crosstalk"] = charge.sum(axis=1, keepdims=True) - charge
+        derivatives = {**stress_derivatives, "crosstalk": charge.sum(axis=1, keepdims=True) - charge}
         for electrode, name in enumerate(sensor.electrode_names):
             own_charge = np.zeros_like(charge)
             own_charge[:, electrode] = charge[:, electrode]
@@ -208,11 +229,19 @@ class FilmCharges:
         ]
         return np.stack(columns, axis=2)
 
-    def _mechanical(self, sensor: Sensor, contact: Array, charge: Array) -> dict[str, Array]:
-        """Compute the derivatives with respect to the properties that change the stress.
+    def _stress_derivatives(self, sensor: Sensor, contact: Array, charge: Array) -> dict[str, Array]:
+        """Compute the derivatives with respect to the properties that change the stress, by the name of the property.
 
         The stress in units of Young's modulus E depends on E, the thickness h and the force F only through F / (E h)
         and the tensions divided by E. The small effect of the bending is neglected here.
+
+        Args:
+            sensor: Sensor with the electrodes and the coefficients.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges of the solved film at these contacts, shape (n, n_electrode), pC.
+
+        Returns:
+            Derivatives, each of shape (n, n_electrode), pC per unit.
         """
         film, fields = _read(self.slopes.film, sensor), _read(self.slopes.fields, sensor)
         derivatives = replace(self.slopes, film=film, fields=fields).jacobian(contact)

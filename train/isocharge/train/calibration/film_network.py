@@ -19,7 +19,7 @@ from isocharge.common.arrays import Array
 from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, series_size
 from isocharge.serve.presses.measured_presses import CONTACT
 from isocharge.simulate import Domain, ForwardMap, NoiseModel, Sweep
-from isocharge.simulate.forward.derivative_maps import NODE_COUNT
+from isocharge.simulate.forward.derivative_maps import few_nodes
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.simulate.solver.stress_limit import yield_force
@@ -126,12 +126,13 @@ def _tension_factors(
     """
     sensor, probe = charges.prior.film(film.film_values)
     sensor, probe = axisymmetric(sensor), round_probe(probe)
+    nodes = few_nodes(sensor.film, charges.domain)
 
     def charges_after(change_MPa: float) -> Array:
         """Solve the axisymmetric film after a change of its pretension, and return its charges."""
         changed_film = replace(sensor.film, pretension=sensor.film.pretension + change_MPa)
         changed = replace(sensor, film=changed_film)
-        forward_map = ForwardMap.build_unchecked(changed, probe, charges.domain, NODE_COUNT, executor=executor)
+        forward_map = ForwardMap.build_unchecked(changed, probe, charges.domain, nodes, executor=executor)
         return forward_map.charges(contact)
 
     before = charges_after(0.0)

@@ -44,6 +44,7 @@ from isocharge.serve.presses.csv_table import csv_text
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor
 from isocharge.simulate import Domain, NoiseModel
+from isocharge.simulate.execution.workers import single_threaded_blas
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.film_network import compact_charges, training_data
@@ -323,7 +324,8 @@ def write_calibration(
     if held_out is not None:
         held_out = usable_held_out(held_out, problem.domain)
     noisy_problem = replace(problem, noise=film.noise)
-    series = compact_charges(noisy_problem, result.charges, film, executor)
+    with single_threaded_blas():
+        series = compact_charges(noisy_problem, result.charges, film, executor)
     settings = config or FitConfig()
     if film.noise != problem.noise:
         settings = FitConfig(settings.network, replace_setting(settings.training, noise=film.noise))
