@@ -92,7 +92,7 @@ def test_friction_pulls_the_film_inwards_and_sticks_near_the_centre(side_force_m
     force = side_force_map.friction_forces(contact, 0.2)
     np.testing.assert_allclose(force[0], [-0.06, 0.08], atol=1e-9)  # 0.2 F towards the centre
     assert 0.0 < np.hypot(*force[1]) < 0.1
-    np.testing.assert_allclose(force[2], 0.0, atol=1e-7)
+    np.testing.assert_allclose(force[2], 0.0, atol=1e-5)  # by symmetry
     for row, (x, y, newtons) in zip(force, contact, strict=True):
         direct = friction_force(press(sensor.film, PROBE, (x, y), newtons, FULL), 0.2)
         np.testing.assert_allclose(row, direct, atol=2e-4)
