@@ -3,6 +3,8 @@
 import os
 import re
 import signal
+import struct
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -75,6 +77,30 @@ def test_pool_with_cancelled_futures_can_be_abandoned(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         interrupt_after_cancelling_futures()
     assert not thread_errors
+
+
+def test_pool_can_be_abandoned_while_a_worker_sends_a_result(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        interrupt_while_sending(tmp_path / "began")
+
+
+def interrupt_while_sending(began: Path) -> None:
+    with local_workers(2) as executor:
+        executor.submit(send_half_of_a_result, began)
+        while not began.exists():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+
+
+def send_half_of_a_result(began: Path) -> None:
+    """Write the length of a result and its first byte to the pipe of the results, as if the rest followed."""
+    frame = sys._getframe()
+    while "result_queue" not in frame.f_locals:
+        frame = frame.f_back
+    length_and_first_byte = struct.pack("!i", 1000) + b"x"
+    os.write(frame.f_locals["result_queue"]._writer.fileno(), length_and_first_byte)
+    began.touch()
+    time.sleep(60.0)
 
 
 def interrupt_after_cancelling_futures() -> None:

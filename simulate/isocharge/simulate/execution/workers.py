@@ -190,12 +190,14 @@ def _abandon(pool: ProcessPoolExecutor) -> None:
 
     The method `ProcessPoolExecutor.shutdown` is not sufficient, because it waits until the running jobs are completed.
     This function ends the workers. A thread of this process, the manager, then notices that they have ended, and closes
-    the pool. Two precautions are necessary.
+    the pool. Three precautions are necessary.
 
     First, all futures are cancelled, and the workers may end only after the manager has discarded the cancelled
-    futures. Otherwise the manager fails with an InvalidStateError. Second, a job that is larger than the buffer of a
-    pipe may still be on its way to the workers. The thread that sends the job would wait forever, unless this process
-    closes its own reading end of the pipe (https://github.com/python/cpython/issues/94777).
+    futures. Otherwise the manager fails with an InvalidStateError. Second, a worker may end while it sends a result.
+    The manager would wait forever for the rest of the result, unless this process closes its own writing end of the
+    pipe. Third, a job that is larger than the buffer of a pipe may still be on its way to the workers. The thread that
+    sends the job would wait forever, unless this process closes its own reading end of the pipe
+    (https://github.com/python/cpython/issues/94777).
 
     Args:
         pool: Process pool whose results are no longer needed.
@@ -203,6 +205,7 @@ def _abandon(pool: ProcessPoolExecutor) -> None:
     internals: Any = pool  # access to private attributes, which mypy does not know
     manager: threading.Thread | None = internals._executor_manager_thread
     job_queue = internals._call_queue
+    result_queue = internals._result_queue
     workers = list(internals._processes.values())
     pool.shutdown(wait=False, cancel_futures=True)
     if manager is None:
@@ -214,6 +217,7 @@ def _abandon(pool: ProcessPoolExecutor) -> None:
     # End the workers, and wait until the manager has noticed that they ended.
     for worker in workers:
         worker.kill()
+    result_queue._writer.close()
     _wait_until(lambda: not manager.is_alive())
 
     # If a job is still being sent, close the reading end of its pipe in this process, so that the sending fails.
