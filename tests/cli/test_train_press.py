@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.train.calibration.synthetic_film import SyntheticFilm
 
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, SessionEnd
 from isocharge.common.errors import PortLost
@@ -23,8 +24,6 @@ from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.calibration import session as session_module
-from isocharge.train.calibration.calibrate import solve_even
-from kept import kept
 
 NAMES = ("A", "B", "C", "D")
 RATE_HZ = 200.0
@@ -161,19 +160,20 @@ def problem():
 
 
 @pytest.fixture(scope="module")
-def described_film(problem):
-    return kept(solve_even, problem)
+def synthetic(problem):
+    """Charges of similar films by a closed formula."""
+    return SyntheticFilm(problem.prior.layout.prior, problem.solved_domain)
 
 
 @pytest.fixture(scope="module")
-def charges(described_film):
+def charges(synthetic):
     """Return the function that returns the charges of contacts on the film of a seed."""
-    return partial(described_film.charges, described_film.prior.draw(np.random.default_rng(3), 1)[0])
+    return partial(synthetic.charges, synthetic.prior.draw(np.random.default_rng(3), 1)[0])
 
 
 @pytest.fixture(scope="module")
-def places(problem, described_film):
-    return np.array([press.contact for press in next_presses(problem, described_film, 3)])
+def places(problem, synthetic):
+    return np.array([press.contact for press in next_presses(problem, synthetic, 3)])
 
 
 def board(charges, places, seed=0) -> Iterator[bytes]:
@@ -227,14 +227,14 @@ PRESS = ("train", "press", "--sensor", "four-25um-biaxial", "-o", "presses.csv")
 
 
 def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(
-    command, desk, charges, places, monkeypatch, described_film
+    command, desk, charges, places, monkeypatch, synthetic
 ):
     """The port ends after two presses. The same command continues with the third row of the list.
 
-    The described film is solved once for all tests, and the film that the presses determine is not solved.
+    The charges are those of a closed formula, and no film is solved.
     """
-    monkeypatch.setattr(session_module, "solve_even", lambda *_: described_film)
-    monkeypatch.setattr(calibrate_module, "solve_even", lambda *_: described_film)
+    monkeypatch.setattr(session_module, "solve_even", lambda *_: synthetic)
+    monkeypatch.setattr(calibrate_module, "solve_even", lambda *_: synthetic)
     monkeypatch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
     _, _, err = command(*PRESS, "--port", "some.bin", "--press-list", "list.csv")
     assert "presses.csv has 2 presses; the same command continues the session" in err
