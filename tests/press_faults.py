@@ -4,6 +4,7 @@ A press is wrong without a flag if x, y or the force is more than four reported 
 the answer carries no flag other than `stress`, which says that the film yields and not that the answer is doubtful.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
@@ -103,13 +104,6 @@ class Shares:
     unnoticed: float
 
 
-def inscribed_radius(corners_mm: Sequence[Sequence[float]]) -> float:
-    """Return the radius of the largest disk about the origin inside a convex polygon, mm."""
-    corners = np.array(corners_mm)
-    middles = 0.5 * (corners + np.roll(corners, 1, axis=0))
-    return float(np.hypot(middles[:, 0], middles[:, 1]).min())
-
-
 def contacts_between(
     rng: np.random.Generator, inner_mm: float, outer_mm: float, count: int, force_range_N: tuple[float, float]
 ) -> Array:
@@ -153,7 +147,7 @@ class FaultStudy:
         self.predictor = Predictor(model)
         self.charges = charges.for_sensor(load_sensor(model))
         self.rng = np.random.default_rng(seed)
-        self.radius_mm = inscribed_radius(self.predictor.metadata.working_area_mm)
+        self.radius_mm = math.sqrt(self.predictor.validity.inscribed_radius_squared_mm2)
         self.contact = self.presses_between(0.0, self.radius_mm, presses)
         self.clean_charge = self.charges.nominal.charges(self.contact)
 
@@ -260,7 +254,7 @@ class WholeFilmStudy:
         metadata = self.predictor.metadata
         sensor = sensor_from_dict(metadata.sensor)
         probe = parse_probe(metadata.probes[0])
-        self.radius_mm = round(inscribed_radius(metadata.working_area_mm), 3)
+        self.radius_mm = round(math.sqrt(self.predictor.validity.inscribed_radius_squared_mm2), 3)
         self.inner_map = with_fast_derivatives(ForwardMap.build(sensor, probe, self.radius_mm, FORCE_RANGE_N))
         self.film_map = whole_film_map(sensor, probe, FORCE_RANGE_N)
 

@@ -11,24 +11,13 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from shared import arguments, print_results
+from shared import arguments, markdown_table, print_results
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from press_faults import FaultStudy, Shares, film_charges
 
 RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
-
-
-def table(results: dict[str, dict[str, Shares]]) -> list[str]:
-    """Return the lines of a Markdown table with a column for each model and a row for each fault."""
-    models = list(results)
-    faults = list(dict.fromkeys(fault for shares in results.values() for fault in shares))
-    lines = ["| fault | " + " | ".join(f"`{model}`" for model in models) + " |", "|---" * (len(models) + 1) + "|"]
-    for fault in faults:
-        cells = [cell(results[model].get(fault)) for model in models]
-        lines.append(f"| {fault} | " + " | ".join(cells) + " |")
-    return lines
 
 
 def cell(shares: Shares | None) -> str:
@@ -52,7 +41,7 @@ def main() -> None:
         results = {model: {fault: asdict(shares) for fault, shares in rows.items()} for model, rows in inside.items()}
         print_results("flags", requested, results)
         return
-    print_results("flags", requested, {"inside the working area": table(inside)})
+    print_results("flags", requested, {"inside the working area": markdown_table("fault", inside, cell)})
 
 
 if __name__ == "__main__":

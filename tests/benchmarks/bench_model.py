@@ -7,6 +7,7 @@ and the forces of the model. Computing the Bayes limit takes half a minute
 for a thousand presses.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -46,8 +47,7 @@ class ModelCase:
         self.predictor = Predictor(model)
         self.rng = np.random.default_rng([seed, 1])
         metadata = self.predictor.metadata
-        corners = np.array(metadata.working_area_mm) @ [1.0, 1j]
-        self.radius = float(np.abs(0.5 * (corners + np.roll(corners, 1))).min())
+        self.radius = math.sqrt(self.predictor.validity.inscribed_radius_squared_mm2)
         sweep = Sweep(self.radius, metadata.force_range_N, MAX_PRESSES, seed)
         self.presses = sweep.contacts()
         sensor = sensor_from_dict(metadata.sensor)

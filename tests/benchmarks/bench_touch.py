@@ -9,6 +9,7 @@ the device file have errors of up to 0.5 %, and the gains of up to 0.2 %; in one
 With `--hand`, a hand that is 2 K warmer than the film comes or goes during a press.
 """
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -268,8 +269,7 @@ def main() -> None:
     asked = options(__doc__, presses=100, hand=False)
     predictor = Predictor(asked.model)
     amplifier = load_amplifier("bench")
-    corners = np.array(predictor.metadata.working_area_mm) @ [1.0, 1j]
-    radius_mm = float(np.abs(0.5 * (corners + np.roll(corners, 1))).min())
+    radius_mm = math.sqrt(predictor.validity.inscribed_radius_squared_mm2)
     film = ForwardMap.build(sensor_from_dict(dict(predictor.metadata.sensor)), Circle(1.0), radius_mm)
     if asked.hand:
         print_results("hand", asked, warm_hand(predictor, film, asked.seed))

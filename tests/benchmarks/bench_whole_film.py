@@ -14,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from bench_flags import percent
-from shared import arguments, print_results
+from shared import arguments, markdown_table, print_results
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -25,24 +25,6 @@ RELEASED = (
     "eight-25um-biaxial,six-25um-biaxial-30mm,eight-25um-biaxial-36mm"
 )
 RING_EDGES_mm = (8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 43.0)
-
-
-def table(results: dict[str, dict[str, RingShares]]) -> list[str]:
-    """Return the lines of a Markdown table with a column for each model and a row for each ring."""
-    models = list(results)
-    rings = sorted({ring for shares in results.values() for ring in shares}, key=row_order)
-    lines = ["| distance | " + " | ".join(f"`{model}`" for model in models) + " |", "|---" * (len(models) + 1) + "|"]
-    for ring in rings:
-        cells = [cell(results[model].get(ring)) for model in models]
-        lines.append(f"| {ring} | " + " | ".join(cells) + " |")
-    return lines
-
-
-def row_order(ring: str) -> tuple[int, float]:
-    """Return the place of a row: the working area, then the rings from the centre outwards, then the means."""
-    if ring[0].isdigit():
-        return 1, float(ring.split()[0])
-    return (0, 0.0) if ring.startswith("inside") else (2, 0.0 if ring.startswith("all") else 1.0)
 
 
 def cell(shares: RingShares | None) -> str:
@@ -60,7 +42,7 @@ def main() -> None:
         numbers = {model: {name: asdict(ring) for name, ring in rings.items()} for model, rings in results.items()}
         print_results("whole film", requested, numbers)
         return
-    print_results("whole film", requested, {"whole film": table(results)})
+    print_results("whole film", requested, {"whole film": markdown_table("distance", results, cell)})
 
 
 if __name__ == "__main__":

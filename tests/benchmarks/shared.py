@@ -3,7 +3,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +63,23 @@ def print_results(name: str, asked: argparse.Namespace, results: dict[str, Any])
             print(title, *rows, sep="\n    ")
         else:
             print(f"{title}: {rows}")
+
+
+def markdown_table(corner: str, results: dict[str, dict[str, Any]], cell: Callable[[Any], str]) -> list[str]:
+    """Return the lines of a Markdown table with a column for each model.
+
+    Args:
+        corner: Title of the first column.
+        results: Values by the name of the model and the name of the row. The rows have the order of the model with the
+            most rows.
+        cell: Function that returns the text of a value, or of None if a model has no value in a row.
+    """
+    models = list(results)
+    lines = [f"| {corner} | " + " | ".join(f"`{model}`" for model in models) + " |", "|---" * (len(models) + 1) + "|"]
+    for row in max(results.values(), key=len):
+        cells = [cell(results[model].get(row)) for model in models]
+        lines.append(f"| {row} | " + " | ".join(cells) + " |")
+    return lines
 
 
 def report_progress(title: str, result: dict[str, float]) -> None:
