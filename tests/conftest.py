@@ -87,9 +87,10 @@ def few_check_presses():
 
 @pytest.fixture(scope="session", autouse=True)
 def whole_films_are_solved_once():
-    """Solve the coarse map of a whole film once for all sweeps of this film."""
+    """Solve the coarse map of a whole film once for all sweeps and all mirror regions of this film."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("isocharge.simulate.dataset.sweep.whole_film_map", whole_film_map_solved_once)
+        for module in ("dataset.sweep", "identifiability.mirror_region"):
+            patch.setattr(f"isocharge.simulate.{module}.whole_film_map", whole_film_map_solved_once)
         yield
 
 

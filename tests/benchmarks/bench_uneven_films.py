@@ -7,12 +7,12 @@ tenth of the largest charge of the press if this is larger.
     python tests/benchmarks/bench_uneven_films.py [--film "oval 0.01"] [--probe circle:1.0] [--presses 20]
 """
 
-import argparse
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+from shared import arguments
 
 from isocharge.simulate import ForwardMap, Sensor, Sweep, load_sensor, parse_probe, press, touch_charge
 
@@ -47,19 +47,17 @@ def direct_errors(forward_map: ForwardMap, sensor: Sensor, count: int) -> np.nda
 
 def main() -> None:
     """Print one row for each film and probe."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--film", action="append", choices=FILMS, help="one of the films; by default all")
-    parser.add_argument("--probe", action="append", choices=PROBES, help="one of the probes; by default all")
-    parser.add_argument("--presses", type=int, default=20, help="presses that are compared with direct solves")
-    options = parser.parse_args()
+    options = arguments(__doc__, film="", probe="", presses=20)
+    films = [options.film] if options.film else FILMS
+    probes = [options.probe] if options.probe else PROBES
 
     built_in = load_sensor("four-25um-biaxial")
     sweep = Sweep(RADIUS_mm, FORCES_N, samples=SAMPLES, orientation="random")
     print(f"{'film':40}{'probe':16}{'solves':>8}{'map, s':>8}{'charges, s':>12}{'worst error, %':>16}{'rms, %':>8}")
     with ProcessPoolExecutor(2) as executor:
-        for name in options.film or FILMS:
+        for name in films:
             sensor = replace(built_in, film=replace(built_in.film, **FILMS[name]))
-            for notation in options.probe or PROBES:
+            for notation in probes:
                 probe = parse_probe(notation)
                 start = time.perf_counter()
                 forward_map = ForwardMap.build(sensor, probe, RADIUS_mm, FORCES_N, executor=executor)

@@ -30,7 +30,7 @@ def test_a_design_is_a_folder_that_other_commands_read(command, tmp_path, monkey
     folder = tmp_path / "mine"
     words = (*DESIGN, "3", "--radius", "4", "--keep", "A", "--known", "--workers", "1", "-o", folder)
     with monkeypatch.context() as patch:
-        patch.setattr(design_module.Search, "refine", lambda *_: exec("raise KeyboardInterrupt"))
+        patch.setattr(design_module, "solve_fields", lambda *_: exec("raise KeyboardInterrupt"))
         assert command(*words)[0] == 130
     assert list(tmp_path.iterdir()) == []
     code, out, err = command(*words)

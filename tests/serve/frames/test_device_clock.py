@@ -69,15 +69,6 @@ def test_times_never_decrease():
     assert np.diff(host_s).min() >= 0.0
 
 
-def test_readings_of_one_chunk_are_spread_by_the_device_clock():
-    clock = DeviceClock()
-    host_s = []
-    for chunk in range(200):
-        t_us = [1000 * number for number in range(16 * chunk, 16 * chunk + 16)]
-        host_s += [time.host_s for time in read(clock, chunk_at(0.016 * (chunk + 1)), t_us, MODULUS)]
-    np.testing.assert_allclose(np.diff(host_s)[160:], 1e-3, rtol=1e-3)
-
-
 def test_readings_without_a_device_clock_share_the_time_between_chunks():
     clock = DeviceClock()
     times = []
@@ -105,17 +96,14 @@ def test_wall_clock_that_is_set_changes_no_step(jump_s, has_clock):
     assert times[-1].host_s - START_S == pytest.approx(1.995 + jump_s, abs=0.2)
 
 
-def test_chunks_without_a_monotonic_time_are_timed_by_their_arrivals():
+@pytest.mark.parametrize(
+    ("arrivals_s", "clocks_ns", "steps_s"),
+    [((0.0, 0.01, 0.03, 0.02), (0, 0, 0, 0), (0.0, 0.01, 0.02, 0.0)), ((0.0, 0.0), (0, 10**9), (0.0, 0.0))],
+    ids=["no monotonic time", "a file"],
+)
+def test_chunks_with_one_clock_only_are_timed_by_their_arrivals(arrivals_s, clocks_ns, steps_s):
     clock = DeviceClock()
     times = []
-    for arrival_s in (0.0, 0.01, 0.03, 0.02):
-        times += read(clock, Chunk(b"x", START_S + arrival_s, 0), [None], MODULUS)
-    assert [time.dt_s for time in times] == pytest.approx([0.0, 0.01, 0.02, 0.0])
-
-
-def test_chunks_of_a_file_have_no_time_between_them():
-    clock = DeviceClock()
-    times = []
-    for clock_ns in (0, 10**9):
-        times += read(clock, Chunk(b"x", START_S, clock_ns), [None], MODULUS)
-    assert [time.dt_s for time in times] == [0.0, 0.0]
+    for arrival_s, clock_ns in zip(arrivals_s, clocks_ns, strict=True):
+        times += read(clock, Chunk(b"x", START_S + arrival_s, clock_ns), [None], MODULUS)
+    assert [time.dt_s for time in times] == pytest.approx(steps_s)

@@ -284,13 +284,6 @@ def test_lost_line_of_a_cycle_costs_its_cycle_only():
     assert parser.counts.malformed == 2
 
 
-def test_line_of_another_layout_is_dropped_and_counted():
-    parser = TextParser()
-    frames = feed("1,2,3", "1,2,3", "1,2,3", "1,2", "A:1", "1,2,3", parser=parser)
-    assert len(frames) == 4
-    assert parser.counts.malformed == 2
-
-
 def test_unrecognised_lines_use_bounded_memory():
     parser = TextParser()
     parser.feed(b"8" * 100_000 + b"\n")
@@ -312,15 +305,6 @@ def test_first_line_of_a_pipe_or_file_is_malformed_only_without_a_header_comment
     frames = parser.feed((first_line + "801.2,799.5\n" * 10).encode())
     assert len(frames) == frame_count
     assert parser.counts.malformed == malformed_count
-
-
-def test_first_line_without_its_beginning_is_dropped():
-    parser = TextParser()
-    frames = parser.feed(b"01.2,799,803\n801.2,799,803\n801.2,799,803\n801.2,799,803\n")
-    assert [frame.values[0] for frame in frames] == [801.2] * 3
-    parser.feed(b"801.2,799,8")
-    parser.reset()
-    assert parser.feed(b"3,9,8\n801.2,799,803\n")[0].values[0] == 801.2
 
 
 def sentence(content):

@@ -80,15 +80,6 @@ def test_loopback_address_needs_no_token(address):
     check_exposure(address, has_token=False)
 
 
-def test_unix_socket_does_not_replace_a_file(handler, tmp_path):
-    path = tmp_path / "touch.sock"
-    server = HttpServer(handler, Address(uds=path))
-    path.unlink()
-    path.write_text("mine")
-    server.close()
-    assert path.read_text() == "mine"
-
-
 def test_unix_socket_of_another_server_is_not_replaced(handler, tmp_path):
     path = tmp_path / "touch.sock"
     first = HttpServer(handler, Address(uds=path))

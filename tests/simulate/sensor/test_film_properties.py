@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from isocharge.common.errors import SceneError, SensorError
+from isocharge.common.errors import SensorError
 from isocharge.simulate import Circle, FilmPrior, load_sensor, parse_probe
 from isocharge.simulate.sensor.film_properties import LARGEST_PRETENSION
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
@@ -88,13 +88,6 @@ def test_draws_have_the_mean_and_the_spread_of_the_prior():
     assert values[:, 0].max() <= LARGEST_PRETENSION
     np.testing.assert_allclose(values.mean(axis=0), PRIOR.mean, atol=0.07 * PRIOR.std.max())
     np.testing.assert_allclose(values.std(axis=0) / PRIOR.std, 1.0, atol=0.1)
-
-
-def test_only_circular_probes_have_a_radius():
-    prior = FilmPrior(SENSOR, parse_probe("rectangle:4.0x2.0"))
-    assert "probe_radius" not in prior.names
-    with pytest.raises(SceneError, match=f"expected {len(prior.names)} values"):
-        prior.film(PRIOR.described)
 
 
 @pytest.mark.parametrize("name", ["eight-25um-biaxial-36mm", "six-25um-biaxial-30mm", "four-25um-biaxial"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SensorError
-from isocharge.simulate import Calibration, Circle, Electrode, Film, Piezo, Sensor, load_sensor, press, touch_charge
+from isocharge.simulate import Calibration, Electrode, Film, Piezo, Sensor, load_sensor
 
 SQUARE = Electrode.of_square("D", (0.0, 0.0), 3.0)
 TRACED = SQUARE.with_trace(((0.0, 0.0), (9.0, 0.0), (9.0, 5.0)), 0.5)
@@ -115,30 +115,6 @@ def test_invalid_sensor_raises_error(three, changes, message):
         replace(three, **changes)
 
 
-def test_only_electrodes_that_share_area_overlap(three):
-    first = three.electrodes[0]
-    for centre in ((0.0, -10.0), (2.0, -9.0), (-2.9, -12.9)):
-        with pytest.raises(SensorError, match="electrodes 'A' and 'D' overlap; move one of them"):
-            replace(three, electrodes=(first, Electrode.of_square("D", centre, 3.0)))
-    touching = Electrode.of_square("D", (3.0, -10.0), 3.0)
-    aslant = Electrode("D", ((1.5, -8.0), (2.0, -9.0), (2.5, -6.0)))  # apart along a slanted line only
-    for other in (touching, aslant):
-        assert len(replace(three, electrodes=(first, other)).electrodes) == 2
-
-
-@pytest.mark.parametrize(
-    ("path", "width", "message"),
-    [
-        (((0, 0),), 0.5, "trace of electrode 'D': expected 3 to 256 corners"),
-        (((0, 0), (9, 0), (0, 1)), 0.5, "trace of electrode 'D': expected a polygon that does not cross itself"),
-        (((0, 0), (9, 0)), 0.0, "does not cross itself"),
-    ],
-)
-def test_invalid_trace_raises_error(path, width, message):
-    with pytest.raises(SensorError, match=message):
-        SQUARE.with_trace(path, width)
-
-
 def test_area_of_a_union_counts_overlaps_once():
     """The area of a trace is its width times the length of its middle line. Overlapping metal counts once."""
     assert TRACED.area == pytest.approx(9.0 + 0.5 * (14.0 - 1.5), rel=1e-12)
@@ -160,16 +136,3 @@ def test_electrode_collects_where_front_and_back_overlap(back, area):
 
 
 # Calibration
-
-
-def test_gain_multiplies_the_charge():
-    four = load_sensor("four-25um-uniaxial")
-    solved = press(four.film, Circle(1.0), (3.0, 1.0), 1.0)
-    calibrated = replace(four, calibration=Calibration(gain={"A": 1.02, "C": 0.95}))
-    ratio = touch_charge(calibrated, solved) / touch_charge(four, solved)
-    np.testing.assert_allclose(ratio, [1.02, 1.0, 0.95, 1.0], rtol=1e-14)
-
-
-def test_place_rotates_then_shifts():
-    placed = Calibration(shift=(0.5, 0.0), rotation=np.pi / 2).place(np.array([[1.0, 0.0], [0.0, 2.0]]))
-    np.testing.assert_allclose(placed, [[0.5, 1.0], [-1.5, 0.0]], atol=1e-15)

@@ -51,11 +51,6 @@ gain = {A = 1.02}
 shift_mm = [0.1, -0.2]
 rotation_deg = 5.0
 """
-OPTIONAL = {"readout", "surface", "pretension_MPa", "d33", "pyro_uC_per_m2_K", "calibration", *"AB"} | {
-    "gain",
-    "shift_mm",
-    "rotation_deg",
-}
 
 
 def whole() -> dict[str, Any]:
@@ -95,20 +90,6 @@ def test_built_in_sensors_can_be_loaded(layout, kind, d31, d32):
     assert load_sensor(name) == Sensor(name, Film(45.0, 0.025, 3000.0, 0.34), Piezo(d31, d32), electrodes)
 
 
-def test_sensor_file_keys_are_converted_to_attributes(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(WHOLE)
-    assert load_sensor(path) == Sensor(
-        "mine",
-        Film(30.0, 0.009, 2500.0, 0.34, 0.5),
-        Piezo(20.0, 2.0, -30.0, -30.0),
-        (Electrode.of_square("A", (0.0, -10.0), 3.0), Electrode.of_square("B", (8.660254, 5.0), 3.0)),
-        "edge",
-        "top",
-        Calibration({"A": 1.02}, (0.1, -0.2), float(np.deg2rad(5.0))),
-    )
-
-
 def test_traces_and_back_metal_are_read():
     """A trace is written as a polygon."""
     pad = ((8.0, 0.0), (12.0, 0.0), (10.0, 4.0))
@@ -120,14 +101,6 @@ def test_traces_and_back_metal_are_read():
 
 
 # Errors
-
-
-@pytest.mark.parametrize("path", [p for p in KEYS if p[-1] not in OPTIONAL], ids=".".join)
-def test_error_message_names_the_missing_key(path):
-    table = whole()
-    del at(table, path[:-1])[path[-1]]
-    with pytest.raises(SensorError, match=rf"^mine\.toml: key '{'.'.join(path)}' is missing$"):
-        sensor_from_dict(table, "mine.toml")
 
 
 WRONG = (None, "3.0", True, [1.0], [1.0, "2"], {}, {"x": 1.0}, float("nan"), float("inf"))

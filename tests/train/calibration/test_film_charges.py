@@ -59,10 +59,10 @@ def test_charges_of_a_similar_film_agree_with_direct_solves(solved):
 @pytest.mark.parametrize("finger", [Finger(5.0), pytest.param(GrowingFinger(5.0), marks=pytest.mark.slow)])
 def test_fingertip_is_solved_with_its_own_pressure(problem, finger):
     """A circle of the same area causes charges that differ by up to 1 %."""
-    charges = solve_even(replace(problem, probe=finger))
+    charges = solve_even(replace(problem, probe=finger, radius=4.0, force_range=(0.4, 0.6)))
     values = charges.prior.mean
-    expected = direct(*charges.prior.film(values), CONTACT)
-    np.testing.assert_allclose(charges.charges(values, CONTACT), expected, rtol=2e-3)
+    expected = direct(*charges.prior.film(values), CONTACT[:1])
+    np.testing.assert_allclose(charges.charges(values, CONTACT[:1]), expected, rtol=2e-3)
 
 
 def test_no_contacts_give_no_charges(solved):

@@ -21,7 +21,7 @@ from kept import kept
 
 QUICK = FitConfig(
     network=NetworkConfig(hidden=(32, 32), misfit_hidden=(16, 16)),
-    training=TrainingConfig(steps=600, misfit_steps=100, misfit_charges=1_000, batch=256),
+    training=TrainingConfig(steps=300, misfit_steps=50, misfit_charges=1_000, batch=256),
 )
 
 

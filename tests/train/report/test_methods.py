@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from isocharge.serve import Predictor, find_model
 from isocharge.simulate import noise_model
 from isocharge.train import LabelledPresses
 from isocharge.train.data.contact_errors import position_error, rms
-from isocharge.train.report.evaluation import METHOD_BUILDERS, FittingTask, model_method
+from isocharge.train.report.evaluation import METHOD_BUILDERS, FittingTask
 
 LARGEST_ERRORS = {
     "triangulation": (0.02, 2e-3),
@@ -40,13 +39,3 @@ def test_methods_find_the_contacts_of_charges_without_noise(name, fitted, presse
     assert rms(position_error(answers, test_presses.contact)) < largest_mm
     assert rms(answers[:, 2] / test_presses.contact[:, 2] - 1.0) < largest_force
     np.testing.assert_allclose(method.call_for(charge[0])(), answers[:1], rtol=1e-9, atol=1e-9)
-
-
-def test_a_model_estimates_the_same_contact_alone_and_in_a_batch():
-    folder = find_model("three-25um-biaxial")
-    method = model_method(folder)
-    charge = np.random.default_rng(0).uniform(300.0, 600.0, (5, 3))
-    expected = Predictor(folder).predict(charge[0])
-    np.testing.assert_allclose(method.estimate(charge)[0], [expected.x_mm, expected.y_mm, expected.force_N], rtol=1e-4)
-    assert method.name == "network `three-25um-biaxial/1`"
-    method.call_for(charge[0])()

@@ -74,16 +74,6 @@ def test_charges_as_fp32_contents(serve, film, predictor, datatype):
         np.testing.assert_array_equal(rows, expected[:, columns])
 
 
-def test_flags_as_bytes_contents(serve):
-    far = tensor([[-3.0, 900.0, 900.0], [800.0, 800.0, 800.0]])
-    (flags,) = call(serve()(), "ModelInfer", model_name="linear", inputs=[far], outputs=[{"name": "flags"}]).outputs
-    first, second = flags.contents.bytes_contents
-    assert flags.datatype == "BYTES"
-    assert flags.shape == [2, 1]
-    assert first.startswith(b"outside")
-    assert second == b""
-
-
 @pytest.mark.parametrize(
     ("fields", "status", "message"),
     [

@@ -74,13 +74,6 @@ def test_every_route_answers_its_method_only(ask, method, path):
     assert error == f"{path}: expected the method {method}, got DELETE"
 
 
-@pytest.mark.parametrize("path", ["/v2/models/cubic/ready", "/v2/models/linear/versions/3/ready", "/v2/models//ready"])
-def test_unknown_model_gets_404(ask, path):
-    status, error = refusal(ask("GET", path))
-    assert status == 404
-    assert error.endswith("is not found; serving: linear/1, linear/2")
-
-
 @pytest.mark.parametrize("n", [1, 2, 100, 4096])
 @pytest.mark.parametrize("datatype", ["FP32", "FP64"])
 @pytest.mark.parametrize(
