@@ -15,7 +15,7 @@ from isocharge.simulate import Circle, Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train.data.contact_errors import ContactErrorStatistics
 from isocharge.train.data.presses import dataset_of
-from isocharge.train.report import QUICK, write_report
+from isocharge.train.report import QUICK, evaluation, page, write_report
 from isocharge.train.report.evaluation import contact_errors
 
 NAME = "three-25um-biaxial"
@@ -71,6 +71,20 @@ def test_presses_without_an_estimate_are_left_out_of_the_errors():
     assert answered == 0.9
     assert errors == pytest.approx(expected, rel=1e-3)
     assert contact_errors(np.full((10, 3), np.nan), truth) == (0.0, {})
+
+
+def test_picture_has_a_panel_for_each_dataset_with_the_evaluated_model_as_a_star():
+    def section(limits):
+        entries = [{"errors": {"position_rms_mm": error_mm}} for error_mm in (0.1, 0.2)] + [{"errors": {}}]
+        records = [evaluation.MethodRecord("method", "", 1.0, entry["errors"], 8.0) for entry in entries]
+        return evaluation.Section("film", False, [], 8.0, (0.05, 2.0), "", "", 1, 1, limits, records, [])
+
+    simulated, measured = page.draw_speed([section({"position_rms_mm": 0.05}), section({})]).axes
+    *points, limit = simulated.lines
+    assert [point.get_marker() for point in points] == ["*", "o"]
+    assert [point.get_ydata()[0] for point in points] == [0.1, 0.2]
+    assert limit.get_ydata()[0] == 0.05
+    assert len(measured.lines) == 2
 
 
 @pytest.mark.slow
