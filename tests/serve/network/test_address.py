@@ -51,6 +51,7 @@ def test_addresses_in_use_or_impossible_are_refused(handler, start_http, tmp_pat
         (Address(uds=tmp_path / "file"), "found a file; choose another path"),
         (Address(uds=tmp_path / "no/such.sock"), "cannot listen on"),
         (Address(uds=tmp_path / ("a" * 200)), "cannot listen on"),
+        (Address(uds=tmp_path / ("a" * 300)), "File name too long"),
         (Address("192.0.2.1"), "cannot listen on 192.0.2.1:0: "),
         (Address("no.such.host.invalid"), "cannot listen on no.such.host.invalid:0: "),
     ]:

@@ -52,15 +52,16 @@ class Address:
         _, max_open_files = resource.getrlimit(resource.RLIMIT_NOFILE)
         with contextlib.suppress(ValueError, OSError):  # macOS refuses an unlimited number
             resource.setrlimit(resource.RLIMIT_NOFILE, (max_open_files, max_open_files))
-        if self.uds is not None:
-            _remove_stale_socket(self.uds)
         try:
             if self.uds is not None:
+                _remove_stale_socket(self.uds)
                 return _listen_unix(self.uds, backlog)
             # create_server sets SO_REUSEADDR. The port of an earlier server can therefore be used again at once.
             is_ipv6 = ":" in self.host
             family = socket.AF_INET6 if is_ipv6 else socket.AF_INET
             return socket.create_server((self.host, self.port), family=family, backlog=backlog)
+        except ListenError:  # its message already states what to do
+            raise
         except (OSError, UnicodeError) as error:  # a host name that cannot be encoded causes a UnicodeError
             place = self.uds or f"{self.host}:{self.port}"
             raise ListenError(f"cannot listen on {place}: {error}; choose another address or port") from error
