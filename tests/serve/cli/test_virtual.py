@@ -129,7 +129,7 @@ def test_random_presses_stay_below_the_yield_point_of_the_film_by_default(run, s
     forward_map = SimpleNamespace(domain=domain, electrodes=("A",), charges=lambda contact: 100.0 * contact[:, 2:])
     played_scripts = []
     monkeypatch.setattr(virtual_sensor, "VirtualSensor", lambda _, script, **__: played_scripts.append(script))
-    virtual_sensor.virtual_sensor(forward_map, "clean", seed=1)
+    virtual_sensor.virtual_sensor(forward_map)
     assert 0.05 < played_scripts[0].force_N.max() <= 0.8
 
 

@@ -109,7 +109,7 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
     """
     touch = TouchStream(predictor)
     followed = []
-    with virtual_sensor(forward_map, "reference", seed=0) as sensor, Port(sensor.url) as port:
+    with virtual_sensor(forward_map) as sensor, Port(sensor.url) as port:
         rate_Hz = sensor.script.rate_Hz
         frame_count = round(seconds * rate_Hz)
         all_records = (record for chunk in port for record in touch.feed(chunk))

@@ -48,6 +48,6 @@ def show_live_film(live: str, seconds: float | None, sensor_name: str | None = N
         with shown_progress():
             radius_mm = played_radius_mm(sensor)
             forward_map = ForwardMap.build(load_sensor(sensor), Circle(1.0), radius_mm, DEFAULT_PLAYED_FORCE_RANGE)
-        with virtual_sensor(forward_map, "reference", seed=0) as board:
+        with virtual_sensor(forward_map) as board:
             say("Ctrl-C stops")
             stream_command(sensor, board.url, output=["none"], live=live, seconds=seconds)

@@ -8,22 +8,18 @@ from isocharge.serve import Script, VirtualSensor, wander
 from isocharge.serve.virtual_sensor.sensor import Charges, Noise
 from isocharge.simulate import Amplifier, ForwardMap, load_amplifier
 
+
 SCRIPT_S = 60.0
 """Length of the random script that a virtual sensor repeats, s."""
 
 
-def virtual_sensor(forward_map: ForwardMap, noise: str, seed: int, rate_Hz: float = 200.0) -> VirtualSensor:
-    """Return a virtual sensor that plays random presses over the whole area of a forward map.
-
-    Args:
-        forward_map: Charges of the presses.
-        noise: Name of the amplifier, such as `reference`.
-        seed: Seed of presses, noise and offsets.
-        rate_Hz: Frames per second, Hz.
-    """
+def virtual_sensor(forward_map: ForwardMap) -> VirtualSensor:
+    """Return the virtual sensor of the demos, which plays random presses over the whole area of a forward map."""
+    seed = 0
+    rate_Hz = 200.0
     _min_force_N, max_force_N = DEFAULT_PLAYED_FORCE_RANGE
     script = random_script(forward_map, seed, rate_Hz, max_force_N)
-    measure = measure_function(load_amplifier(noise), len(forward_map.electrodes), rate_Hz, seed)
+    measure = measure_function(load_amplifier("reference"), len(forward_map.electrodes), rate_Hz, seed)
     return VirtualSensor(film_charges(forward_map), script, noise=measure, seed=seed)
 
 

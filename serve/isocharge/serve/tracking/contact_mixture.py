@@ -56,12 +56,6 @@ FORCE_ACCELERATION_DENSITY = 2.0
 The density is small, because a wrong contact together with a change of the force may explain the charges.
 """
 
-MAX_COMPONENTS = 8
-"""Largest number of components that are kept after an update."""
-
-MERGE_DISTANCE = 0.7
-"""Difference of each entry of `MOTION` below which two components are merged, in standard deviations of the entry."""
-
 
 class ContactHypothesis(NamedTuple):
     """A contact that explains the measured charges, with its probability.
@@ -220,15 +214,17 @@ def update_components(
     return UpdatedComponents(Components(states, covariance, log_weight), squared_misfit, squared_distance)
 
 
-def prune_components(components: Components) -> Components:
+def prune_components(components: Components, max_count: int = 8, merge_distance: float = 0.7) -> Components:
     """Remove components whose weight is too small for a number, and merge components with a similar motion.
 
     If the motions of two components are similar, the less probable component is removed. The weight of the removed
-    component is added to the weight of the more probable component. Only the `MAX_COMPONENTS` most probable components
-    remain.
+    component is added to the weight of the more probable component.
 
     Args:
         components: Components after an update.
+        max_count: Largest number of components that remain, which are the most probable ones.
+        merge_distance: Difference of each entry of `MOTION` below which two components are merged, in standard
+            deviations of the entry.
     """
     log_weight = components.log_weight - components.log_weight.max()
     motion = components.mean[:, MOTION]
@@ -237,13 +233,13 @@ def prune_components(components: Components) -> Components:
     for row in np.argsort(-log_weight, kind="stable").tolist():
         if np.exp(log_weight[row]) < np.finfo(float).tiny:
             break
-        is_similar = (np.abs(motion[kept] - motion[row]) < MERGE_DISTANCE * std[row]).all(axis=1)
+        is_similar = (np.abs(motion[kept] - motion[row]) < merge_distance * std[row]).all(axis=1)
         if is_similar.any():
             first = kept[int(is_similar.argmax())]
             log_weight[first] = np.logaddexp(log_weight[first], log_weight[row])  # add the weights
         else:
             kept.append(row)
-    return components._replace(log_weight=log_weight).select(kept[:MAX_COMPONENTS])
+    return components._replace(log_weight=log_weight).select(kept[:max_count])
 
 
 GAIN_STD = 0.01
@@ -268,12 +264,6 @@ stop before the fold.
 
 SPLIT_DISTANCE = 2.5
 """Distance of an added component from the component that extends across a fold, in standard deviations."""
-
-SPLIT_VARIANCE_RATIO = 0.25
-"""Variance of a component added at a fold along the axis of the split, relative to the original component."""
-
-GRID_POINTS = 13
-"""Number of components along each axis of the film when a touch begins."""
 
 UPDATE_ITERATIONS = 3
 """Number of iterations of the Kalman filter in each update."""
@@ -350,10 +340,14 @@ class ContactMixture:
             self._update(self._initial_components(), mean_pC, variance_pC2, INITIAL_ITERATIONS)
         return self._hypotheses
 
-    def _initial_components(self) -> Components:
-        """Return components with a medium force and large variances at the points of a grid all over the film."""
+    def _initial_components(self, grid_points: int = 13) -> Components:
+        """Return components with a medium force and large variances at the points of a grid all over the film.
+
+        Args:
+            grid_points: Number of components along each axis of the film.
+        """
         domain = self.charges.domain
-        coordinates = np.linspace(-domain.radius, domain.radius, GRID_POINTS)
+        coordinates = np.linspace(-domain.radius, domain.radius, grid_points)
         grid = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
         grid = grid[np.hypot(grid[:, 0], grid[:, 1]) <= domain.radius]
         mean = np.zeros((len(grid), MOTION.stop + len(self.charges.electrodes)))
@@ -408,20 +402,21 @@ class ContactMixture:
         return np.asarray(np.linalg.det(transposed @ jacobians) < 0.0)
 
 
-def _components_at_ends(components: Components) -> Components:
+def _components_at_ends(components: Components, variance_ratio: float = 0.25) -> Components:
     """Return two narrow components at both ends of the longest axis of the most probable component.
 
     The weight of each is the density of the most probable component there.
 
     Args:
         components: Components, the most probable first.
+        variance_ratio: Variance of an end along the axis, relative to the most probable component.
     """
     covariance = components.covariance[0]
     variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])  # in ascending order
     # Expected change of the whole state if the position changes by one standard deviation along the axis
     change = covariance[:, POSITION] @ axes[:, 1] / math.sqrt(variances[1])
     mean = components.mean[0] + SPLIT_DISTANCE * np.array([change, -change])
-    narrow_covariance = covariance - (1.0 - SPLIT_VARIANCE_RATIO) * np.outer(change, change)
+    narrow_covariance = covariance - (1.0 - variance_ratio) * np.outer(change, change)
     log_weight = components.log_weight[0] - 0.5 * SPLIT_DISTANCE**2
     return Components(mean, np.array([narrow_covariance] * 2), np.full(2, log_weight))
 
