@@ -8,7 +8,6 @@ from isocharge.serve import Script, VirtualSensor, wander
 from isocharge.serve.virtual_sensor.sensor import Charges, Noise
 from isocharge.simulate import Amplifier, ForwardMap, load_amplifier
 
-
 SCRIPT_S = 60.0
 """Length of the random script that a virtual sensor repeats, s."""
 
