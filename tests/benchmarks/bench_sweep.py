@@ -31,7 +31,7 @@ from isocharge.simulate import (
     run_sweep,
     touch_charge,
 )
-from isocharge.simulate.execution.workers import in_order
+from isocharge.simulate.execution import in_order
 
 PROBES = ("circle:1.0", "rectangle:4.0x2.0", "triangle:4.0")
 FINER = Resolution(order=7, around=8, rings=7, rim=2)

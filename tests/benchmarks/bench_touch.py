@@ -24,7 +24,7 @@ from isocharge.serve import Chunk, Frame, Predictor, Script, TouchStream, device
 from isocharge.serve.record.record import PredictionRecord
 from isocharge.serve.virtual_sensor.script import VirtualScript
 from isocharge.simulate import Circle, ForwardMap, load_amplifier
-from isocharge.simulate.measuring_chain.amplifier import Amplifier
+from isocharge.simulate.measuring_chain import Amplifier
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
 PERCENTILES = (50, 95, 100)

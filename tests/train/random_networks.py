@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from isocharge.train.training.activations import TANH
-from isocharge.train.training.folded_network import ANGLES, LARGEST_INT8, FoldedNetwork, Layer, Perceptron
+from isocharge.train.training.folded_network import ANGLES, LARGEST_INT8, TANH, FoldedNetwork, Layer, Perceptron
 from isocharge.train.training.network import logarithmic_features
 
 TYPICAL_pC = 512.0

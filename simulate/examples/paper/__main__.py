@@ -23,7 +23,7 @@ from isocharge.cli.shared.terminal import shown_progress
 from isocharge.common.files import new_folder
 from isocharge.common.progress import track
 from isocharge.simulate import local_workers
-from isocharge.simulate.execution.workers import cores
+from isocharge.simulate.execution import cores
 from isocharge.simulate.plots.figure import save_picture
 
 

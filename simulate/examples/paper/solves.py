@@ -27,7 +27,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.execution.workers import in_order
+from isocharge.simulate.execution import in_order
 from isocharge.simulate.numerics.disk import sunflower
 
 FORCE = 1.0

@@ -20,10 +20,9 @@ with require("simulate"):
 
 if TYPE_CHECKING:
     from isocharge.common.contact_domain import Domain
-    from isocharge.simulate.dataset.sampling import Sweep
     from isocharge.simulate.dataset.shards import Dataset, Samples, read_dataset, write_dataset
-    from isocharge.simulate.dataset.sweep import run_sweep
-    from isocharge.simulate.execution.workers import dask_workers, local_workers
+    from isocharge.simulate.dataset.sweep import Sweep, run_sweep
+    from isocharge.simulate.execution import dask_workers, local_workers
     from isocharge.simulate.forward.charge_map import ChargeMap, FunctionMap
     from isocharge.simulate.forward.charge_spline import ChargeSpline
     from isocharge.simulate.forward.derivative_maps import FilmSlopes, SideForceMap
@@ -35,9 +34,8 @@ if TYPE_CHECKING:
     from isocharge.simulate.identifiability.working_area import working_area
     from isocharge.simulate.layout.case import DesignCase
     from isocharge.simulate.layout.design import design
-    from isocharge.simulate.measuring_chain.amplifier import Amplifier, load_amplifier, noise_model
-    from isocharge.simulate.measuring_chain.noise import NoiseModel
-    from isocharge.simulate.mechanics.theory import Theory
+    from isocharge.simulate.measuring_chain import Amplifier, NoiseModel, load_amplifier, noise_model
+    from isocharge.simulate.mechanics.scaling import Theory
     from isocharge.simulate.mesh.blocks import Resolution
     from isocharge.simulate.sensor.film import Film, Piezo
     from isocharge.simulate.sensor.film_properties import FilmPrior, virtual_film

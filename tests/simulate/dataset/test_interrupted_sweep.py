@@ -45,7 +45,7 @@ sys.path[:0] = {path!r}
 from isocharge.simulate import *
 from isocharge.common.progress import listening
 from isocharge.simulate.forward import forward_map
-from isocharge.simulate.execution.workers import local_workers
+from isocharge.simulate.execution import local_workers
 
 def killed(title, done, *_):
     if title == "pressing" and done >= 20:

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import Circle, Ellipse, Film, Polygon, load_sensor
-from isocharge.simulate.forward.family import HARMONICS
-from isocharge.simulate.forward.turns import Turns
+from isocharge.simulate.forward.family import HARMONICS, Turns
 
 EVEN = load_sensor("three-25um-biaxial").film
 UNEVEN = replace(EVEN, pretension=1.0, deviator=(0.3, 0.1))

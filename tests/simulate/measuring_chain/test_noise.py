@@ -6,7 +6,7 @@ from scipy import stats
 
 from isocharge.common.errors import InputError
 from isocharge.simulate import NoiseModel, load_amplifier, noise_model
-from isocharge.simulate.measuring_chain.amplifier import AMPLIFIER_LEVELS
+from isocharge.simulate.measuring_chain import AMPLIFIER_LEVELS
 
 
 @pytest.mark.parametrize(("charge", "sigma"), [(0.0, 1.0), (500.0, np.sqrt(2.0)), (3000.0, 6.0827625)])

@@ -8,7 +8,7 @@ from tests.train.random_networks import random_network
 
 from isocharge.serve import Predictor, find_model, load_model, write_model
 from isocharge.train.model_release.onnx_graph import read_graph, write_graph
-from isocharge.train.training.activations import ACTIVATIONS
+from isocharge.train.training.folded_network import ACTIVATIONS
 
 CLOSED_FORMS = {
     "tanh": lambda x: (np.exp(x) - np.exp(-x)) / (np.exp(x) + np.exp(-x)),

@@ -14,7 +14,7 @@ from isocharge.serve.model.validity import Validity
 from isocharge.train.export_c.folder import export_c
 from isocharge.train.export_c.model_source import FLAG_BITS
 from isocharge.train.model_release.onnx_graph import write_graph
-from isocharge.train.training.activations import TANH
+from isocharge.train.training.folded_network import TANH
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])

@@ -14,7 +14,7 @@ from isocharge.cli.shared.terminal import say
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.simulate import Dataset, Film, Probe, Sensor, Sweep, noise_model, read_dataset, working_area
-from isocharge.simulate.execution.workers import dask_workers, local_workers
+from isocharge.simulate.execution import dask_workers, local_workers
 from isocharge.simulate.sensor.probe import PROBE_HELP
 
 ProbeOption = Annotated[str, typer.Option("--probe", metavar="SHAPE", help=PROBE_HELP)]

@@ -98,7 +98,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object 
 
 def worker_count(workers: int | None) -> int:
     """Return the value of `--workers`. Without the option, return the number of processor cores, but at most 64."""
-    from isocharge.simulate.execution.workers import cores
+    from isocharge.simulate.execution import cores
 
     return workers or min(cores(), 64)
 

@@ -34,7 +34,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import SceneError
-from isocharge.simulate.forward.family import NodeCount
+from isocharge.simulate.forward.family import NodeCount, Reading
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared, side_force_unit
 from isocharge.simulate.mechanics.stress import tension_change
@@ -42,7 +42,6 @@ from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.solver.equilibrium import Equilibrium
 from isocharge.simulate.solver.load_case import SolveSettings
-from isocharge.simulate.solver.press_chain import Reading
 from isocharge.simulate.solver.sensitivity import (
     FILM_FIELDS,
     FILM_IS_ODD,

@@ -1,34 +1,154 @@
 """Families of presses with one probe. Only a few presses of a family are solved.
 
 The solved presses are the nodes of the family. For every other press, the stress is interpolated between the nodes.
+
+On a film that is not axisymmetric, the stress depends on the direction from the centre of the film to the press. Under
+a probe that is not axisymmetric, it also depends on the rotation of the probe relative to this direction. A turn is a
+pair of both angles. In a frame that rotates with the probe, the stress at a node of the mesh is the Fourier series
+
+    sum c_mk exp(i (2 m d + k r)),
+
+where r is the rotation, and d is the direction plus the rotation. The film is the same after half a turn about its
+centre, so only the even harmonics of d occur. If |m| increases, the coefficients decrease like a power of the
+unevenness of the film. If |k| increases, they decrease like a power of the size of the probe divided by its distance
+from the rim. If both increase, they decrease like the product of both powers. Therefore the series is cut off at a
+smaller |k| if |m| is larger.
+
+The presses are solved at the points of a lattice of rank one: the rotations r are evenly spaced over a full turn, and d
+increases by the same step from each rotation to the next. The step is chosen such that no two terms of the series have
+the same values at all points. The values at the points then determine all coefficients.
 """
 
 import math
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Complexes
+from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import SceneError
+from isocharge.common.progress import track
+from isocharge.simulate.execution import in_order
 from isocharge.simulate.forward.readout import touch_charge
-from isocharge.simulate.forward.turns import Turns
 from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.conformal_map import distance_coordinate
+from isocharge.simulate.mesh.placement import distance_coordinate
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import (
     chebyshev_nodes,
     lagrange_values,
 )
-from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
 from isocharge.simulate.solver.load_case import SolveSettings, check_press, layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
-from isocharge.simulate.solver.press_chain import Chain, Reading, solve_chains
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Directions and rotations at which presses are solved.
+
+    Attributes:
+        direction: Directions from the centre of the film to the presses, plus the rotation of a probe that is not
+            axisymmetric, shape (n_turn,), rad. They are zero if the film is axisymmetric.
+        rotation: Rotations of the probe relative to the direction of the press, evenly spaced over a full turn, shape
+            (n_turn,), rad. They are zero if the probe is axisymmetric.
+        harmonics: Pairs (2 m, k) of the terms of the Fourier series, shape (n_term, 2).
+        symmetry_order: Order of the rotational symmetry of the probe: the number of rotations within a full turn that
+            map the probe onto itself. Only the first n_turn / symmetry_order turns are solved. A rotation of the probe
+            by one of its periods adds the same angle to the direction, so that it is the same press.
+    """
+
+    direction: Array
+    rotation: Array
+    harmonics: Integers
+    symmetry_order: int
+
+    @classmethod
+    def spread(cls, film: Film, probe: Probe, largest_harmonics: tuple[int, ...]) -> "Turns":
+        """Choose the turns at which presses are solved, as few as determine the coefficients of a Fourier series.
+
+        Args:
+            film: Film on which the probe presses.
+            probe: Probe that presses the film.
+            largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on; see the docstring of
+                the module. For an axisymmetric film, only m = 0 is used. For an axisymmetric probe, only k = 0 is used.
+        """
+        largest_m = 0 if film.is_axisymmetric else len(largest_harmonics) - 1
+        pairs: list[tuple[int, int]] = []  # (m, k) of each term
+        for m in _symmetric_range(largest_m):
+            largest_k = 0 if probe.is_axisymmetric else largest_harmonics[abs(m)]
+            pairs.extend((m, k) for k in _symmetric_range(largest_k))
+        harmonics = np.array(pairs)
+        symmetry_order = 1 if probe.is_axisymmetric else round(2.0 * np.pi / probe.period)
+        n_turn, step = _lattice(harmonics, symmetry_order)
+        turn = np.arange(n_turn)
+        return cls(
+            direction=np.zeros(n_turn) if film.is_axisymmetric else np.pi * step * turn / n_turn,
+            rotation=np.zeros(n_turn) if probe.is_axisymmetric else 2.0 * np.pi * turn / n_turn,
+            harmonics=harmonics * np.array([2, 1]),
+            symmetry_order=symmetry_order,
+        )
+
+    @property
+    def solved(self) -> list[tuple[float, float]]:
+        """Direction and rotation of each turn at which presses are solved."""
+        n_solved = self.rotation.size // self.symmetry_order
+        return list(zip(self.direction[:n_solved].tolist(), self.rotation[:n_solved].tolist(), strict=True))
+
+    def weights(self, direction: Array, rotation: Array) -> Array:
+        """Compute the weights that interpolate between the turns.
+
+        Args:
+            direction: Directions of the presses as in the attribute `direction`, shape (n,), rad.
+            rotation: Rotations of the probe as in the attribute `rotation`, shape (n,) or (1,), rad.
+
+        Returns:
+            Weights, shape (n, n_turn). The weights of each press sum to 1.
+        """
+        angles = np.stack(np.broadcast_arrays(direction, rotation), axis=1)
+        phase = angles @ self.harmonics.T  # shape (n, n_term)
+        turn_phase = np.stack([self.direction, self.rotation], axis=1) @ self.harmonics.T  # shape (n_turn, n_term)
+        terms = np.exp(1j * phase) @ np.exp(-1j * turn_phase).T
+        return np.asarray(terms.real / self.rotation.size)
+
+
+def _symmetric_range(largest: int) -> range:
+    """Return the integers from -`largest` to `largest`."""
+    return range(-largest, largest + 1)
+
+
+def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
+    """Find the smallest lattice of turns at which no two harmonics have the same values.
+
+    At the turn j of n, the angle d is pi s j / n and the rotation of the probe is 2 pi j / n, where s is the
+    step. The harmonic (m, k) has the phase 2 pi (m s + k) j / n. Two harmonics therefore have the same values at all
+    turns if and only if the remainders of m s + k after the division by n are equal. After one period of the probe,
+    both angles must have increased by the period, so that s - 2 is a multiple of the symmetry order.
+
+    Args:
+        harmonics: Pairs (m, k), shape (n_term, 2).
+        symmetry_order: Order of the rotational symmetry of the probe.
+
+    Returns:
+        Number of turns, which is a multiple of the symmetry order, and step.
+    """
+    min_period_count = math.ceil(len(harmonics) / symmetry_order)
+    for period_count in count(min_period_count):
+        n_turn = symmetry_order * period_count
+        for step in range(2 % symmetry_order, n_turn, symmetry_order):
+            remainders = (harmonics @ (step, 1)) % n_turn
+            if len(set(remainders.tolist())) == len(harmonics):
+                return n_turn, step
+    raise AssertionError("a lattice with more turns than pairs of angles separates all harmonics")
+
 
 HARMONICS = (4, 3, 2, 1)
 """Usual largest harmonics of a family; see `Turns.spread`.
@@ -79,6 +199,27 @@ ASYMMETRIC_NODE_COUNTS = (
 Every solve is repeated in several directions. If the first number of forces is not sufficient, only this number is
 increased at first. A film with a pretension starts with the second entry.
 """
+
+
+Reading = Callable[[Equilibrium, Surface], Array]
+"""Type of a function that computes values from a solved press, such as the stresses at a surface of the film.
+
+The returned array has any shape.
+"""
+
+
+def probe_frame_stress(solved: Equilibrium, surface: Surface) -> Array:
+    """Compute the scaled touch stress at the nodes of the mesh in a frame that rotates with the probe.
+
+    Args:
+        solved: Equilibrium of the film under the press.
+        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
+
+    Returns:
+        Stress components (S11, S22, S12), shape (n_element, n_local, 3), in units of Young's modulus times the squared
+        amplitude, dimensionless.
+    """
+    return rotate_stress(nodal_stress(solved, surface), -solved.probe.angle)
 
 
 @dataclass(frozen=True)
@@ -177,24 +318,43 @@ class Family:
             Values that `read` computes, shape (n_distance, n_force, n_solved_turn, n_value), dimensionless. The method
             `unfold` extends stresses to all rotations.
         """
-        # A chain contains the presses with all forces at one position and rotation. Instead of the press, the film is
-        # rotated, so that every press lies on the positive x axis.
         turns = self.turns.solved
-        chains = [
-            Chain(
-                film=sensor.film.rotated(rotation - direction),
-                probe=probe.rotated(rotation),
-                distance=float(distance),
-                forces=self.force,
-                surface=sensor.surface,
-                settings=settings,
-                read=read,
-            )
-            for distance in self.distance
-            for direction, rotation in turns
-        ]
-        solved = solve_chains(chains, executor)
+        chains = [(float(distance), turn) for distance in self.distance for turn in turns]
+        solve = partial(self._solve_chain, sensor, probe, settings, read)
+        solved = np.stack(list(track(in_order(executor, solve, chains), "solving the film", len(chains))))
         return solved.reshape(self.distance.size, len(turns), self.force.size, -1).swapaxes(1, 2)
+
+    def _solve_chain(
+        self,
+        sensor: Sensor,
+        probe: Probe,
+        settings: SolveSettings,
+        read: Reading,
+        chain: tuple[float, tuple[float, float]],
+    ) -> Array:
+        """Solve the presses with all forces at one position and rotation, one after the other; see `solve`.
+
+        Args:
+            sensor: Sensor with the film, and with the surface at which the stress is read.
+            probe: Probe that presses the film.
+            settings: Theory, mesh and width of the thin rings at the rim.
+            read: Function that computes the returned values from each solved press.
+            chain: Distance from the centre of the film, mm, and the direction and rotation of a turn, rad.
+
+        Returns:
+            Values that `read` computes, shape (n_force, n_value).
+        """
+        # Instead of the press, the film is rotated, so that every press lies on the positive x axis.
+        distance, (direction, rotation) = chain
+        film = sensor.film.rotated(rotation - direction)
+        rotated_probe = probe.rotated(rotation)
+        values_of_forces = []
+        equilibrium: Equilibrium | None = None
+        for force in self.force.tolist():
+            # The equilibrium under the previous force is a good start for the iterations of the solver.
+            equilibrium = press(film, rotated_probe, (distance, 0.0), force, settings, start=equilibrium)
+            values_of_forces.append(read(equilibrium, sensor.surface).ravel())
+        return np.stack(values_of_forces)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
         """By symmetry, extend the stress from the rotations within one period of the probe to all rotations.

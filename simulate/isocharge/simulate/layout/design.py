@@ -21,7 +21,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import InputError, SolveError
 from isocharge.common.progress import track
-from isocharge.simulate.execution.workers import in_order
+from isocharge.simulate.execution import in_order
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap

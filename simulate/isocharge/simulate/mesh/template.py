@@ -11,9 +11,7 @@ import numpy as np
 from isocharge.common.arrays import Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.sensor.probe import Circle, Polygon, Probe
-from isocharge.simulate.sensor.probe_shapes.base import FootprintTopology
-from isocharge.simulate.sensor.probe_shapes.round import RoundProbe
+from isocharge.simulate.sensor.probe import Circle, FootprintTopology, Polygon, Probe, RoundProbe
 
 SAMPLE_REACH = 0.1
 """Reach of the footprint of the sample press, in film radii.

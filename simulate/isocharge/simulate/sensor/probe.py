@@ -1,4 +1,4 @@
-"""List of all probe shapes, and a parser for the notation of probes on the command line and in files.
+"""Probes, their footprints, and a parser for the notation of probes on the command line and in files.
 
 Examples of the notation:
 
@@ -12,15 +12,628 @@ Examples of the notation:
 
 All lengths are in mm. The suffix `@30` rotates the footprint by 30 degrees anticlockwise. The position of a probe is
 the centroid of its footprint.
+
+A footprint is the area on which a probe presses. Points of a footprint are complex numbers x + iy in mm, relative to
+the centroid of the footprint.
+
+The mesh of a polygonal footprint consists of blocks with straight sides. A probe whose footprint has a smooth boundary
+is a subclass of `CurvedProbe`. Its footprint contains a core polygon. The mesh of the footprint consists of blocks with
+straight sides in the core polygon, and of blocks with one curved side between the core polygon and the boundary.
+
+A soft sphere that is pressed against a flat surface touches the surface in a circle of radius a. If F is the force, the
+pressure at the distance r from the centre of this circle is p(r) = p0 sqrt(1 - (r / a)^2), with the maximum
+p0 = 1.5 F / (pi a^2) (Johnson 1985, Contact Mechanics, equation 3.39). The radius a is proportional to the cube root of
+the force (equation 3.40). A fingertip has this pressure.
 """
 
-import numpy as np
+import math
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Self
 
+import numpy as np
+import shapely
+
+from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError, cut
-from isocharge.simulate.sensor.probe_shapes.base import NUMBER, Probe, ProbeNotation
-from isocharge.simulate.sensor.probe_shapes.ellipse import Ellipse
-from isocharge.simulate.sensor.probe_shapes.polygon import Polygon
-from isocharge.simulate.sensor.probe_shapes.round import Circle, Finger, GrowingFinger
+from isocharge.simulate.numerics.interpolation import gauss_line
+from isocharge.simulate.numerics.polygon import area_in_disk, area_of, centroid_of, is_convex, to_complex, to_corners
+from isocharge.simulate.sensor.film import check_range, tidy
+
+NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+"""Regular expression of a decimal number in the notation of a probe."""
+
+MIN_LENGTH = 0.02
+"""Smallest accepted radius, side, axis or reach of a footprint, mm. A smaller value was probably given in metres."""
+
+CORE_SHARE = 0.45 * math.sqrt(2.0)
+"""Ratio of the distance of a corner of the core polygon from the centroid to that of the boundary, dimensionless."""
+
+OUTLINE_POINTS = 1024
+"""Number of points of the outline of a curved footprint, whose area is accurate to 1e-5."""
+
+
+@dataclass(frozen=True)
+class ProbeNotation:
+    """One notation of a probe shape on the command line and in files, such as `rectangle:WIDTHxHEIGHT`.
+
+    Attributes:
+        name: Word before the colon.
+        parameters: Text after the colon. Each word of capital letters stands for a number (mm).
+        build: Function that creates the probe without a rotation from the numbers.
+        pattern: Regular expression of the text after the colon. If it is empty, it is derived from `parameters`.
+    """
+
+    name: str
+    parameters: str
+    build: Callable[..., "Probe"]
+    pattern: str = ""
+
+    @property
+    def form(self) -> str:
+        """Notation with placeholders for the numbers, for help texts and error messages."""
+        return f"{self.name}:{self.parameters}"
+
+    def parse(self, text: str) -> "Probe | None":
+        """Create the probe that a text in this notation describes.
+
+        Args:
+            text: Notation of a probe, such as "rectangle:4.0x2.0@30".
+
+        Returns:
+            The probe; None if the text is in another notation.
+
+        Raises:
+            SceneError: If the text is in this notation, but no such footprint can exist.
+        """
+        # Each word of capital letters in `parameters`, such as "WIDTHxHEIGHT", is replaced by the pattern of a number.
+        pattern = self.pattern or re.sub("[A-Z]+", lambda _: NUMBER, self.parameters)
+        match = re.fullmatch(rf"{self.name}:(?P<parameters>{pattern})(?:@(?P<degrees>{NUMBER}))?", text)
+        if match is None:
+            return None
+        numbers = [float(number) for number in re.findall(NUMBER, match["parameters"])]
+        degrees = float(match["degrees"] or 0.0)
+        return self.build(*numbers).rotated(float(np.deg2rad(degrees)))
+
+
+@dataclass(frozen=True)
+class FootprintTopology:
+    """Number and kind of the mesh blocks that a footprint needs.
+
+    Probes with the same topology use the same mesh template.
+
+    Attributes:
+        n_corner: Number of corners of the core polygon. The core polygon of a polygonal footprint is the whole
+            footprint.
+        is_curved: Whether blocks with a curved outer side lie between the core polygon and the boundary of the
+            footprint.
+        fills_circle: Whether the boundary of the footprint is the innermost circle of the mesh. Otherwise there is a
+            gap between the footprint and the innermost circle.
+    """
+
+    n_corner: int
+    is_curved: bool
+    fills_circle: bool
+
+
+class Probe(ABC):
+    """Base class of all probes. A probe is a body that presses on the film within its footprint.
+
+    The distribution of the pressure over the footprint does not depend on the film. The pressure is uniform unless a
+    subclass overrides `has_uniform_pressure`, `pressure` and `force_share`. Subclasses, such as `Circle`, `Ellipse`,
+    `Finger` and `Polygon`, are frozen dataclasses.
+    """
+
+    @property
+    @abstractmethod
+    def angle(self) -> float:
+        """Rotation of the footprint about its centroid, anticlockwise, rad."""
+
+    @property
+    @abstractmethod
+    def notation(self) -> str:
+        """Notation of this probe without its rotation, which `parse_probe` converts back into the probe."""
+
+    @property
+    @abstractmethod
+    def area(self) -> float:
+        """Area of the footprint, mm^2."""
+
+    @property
+    @abstractmethod
+    def reach(self) -> float:
+        """Distance from the centroid of the footprint to the farthest point of the footprint, mm."""
+
+    @property
+    @abstractmethod
+    def period(self) -> float:
+        """Smallest rotation that maps the footprint onto itself, rad.
+
+        The period of a circle is zero, because every rotation maps a circle onto itself.
+        """
+
+    @property
+    @abstractmethod
+    def topology(self) -> FootprintTopology:
+        """Number and kind of the mesh blocks for this footprint."""
+
+    @property
+    @abstractmethod
+    def outline(self) -> Complexes:
+        """Points x + iy along the boundary, anticlockwise, shape (n,), mm.
+
+        For a polygon, the points are its corners. For a curved footprint, the points lie on the curved boundary.
+        """
+
+    @abstractmethod
+    def core(self, unit: float) -> Complexes:
+        """Return the corners x + iy of the core polygon, anticlockwise.
+
+        The corners of the core polygon of a curved footprint are evenly spaced in the boundary parameter. The parameter
+        of the first corner is half of the spacing.
+
+        Args:
+            unit: Unit of the returned corners, mm.
+
+        Returns:
+            Corners, shape (topology.n_corner,), in multiples of `unit`.
+        """
+
+    @abstractmethod
+    def boundary(self, parameter: Array) -> Complexes:
+        """Return points on the boundary of the footprint, including the rotation by `angle`.
+
+        Args:
+            parameter: Values from 0 to 2 pi, any shape. If the parameter increases, the point moves anticlockwise along
+                the boundary. An increase of the parameter by `period` must rotate the point by `period`.
+
+        Returns:
+            Points x + iy relative to the centroid, of the shape of `parameter`, mm.
+        """
+
+    def rotated(self, angle: float) -> Self:
+        """Return a copy of the probe that is rotated further about its centroid.
+
+        Args:
+            angle: Further rotation, anticlockwise, rad.
+        """
+        if self.is_axisymmetric:  # a rotation does not change a circle
+            return self
+        return replace(self, angle=self.angle + angle)  # type: ignore[type-var]
+
+    @property
+    def grows(self) -> bool:
+        """Whether the footprint becomes larger with the force."""
+        return False
+
+    def under(self, force: float) -> "Probe":  # noqa: ARG002
+        """Return a probe with the footprint that this probe has under a force (N)."""
+        return self
+
+    def farthest_distance(self, at: tuple[float, float]) -> float:
+        """Return the distance from the centre of the film to the farthest point of the outline, mm.
+
+        Args:
+            at: Position (x, y) of the centroid relative to the centre of the film, mm.
+        """
+        return float(np.abs(complex(*at) + self.outline).max())
+
+    @property
+    def has_uniform_pressure(self) -> bool:
+        """Whether the pressure is the same at all points of the footprint."""
+        return True
+
+    def pressure(self, points: Complexes) -> Array:
+        """Return the pressure at points of the footprint, divided by the mean pressure.
+
+        Args:
+            points: Points x + iy relative to the centroid, any shape, mm.
+
+        Returns:
+            Relative pressure, of the shape of `points`, dimensionless. Its mean over the footprint is 1, and its centre
+            of pressure is the centroid.
+        """
+        return np.ones(points.shape)
+
+    def force_share(self, corners: Array, at: complex) -> float:
+        """Return the fraction of the force that acts on a convex polygon of the film, from 0 to 1.
+
+        For a curved footprint, the fraction is computed from its outline.
+
+        Args:
+            corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
+            at: Position of the centroid of the footprint as x + iy, mm.
+        """
+        outline = shapely.Polygon(to_corners(at + self.outline))
+        return float(shapely.intersection(shapely.Polygon(corners), outline).area / outline.area)
+
+    @property
+    def is_axisymmetric(self) -> bool:
+        """Whether every rotation maps the footprint onto itself."""
+        return self.period == 0.0
+
+
+class CurvedProbe(Probe):
+    """Base class of probes with a convex footprint whose boundary is smooth.
+
+    A subclass has a field `angle` and implements `boundary`, `notation`, `area`, `reach` and `period`. The class
+    `CurvedProbe` implements all other methods of `Probe`. A subclass may override these methods with closed formulas.
+    """
+
+    @property
+    def topology(self) -> FootprintTopology:
+        """Topology with a core polygon, and a layer of blocks between the core polygon and the boundary.
+
+        The core polygon has the rotational symmetry of the footprint. The layer around a circular footprint reaches up
+        to the innermost circle of the mesh.
+        """
+        # A circle, and a footprint that only a half turn or a full turn maps onto itself, has a core with four corners.
+        n_corner = 4
+        if 0.0 < self.period < 0.9 * math.pi:
+            n_corner = round(math.tau / self.period)
+        return FootprintTopology(n_corner, is_curved=True, fills_circle=self.is_axisymmetric)
+
+    @property
+    def outline(self) -> Complexes:
+        """Points x + iy of the boundary at evenly spaced parameters, shape (OUTLINE_POINTS,), mm."""
+        return self.boundary(2.0 * np.pi * np.arange(OUTLINE_POINTS) / OUTLINE_POINTS)
+
+    def core(self, unit: float) -> Complexes:
+        """Return the corners x + iy of the core polygon in multiples of `unit` (mm), shape (n_corner,)."""
+        n_corner = self.topology.n_corner
+        parameter = 2.0 * np.pi * (np.arange(n_corner) + 0.5) / n_corner
+        return np.asarray(CORE_SHARE * self.boundary(parameter) / unit)
+
+
+def check_angle(angle: float) -> None:
+    """Raise an error if the rotation of a footprint is not a finite number.
+
+    Args:
+        angle: Rotation, rad.
+
+    Raises:
+        SceneError: If `angle` is infinite or not a number.
+    """
+    if not np.isfinite(angle):
+        raise SceneError(f"probe angle: expected a finite number, got {angle}")
+
+
+def check_length(what: str, length: float) -> None:
+    """Raise an error if a length of a footprint is infinite, or so small that it was probably given in metres.
+
+    Args:
+        what: Name of the length in the error message.
+        length: Radius, side, axis or reach of the footprint, mm.
+
+    Raises:
+        SceneError: If `length` is below `MIN_LENGTH` or infinite.
+    """
+    check_range(what, length, (MIN_LENGTH, np.inf), "mm", SceneError)
+
+
+PEAK_PRESSURE = 1.5
+"""Ratio of the largest pressure to the mean pressure, dimensionless."""
+
+PRESSURE_LEVELS = 48
+"""Number of pressure levels over which the force on an area is integrated."""
+
+
+@dataclass(frozen=True)
+class RoundProbe(CurvedProbe):
+    """Base class of probes with a circular footprint.
+
+    A subclass implements `notation`. A subclass whose pressure is not uniform also overrides `pressure`.
+
+    Attributes:
+        radius: Radius of the footprint, mm.
+    """
+
+    radius: float
+
+    angle = 0.0
+    """Rotation of the footprint, rad. The rotation is always zero, because a rotation does not change a circle."""
+
+    period = 0.0
+    """Period of the footprint. The period is always zero, because every rotation maps a circle onto itself."""
+
+    def __post_init__(self) -> None:
+        check_length("probe radius", self.radius)
+
+    @property
+    def area(self) -> float:
+        """Area of the footprint, mm^2."""
+        return float(np.pi * self.radius**2)
+
+    @property
+    def reach(self) -> float:
+        """Radius of the circle, which is the distance from its centre to its farthest point, mm."""
+        return self.radius
+
+    def boundary(self, parameter: Array) -> Complexes:
+        """Return points x + iy of the circle, mm. The parameter is the polar angle, rad."""
+        return np.asarray(self.radius * np.exp(1j * parameter))
+
+    def farthest_distance(self, at: tuple[float, float]) -> float:
+        """Return the distance from the centre of the film to the farthest point of the circle, mm."""
+        return float(np.hypot(*at)) + self.radius
+
+    def force_share(self, corners: Array, at: complex) -> float:
+        """Return the fraction of a uniformly distributed force that acts on a convex polygon of the film."""
+        return float(area_in_disk(to_complex(corners), at, self.radius)) / self.area
+
+
+@dataclass(frozen=True)
+class Circle(RoundProbe):
+    """Probe with a circular footprint and a uniform pressure.
+
+    Attributes:
+        radius: Radius of the footprint, mm.
+    """
+
+    @property
+    def notation(self) -> str:
+        """Notation of this probe, which `parse_probe` converts back into the probe."""
+        return f"circle:{tidy(self.radius)}"
+
+
+@dataclass(frozen=True)
+class Finger(RoundProbe):
+    """Probe with a circular footprint. The pressure decreases from a maximum at the centre to zero at the edge.
+
+    Attributes:
+        radius: Radius of the footprint, mm, which does not depend on the force. The radius is 4 to 8 mm for a
+            fingertip.
+    """
+
+    has_uniform_pressure = False
+
+    @property
+    def notation(self) -> str:
+        """Notation of this probe, which `parse_probe` converts back into the probe."""
+        return f"finger:{tidy(self.radius)}"
+
+    def pressure(self, points: Complexes) -> Array:
+        """Return the Hertzian pressure at points, divided by the mean pressure. It is zero outside the footprint.
+
+        Args:
+            points: Points x + iy relative to the centre of the footprint, any shape, mm.
+
+        Returns:
+            Relative pressure, of the shape of `points`, dimensionless.
+        """
+        squared_ratio_to_peak = np.clip(1.0 - np.abs(points) ** 2 / self.radius**2, 0.0, None)
+        return np.asarray(PEAK_PRESSURE * np.sqrt(squared_ratio_to_peak))
+
+    def force_share(self, corners: Array, at: complex) -> float:
+        """Return the fraction of the force that acts on a convex polygon of the film, from 0 to 1.
+
+        Let a be the radius of the footprint. The pressure exceeds the fraction t of its peak within a disk of radius
+        a sqrt(1 - t^2). Let A(t) be the area that the polygon and this disk have in common. The force on the polygon is
+        the peak pressure times the integral of A(t) over t from 0 to 1. The integral is computed by a Gauss rule.
+
+        Args:
+            corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
+            at: Position of the centroid of the footprint as x + iy, mm.
+        """
+        pressure_fraction, weights = gauss_line(PRESSURE_LEVELS)
+        disk_radius = self.radius * np.sqrt(1.0 - pressure_fraction**2)
+        common_areas = area_in_disk(to_complex(corners), at, disk_radius)  # A(t), mm^2
+
+        # For a force of 1, the mean pressure is 1 / area, and the peak pressure is `PEAK_PRESSURE` times as large.
+        return float(PEAK_PRESSURE / self.area * (weights @ common_areas))
+
+
+@dataclass(frozen=True)
+class GrowingFinger(Finger):
+    """Fingertip whose contact area grows with the force, as that of an elastic sphere does.
+
+    Attributes:
+        radius: Radius of the footprint at 1 N, mm. Under the force F, it is larger by the cube root of F / (1 N).
+    """
+
+    grows = True
+
+    @property
+    def notation(self) -> str:
+        """Notation of this probe, which `parse_probe` converts back into the probe."""
+        return f"growing-finger:{tidy(self.radius)}"
+
+    def under(self, force: float) -> Finger:
+        """Return the fingertip with the radius that it has under a force (N)."""
+        return Finger(self.radius * float(np.cbrt(force)))
+
+
+@dataclass(frozen=True)
+class Ellipse(CurvedProbe):
+    """Probe with an elliptical footprint and a uniform pressure.
+
+    Attributes:
+        width: Length of the axis along x before the rotation, mm.
+        height: Length of the axis along y before the rotation, mm.
+        angle: Rotation about the centre, anticlockwise, rad.
+    """
+
+    width: float
+    height: float
+    angle: float = 0.0
+
+    period = math.pi
+    """Smallest rotation that maps the ellipse onto itself, rad. It is half a turn."""
+
+    def __post_init__(self) -> None:
+        check_length("probe width", self.width)
+        check_length("probe height", self.height)
+        check_angle(self.angle)
+
+    @property
+    def notation(self) -> str:
+        """Notation of this probe without its rotation, which `parse_probe` converts back into the probe."""
+        return f"ellipse:{tidy(self.width)}x{tidy(self.height)}"
+
+    @property
+    def area(self) -> float:
+        """Area of the ellipse, mm^2."""
+        return float(0.25 * np.pi * self.width * self.height)
+
+    @property
+    def reach(self) -> float:
+        """Distance from the centre to the farthest point of the ellipse, mm. It is half of the longer axis."""
+        return 0.5 * max(self.width, self.height)
+
+    def boundary(self, parameter: Array) -> Complexes:
+        """Return points x + iy of the ellipse, mm. The parameter is the eccentric angle, rad."""
+        before_rotation = 0.5 * self.width * np.cos(parameter) + 0.5j * self.height * np.sin(parameter)
+        return np.asarray(before_rotation * np.exp(1j * self.angle))
+
+
+MAX_CORNERS = 64
+"""Largest number of corners of a polygon.
+
+A polygon with more corners has nearly the charges of a circle, which needs fewer unknowns.
+"""
+
+
+@dataclass(frozen=True)
+class Polygon(Probe):
+    """Probe with a convex polygonal footprint and a uniform pressure.
+
+    Attributes:
+        corners: Corners (x, y) before the rotation, anticlockwise, mm. They are stored relative to the centroid.
+        angle: Rotation about the centroid, anticlockwise, rad.
+        shape: Notation of a rectangle or a triangle without its rotation; empty for another polygon.
+    """
+
+    corners: tuple[tuple[float, float], ...]
+    angle: float = 0.0
+    shape: str = ""
+
+    def __post_init__(self) -> None:
+        """Check that the corners form a convex polygon, and shift them such that its centroid becomes the origin.
+
+        Raises:
+            SceneError: If the corners do not form such a polygon, or if the polygon is too small.
+        """
+        corners = np.array(self.corners, dtype=float)
+        if corners.shape[1:] != (2,) or not (3 <= len(corners) <= MAX_CORNERS and np.isfinite(corners).all()):
+            raise SceneError(f"probe: expected 3 to {MAX_CORNERS} corners (x, y), got {cut(str(self.corners))}")
+        check_angle(self.angle)
+        if not is_convex(corners):
+            raise SceneError(
+                f"probe: expected a convex polygon with its corners anticlockwise, got {cut(str(corners.tolist()))} mm"
+            )
+        # Corners that are relative to their centroid are stored as they are, without further rounding errors.
+        centroid = centroid_of(corners)
+        if np.linalg.norm(centroid) > 1e-9 * self.reach:
+            object.__setattr__(self, "corners", _as_tuples(corners - centroid))  # the dataclass is frozen
+        check_length("probe reach", self.reach)
+
+    @classmethod
+    def of(cls, corners: Array, angle: float = 0.0, shape: str = "") -> "Polygon":
+        """Create a polygon from an array of corners.
+
+        Args:
+            corners: Corners (x, y) relative to any point, anticlockwise, shape (n, 2), mm.
+            angle: Rotation about the centroid, anticlockwise, rad.
+            shape: Notation of a rectangle or a triangle without its rotation; empty for another polygon.
+
+        Raises:
+            SceneError: If the corners do not form a convex polygon, or if the polygon is too small.
+        """
+        return cls(_as_tuples(corners), angle, shape)
+
+    @classmethod
+    def rectangle(cls, width: float, height: float, angle: float = 0.0) -> "Polygon":
+        """Create a probe with a rectangular footprint.
+
+        Args:
+            width: Length of the sides along x before the rotation, mm.
+            height: Length of the sides along y before the rotation, mm.
+            angle: Rotation about the centroid, anticlockwise, rad.
+        """
+        check_length("probe width", width)
+        check_length("probe height", height)
+        x = 0.5 * width
+        y = 0.5 * height
+        return cls(((x, y), (-x, y), (-x, -y), (x, -y)), angle, f"rectangle:{tidy(width)}x{tidy(height)}")
+
+    @classmethod
+    def triangle(cls, side: float, angle: float = 0.0) -> "Polygon":
+        """Create a probe whose footprint is an equilateral triangle. Before the rotation, one corner points to +y.
+
+        Args:
+            side: Length of the sides, mm.
+            angle: Rotation about the centroid, anticlockwise, rad.
+        """
+        check_length("probe side", side)
+        circumradius = side / np.sqrt(3.0)
+        corner_angles = 0.5 * np.pi + 2.0 * np.pi / 3.0 * np.arange(3)
+        return cls.of(to_corners(np.exp(1j * corner_angles) * circumradius), angle, f"triangle:{tidy(side)}")
+
+    @property
+    def notation(self) -> str:
+        """Notation of this probe without its rotation, which `parse_probe` converts back into the probe."""
+        corners = ";".join(f"{tidy(x)},{tidy(y)}" for x, y in self.corners)
+        return self.shape or f"polygon:{corners}"
+
+    @property
+    def area(self) -> float:
+        """Area of the polygon, mm^2."""
+        return area_of(np.array(self.corners))
+
+    @property
+    def reach(self) -> float:
+        """Distance from the centroid to the farthest corner, mm."""
+        return float(np.linalg.norm(np.array(self.corners), axis=1).max())
+
+    @property
+    def period(self) -> float:
+        """Smallest rotation that maps the polygon onto itself, rad."""
+        # A rotation that maps the polygon onto itself maps each corner to another corner, which is a fixed number of
+        # corners ahead (`corner_shift`). The smallest possible shift divides the number of corners.
+        corners = to_complex(np.array(self.corners))
+        for corner_shift in range(1, corners.size):
+            if corners.size % corner_shift != 0:
+                continue
+            rotation = np.exp(2j * np.pi * corner_shift / corners.size)
+            corners_ahead = np.roll(corners, -corner_shift)
+            if np.allclose(corners_ahead, corners * rotation, rtol=0.0, atol=1e-9 * self.reach):
+                return float(math.tau * corner_shift / corners.size)
+        return math.tau  # only a full turn maps the polygon onto itself
+
+    @property
+    def topology(self) -> FootprintTopology:
+        """Topology of a polygonal footprint. The core polygon is the whole footprint."""
+        return FootprintTopology(len(self.corners), is_curved=False, fills_circle=False)
+
+    @property
+    def outline(self) -> Complexes:
+        """Corners x + iy of the rotated polygon relative to its centroid, anticlockwise, shape (n_corner,), mm."""
+        return np.asarray(to_complex(np.array(self.corners)) * np.exp(1j * self.angle))
+
+    def core(self, unit: float) -> Complexes:
+        """Return the corners x + iy of the rotated polygon in multiples of `unit` (mm), shape (n_corner,)."""
+        return np.asarray(self.outline / unit)
+
+    def boundary(self, parameter: Array) -> Complexes:
+        """Return points x + iy of the boundary, mm.
+
+        The parameter 0 is the middle of the edge that ends at the first corner. Each edge covers the same range of the
+        parameter.
+
+        Args:
+            parameter: Values from 0 to 2 pi, any shape.
+        """
+        corners = np.append(self.outline, self.outline[:1])  # the first corner is repeated, which closes the boundary
+        corner_parameter = 2.0 * np.pi * (np.arange(corners.size) + 0.5) / (corners.size - 1)
+        return np.asarray(np.interp(parameter, corner_parameter, corners, period=2.0 * np.pi))
+
+
+def _as_tuples(corners: Array) -> tuple[tuple[float, float], ...]:
+    """Convert corners (x, y) of shape (n, 2) into nested tuples, which can be compared and hashed."""
+    return tuple((float(x), float(y)) for x, y in corners)
+
 
 __all__ = ["PROBE_HELP", "Circle", "Ellipse", "Finger", "GrowingFinger", "Polygon", "Probe", "parse_probe"]
 

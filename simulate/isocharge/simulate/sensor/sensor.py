@@ -27,8 +27,7 @@ from isocharge.simulate.numerics.polygon import (
     trace_outline,
     union_triangles,
 )
-from isocharge.simulate.sensor.film import Film, Piezo, Surface
-from isocharge.simulate.sensor.size_check import check_range
+from isocharge.simulate.sensor.film import Film, Piezo, Surface, check_range
 
 Readout = Literal["area", "edge"]
 """Part of an electrode over which the stress is averaged: the area or the edges (Mirbagheri et al. 2007, eq. 2, 3)."""

@@ -28,9 +28,8 @@ from isocharge.common.structs import (
     read_toml,
 )
 from isocharge.common.toml_text import to_toml
-from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, FILM_NUMBERS, Film, Piezo, Surface
+from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, FILM_NUMBERS, Film, Piezo, Surface, tidy
 from isocharge.simulate.sensor.sensor import Calibration, Electrode, Readout, Sensor
-from isocharge.simulate.sensor.size_check import tidy
 
 MAX_COORDINATE_mm = 1e6
 """Largest accepted magnitude of a coordinate or a length in a sensor file, mm."""

@@ -14,9 +14,8 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_stress
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups, Theory, scaled_stress
 from isocharge.simulate.mechanics.stress import principal_stresses, rotate_stress, strain
-from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.film import Film, Surface

@@ -18,7 +18,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.structs import finite_or_none
-from isocharge.simulate.mechanics.theory import bending_length, modelling_error
+from isocharge.simulate.mechanics.scaling import bending_length, modelling_error
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import gauss_reference_square, modal_matrix
 from isocharge.simulate.solver.equilibrium import (

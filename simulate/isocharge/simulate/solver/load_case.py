@@ -9,12 +9,17 @@ from typing import Literal
 import numpy as np
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.scaling import amplitude_squared
-from isocharge.simulate.mechanics.theory import ACCURACY, WITH_BENDING, Theory, bending_length, check_strains
+from isocharge.simulate.mechanics.scaling import (
+    ACCURACY,
+    WITH_BENDING,
+    Theory,
+    amplitude_squared,
+    bending_length,
+    check_strains,
+)
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.conformal_map import CLEARANCE
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, distance_on_circular_film, place
-from isocharge.simulate.mesh.placement import Placement
+from isocharge.simulate.mesh.placement import CLEARANCE, Placement
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.solver.error_estimate import shape_error

@@ -11,7 +11,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SolveError
-from isocharge.simulate.execution.workers import single_threaded_blas
+from isocharge.simulate.execution import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.blocks import Resolution

@@ -35,14 +35,15 @@ the lifting.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
-from isocharge.simulate.execution.workers import single_threaded_blas
+from isocharge.simulate.execution import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.scaling import side_force_unit
+from isocharge.simulate.mechanics.scaling import Anisotropy, side_force_unit
 from isocharge.simulate.mechanics.stress import stress_rotation
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
 from isocharge.simulate.mesh.placement import Placement
@@ -73,83 +74,72 @@ class StressField:
     odd: bool
 
 
-def _tension_imperfection(direction: tuple[float, float, float]) -> AddImperfection:
-    """Create a function that adds a tension to the pretension of a film.
+def _add_tension(solved: Equilibrium, value: float, direction: tuple[float, float, float]) -> Equilibrium:
+    """Add a tension to the pretension of the film.
 
     The unit of the tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is the
     amplitude of the press.
 
     Args:
+        solved: The press.
+        value: Number of units.
         direction: Components (T11, T22, T12) of one unit.
     """
-
-    def add_tension(solved: Equilibrium, value: float) -> Equilibrium:
-        """Return the equilibrium with `value` units of additional tension."""
-        unit = 1.0 + solved.groups.tension  # divided by E A^2, like all tensions in `groups`
-        anisotropy = solved.groups.anisotropy
-        tension = anisotropy.tension + value * unit * np.array(direction)
-        return replace(solved, groups=replace(solved.groups, anisotropy=replace(anisotropy, tension=tension)))
-
-    return add_tension
+    unit = 1.0 + solved.groups.tension  # divided by E A^2, like all tensions in `groups`
+    tension = solved.groups.anisotropy.tension + value * unit * np.array(direction)
+    return _with_anisotropy(solved, replace(solved.groups.anisotropy, tension=tension))
 
 
-def _stiffness_imperfection(angle: float) -> AddImperfection:
-    """Create a function that makes a film orthotropic.
-
-    The value of the imperfection is ln(E1 / E2). To first order, E1 = E (1 + value / 2) and E2 = E (1 - value / 2).
+def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equilibrium:
+    """Make the film orthotropic.
 
     Args:
+        solved: The press.
+        log_ratio: Value of ln(E1 / E2). To first order, E1 = E (1 + log_ratio / 2) and E2 = E (1 - log_ratio / 2).
         angle: Angle from the direction of the press to axis 1 of the film, rad.
     """
+    # Change of the elasticity matrix divided by E, in the axes of the film
+    plane_modulus = 1.0 / (1.0 - solved.groups.poisson**2)
+    change_along_axis_1 = 0.5 * log_ratio * plane_modulus
+    change_in_film_axes = np.diag([change_along_axis_1, -change_along_axis_1, 0.0])
 
-    def add_stiffness(solved: Equilibrium, log_ratio: float) -> Equilibrium:
-        """Return the equilibrium of a film with the given value of ln(E1 / E2)."""
-        # Change of the elasticity matrix divided by E, in the axes of the film
-        plane_modulus = 1.0 / (1.0 - solved.groups.poisson**2)
-        change_along_axis_1 = 0.5 * log_ratio * plane_modulus
-        change_in_film_axes = np.diag([change_along_axis_1, -change_along_axis_1, 0.0])
-
-        # Rotate the change into the frame of the press.
-        rotation = stress_rotation(angle)
-        moduli_change = rotation @ change_in_film_axes @ rotation.T
-        anisotropy = solved.groups.anisotropy
-        moduli = anisotropy.moduli + moduli_change
-        return replace(solved, groups=replace(solved.groups, anisotropy=replace(anisotropy, moduli=moduli)))
-
-    return add_stiffness
+    # Rotate the change into the frame of the press.
+    rotation = stress_rotation(angle)
+    moduli = solved.groups.anisotropy.moduli + rotation @ change_in_film_axes @ rotation.T
+    return _with_anisotropy(solved, replace(solved.groups.anisotropy, moduli=moduli))
 
 
-def _oval_imperfection(direction: complex) -> AddImperfection:
-    """Create a function that makes the clamp of a film oval.
+def _with_anisotropy(solved: Equilibrium, anisotropy: Anisotropy) -> Equilibrium:
+    """Return a press with other direction-dependent properties of the film."""
+    return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
 
-    The value of the imperfection is the parameter e of the oval clamp; see `PlacedMesh.oval`.
+
+def _add_oval(solved: Equilibrium, value: float, direction: complex) -> Equilibrium:
+    """Make the clamp of the film oval.
 
     Args:
+        solved: The press.
+        value: Parameter e of the oval clamp; see `PlacedMesh.oval`.
         direction: exp(2 i alpha), where alpha is the angle from the direction of the press to the longer axis.
     """
-
-    def add_oval(solved: Equilibrium, value: float) -> Equilibrium:
-        """Return the equilibrium of a film whose oval clamp has the parameter `value`."""
-        # The position of the probe does not change, so its position on the circular film does.
-        mesh = solved.mesh
-        radius = solved.film.radius
-        oval = mesh.oval + value * direction
-        relative_position = np.array(np.hypot(*solved.at) / radius, dtype=complex)
-        circular_distance = radius * from_oval(relative_position, oval).real
-        placement = Placement.of(mesh.template, mesh.placement.probe, circular_distance, radius, mesh.layer)
-        return replace(solved, mesh=replace(mesh, oval=oval, placement=placement))
-
-    return add_oval
+    # The position of the probe does not change, so its position on the circular film does.
+    mesh = solved.mesh
+    radius = solved.film.radius
+    oval = mesh.oval + value * direction
+    relative_position = np.array(np.hypot(*solved.at) / radius, dtype=complex)
+    circular_distance = radius * from_oval(relative_position, oval).real
+    placement = Placement.of(mesh.template, mesh.placement.probe, circular_distance, radius, mesh.layer)
+    return replace(solved, mesh=replace(mesh, oval=oval, placement=placement))
 
 
 FILM_FIELDS = (
-    StressField(_tension_imperfection((1.0, 1.0, 0.0)), odd=False),
-    StressField(_tension_imperfection((1.0, -1.0, 0.0)), odd=False),
-    StressField(_tension_imperfection((0.0, 0.0, 1.0)), odd=True),
-    StressField(_stiffness_imperfection(0.0), odd=False),
-    StressField(_stiffness_imperfection(0.25 * np.pi), odd=True),
-    StressField(_oval_imperfection(1.0), odd=False),
-    StressField(_oval_imperfection(1j), odd=True),
+    StressField(partial(_add_tension, direction=(1.0, 1.0, 0.0)), odd=False),
+    StressField(partial(_add_tension, direction=(1.0, -1.0, 0.0)), odd=False),
+    StressField(partial(_add_tension, direction=(0.0, 0.0, 1.0)), odd=True),
+    StressField(partial(_add_stiffness, angle=0.0), odd=False),
+    StressField(partial(_add_stiffness, angle=0.25 * np.pi), odd=True),
+    StressField(partial(_add_oval, direction=1.0), odd=False),
+    StressField(partial(_add_oval, direction=1j), odd=True),
 )
 """Stress fields of a changed film: mean tension, uneven tension, uneven stiffness, and oval clamp.
 
@@ -160,29 +150,26 @@ FILM_IS_ODD = np.array([field.odd for field in FILM_FIELDS])
 """Whether each of `FILM_FIELDS` is odd about the direction of the press, shape (n_field,)."""
 
 
-def _side_load_imperfection(direction: tuple[float, float]) -> AddImperfection:
-    """Create a function that adds a side load to a press.
+def _add_side_load(solved: Equilibrium, value: float, direction: tuple[float, float]) -> Equilibrium:
+    """Add a side load to a press.
 
     The unit of the side load is E h a A^2, with Young's modulus E, the thickness h, the film radius a and the amplitude
     A.
 
     Args:
+        solved: The press.
+        value: Number of units.
         direction: Unit vector (x, y) of the side load.
     """
-
-    def add_side_load(solved: Equilibrium, value: float) -> Equilibrium:
-        """Return the equilibrium with `value` units of additional side load."""
-        load_x, load_y = solved.groups.side_load
-        direction_x, direction_y = direction
-        side_load = (load_x + value * direction_x, load_y + value * direction_y)
-        return replace(solved, groups=replace(solved.groups, side_load=side_load))
-
-    return add_side_load
+    load_x, load_y = solved.groups.side_load
+    direction_x, direction_y = direction
+    side_load = (load_x + value * direction_x, load_y + value * direction_y)
+    return replace(solved, groups=replace(solved.groups, side_load=side_load))
 
 
 SIDE_FORCE_FIELDS = (
-    StressField(_side_load_imperfection((1.0, 0.0)), odd=False),
-    StressField(_side_load_imperfection((0.0, 1.0)), odd=True),
+    StressField(partial(_add_side_load, direction=(1.0, 0.0)), odd=False),
+    StressField(partial(_add_side_load, direction=(0.0, 1.0)), odd=True),
 )
 """Stress fields of a side force along the direction of the press (even), and across this direction (odd)."""
 

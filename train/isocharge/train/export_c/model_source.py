@@ -41,7 +41,6 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import COLUMNS
 from isocharge.serve.model.validity import Validity
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
-from isocharge.train.training.activations import Activation
 from isocharge.train.training.folded_network import (
     ANGLES,
     COSINES_TO_CORRELATIONS,
@@ -50,6 +49,7 @@ from isocharge.train.training.folded_network import (
     LOG_STD,
     MISFIT_UNIT,
     POSITION,
+    Activation,
     ChargeFeatures,
     FoldedNetwork,
     Perceptron,

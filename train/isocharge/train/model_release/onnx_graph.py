@@ -20,8 +20,8 @@ from isocharge.serve.model.session import open_session, run
 from isocharge.serve.presses.number_table import LARGEST
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
-from isocharge.train.training.activations import ACTIVATIONS
 from isocharge.train.training.folded_network import (
+    ACTIVATIONS,
     ANGLES,
     ChargeFeatures,
     FoldedNetwork,

@@ -13,7 +13,7 @@ from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.errors import ConfigError
 from isocharge.common.structs import Settings, WrongKey, convert, read_toml
 from isocharge.simulate import NoiseModel, noise_model
-from isocharge.train.training.activations import ACTIVATIONS, TANH
+from isocharge.train.training.folded_network import ACTIVATIONS, TANH
 
 Width = Annotated[int, Meta(ge=1, le=4096)]
 Widths = Annotated[tuple[Width, ...], Meta(min_length=1, description="widths from 1 to 4096")]
@@ -64,7 +64,7 @@ class NetworkConfig(Settings, frozen=True):
         hidden: Widths of the hidden layers of the contact network; None for the default.
         misfit_hidden: Widths of the hidden layers of the misfit network, which must have as many hidden layers as the
             contact network; None for the default.
-        activation: Name of the activation of the hidden layers (`isocharge.train.training.activations`).
+        activation: Name of the activation of the hidden layers (`isocharge.train.training.folded_network`).
         weights: "float32", or "int8" to round the weights between hidden layers to 8 bits and then train the other
             weights further. In C, the rounded weights take a quarter of the memory.
     """

@@ -23,15 +23,17 @@ from torch import Tensor, nn
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
-from isocharge.train.training.activations import ACTIVATIONS, TANH, Activation
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.folded_network import (
+    ACTIVATIONS,
     LARGEST_INT8,
     LOG_FORCE,
     LOG_STD,
     MEAN,
     MISFIT_UNIT,
+    TANH,
     TURN,
+    Activation,
     ChargeFeatures,
     FoldedNetwork,
     Layer,

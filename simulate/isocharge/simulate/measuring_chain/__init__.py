@@ -1,1 +1,0 @@
-"""Models of the noise of single readings, and of amplifiers whose output also depends on earlier charges."""
