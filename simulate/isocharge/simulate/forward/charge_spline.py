@@ -10,7 +10,9 @@ interpolates its stress fields between forces in the same way. The interpolation
 further error.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy  # scipy.interpolate is imported when it is used
@@ -26,7 +28,6 @@ from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.numerics.disk import onto_disk, sunflower
 from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film
-from isocharge.simulate.sensor.sensor import Calibration
 
 MAX_KNOT_SPACING = 0.3
 """Largest distance between the knots, mm."""
@@ -68,7 +69,6 @@ class ChargeSpline:
     Attributes:
         electrodes: Names of the electrodes, in the order of the charges.
         film: Film whose squared amplitude scales the charges.
-        calibration: Calibration that adds the crosstalk to the charges.
         domain: Presses for which the splines are valid.
         force: Forces at which splines were fitted, shape (n_force,), N.
         table: Spline in x and y that returns the scaled charges without crosstalk, shape (n_force, n_electrode), pC.
@@ -78,7 +78,6 @@ class ChargeSpline:
 
     electrodes: tuple[str, ...]
     film: Film
-    calibration: Calibration
     domain: Domain
     force: Array
     table: "scipy.interpolate.NdBSpline"
@@ -106,15 +105,14 @@ class ChargeSpline:
         spacing = spacing or min(MAX_KNOT_SPACING, RELATIVE_KNOT_SPACING * forward_map.probe.reach)
 
         sensor = forward_map.sensor
-        samples = _ScaledCharges(forward_map, _force_nodes(forward_map))
+        force = _force_nodes(forward_map)
         # The error is unknown (NaN) until the finished splines are compared with the forward map.
         spline = cls(
             electrodes=forward_map.electrodes,
             film=sensor.film,
-            calibration=sensor.calibration,
             domain=domain,
-            force=samples.force,
-            table=_fit_disk(samples, domain.radius, spacing),
+            force=force,
+            table=_fit_disk(partial(_scaled_charges, forward_map, force), domain.radius, spacing),
             error=np.nan,
         )
         return replace(spline, error=_largest_error(spline, forward_map))
@@ -216,7 +214,7 @@ class ChargeSpline:
         Returns:
             Scaled charges, shape (n, n_force, n_electrode), pC.
         """
-        return self.calibration.read(np.asarray(self.table(position)))
+        return np.asarray(self.table(position))
 
     def scaled_gradients(self, position: Array) -> Array:
         """Compute the derivatives of `scaled_charges` with respect to x and y.
@@ -228,9 +226,7 @@ class ChargeSpline:
             Derivatives, shape (n, n_force, n_electrode, 2), pC/mm.
         """
         # The argument `nu` contains the orders of the derivative with respect to x and y.
-        x_derivative = self.calibration.read(np.asarray(self.table(position, nu=(1, 0))))
-        y_derivative = self.calibration.read(np.asarray(self.table(position, nu=(0, 1))))
-        return np.stack([x_derivative, y_derivative], axis=-1)
+        return np.stack([self.table(position, nu=(1, 0)), self.table(position, nu=(0, 1))], axis=-1)
 
 
 def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
@@ -259,61 +255,47 @@ def _force_nodes(forward_map: ForwardMap) -> Array:
     return np.asarray(np.exp(log_force))
 
 
-@dataclass(frozen=True)
-class _ScaledCharges:
-    """Computation of the scaled charges to which splines are fitted. The scaled charges do not include crosstalk.
+def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> Array:
+    """Compute the scaled charges that presses at given positions cause, to which splines are fitted.
 
-    Attributes:
+    A scaled charge is a charge divided by the squared amplitude of the press. The charges consist of the stress
+    charges, which the stress causes by d31, d32 and d12, and the pressure charges, which the contact pressure causes by
+    d33.
+
+    Args:
         forward_map: Forward map that computes the charges.
         force: Forces at which the splines are fitted, shape (n_force,), N.
+        position: Positions (x, y), shape (n, 2), mm.
+
+    Returns:
+        Scaled charges, shape (n, n_force, n_electrode), pC.
     """
+    sensor = forward_map.sensor
+    solved_force = forward_map.family.force
+    solved_charge = forward_map.stress_charges_by_force(position)
+    solved_charge /= amplitude_squared(sensor.film, solved_force)[:, None]
 
-    forward_map: ForwardMap
-    force: Array
+    # A sensor with d33 has more spline forces than solved forces. Interpolate the charges to the spline forces.
+    force_weights = lagrange_values(np.log(solved_force), np.log(force))
+    scaled_charge = force_weights @ solved_charge  # shape (n, n_force, n_electrode)
 
-    def charges_at(self, position: Array) -> Array:
-        """Compute the scaled charges that presses at given positions cause.
-
-        A scaled charge is a charge divided by the squared amplitude of the press. At each position, the charges are
-        computed for every force at which splines are fitted. The charges consist of the stress charges, which the
-        stress causes by d31, d32 and d12, and the pressure charges, which the contact pressure causes by d33.
-
-        Args:
-            position: Positions (x, y), shape (n, 2), mm.
-
-        Returns:
-            Scaled charges, shape (n, n_force, n_electrode), pC.
-        """
-        forward_map = self.forward_map
-        film = forward_map.sensor.film
-        solved_force = forward_map.family.force
-        scaled_stress_charge = forward_map.stress_charges_by_force(position)
-        scaled_stress_charge /= amplitude_squared(film, solved_force)[:, None]
-        if forward_map.sensor.piezo.d33 == 0.0:
-            return scaled_stress_charge
-
-        # A sensor with d33 has more spline forces than solved forces. Interpolate the charges to the spline forces.
-        nodes = np.log(solved_force)
-        force_weights = lagrange_values(nodes, np.log(self.force))
-        scaled_charge = force_weights @ scaled_stress_charge  # shape (n, n_force, n_electrode)
-
-        # Add the charge of the contact pressure.
-        for index, force in enumerate(self.force.tolist()):
-            contact = np.column_stack([position, np.full(len(position), force)])
-            pressure_charge = contact_charges(forward_map.sensor, forward_map.probe, contact, np.zeros(len(position)))
-            scaled_charge[:, index] += pressure_charge / amplitude_squared(film, force)
-        return np.asarray(scaled_charge)
+    # Add the charge of the contact pressure.
+    for index, one_force in enumerate(force.tolist()):
+        contact = np.column_stack([position, np.full(len(position), one_force)])
+        pressure_charge = contact_charges(sensor, forward_map.probe, contact, np.zeros(len(position)))
+        scaled_charge[:, index] += pressure_charge / amplitude_squared(sensor.film, one_force)
+    return sensor.calibration.read(scaled_charge)
 
 
 def _fit_disk(
-    samples: _ScaledCharges, radius: float, spacing: float, min_cells: int = 8
+    charges_at: Callable[[Array], Array], radius: float, spacing: float, min_cells: int = 8
 ) -> "scipy.interpolate.NdBSpline":
     """Fit a cubic spline to the scaled charges of all electrodes over the disk.
 
     The fit is by least squares with a penalty on the third differences of the coefficients.
 
     Args:
-        samples: Scaled charges to which the spline is fitted.
+        charges_at: Function that computes the scaled charges, shape (n, n_force, n_electrode), at positions.
         radius: Radius of the disk, mm.
         spacing: Largest distance between the knots, mm.
         min_cells: Smallest number of cells of a spline along x or y.
@@ -328,7 +310,7 @@ def _fit_disk(
     knots = (line_knots, line_knots)
     count = line_knots.size - 4
     position = radius * _fit_positions(cells)
-    values = samples.charges_at(position)
+    values = charges_at(position)
 
     # The design matrix converts the coefficients into the values of the spline. The matrix of SciPy has no columns for
     # the last coefficients if they do not affect any position, so it is created again with its full shape.

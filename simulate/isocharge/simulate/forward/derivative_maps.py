@@ -28,6 +28,7 @@ Example:
 import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -104,7 +105,7 @@ class FilmSlopes:
         """
         if not forward_map.probe.is_axisymmetric:
             raise SceneError(f"properties of a film: expected a circular probe, got {forward_map.probe.notation}")
-        return cls(forward_map, _solve_fields(forward_map, _film_changes, executor))
+        return cls(forward_map, _solve_fields(forward_map, partial(stress_changes, fields=FILM_FIELDS), executor))
 
     def jacobian(self, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of the charges with respect to the properties in `TENSION`, `STIFFNESS` and `OVAL`.
@@ -320,12 +321,7 @@ def _side_force_changes(solved: Equilibrium, surface: Surface) -> Array:
         The holding force is the side force that prevents the film from slipping under the probe.
     """
     relative_holding_force = np.array(holding_force(solved)) / solved.force
-    return np.append(stress_changes(solved, SIDE_FORCE_FIELDS, surface), relative_holding_force)
-
-
-def _film_changes(solved: Equilibrium, surface: Surface) -> Array:
-    """For one press, compute how `sensitivity.FILM_FIELDS` change the scaled stress; see `stress_changes`."""
-    return stress_changes(solved, FILM_FIELDS, surface)
+    return np.append(stress_changes(solved, surface, SIDE_FORCE_FIELDS), relative_holding_force)
 
 
 def _solve_fields(forward_map: ForwardMap, read: Reading, executor: Executor | None) -> ForwardMap:

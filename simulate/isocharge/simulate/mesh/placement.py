@@ -561,26 +561,12 @@ class Placement:
 
         # The angle of a node and the logarithm of its radius are interpolated linearly with respect to the depth,
         # between the innermost circle and the rim. On the rim, the logarithm of the radius is 0.
-        circle_angle = self._node_circle_angles(blocks)  # shape (n_sector, n_local)
+        circle_angle = self.circle_angles[:-1, None] + angular * np.diff(self.circle_angles)[:, None]
         rim_angle = self.rim_angles[:-1, None] + angular * np.diff(self.rim_angles)[:, None]
         angle = (1.0 - depth) * circle_angle + depth * rim_angle  # shape (n_ring, n_sector, n_local)
         log_radius = (1.0 - depth) * np.log(self.template_radius)
         template_points = np.exp(log_radius + 1j * angle)
         return self.to_film(template_points).reshape(-1, radial.size)
-
-    def _node_circle_angles(self, blocks: Blocks) -> Array:
-        """Compute the angles of the nodes of each sector on the innermost circle in the template plane.
-
-        Args:
-            blocks: The elements.
-
-        Returns:
-            Angles, shape (n_sector, n_local), rad.
-        """
-        _, angular = _unit_coordinates(blocks)
-        first_side = self.circle_angles[:-1, None]
-        last_side = self.circle_angles[1:, None]
-        return np.asarray(first_side + angular * (last_side - first_side))
 
 
 def _unit_coordinates(blocks: Blocks) -> tuple[Array, Array]:

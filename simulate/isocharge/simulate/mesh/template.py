@@ -71,7 +71,7 @@ class SampleCurve(RoundProbe):
     """
 
     other_topology: FootprintTopology
-    notation = "sample"
+    name = "sample"
     period = 2.0 * np.pi
 
     @property

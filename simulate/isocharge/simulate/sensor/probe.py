@@ -31,7 +31,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 import shapely
@@ -203,10 +203,8 @@ class Probe(ABC):
             return self
         return replace(self, angle=self.angle + angle)  # type: ignore[type-var]
 
-    @property
-    def grows(self) -> bool:
-        """Whether the footprint becomes larger with the force."""
-        return False
+    grows = False
+    """Whether the footprint becomes larger with the force."""
 
     def under(self, force: float) -> "Probe":  # noqa: ARG002
         """Return a probe with the footprint that this probe has under a force (N)."""
@@ -220,10 +218,8 @@ class Probe(ABC):
         """
         return float(np.abs(complex(*at) + self.outline).max())
 
-    @property
-    def has_uniform_pressure(self) -> bool:
-        """Whether the pressure is the same at all points of the footprint."""
-        return True
+    has_uniform_pressure = True
+    """Whether the pressure is the same at all points of the footprint."""
 
     def pressure(self, points: Complexes) -> Array:
         """Return the pressure at points of the footprint, divided by the mean pressure.
@@ -324,13 +320,16 @@ PRESSURE_LEVELS = 48
 class RoundProbe(CurvedProbe):
     """Base class of probes with a circular footprint.
 
-    A subclass implements `notation`. A subclass whose pressure is not uniform also overrides `pressure`.
+    A subclass has a `name`. A subclass whose pressure is not uniform also overrides `pressure`.
 
     Attributes:
         radius: Radius of the footprint, mm.
     """
 
     radius: float
+
+    name: ClassVar[str]
+    """Word before the colon in the notation of the probe."""
 
     angle = 0.0
     """Rotation of the footprint, rad. The rotation is always zero, because a rotation does not change a circle."""
@@ -340,6 +339,11 @@ class RoundProbe(CurvedProbe):
 
     def __post_init__(self) -> None:
         check_length("probe radius", self.radius)
+
+    @property
+    def notation(self) -> str:
+        """Notation of this probe, which `parse_probe` converts back into the probe."""
+        return f"{self.name}:{tidy(self.radius)}"
 
     @property
     def area(self) -> float:
@@ -372,10 +376,7 @@ class Circle(RoundProbe):
         radius: Radius of the footprint, mm.
     """
 
-    @property
-    def notation(self) -> str:
-        """Notation of this probe, which `parse_probe` converts back into the probe."""
-        return f"circle:{tidy(self.radius)}"
+    name = "circle"
 
 
 @dataclass(frozen=True)
@@ -387,12 +388,8 @@ class Finger(RoundProbe):
             fingertip.
     """
 
+    name = "finger"
     has_uniform_pressure = False
-
-    @property
-    def notation(self) -> str:
-        """Notation of this probe, which `parse_probe` converts back into the probe."""
-        return f"finger:{tidy(self.radius)}"
 
     def pressure(self, points: Complexes) -> Array:
         """Return the Hertzian pressure at points, divided by the mean pressure. It is zero outside the footprint.
@@ -433,12 +430,8 @@ class GrowingFinger(Finger):
         radius: Radius of the footprint at 1 N, mm. Under the force F, it is larger by the cube root of F / (1 N).
     """
 
+    name = "growing-finger"
     grows = True
-
-    @property
-    def notation(self) -> str:
-        """Notation of this probe, which `parse_probe` converts back into the probe."""
-        return f"growing-finger:{tidy(self.radius)}"
 
     def under(self, force: float) -> Finger:
         """Return the fingertip with the radius that it has under a force (N)."""

@@ -20,9 +20,9 @@ can be solved with the factorisation of the sparse matrix K (Sherman and Morriso
 Fields that are odd about the line of symmetry do not change the volume of the air. For these fields, the matrix is K.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 from scipy.sparse import csc_matrix, eye_array
@@ -187,32 +187,24 @@ class Assembly:
         return csc_matrix((entries, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
 
 
+@dataclass(frozen=True)
 class Factor:
-    """Factorisation of the matrix of a mesh."""
+    """Factorisation of the matrix of a mesh.
 
-    def __init__(
-        self,
-        assembly: Assembly,
-        interior_inverse: Array,
-        coupling: Array,
-        reduced_coupling: Array,
-        skeleton_factor: SuperLU,
-    ) -> None:
-        """Store the factors.
+    Attributes:
+        assembly: Linear solver with the indices of the unknowns.
+        interior_inverse: Inverse of the block of the interior unknowns of each element, shape
+            (n_element, n_interior, n_interior).
+        coupling: Block between interior unknowns and unknowns on sides, shape (n_element, n_interior, n_side).
+        reduced_coupling: Product of `interior_inverse` and `coupling`, same shape as `coupling`.
+        skeleton_factor: Factorisation of the matrix of the skeleton unknowns.
+    """
 
-        Args:
-            assembly: Linear solver with the indices of the unknowns.
-            interior_inverse: Inverse of the block of the interior unknowns of each element, shape
-                (n_element, n_interior, n_interior).
-            coupling: Block between interior unknowns and unknowns on sides, shape (n_element, n_interior, n_side).
-            reduced_coupling: Product of `interior_inverse` and `coupling`, same shape as `coupling`.
-            skeleton_factor: Factorisation of the matrix of the skeleton unknowns.
-        """
-        self._assembly = assembly
-        self._interior_inverse = interior_inverse
-        self._coupling = coupling
-        self._reduced_coupling = reduced_coupling
-        self._skeleton_factor = skeleton_factor
+    assembly: Assembly
+    interior_inverse: Array
+    coupling: Array
+    reduced_coupling: Array
+    skeleton_factor: SuperLU
 
     def solve(self, right: Array) -> Array:
         """Solve the linear system for the free unknowns.
@@ -224,24 +216,24 @@ class Factor:
         Returns:
             Solution (U1, U2, W) at the nodes, shape (n_node, 3). Fixed unknowns are zero.
         """
-        assembly = self._assembly
+        assembly = self.assembly
         padded_right = np.zeros(assembly.free.shape)
         padded_right[:, :3] = right  # the right-hand side of the auxiliary unknown of bending is zero
         flat_right = padded_right.ravel()
 
         # Eliminate the interior unknowns of each element from the right-hand side.
         interior_right = flat_right[assembly.interior_unknowns][..., None]  # shape (n_element, n_interior, 1)
-        interior_solution = self._interior_inverse @ interior_right
-        coupled_right = self._coupling.transpose(0, 2, 1) @ interior_solution  # shape (n_element, n_side, 1)
+        interior_solution = self.interior_inverse @ interior_right
+        coupled_right = self.coupling.transpose(0, 2, 1) @ interior_solution  # shape (n_element, n_side, 1)
         reduced_right = flat_right - np.bincount(assembly.side_unknowns.ravel(), coupled_right.ravel(), flat_right.size)
 
         # Solve for the unknowns of the skeleton.
         solution = np.zeros(flat_right.size)
-        solution[assembly.skeleton] = self._skeleton_factor.solve(reduced_right[assembly.skeleton])
+        solution[assembly.skeleton] = self.skeleton_factor.solve(reduced_right[assembly.skeleton])
 
         # Compute the interior unknowns of each element from the unknowns on its sides.
         side_solution = solution[assembly.side_unknowns][..., None]  # shape (n_element, n_side, 1)
-        correction = self._reduced_coupling @ side_solution
+        correction = self.reduced_coupling @ side_solution
         solution[assembly.interior_unknowns] = (interior_solution - correction)[..., 0]
         return solution.reshape(assembly.free.shape)[:, :3]
 
@@ -293,45 +285,15 @@ def assembly(mesh: Template, unknowns_per_node: int, odd: bool = False) -> Assem
     return Assembly(mesh, unknowns_per_node, odd)
 
 
-class TangentFactor(Protocol):
-    """Interface of a factorised tangent matrix, with which linear systems are solved."""
+SolveTangent = Callable[[Array], Array]
+"""Function that solves a linear system with a factorised tangent for the displacements at the nodes.
 
-    def solve(self, right: Array) -> Array:
-        """Solve for the displacements at the nodes.
-
-        Args:
-            right: Forces along (U1, U2, W) at the nodes, shape (n_node, 3).
-
-        Returns:
-            Displacements (U1, U2, W) at the nodes, shape (n_node, 3).
-        """
+The argument is the right-hand side for (U1, U2, W) at the nodes, and the result is the solution, both of the shape
+(n_node, 3). Fixed unknowns are zero.
+"""
 
 
-@dataclass(frozen=True)
-class _AirFactor:
-    """Factorisation of the tangent K + c v v' of a film with trapped air.
-
-    Attributes:
-        film: Factorisation of the matrix K of the film.
-        weights: Integration weights v of the displaced volume, shape (n_node,).
-        response: Displacements y = K^-1 v of the film under a uniform pressure, shape (n_node, 3).
-        pressure_per_volume: Factor c / (1 + c v . y). Multiplied by the volume that the film would displace without the
-            air, the factor results in the pressure of the air.
-    """
-
-    film: Factor
-    weights: Array
-    response: Array
-    pressure_per_volume: float
-
-    def solve(self, right: Array) -> Array:
-        """Solve for the displacements at the nodes; see `TangentFactor.solve`."""
-        field_without_air = self.film.solve(right)
-        volume = float(self.weights @ field_without_air[:, 2])
-        return np.asarray(field_without_air - self.pressure_per_volume * volume * self.response)
-
-
-def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added_tension: float = 0.0) -> TangentFactor:
+def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added_tension: float = 0.0) -> SolveTangent:
     """Factorise the tangent of the film for given displacements, including the stiffness of trapped air.
 
     The tangent is K + c v v', where K is the matrix of the film, v contains the integration weights of the displaced
@@ -344,20 +306,26 @@ def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added
         added_tension: Tension that is added to the pretension, in units of E_young A^2.
 
     Returns:
-        Factorisation of the tangent.
+        Function that solves linear systems with the tangent.
     """
-    film_factor = assembly.factor(elastic.tangent(field, added_tension))
-    if elastic.back is None or elastic.groups.compression == 0.0:  # there is no trapped air
-        return film_factor
-    if assembly.odd:  # odd fields do not compress the air
-        return film_factor
+    solve_film = assembly.factor(elastic.tangent(field, added_tension)).solve
+    has_air = elastic.groups.compression != 0.0
+    if not has_air or assembly.odd:  # odd fields do not compress the air
+        return solve_film
 
     # The air changes a solution x by -c / (1 + c v . y) (v . x) y, where y = K^-1 v is the response of the film to a
     # uniform pressure.
     weights = elastic.back.weights  # v
     uniform_pressure = np.zeros_like(field)
     uniform_pressure[:, 2] = weights
-    response = film_factor.solve(uniform_pressure)  # y
+    response = solve_film(uniform_pressure)  # y
     air_stiffness = elastic.back.stiffness(field[:, 2])
     pressure_per_volume = air_stiffness / (1.0 + air_stiffness * float(weights @ response[:, 2]))
-    return _AirFactor(film_factor, weights, response, pressure_per_volume)
+
+    def solve_with_air(right: Array) -> Array:
+        """Solve for the displacements at the nodes; see `SolveTangent`."""
+        field_without_air = solve_film(right)
+        volume = float(weights @ field_without_air[:, 2])
+        return np.asarray(field_without_air - pressure_per_volume * volume * response)
+
+    return solve_with_air

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Complexes, Integers
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups, Theory, scaled_stress
@@ -305,19 +305,8 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
         first_outside = np.argmax(is_outside)
         x, y = points[first_outside]
         raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {film.radius:.4g} mm")
-    return equilibrium.mesh.locate(_to_press_frame(equilibrium, points))
 
-
-def _to_press_frame(equilibrium: Equilibrium, points: Array) -> Complexes:
-    """Rotate points into the frame in which the press lies on the positive x axis.
-
-    Args:
-        equilibrium: The solved press.
-        points: Points (x, y) in the axes of the film, shape (n, 2), mm.
-
-    Returns:
-        Points x + iy, shape (n,), in film radii.
-    """
-    complex_points = (points[:, 0] + 1j * points[:, 1]) / equilibrium.film.radius
+    # Rotate the points, x + iy in film radii, into the frame in which the press lies on the positive x axis.
+    complex_points = (points[:, 0] + 1j * points[:, 1]) / film.radius
     press_x, press_y = equilibrium.at
-    return np.asarray(complex_points * np.exp(-1j * np.arctan2(press_y, press_x)))
+    return equilibrium.mesh.locate(complex_points * np.exp(-1j * np.arctan2(press_y, press_x)))

@@ -19,7 +19,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Complexes
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.solver.assembly import Assembly, TangentFactor, factor_tangent
+from isocharge.simulate.solver.assembly import Assembly, SolveTangent, factor_tangent
 
 STABILISING_TENSION = 0.4
 """Stabilising tension at a relative residual of one.
@@ -147,8 +147,8 @@ def solve_newton(
 
         # Compute the Newton step.
         stabilising_tension = _stabilising_tension(elastic, relative_residual)
-        factor = factor_tangent(elastic, assembly, iterate.field, stabilising_tension)
-        step = factor.solve(-iterate.residual)
+        solve = factor_tangent(elastic, assembly, iterate.field, stabilising_tension)
+        step = solve(-iterate.residual)
         step_size = _step_size(elastic, iterate.field, step, iterate.residual)
         step_sizes.append(step_size)
         if step_size <= ROUND_OFF:
@@ -160,7 +160,7 @@ def solve_newton(
             next_iterate = _line_search(iterate, _descent_step(iterate, assembly, step))
         if next_iterate is None:
             return iterate.result(iteration, converged=False, message="no step lowers the energy any more")
-        iterate = _chord_steps(next_iterate, factor, relative_residual, tolerance)
+        iterate = _chord_steps(next_iterate, solve, relative_residual, tolerance)
     raise AssertionError("the loop returns")  # the last iteration returns in every case
 
 
@@ -282,7 +282,7 @@ def _take_full_step(iterate: _Iterate, step: Array) -> _Iterate | None:
 
 def _chord_steps(
     iterate: _Iterate,
-    factor: TangentFactor,
+    solve: SolveTangent,
     previous_residual: float,
     tolerance: float,
     max_first_ratio: float = 0.15,
@@ -296,7 +296,7 @@ def _chord_steps(
 
     Args:
         iterate: Iterate after the Newton step.
-        factor: Factorised tangent of the Newton step.
+        solve: Function that solves linear systems with the tangent of the last Newton step.
         previous_residual: Relative residual before the Newton step.
         tolerance: Relative residual at which the solve has converged.
         max_first_ratio: Largest ratio of the residual after a Newton step to the residual before the step at which the
@@ -310,7 +310,7 @@ def _chord_steps(
     if iterate.relative_residual > max_first_ratio * previous_residual:
         return iterate
     while iterate.relative_residual > tolerance:
-        next_iterate = iterate.after(factor.solve(-iterate.residual))
+        next_iterate = iterate.after(solve(-iterate.residual))
         # The condition is negated, so that a residual that is NaN ends the loop.
         if not next_iterate.relative_residual < max_ratio * iterate.relative_residual:
             break
@@ -346,8 +346,8 @@ def _descent_step(
         is_descent_direction = np.isfinite(step).all() and energy_slope < 0.0
         if is_descent_direction:
             break
-        stiffer_factor = factor_tangent(elastic, assembly, iterate.field, added_tension)
-        step = stiffer_factor.solve(-iterate.residual)
+        solve_stiffer = factor_tangent(elastic, assembly, iterate.field, added_tension)
+        step = solve_stiffer(-iterate.residual)
         added_tension *= 2.0
     return step
 

@@ -48,7 +48,7 @@ from isocharge.simulate.mechanics.stress import stress_rotation
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface
-from isocharge.simulate.solver.assembly import TangentFactor, assembly, factor_tangent
+from isocharge.simulate.solver.assembly import SolveTangent, assembly, factor_tangent
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
 
 STEP = 1e-3
@@ -177,7 +177,7 @@ SIDE_FORCE_IS_ODD = np.array([field.odd for field in SIDE_FORCE_FIELDS])
 """Whether each of `SIDE_FORCE_FIELDS` is odd, shape (2,)."""
 
 
-def stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: Surface = "middle") -> Array:
+def stress_changes(solved: Equilibrium, surface: Surface, fields: Sequence[StressField]) -> Array:
     """Compute how the scaled stress at the nodes changes, for example by `FILM_FIELDS` or `SIDE_FORCE_FIELDS`.
 
     The press is rotated onto the x axis. The changes are those at fixed points of the rotated film. The unit of a
@@ -186,8 +186,8 @@ def stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: 
 
     Args:
         solved: Press with a circular probe.
-        fields: Stress fields to be computed.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
+        fields: Stress fields to be computed.
 
     Returns:
         Changes per unit, shape (n_element, n_local, n_field, 3), in the order of the table of a `ForwardMap` with
@@ -197,23 +197,23 @@ def stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: 
     # factorised once for all even fields, and once for all odd fields.
     with single_threaded_blas():
         elastic = ElasticFilm(solved.mesh.geometry, solved.groups)
-        factors = [
+        solves = [
             factor_tangent(elastic, assembly(solved.mesh.template, elastic.unknowns_per_node, odd), solved.field)
             for odd in (False, True)
         ]
-        changes = [_change_by_imperfection(solved, field.add, factors[field.odd], surface) for field in fields]
+        changes = [_change_by_imperfection(solved, field.add, solves[field.odd], surface) for field in fields]
         return np.stack(changes, axis=2)
 
 
 def _change_by_imperfection(
-    solved: Equilibrium, add_imperfection: AddImperfection, factor: TangentFactor, surface: Surface
+    solved: Equilibrium, add_imperfection: AddImperfection, solve: SolveTangent, surface: Surface
 ) -> Array:
     """Compute how one imperfection changes the scaled stress at the nodes.
 
     Args:
         solved: The solved press.
         add_imperfection: Function that adds a given value of the imperfection to the film of the press.
-        factor: Factorised tangent of the press.
+        solve: Function that solves linear systems with the tangent of the press.
         surface: Surface of the film at which the stress is computed.
 
     Returns:
@@ -227,7 +227,7 @@ def _change_by_imperfection(
     # residual by one step is half of the difference between both residuals.
     positive_residual = ElasticFilm(positive_press.mesh.geometry, positive_press.groups).residual(positive_press.field)
     negative_residual = ElasticFilm(negative_press.mesh.geometry, negative_press.groups).residual(negative_press.field)
-    displacement_change = -0.5 * factor.solve(positive_residual - negative_residual)
+    displacement_change = -0.5 * solve(positive_residual - negative_residual)
 
     # Compute the derivative of the stress by a central difference.
     positive_equilibrium = replace(positive_press, field=positive_press.field + displacement_change)
@@ -291,11 +291,11 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
     compliance = np.empty((n_direction, n_direction))
     with single_threaded_blas():
         elastic = ElasticFilm(geometry, groups)
-        factor = factor_tangent(elastic, assembly(mesh.template, elastic.unknowns_per_node), solved.field)
+        solve = factor_tangent(elastic, assembly(mesh.template, elastic.unknowns_per_node), solved.field)
         for direction in range(n_direction):
             unit_load = np.zeros_like(solved.field)
             unit_load[:, direction] = geometry.load
-            compliance[:, direction] = geometry.load @ factor.solve(unit_load)[:, :n_direction]
+            compliance[:, direction] = geometry.load @ solve(unit_load)[:, :n_direction]
 
     # Compute the scaled side load that cancels the slip.
     scaled_force = np.zeros(2)
