@@ -16,8 +16,7 @@ from isocharge.simulate import (
     press,
     touch_stress,
 )
-from isocharge.simulate.solver.equilibrium import principal_stress
-from isocharge.simulate.solver.error_estimate import cautions, estimated_error, mesh_error
+from isocharge.simulate.solver.equilibrium import cautions, estimated_error, mesh_error, principal_stress
 
 MEMBRANE = Theory(bending=False)
 

@@ -39,7 +39,7 @@ from isocharge.simulate.forward.forward_map import ForwardMap, outermost_distanc
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings
-from isocharge.simulate.solver.stress_limit import yield_force
+from isocharge.simulate.solver.press import yield_force
 
 MAX_SAMPLES = 10_000_000
 """Largest number of presses of a sweep. The files of a dataset with so many presses occupy about 600 MB."""

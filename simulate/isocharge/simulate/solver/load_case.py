@@ -22,7 +22,7 @@ from isocharge.simulate.mesh.placed_mesh import PlacedMesh, distance_on_circular
 from isocharge.simulate.mesh.placement import CLEARANCE, Placement
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
-from isocharge.simulate.solver.error_estimate import shape_error
+from isocharge.simulate.solver.equilibrium import shape_error
 
 TOLERANCE = 1e-7
 """Ratio of the out-of-balance force to the load at which a solve has converged, dimensionless.
@@ -262,7 +262,7 @@ def choose_mesh(case: LoadCase) -> PlacedMesh:
 def needs_second_mesh(case: LoadCase) -> bool:
     """Return whether a press must be solved on two meshes in order to estimate the error of the charges.
 
-    The docstring of the module `error_estimate` states the reasons.
+    The docstring of the module `equilibrium` states the reasons.
 
     Args:
         case: The press and the required accuracy.
