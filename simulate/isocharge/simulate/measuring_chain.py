@@ -414,9 +414,7 @@ BENCH = Amplifier(
 """Amplifier of the level `bench`, which is plausible for an electric environment with little interference."""
 
 AMPLIFIER_LEVELS = {
-    "clean": Amplifier(noise=NOISE_LEVELS["clean"]),
-    "reference": Amplifier(noise=NOISE_LEVELS["reference"]),
-    "measured": Amplifier(noise=NOISE_LEVELS["measured"]),
+    **{level: Amplifier(noise=NOISE_LEVELS[level]) for level in ("clean", "reference", "measured")},
     "bench": BENCH,
     "surgery": replace(BENCH, noise=NOISE_LEVELS["surgery"], hum=5.0, step=0.5),
 }

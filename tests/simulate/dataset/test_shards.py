@@ -113,17 +113,6 @@ def test_read_dataset_of_another_folder_raises_dataset_error(tmp_path):
             read_dataset(path)
 
 
-def test_read_dataset_of_another_sensor_raises_dataset_error(dataset):
-    assert read_dataset(dataset, SENSOR).sensor == SENSOR
-    thicker = replace(SENSOR, film=replace(SENSOR.film, thickness=0.03), readout="edge")
-    for other, got in (
-        (load_sensor("four-25um-biaxial"), "'three-25um-biaxial'"),
-        (thicker, "one of that name with another film, readout"),
-    ):
-        with pytest.raises(DatasetError, match=rf"manifest\.json: expected the sensor '{other.name}', got {got}; use"):
-            read_dataset(dataset, other)
-
-
 def write_shard(folder: Path, data: bytes) -> None:
     """Replace the bytes of the first shard, and write the correct checksum into the manifest."""
     (folder / "shard-00000.npz").write_bytes(data)

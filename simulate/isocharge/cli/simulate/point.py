@@ -1,6 +1,5 @@
 """Command `isocharge simulate point`, which computes the charges and the deflection of one press."""
 
-from math import isfinite
 from typing import Annotated
 
 import typer
@@ -15,7 +14,6 @@ from isocharge.cli.shared.options import (
 from isocharge.cli.shared.terminal import say, show_result
 from isocharge.common.errors import InputError
 from isocharge.simulate import (
-    Equilibrium,
     SolveSettings,
     load_sensor,
     parse_probe,
@@ -25,7 +23,7 @@ from isocharge.simulate import (
 from isocharge.simulate.forward.readout import thermal_charge
 from isocharge.simulate.mechanics.scaling import theory_by_name
 from isocharge.simulate.mechanics.stress import warmed
-from isocharge.simulate.solver.equilibrium import estimated_error, summary
+from isocharge.simulate.solver.equilibrium import summary
 from isocharge.simulate.solver.sensitivity import check_friction, friction_force
 
 
@@ -108,23 +106,23 @@ def point_command(
         report["side_force_N"] = list(applied_side_force)
     warnings = report["warnings"] if json else report.pop("warnings")
     show_result(report, json=json)
-    for warning in [*_cautions(equilibrium, accuracy), *warnings]:
+    for warning in [*_cautions(report["estimated_error"], accuracy, theory), *warnings]:
         say(f"caution: {warning}")
 
 
-def _cautions(equilibrium: Equilibrium, accuracy: float) -> list[str]:
+def _cautions(error: float | None, accuracy: float, theory: str) -> list[str]:
     """Return warnings about the estimated error of the charges of a press.
 
     Args:
-        equilibrium: Equilibrium of the film under the press.
+        error: Estimated relative error of the charges, dimensionless; None if it is infinite.
         accuracy: Required relative error of the charges, dimensionless.
+        theory: Name of the theory of the film.
 
     Returns:
         A list with one warning if the estimated error exceeds the required error; otherwise an empty list.
     """
-    error = estimated_error(equilibrium)
-    if not isfinite(error):
-        return [f"a {equilibrium.theory.name} does not describe this film at all; omit --theory"]
+    if error is None:
+        return [f"a {theory} does not describe this film at all; omit --theory"]
     if error > accuracy:
         return [f"expected an error of the charges of at most {accuracy:.2g} (--accuracy), got {error:.2g}"]
     return []

@@ -245,21 +245,20 @@ def _check_samples(samples: Samples, n_electrode: int, shard_label: str) -> None
             )
 
 
-def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
+def read_dataset(folder: Path) -> Dataset:
     """Read a dataset, and check the checksums and the columns of all shards.
 
     Args:
         folder: Folder of the dataset.
-        sensor: Expected sensor. If it is None, the dataset may belong to any sensor.
 
     Returns:
         The dataset. Its manifest also contains the entries that this function ignores.
 
     Raises:
-        DatasetError: If the folder is not a dataset, has a different format version or sensor, or is damaged or
-            incomplete. The message names the file and a remedy.
+        DatasetError: If the folder is not a dataset, has a different format version, or is damaged or incomplete. The
+            message names the file and a remedy.
     """
-    # Read the manifest. Check that it describes the expected sensor.
+    # Read the manifest.
     folder = Path(folder)
     manifest_path = f"{folder}/manifest.json"
     manifest, checksum = _read_manifest(folder)
@@ -268,11 +267,6 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
         dataset_sensor = sensor_from_dict(checked_manifest.sensor, manifest_path)
     except SensorError as error:
         raise DatasetError(str(error)) from error
-    if sensor is not None and sensor != dataset_sensor:
-        raise DatasetError(
-            f"{manifest_path}: expected the sensor {sensor.name!r}, got {_difference(dataset_sensor, sensor)}; use its "
-            "own dataset, or make one"
-        )
     if checked_manifest.electrodes != list(dataset_sensor.electrode_names):
         raise DatasetError(
             f"{manifest_path}: electrodes: expected the sensor's electrodes in its order, "
@@ -290,26 +284,6 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
         raise DatasetError(f"{manifest_path}: expected presses in the working area, got none; sweep again")
     outside = all_samples[is_outside] if is_outside.any() else None
     return Dataset(dataset_sensor, all_samples[~is_outside], manifest, checksum, outside)
-
-
-def _difference(sensor: Sensor, expected: Sensor) -> str:
-    """Describe for an error message how the sensor of a dataset differs from the expected sensor.
-
-    Args:
-        sensor: Sensor of the dataset.
-        expected: Sensor that was expected.
-
-    Returns:
-        If the names of the sensors differ, the name of the sensor of the dataset. Otherwise a text with the keys of the
-        sensor file whose values differ.
-    """
-    if sensor.name != expected.name:
-        return repr(sensor.name)
-    table = sensor_to_dict(sensor)
-    expected_table = sensor_to_dict(expected)
-    all_keys = table.keys() | expected_table.keys()
-    different_keys = sorted(key for key in all_keys if table.get(key) != expected_table.get(key))
-    return f"one of that name with another {', '.join(different_keys)}"
 
 
 class _Shard(Struct):

@@ -305,8 +305,7 @@ def _solve_nonlinear(
     # Compute the first iterate without a starting equilibrium.
     template_points = mesh.placement.to_template(from_oval(mesh.node_points, mesh.oval))
     default_field = schwerin_start(template_points, float(mesh.placement.template_radius), elastic.groups)
-    if elastic.groups.static_pressure != 0.0:
-        default_field += _static_start(mesh, elastic.groups)
+    default_field += _static_start(mesh, elastic.groups)
 
     first_field = _first_field(start, mesh.template, default_field)
     result = solve_newton(elastic, solver, first_field, case.settings.tolerance)
@@ -373,8 +372,8 @@ def _solve_by_load_steps(
 def _first_field(start: Equilibrium | None, template: Template, default: Array) -> Array:
     """Return the first iterate of Newton's method, shape (n_node, 3).
 
-    If the mesh of the starting equilibrium has the same elements, the first iterate is the field of the starting
-    equilibrium. If the elements differ only in the polynomial order, the field is interpolated.
+    If the mesh of the starting equilibrium has the same elements, which may have another polynomial order, the first
+    iterate is interpolated from the field of the starting equilibrium.
 
     Args:
         start: Equilibrium of a similar press; None if there is no such equilibrium.
@@ -392,28 +391,13 @@ def _first_field(start: Equilibrium | None, template: Template, default: Array) 
     if not (has_same_blocks and has_same_resolution_except_order):
         return default
 
-    if start_template.resolution.order == template.resolution.order:
-        return start.field
-    return _interpolate_to_order(start.field, start_template, template)
-
-
-def _interpolate_to_order(field: Array, field_template: Template, template: Template) -> Array:
-    """Interpolate a nodal field to the nodes of the same elements with another polynomial order.
-
-    Args:
-        field: Values at the nodes of `field_template`, shape (n_field_node, 3).
-        field_template: Template of the field.
-        template: Template with elements of another order.
-
-    Returns:
-        Values at the nodes of `template`, shape (n_node, 3).
-    """
-    # Weights of the nodes of an element for the values at its new nodes, shape (n_local, n_field_local)
-    weights = tensor_values(field_template.resolution.order, template.xi, template.eta)
-    new_field = np.empty((template.n_node, 3))
-    # A node of several elements is assigned several times. The field is continuous, so the values are equal.
-    new_field[template.nodes] = weights @ field[field_template.nodes]
-    return new_field
+    # Interpolate to the nodes of the elements with the new order. The weights of the nodes of an element have the shape
+    # (n_local, n_start_local). A node of several elements is assigned several times. The field is continuous, so the
+    # values are equal.
+    weights = tensor_values(start_template.resolution.order, template.xi, template.eta)
+    field = np.empty((template.n_node, 3))
+    field[template.nodes] = weights @ start.field[start_template.nodes]
+    return field
 
 
 def _failure_reason(solved: Equilibrium, tolerance: float) -> str:
