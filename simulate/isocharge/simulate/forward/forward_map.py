@@ -136,7 +136,6 @@ class ForwardMap:
         film = sensor.film
         domain = Domain(radius, force_range)
         check_family(film, probe, domain)
-        mesh = family_mesh(film, probe, domain, settings)
 
         # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared at
         # the check presses, which are solved directly in the first pass of the loop. If the error is very large, the
@@ -147,8 +146,8 @@ class ForwardMap:
         remaining_counts = list(node_counts(film))
         while remaining_counts:
             count = remaining_counts.pop(0)
-            family = Family.spread(domain, film, probe, count)
-            forward_map = cls._solve(sensor, probe, family, settings.theory, mesh, executor)
+            forward_map = cls.build_unchecked(sensor, probe, domain, count, settings, executor=executor)
+            settings = replace(forward_map.settings, layer=forward_map.layer)  # the next map has the same mesh
             if not check_charges:
                 solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
                 check_charges = list(in_order(executor, solve_directly, checks))
@@ -192,37 +191,12 @@ class ForwardMap:
             SolveError: If a press has no equilibrium.
         """
         check_family(sensor.film, probe, domain)
-        mesh = family_mesh(sensor.film, probe, domain, settings)
+        resolution, layer = family_mesh(sensor.film, probe, domain, settings)
+        same_mesh = SolveSettings(theory=settings.theory, resolution=resolution, layer=layer)
         family = Family.spread(domain, sensor.film, probe, count)
-        return cls._solve(sensor, probe, family, settings.theory, mesh, executor, read)
-
-    @classmethod
-    def _solve(
-        cls,
-        sensor: Sensor,
-        probe: Probe,
-        family: Family,
-        theory: Theory,
-        mesh: tuple[Resolution, float],
-        executor: Executor | None,
-        read: Reading = probe_frame_stress,
-    ) -> "ForwardMap":
-        """Solve a family of presses. The error of the map is infinite, because it is not known.
-
-        Args:
-            sensor: Sensor whose charges the map computes.
-            probe: Probe that presses the film.
-            family: Presses to be solved.
-            theory: Terms of the film theory.
-            mesh: Fineness of the mesh, and total width of the thin rings at the rim, in film radii.
-            executor: Executor that runs the solves; None for this process.
-            read: Function that computes the stress fields from each solved press.
-        """
-        resolution, layer = mesh
-        settings = SolveSettings(theory=theory, resolution=resolution, layer=layer)
         template = template_for(probe, resolution, whole=not sensor.film.is_axisymmetric)
-        table = family.unfold(family.solve(sensor, probe, settings, executor, read), template)
-        return cls(sensor, probe, family, theory, resolution, layer, table, np.inf)
+        table = family.unfold(family.solve(sensor, probe, same_mesh, executor, read), template)
+        return cls(sensor, probe, family, settings.theory, resolution, layer, table, np.inf)
 
     @property
     def domain(self) -> Domain:
