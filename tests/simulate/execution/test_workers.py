@@ -17,8 +17,8 @@ import pytest
 from isocharge.common.errors import InputError, WorkersLost
 from isocharge.common.progress import listening
 from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, Theory, load_sensor, run_sweep
+from isocharge.simulate import execution as module
 from isocharge.simulate.execution import dask_workers, in_order, local_workers
-from isocharge.simulate.execution import workers as module
 
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = SolveSettings(theory=Theory(bending=False), resolution=Resolution(4, 8, 4))

@@ -39,10 +39,9 @@ from isocharge.simulate.forward.family import NodeCount, Reading
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared, side_force_unit
 from isocharge.simulate.mechanics.stress import tension_change
-from isocharge.simulate.mesh.conformal_map import distance_coordinate
+from isocharge.simulate.mesh.placement import distance_coordinate
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.solver.equilibrium import Equilibrium
-from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.sensitivity import (
     FILM_FIELDS,
     FILM_IS_ODD,
@@ -337,7 +336,7 @@ def _solve_fields(forward_map: ForwardMap, read: Reading, executor: Executor | N
         forward_map.probe,
         forward_map.domain,
         few_nodes(forward_map.sensor.film, forward_map.domain),
-        SolveSettings(theory=forward_map.theory, resolution=forward_map.resolution, layer=forward_map.layer),
+        replace(forward_map.settings, layer=forward_map.layer),
         read=read,
         executor=executor,
     )

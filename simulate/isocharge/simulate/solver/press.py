@@ -390,6 +390,8 @@ def _first_field(start: Equilibrium | None, template: Template, default: Array) 
     has_same_resolution_except_order = resolution_with_same_order == template.resolution
     if not (has_same_blocks and has_same_resolution_except_order):
         return default
+    if start_template.resolution.order == template.resolution.order:
+        return start.field
 
     # Interpolate to the nodes of the elements with the new order. The weights of the nodes of an element have the shape
     # (n_local, n_start_local). A node of several elements is assigned several times. The field is continuous, so the
