@@ -179,14 +179,12 @@ def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -
         ring_warming_K: Temperature of the ring minus the temperature for which the ring is described, K.
 
     Returns:
-        The copy. If the film has no expansion coefficients, the sensor itself is returned.
+        The copy, which equals the sensor if the film has no expansion coefficients.
 
     Raises:
         SensorError: If the film becomes so slack that it is outside the range of the simulator.
     """
     film = sensor.film
-    if film.expansion is None:
-        return sensor
     change_11, change_22, change_12 = tension_change(film, film_warming_K, ring_warming_K).tolist()
     warm_film = replace(film, pretension=film.pretension + 0.5 * (change_11 + change_22))
     if not film.expands_evenly:  # otherwise only the mean of the pretension changes

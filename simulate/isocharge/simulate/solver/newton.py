@@ -92,18 +92,19 @@ def schwerin_start(template_points: Complexes, template_radius: float, groups: D
     return field
 
 
-def parabolic_start(radius: np.ndarray, groups: DimensionlessGroups) -> Array:
+def parabolic_start(circular_points: Complexes, groups: DimensionlessGroups) -> Array:
     """Compute the first iterate of Newton's method for a film under static pressure without a probe.
 
     The deflection is a paraboloid whose height approximates the deflection under the static pressure.
 
     Args:
-        radius: Distances of the nodes from the centre of the film, shape (n_node,), in film radii.
+        circular_points: Nodes x + iy on the circular film, shape (n_node,), in film radii.
         groups: Dimensionless groups of the film.
 
     Returns:
         Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
     """
+    radius = np.abs(circular_points)
     field = np.zeros((radius.size, 3))
     field[:, 2] = groups.static_height * np.maximum(1.0 - radius**2, 0.0)
     is_on_rim = radius > 1.0 - 1e-9

@@ -197,7 +197,18 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
         raise too_near_the_rim(case, mesh.resolution)
     elastic = _elastic_film(case, mesh.geometry, case.force)
     solver = assembly(mesh.template, elastic.unknowns_per_node)
-    result = _solve_nonlinear(case, elastic, solver, mesh, start)
+
+    # The first iterate is an approximate deflection under the probe and the static pressure, or the field of the
+    # starting equilibrium. If Newton's method fails, the load is applied in steps.
+    circular_points = from_oval(mesh.node_points, mesh.oval)
+    template_points = mesh.placement.to_template(circular_points)
+    default_field = schwerin_start(template_points, float(mesh.placement.template_radius), elastic.groups)
+    default_field += parabolic_start(circular_points, elastic.groups)
+    first_field = _first_field(start, mesh.template, default_field)
+    result = solve_newton(elastic, solver, first_field, case.settings.tolerance)
+    if not result.converged:
+        result = _solve_by_load_steps(case, result, mesh.geometry, solver, default_field)
+
     equilibrium = Equilibrium(
         film=case.film,
         probe=case.probe,
@@ -235,7 +246,7 @@ def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
     mesh = equilibrium.mesh
     elastic = ElasticFilm(mesh.geometry, equilibrium.groups.without_probe)
     solver = assembly(mesh.template, elastic.unknowns_per_node)
-    first_field = _static_start(mesh, elastic.groups)
+    first_field = parabolic_start(from_oval(mesh.node_points, mesh.oval), elastic.groups)
     result = solve_newton(elastic, solver, first_field, tolerance)
 
     # The number of iterations is the sum of both solves.
@@ -246,17 +257,6 @@ def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
         return equilibrium_with_rest
     message = f"under the static pressure without a contact, {result.message}"
     return replace(equilibrium_with_rest, status="failed", message=message)
-
-
-def _static_start(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
-    """Return the first iterate for a film under static pressure, shape (n_node, 3).
-
-    Args:
-        mesh: Mesh of the film.
-        groups: Dimensionless groups of the film.
-    """
-    radius = np.abs(from_oval(mesh.node_points, mesh.oval))
-    return parabolic_start(radius, groups)
 
 
 def _elastic_film(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
@@ -281,37 +281,6 @@ def _elastic_film(case: LoadCase, geometry: Geometry, force: float) -> ElasticFi
         side_force=(force_factor * side_x, force_factor * side_y),
     )
     return ElasticFilm(geometry, groups)
-
-
-def _solve_nonlinear(
-    case: LoadCase, elastic: ElasticFilm, solver: Assembly, mesh: PlacedMesh, start: Equilibrium | None
-) -> NewtonResult:
-    """Solve a press with a nonlinear theory by Newton's method.
-
-    If the starting equilibrium has the same elements, `_first_field` computes the first iterate from the starting
-    field. Without such an equilibrium, the first iterate is an approximate deflection under the probe and the static
-    pressure. If Newton's method fails, the load is applied in steps.
-
-    Args:
-        case: The press and the settings of its solve.
-        elastic: Discrete model of the film.
-        solver: Linear solver for the mesh.
-        mesh: The mesh.
-        start: Equilibrium of a similar press from which the solve starts; None if there is no such equilibrium.
-
-    Returns:
-        The result, which may not have converged.
-    """
-    # Compute the first iterate without a starting equilibrium.
-    template_points = mesh.placement.to_template(from_oval(mesh.node_points, mesh.oval))
-    default_field = schwerin_start(template_points, float(mesh.placement.template_radius), elastic.groups)
-    default_field += _static_start(mesh, elastic.groups)
-
-    first_field = _first_field(start, mesh.template, default_field)
-    result = solve_newton(elastic, solver, first_field, case.settings.tolerance)
-    if result.converged:
-        return result
-    return _solve_by_load_steps(case, result, mesh.geometry, solver, default_field)
 
 
 def _solve_by_load_steps(
