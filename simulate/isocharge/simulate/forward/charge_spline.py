@@ -25,7 +25,7 @@ from isocharge.simulate.forward.charge_map import ChargeMap, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import contact_charges
 from isocharge.simulate.mechanics.scaling import amplitude_squared
-from isocharge.simulate.numerics.disk import onto_disk, sunflower
+from isocharge.simulate.numerics.disk import contacts_at, onto_disk, sunflower
 from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film
 
@@ -281,7 +281,7 @@ def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> A
 
     # Add the charge of the contact pressure.
     for index, one_force in enumerate(force.tolist()):
-        contact = np.column_stack([position, np.full(len(position), one_force)])
+        contact = contacts_at(position, one_force)
         pressure_charge = contact_charges(sensor, forward_map.probe, contact, np.zeros(len(position)))
         scaled_charge[:, index] += pressure_charge / amplitude_squared(sensor.film, one_force)
     return sensor.calibration.read(scaled_charge)

@@ -52,6 +52,7 @@ from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placed_mesh import distance_on_circular_film, film_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import template_for
+from isocharge.simulate.numerics.disk import contacts_at
 from isocharge.simulate.numerics.interpolation import lagrange_values
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
@@ -291,7 +292,7 @@ class ForwardMap:
         # Integrate all fields of the stacked map. All fields have the symmetry of the stress.
         n_force = self.family.force.size
         first_force = self.family.force[0]
-        contact = np.column_stack([position, np.full(len(position), first_force)])
+        contact = contacts_at(position, first_force)
         chunk_size = max(1, CHUNK_SIZE // n_force)  # a press of the stacked map has n_force fields
         charges = self._stacked_forces.field_charges(contact, EVEN_FIELD.repeat(n_force), chunk_size=chunk_size)
 

@@ -30,7 +30,7 @@ from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_cou
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.nearest_contact import explain, starting_contacts
 from isocharge.simulate.measuring_chain import NoiseModel
-from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, onto_disk, sunflower
+from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, contacts_at, onto_disk, sunflower
 
 FOLD_WIDTH = 0.02
 """Distance between two contacts on both sides of a fold, mm.
@@ -93,7 +93,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     def contacts(position: Array) -> Array:
         """Return contacts at positions of shape (..., 2), moved onto the disk of the map, shape (n, 3)."""
         inside = onto_disk(position.reshape(-1, 2), radius)
-        return np.column_stack([inside, np.full(len(inside), force)])
+        return contacts_at(inside, force)
 
     def precision(position: Array) -> Array:
         """Return the inverse of the position error, which is zero at a fold, shape of the positions without (2,)."""
@@ -231,7 +231,7 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     """
     # Choose the first contacts, and compute the distance above which a second contact counts as distant.
     position = INNER_RADIUS * charge_map.domain.radius * sunflower(places)
-    contact = np.column_stack([position, np.full(len(position), force)])
+    contact = contacts_at(position, force)
     charge = charge_map.charges(contact)
     position_std = limits_at(charge_map, contact, noise).position
     min_distance = np.maximum(MIN_DISTANCE, MIN_DISTANCE_SIGMAS * position_std)

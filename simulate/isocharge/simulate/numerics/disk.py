@@ -31,6 +31,11 @@ def onto_disk(position: Array, radius: float) -> Array:
     return np.asarray(position / np.maximum(1.0, relative_distance)[:, None])
 
 
+def contacts_at(position: Array, force: float) -> Array:
+    """Return contacts (x, y, F), shape (n, 3), at positions (x, y), shape (n, 2), which all have the same force F."""
+    return np.column_stack([position, np.full(len(position), force)])
+
+
 @dataclass(frozen=True)
 class Rings:
     """Positions on concentric rings around the origin.
@@ -67,8 +72,7 @@ class Rings:
         Returns:
             Contacts, ordered ring by ring, shape (n_ring * n_angle, 3).
         """
-        flat_position = self.position.reshape(-1, 2)
-        return np.concatenate([flat_position, np.full((len(flat_position), 1), force)], axis=1)
+        return contacts_at(self.position.reshape(-1, 2), force)
 
     def per_ring(self, values: Array) -> Array:
         """Split the first axis of an array into one axis for the rings and one axis for the angles.
