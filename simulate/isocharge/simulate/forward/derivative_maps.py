@@ -40,6 +40,7 @@ from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared, side_force_unit
 from isocharge.simulate.mechanics.stress import tension_change
 from isocharge.simulate.mesh.placement import distance_coordinate
+from isocharge.simulate.numerics.polygon import to_complex, to_corners
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.solver.equilibrium import Equilibrium
 from isocharge.simulate.solver.sensitivity import (
@@ -263,15 +264,14 @@ class SideForceMap:
         check_friction(coefficient)
         contact = self.film.domain.check(contact, "side forces")
         force = contact[:, 2]
-        position = contact[:, 0] + 1j * contact[:, 1]
+        position = to_complex(contact[:, :2])
         rotation = np.zeros(1)  # a circular probe has no orientation
         weights = self.fields.family.weights(position, force, rotation)
 
         # Rotate the holding force, Fx + i Fy, from the frame of the press to the axes x and y.
-        relative_force = (weights @ self.holding) @ np.array([1.0, 1j])  # divided by the force of the press
+        relative_force = to_complex(weights @ self.holding)  # divided by the force of the press
         holding_force = force * relative_force * np.exp(1j * np.angle(position))
-        components = np.stack([holding_force.real, holding_force.imag], axis=1)
-        return limit_to_friction(components, coefficient * force)
+        return limit_to_friction(to_corners(holding_force), coefficient * force)
 
     def friction_charges(self, contact: Array, coefficient: float) -> Array:
         """Compute, to first order, how the friction of a probe on a vertical stage changes the charges.

@@ -54,6 +54,7 @@ from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.numerics.disk import contacts_at
 from isocharge.simulate.numerics.interpolation import lagrange_values
+from isocharge.simulate.numerics.polygon import to_complex
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
@@ -376,7 +377,7 @@ class ForwardMap:
         """
         if self.probe.grows:
             return self._field_charges_of_growing_footprint(contact, is_odd)
-        position = contact[:, 0] + 1j * contact[:, 1]
+        position = to_complex(contact[:, :2])
         if orientation is None:
             orientation = np.zeros(len(contact))
         charges = np.empty((len(contact), len(self.electrodes), is_odd.size))

@@ -18,6 +18,7 @@ from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import ElectrodePieces, PressMeshes
 from isocharge.simulate.mechanics.stress import rotate_stress
+from isocharge.simulate.numerics.polygon import to_complex, to_corners
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
@@ -118,7 +119,7 @@ class PressedFilm:
             fields: Stress fields that `solve_fields` returns, in a domain that contains the presses.
             presses: Positions (x, y) of the presses, shape (n, 2), mm.
         """
-        position = presses @ np.array([1.0, 1j])  # x + iy
+        position = to_complex(presses)
         direction = np.angle(position)
         press_weights = fields.family.weights(position, np.full(len(presses), fields.family.force[0]), np.zeros(1))
         meshes = fields.meshes_under(position, np.zeros(1))
@@ -201,7 +202,7 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
 
     stress, _ = stress_of(solved)
     points = film.radius * (1.0 - 1e-12) * mesh.points.ravel()  # on the film despite rounding errors
-    nodes = np.stack([points.real, points.imag], axis=1)
+    nodes = to_corners(points)
     columns = [stress]
     for column, relative_step in STEPS.items():
         step = relative_step if column in ("ln force", "pretension") else relative_step * radius

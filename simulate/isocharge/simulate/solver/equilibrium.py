@@ -35,6 +35,7 @@ from isocharge.simulate.mechanics.scaling import (
 from isocharge.simulate.mechanics.stress import principal_stresses, rotate_stress, strain
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import gauss_reference_square, modal_matrix, tensor_values
+from isocharge.simulate.numerics.polygon import to_complex, to_corners
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.probe import Probe
 
@@ -324,9 +325,8 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
         raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {film.radius:.4g} mm")
 
     # Rotate the points, x + iy in film radii, into the frame in which the press lies on the positive x axis.
-    complex_points = (points[:, 0] + 1j * points[:, 1]) / film.radius
     press_x, press_y = equilibrium.at
-    return equilibrium.mesh.locate(complex_points * np.exp(-1j * np.arctan2(press_y, press_x)))
+    return equilibrium.mesh.locate(to_complex(points) / film.radius * np.exp(-1j * np.arctan2(press_y, press_x)))
 
 
 SAFETY = 2.0
@@ -502,7 +502,7 @@ def _patch_charges(
     xi, eta, weights = gauss_reference_square(points_per_side)
     half_side = 0.5 * relative_side * film_radius
     complex_points = (centres[:, :, None] + half_side * (xi + 1j * eta)).ravel()
-    points = np.stack([complex_points.real, complex_points.imag], axis=1)
+    points = to_corners(complex_points)
 
     # Stress at the integration points. The stress is set to zero outside the film.
     is_on_film = np.abs(complex_points) < equilibrium.film.rim_distance(np.angle(complex_points))
