@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SolveError
-from isocharge.simulate import Circle, Polygon, Resolution, SolveSettings, Theory, press
+from isocharge.simulate import Circle, Polygon, Resolution, SolveSettings, Theory, deflection, press
 
 FORCES = (1e-5, 0.1, 10.0)
 MEMBRANE = Theory(bending=False)
@@ -32,6 +32,13 @@ def test_newton_converges_from_the_flat_film_for_every_force(film, changes, theo
         solved = press(replace(film, **changes), PROBES[probe], (5.0, 3.0), force, SolveSettings(theory=theory))
         assert solved.residual <= 1e-7 or "round-off" in solved.message
         assert solved.iterations <= 20
+
+
+def test_compressed_plate_buckles_into_a_stable_equilibrium(film):
+    """Newton's steps alone lead to an unstable equilibrium, in which the plate is nearly flat."""
+    plate = replace(film, thickness=0.5, pretension=-1.0)
+    solved = press(plate, Circle(3.0), (0.0, 0.0), 0.01)
+    assert abs(deflection(solved, np.zeros((1, 2)))[0]) > plate.thickness
 
 
 @pytest.mark.parametrize("theory", [MEMBRANE, FULL], ids=["membrane", "full"])

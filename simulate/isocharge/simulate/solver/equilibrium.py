@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
 from isocharge.common.structs import finite_or_none
@@ -483,7 +483,7 @@ def relative_difference(one: Equilibrium, other: Equilibrium, patches_per_ring: 
 
 
 def _patch_charges(
-    equilibrium: Equilibrium, centres: Array, relative_side: float = 1.0 / 15.0, points_per_side: int = 6
+    equilibrium: Equilibrium, centres: Complexes, relative_side: float = 1.0 / 15.0, points_per_side: int = 6
 ) -> Array:
     """Compute the charge per area of each square patch, for a biaxial film and for a uniaxial film.
 
