@@ -72,6 +72,12 @@ def test_compression_near_the_rim_gives_a_warning(film):
         assert (principal_stress(solved)[0] > 0.0) == taut == (not wrinkles)
 
 
+def test_compression_without_a_press_gives_a_warning(film):
+    compressed = replace(film, pretension=-0.1, deviator=(0.03, 0.04))
+    (sentence,) = cautions(press(compressed, Circle(1.0), (0.0, 0.0), 0.5))
+    assert "without a press, the film is compressed to -0.15 MPa" in sentence
+
+
 def test_stress_above_the_yield_stress_of_pvdf_gives_a_warning(film):
     """The largest stress includes the pretension."""
     light, heavy = (press(film, Circle(1.0), (2.0, 0.0), force) for force in (0.01, 5.0))

@@ -37,8 +37,16 @@ def test_newton_converges_from_the_flat_film_for_every_force(film, changes, theo
 def test_compressed_plate_buckles_into_a_stable_equilibrium(film):
     """Newton's steps alone lead to an unstable equilibrium, in which the plate is nearly flat."""
     plate = replace(film, thickness=0.5, pretension=-1.0)
-    solved = press(plate, Circle(3.0), (0.0, 0.0), 0.01)
+    solved = press(plate, Circle(3.0), (0.0, 0.0), 0.01, throw=False)
     assert abs(deflection(solved, np.zeros((1, 2)))[0]) > plate.thickness
+
+
+def test_press_under_which_the_film_bulges_against_the_push_is_refused(film):
+    plate = replace(film, thickness=0.5, pretension=-1.0)
+    with pytest.raises(SolveError, match="bulges against the push"):
+        press(plate, Circle(1.0), (0.0, 0.0), 0.01)
+    pushed = press(plate, Circle(1.0), (0.0, 0.0), 1.0)
+    assert deflection(pushed, np.zeros((1, 2)))[0] > 0.0
 
 
 @pytest.mark.parametrize("theory", [MEMBRANE, FULL], ids=["membrane", "full"])

@@ -534,6 +534,12 @@ def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
         sentences.append(f"the film is stressed to {largest:.3g} MPa; PVDF yields from {DEFAULT_STRESS_LIMIT:g} MPa on")
     if smallest < -WRINKLE_SHARE * largest:
         sentences.append(f"the film is compressed to {smallest:.3g} MPa somewhere; a thin film may wrinkle there")
+    smallest_tension = equilibrium.film.pretension - np.hypot(*equilibrium.film.deviator)
+    if smallest_tension < 0.0:
+        sentences.append(
+            f"without a press, the film is compressed to {smallest_tension:.3g} MPa; if it wrinkles then, the measured "
+            "charges are smaller, because touch charges are computed relative to the flat film"
+        )
     return tuple(sentences)
 
 

@@ -208,6 +208,9 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
     result = solve_newton(elastic, solver, first_field, case.settings.tolerance)
     if not result.converged:
         result = _solve_by_load_steps(case, result, mesh.geometry, solver, default_field)
+    work = mesh.geometry.load @ result.field[:, 2]
+    if work < 0.0 and case.film.static_pressure == 0.0:  # a compressed film can bulge to either side
+        result = replace(result, converged=False, message="the film bulges against the push")
 
     equilibrium = Equilibrium(
         film=case.film,
