@@ -1,4 +1,4 @@
-"""Patterns of points in a disk, and projection of points outside a disk onto its edge."""
+"""Patterns of points in a disk, projection of points onto the edge of a disk, and contacts at given points."""
 
 from dataclasses import dataclass
 
@@ -10,30 +10,11 @@ ROUNDING = 1e-9
 """Relative tolerance for points on the edge of a disk, dimensionless."""
 
 INNER_RADIUS = 1.0 - ROUNDING
-"""Radius of the disk in which contacts are searched for, divided by the radius of the charge map, dimensionless.
+"""Radius of a disk that lies just inside the disk with the radius one, dimensionless.
 
-The value is smaller than one, because rounding errors would otherwise move some contacts out of the disk.
+Contacts are searched for in the smaller disk, because rounding errors would otherwise move some contacts out of the
+domain of a charge map.
 """
-
-
-def onto_disk(position: Array, radius: float) -> Array:
-    """Replace each position outside a disk by the nearest point on the edge of the disk.
-
-    Args:
-        position: Positions (x, y), shape (n, 2), in the unit of the radius.
-        radius: Radius of the disk, whose centre is the origin.
-
-    Returns:
-        Positions within the disk or on its edge, shape (n, 2). Positions that were inside are unchanged.
-    """
-    x, y = position.T
-    relative_distance = np.hypot(x, y) / radius
-    return np.asarray(position / np.maximum(1.0, relative_distance)[:, None])
-
-
-def contacts_at(position: Array, force: float) -> Array:
-    """Return contacts (x, y, F), shape (n, 3), at positions (x, y), shape (n, 2), which all have the same force F."""
-    return np.column_stack([position, np.full(len(position), force)])
 
 
 @dataclass(frozen=True)
@@ -84,6 +65,26 @@ class Rings:
             The same values, shape (n_ring, n_angle, ...).
         """
         return values.reshape(*self.position.shape[:2], *values.shape[1:])
+
+
+def onto_disk(position: Array, radius: float) -> Array:
+    """Replace each position outside a disk by the nearest point on the edge of the disk.
+
+    Args:
+        position: Positions (x, y), shape (n, 2), in the unit of the radius.
+        radius: Radius of the disk, whose centre is the origin.
+
+    Returns:
+        Positions within the disk or on its edge, shape (n, 2). Positions that were inside are unchanged.
+    """
+    x, y = position.T
+    relative_distance = np.hypot(x, y) / radius
+    return np.asarray(position / np.maximum(1.0, relative_distance)[:, None])
+
+
+def contacts_at(position: Array, force: float) -> Array:
+    """Return contacts (x, y, F), shape (n, 3), at positions (x, y), shape (n, 2), which all have the same force F."""
+    return np.column_stack([position, np.full(len(position), force)])
 
 
 def sunflower(count: int) -> Array:

@@ -1,4 +1,8 @@
-"""Mechanical properties and piezoelectric coefficients of the film, with the check of the ranges of quantities."""
+"""Mechanical properties and piezoelectric coefficients of a film, and their accepted ranges.
+
+The table `FILM_NUMBERS` declares the unit and the range of each mechanical property. The function `check_range` raises
+an error if a quantity is outside its range. Probes, electrodes and layouts use it, too.
+"""
 
 import cmath
 import math
@@ -9,42 +13,6 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, SensorError
-
-OTHER_UNITS = {"mm": ("m", 1e3), "um": ("mm", 1e3), "MPa": ("Pa", 1e-6), "GPa": ("MPa", 1e-3)}
-"""For some units, another unit in which a value is easily given by mistake, and the factor that converts the value."""
-
-
-def tidy(value: float) -> float:
-    """Round a number to twelve significant digits, in order to remove the rounding errors of unit conversions."""
-    return float(f"{value:.12g}")
-
-
-def check_range(what: str, value: float, allowed: tuple[float, float], unit: str, error: type[InputError]) -> None:
-    """Raise an error if a quantity is infinite or outside its accepted range.
-
-    If the value was probably given in a unit of `OTHER_UNITS`, the message converts it.
-
-    Args:
-        what: Name of the quantity in the error message.
-        value: Value to be checked. NaN is outside every range.
-        allowed: Smallest and largest accepted value.
-        unit: Unit of the value, such as "mm" or "MPa".
-        error: Class of the error that is raised.
-
-    Raises:
-        InputError: If the value is not accepted. The class of the error is `error`.
-    """
-    low, high = allowed
-    if low <= value <= high and math.isfinite(value):
-        return
-    hint = ""
-    other_unit, factor = OTHER_UNITS.get(unit, ("", math.nan))
-    if low <= factor * value <= high:
-        hint = f"; {value:.6g} {other_unit} are {factor * value:.6g} {unit}"
-    expected = f"at least {low:g}" if high == math.inf else f"{low:g} to {high:g}"
-    space = " " if unit else ""
-    raise error(f"{what}: expected {expected}{space}{unit}, got {value:.6g}{space}{unit}{hint}")
-
 
 Surface = Literal["middle", "top", "bottom"]
 """Surface at which the stress of the film is read. The top is the surface that the probe touches."""
@@ -86,12 +54,6 @@ FILM_NUMBERS = {
     "ring_expansion": FilmNumber("ring_expansion_ppm_per_K", "ppm/K", 1e6, -1e3, 1e3),
 }
 """Unit and accepted range of each attribute of `Film`. The sensor file is read and written according to this table."""
-
-PIEZO_LIMITS = (1e-3, 1e5)
-"""Smallest accepted magnitude of d31, d32 or d33 if it is not zero, and largest magnitude, pC/N or pC/(mm^2 K).
-
-A smaller coefficient was probably given in C/N. The largest is thirty times that of the strongest crystals.
-"""
 
 ALUMINIUM_EXPANSION = 23e-6
 """Thermal expansion coefficient of aluminium, 1/K. Most rings are made of aluminium."""
@@ -208,6 +170,13 @@ class Film:
             )
 
 
+PIEZO_LIMITS = (1e-3, 1e5)
+"""Smallest accepted magnitude of d31, d32 or d33 if it is not zero, and largest magnitude, pC/N or pC/(mm^2 K).
+
+A smaller coefficient was probably given in C/N. The largest is thirty times that of the strongest crystals.
+"""
+
+
 @dataclass(frozen=True)
 class Piezo:
     """Piezoelectric strain coefficients and pyroelectric coefficient of a film.
@@ -249,3 +218,39 @@ class Piezo:
                 )
         if self.d31 == self.d32 == self.d12 == 0.0:
             raise SensorError("piezo d31 and d32 are both 0: such a film gives no charge")
+
+
+OTHER_UNITS = {"mm": ("m", 1e3), "um": ("mm", 1e3), "MPa": ("Pa", 1e-6), "GPa": ("MPa", 1e-3)}
+"""For some units, another unit in which a value is easily given by mistake, and the factor that converts the value."""
+
+
+def tidy(value: float) -> float:
+    """Round a number to twelve significant digits, in order to remove the rounding errors of unit conversions."""
+    return float(f"{value:.12g}")
+
+
+def check_range(what: str, value: float, allowed: tuple[float, float], unit: str, error: type[InputError]) -> None:
+    """Raise an error if a quantity is infinite or outside its accepted range.
+
+    If the value was probably given in a unit of `OTHER_UNITS`, the message converts it.
+
+    Args:
+        what: Name of the quantity in the error message.
+        value: Value to be checked. NaN is outside every range.
+        allowed: Smallest and largest accepted value.
+        unit: Unit of the value, such as "mm" or "MPa".
+        error: Class of the error that is raised.
+
+    Raises:
+        InputError: If the value is not accepted. The class of the error is `error`.
+    """
+    low, high = allowed
+    if low <= value <= high and math.isfinite(value):
+        return
+    hint = ""
+    other_unit, factor = OTHER_UNITS.get(unit, ("", math.nan))
+    if low <= factor * value <= high:
+        hint = f"; {value:.6g} {other_unit} are {factor * value:.6g} {unit}"
+    expected = f"at least {low:g}" if high == math.inf else f"{low:g} to {high:g}"
+    space = " " if unit else ""
+    raise error(f"{what}: expected {expected}{space}{unit}, got {value:.6g}{space}{unit}{hint}")

@@ -23,7 +23,8 @@ straight sides in the core polygon, and of blocks with one curved side between t
 A soft sphere that is pressed against a flat surface touches the surface in a circle of radius a. If F is the force, the
 pressure at the distance r from the centre of this circle is p(r) = p0 sqrt(1 - (r / a)^2), with the maximum
 p0 = 1.5 F / (pi a^2) (Johnson 1985, Contact Mechanics, equation 3.39). The radius a is proportional to the cube root of
-the force (equation 3.40). A fingertip has this pressure.
+the force (equation 3.40). The class `Finger` has this pressure and a constant radius. The radius of a `GrowingFinger`
+grows with the force.
 """
 
 import math
@@ -42,9 +43,6 @@ from isocharge.simulate.numerics.interpolation import gauss_line
 from isocharge.simulate.numerics.polygon import area_in_disk, area_of, centroid_of, is_convex, to_complex, to_corners
 from isocharge.simulate.sensor.film import check_range, tidy
 
-NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
-"""Regular expression of a decimal number in the notation of a probe."""
-
 MIN_LENGTH = 0.02
 """Smallest accepted radius, side, axis or reach of a footprint, mm. A smaller value was probably given in metres."""
 
@@ -53,49 +51,6 @@ CORE_SHARE = 0.45 * math.sqrt(2.0)
 
 OUTLINE_POINTS = 1024
 """Number of points of the outline of a curved footprint, whose area is accurate to 1e-5."""
-
-
-@dataclass(frozen=True)
-class ProbeNotation:
-    """One notation of a probe shape on the command line and in files, such as `rectangle:WIDTHxHEIGHT`.
-
-    Attributes:
-        name: Word before the colon.
-        parameters: Text after the colon. Each word of capital letters stands for a number (mm).
-        build: Function that creates the probe without a rotation from the numbers.
-        pattern: Regular expression of the text after the colon. If it is empty, it is derived from `parameters`.
-    """
-
-    name: str
-    parameters: str
-    build: Callable[..., "Probe"]
-    pattern: str = ""
-
-    @property
-    def form(self) -> str:
-        """Notation with placeholders for the numbers, for help texts and error messages."""
-        return f"{self.name}:{self.parameters}"
-
-    def parse(self, text: str) -> "Probe | None":
-        """Create the probe that a text in this notation describes.
-
-        Args:
-            text: Notation of a probe, such as "rectangle:4.0x2.0@30".
-
-        Returns:
-            The probe; None if the text is in another notation.
-
-        Raises:
-            SceneError: If the text is in this notation, but no such footprint can exist.
-        """
-        # Each word of capital letters in `parameters`, such as "WIDTHxHEIGHT", is replaced by the pattern of a number.
-        pattern = self.pattern or re.sub("[A-Z]+", lambda _: NUMBER, self.parameters)
-        match = re.fullmatch(rf"{self.name}:(?P<parameters>{pattern})(?:@(?P<degrees>{NUMBER}))?", text)
-        if match is None:
-            return None
-        numbers = [float(number) for number in re.findall(NUMBER, match["parameters"])]
-        degrees = float(match["degrees"] or 0.0)
-        return self.build(*numbers).rotated(float(np.deg2rad(degrees)))
 
 
 @dataclass(frozen=True)
@@ -283,39 +238,6 @@ class CurvedProbe(Probe):
         return np.asarray(CORE_SHARE * self.boundary(parameter) / unit)
 
 
-def check_angle(angle: float) -> None:
-    """Raise an error if the rotation of a footprint is not a finite number.
-
-    Args:
-        angle: Rotation, rad.
-
-    Raises:
-        SceneError: If `angle` is infinite or not a number.
-    """
-    if not np.isfinite(angle):
-        raise SceneError(f"probe angle: expected a finite number, got {angle}")
-
-
-def check_length(what: str, length: float) -> None:
-    """Raise an error if a length of a footprint is infinite, or so small that it was probably given in metres.
-
-    Args:
-        what: Name of the length in the error message.
-        length: Radius, side, axis or reach of the footprint, mm.
-
-    Raises:
-        SceneError: If `length` is below `MIN_LENGTH` or infinite.
-    """
-    check_range(what, length, (MIN_LENGTH, np.inf), "mm", SceneError)
-
-
-PEAK_PRESSURE = 1.5
-"""Ratio of the largest pressure to the mean pressure, dimensionless."""
-
-PRESSURE_LEVELS = 48
-"""Number of pressure levels over which the force on an area is integrated."""
-
-
 @dataclass(frozen=True)
 class RoundProbe(CurvedProbe):
     """Base class of probes with a circular footprint.
@@ -379,6 +301,13 @@ class Circle(RoundProbe):
     name = "circle"
 
 
+FINGER_PEAK_PRESSURE = 1.5
+"""Ratio of the largest pressure to the mean pressure under a fingertip, dimensionless."""
+
+FINGER_PRESSURE_LEVELS = 48
+"""Number of pressure levels over which the force on an area is integrated."""
+
+
 @dataclass(frozen=True)
 class Finger(RoundProbe):
     """Probe with a circular footprint. The pressure decreases from a maximum at the centre to zero at the edge.
@@ -401,7 +330,7 @@ class Finger(RoundProbe):
             Relative pressure, of the shape of `points`, dimensionless.
         """
         squared_ratio_to_peak = np.clip(1.0 - np.abs(points) ** 2 / self.radius**2, 0.0, None)
-        return np.asarray(PEAK_PRESSURE * np.sqrt(squared_ratio_to_peak))
+        return np.asarray(FINGER_PEAK_PRESSURE * np.sqrt(squared_ratio_to_peak))
 
     def force_share(self, corners: Array, at: complex) -> float:
         """Return the fraction of the force that acts on a convex polygon of the film, from 0 to 1.
@@ -414,12 +343,12 @@ class Finger(RoundProbe):
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
             at: Position of the centroid of the footprint as x + iy, mm.
         """
-        pressure_fraction, weights = gauss_line(PRESSURE_LEVELS)
+        pressure_fraction, weights = gauss_line(FINGER_PRESSURE_LEVELS)
         disk_radius = self.radius * np.sqrt(1.0 - pressure_fraction**2)
         common_areas = area_in_disk(to_complex(corners), at, disk_radius)  # A(t), mm^2
 
-        # For a force of 1, the mean pressure is 1 / area, and the peak pressure is `PEAK_PRESSURE` times as large.
-        return float(PEAK_PRESSURE / self.area * (weights @ common_areas))
+        # For a force of 1, the mean pressure is 1 / area. The peak pressure is `FINGER_PEAK_PRESSURE` times as large.
+        return float(FINGER_PEAK_PRESSURE / self.area * (weights @ common_areas))
 
 
 @dataclass(frozen=True)
@@ -623,12 +552,83 @@ class Polygon(Probe):
         return np.asarray(np.interp(parameter, corner_parameter, corners, period=2.0 * np.pi))
 
 
+def check_angle(angle: float) -> None:
+    """Raise an error if the rotation of a footprint is not a finite number.
+
+    Args:
+        angle: Rotation, rad.
+
+    Raises:
+        SceneError: If `angle` is infinite or not a number.
+    """
+    if not np.isfinite(angle):
+        raise SceneError(f"probe angle: expected a finite number, got {angle}")
+
+
+def check_length(what: str, length: float) -> None:
+    """Raise an error if a length of a footprint is infinite, or so small that it was probably given in metres.
+
+    Args:
+        what: Name of the length in the error message.
+        length: Radius, side, axis or reach of the footprint, mm.
+
+    Raises:
+        SceneError: If `length` is below `MIN_LENGTH` or infinite.
+    """
+    check_range(what, length, (MIN_LENGTH, np.inf), "mm", SceneError)
+
+
 def _as_tuples(corners: Array) -> tuple[tuple[float, float], ...]:
     """Convert corners (x, y) of shape (n, 2) into nested tuples, which can be compared and hashed."""
     return tuple((float(x), float(y)) for x, y in corners)
 
 
-__all__ = ["PROBE_HELP", "Circle", "Ellipse", "Finger", "GrowingFinger", "Polygon", "Probe", "parse_probe"]
+NUMBER_PATTERN = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+"""Regular expression of a decimal number in the notation of a probe."""
+
+
+@dataclass(frozen=True)
+class ProbeNotation:
+    """One notation of a probe shape on the command line and in files, such as `rectangle:WIDTHxHEIGHT`.
+
+    Attributes:
+        name: Word before the colon.
+        parameters: Text after the colon. Each word of capital letters stands for a number (mm).
+        build: Function that creates the probe without a rotation from the numbers.
+        pattern: Regular expression of the text after the colon. If it is empty, it is derived from `parameters`.
+    """
+
+    name: str
+    parameters: str
+    build: Callable[..., "Probe"]
+    pattern: str = ""
+
+    @property
+    def form(self) -> str:
+        """Notation with placeholders for the numbers, for help texts and error messages."""
+        return f"{self.name}:{self.parameters}"
+
+    def parse(self, text: str) -> "Probe | None":
+        """Create the probe that a text in this notation describes.
+
+        Args:
+            text: Notation of a probe, such as "rectangle:4.0x2.0@30".
+
+        Returns:
+            The probe; None if the text is in another notation.
+
+        Raises:
+            SceneError: If the text is in this notation, but no such footprint can exist.
+        """
+        # Each word of capital letters in `parameters`, such as "WIDTHxHEIGHT", is replaced by the pattern of a number.
+        pattern = self.pattern or re.sub("[A-Z]+", lambda _: NUMBER_PATTERN, self.parameters)
+        match = re.fullmatch(rf"{self.name}:(?P<parameters>{pattern})(?:@(?P<degrees>{NUMBER_PATTERN}))?", text)
+        if match is None:
+            return None
+        numbers = [float(number) for number in re.findall(NUMBER_PATTERN, match["parameters"])]
+        degrees = float(match["degrees"] or 0.0)
+        return self.build(*numbers).rotated(float(np.deg2rad(degrees)))
+
 
 PROBE_SHAPES = (
     ProbeNotation("circle", "RADIUS", Circle),
@@ -638,7 +638,7 @@ PROBE_SHAPES = (
         "polygon",
         "X,Y;X,Y;X,Y",
         lambda *coordinates: Polygon.of(np.reshape(coordinates, (-1, 2))),
-        pattern=rf"{NUMBER},{NUMBER}(?:;{NUMBER},{NUMBER})+",
+        pattern=rf"{NUMBER_PATTERN},{NUMBER_PATTERN}(?:;{NUMBER_PATTERN},{NUMBER_PATTERN})+",
     ),
     ProbeNotation("ellipse", "WIDTHxHEIGHT", Ellipse),
     ProbeNotation("finger", "RADIUS", Finger),
@@ -663,7 +663,7 @@ def parse_probe(text: str) -> Probe:
     """Create the probe that a notation describes.
 
     Args:
-        text: Notation such as "rectangle:4.0x2.0@30"; see the docstring of this module.
+        text: Notation such as "rectangle:4.0x2.0@30"; see the docstring of the module.
 
     Raises:
         SceneError: If the text is not the notation of a probe, or no such footprint can exist.
