@@ -5,7 +5,8 @@ The potential energy of the film is
     Pi = stretching energy + bending energy + pressure energy - load * mean(W) - dot(side load, mean(U1, U2)).
 
 The two means are taken over the footprint of the probe and weighted with the pressure of the probe. The class
-`BackPressure` computes the pressure energy, which is the energy of a static pressure and of trapped air.
+`ElasticFilm` computes the potential energy. It adds the energies that the classes `Membrane`, `Bending` and
+`BackPressure` compute. The pressure energy is the energy of a static pressure and of trapped air.
 
 The energy is a function of the scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3). Lengths are in units
 of the film radius a. The displacements w and u, and the Green-Lagrange strain E, are
@@ -31,100 +32,6 @@ from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_stress
 from isocharge.simulate.mechanics.stress import strain
 from isocharge.simulate.mesh.placed_mesh import Geometry
-
-
-class BackPressure:
-    """Energy of the static pressure and of the trapped air for a given mesh and given dimensionless groups.
-
-    Let V0 be the volume of the closed cavity behind the film, and let p0 be the pressure of the atmosphere. If the film
-    displaces the volume V at constant temperature, the pressure of the trapped air rises by p0 V0 / (V0 - V) - p0
-    (Boyle's law). The energy of the trapped air is -p0 V0 (ln(1 - V / V0) + V / V0).
-
-    As in the theory of plates, the static pressure and the pressure of the air act perpendicular to the undeformed
-    film, and on its undeformed area. In the units of `mechanics.scaling`, the ratio V / V0 is the integral of the
-    deflection W over the film, multiplied by the dimensionless group `compression`.
-
-    Attributes:
-        geometry: Elements of the mesh.
-        groups: Dimensionless groups of the press.
-    """
-
-    def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
-        self.geometry = geometry
-        self.groups = groups
-        # The nodal loads add up to one divided by the number of copies of the mesh that cover the whole film.
-        self._copies = 1.0 / float(geometry.load.sum())
-
-    @cached_property
-    def weights(self) -> Array:
-        """Weights with which nodal deflections are integrated over the meshed part of the film, shape (n_node,)."""
-        return self.geometry.gather(self.geometry.mass)
-
-    def energy(self, deflection: Array) -> float:
-        """Compute the energy of the static pressure and of the trapped air for the meshed part of the film.
-
-        The energy of the whole film is the energy of the trapped air minus the work of the static pressure. The energy
-        of the meshed part is the energy of the whole film divided by the number of copies of the mesh that cover the
-        film.
-
-        Args:
-            deflection: Scaled deflection W at the nodes, shape (n_node,).
-
-        Returns:
-            Energy, dimensionless. It is infinite if the film displaces the whole volume of the air.
-        """
-        volume = self._volume(deflection)
-        energy = -self.groups.static_pressure * volume
-        if self.groups.compression != 0.0:
-            displaced_share = self.groups.compression * volume
-            if displaced_share >= 1.0:
-                return np.inf
-            # The energy of the air is divided by p0 V0. In scaled units, the volume V0 of the air is 1 / compression.
-            energy_unit = self.groups.ambient_pressure / self.groups.compression
-            energy += energy_unit * (-np.log1p(-displaced_share) - displaced_share)
-        return float(energy / self._copies)
-
-    def forces(self, deflection: Array) -> Array:
-        """Compute the derivatives of the energy with respect to the deflection of each node.
-
-        Args:
-            deflection: Scaled deflection W at the nodes, shape (n_node,).
-
-        Returns:
-            Derivatives, shape (n_node,). They are infinite if the film displaces the whole volume of the air.
-        """
-        # At constant temperature, the pressure p0 of the air increases by p0 x / (1 - x), where x = V / V0 is the
-        # displaced share of the volume of the air.
-        displaced_share = self.groups.compression * self._volume(deflection)
-        if displaced_share >= 1.0:
-            return np.full_like(deflection, np.inf)
-        air_pressure = self.groups.ambient_pressure * displaced_share / (1.0 - displaced_share)
-        pressure = air_pressure - self.groups.static_pressure
-        return pressure * self.weights
-
-    def stiffness(self, deflection: Array) -> float:
-        """Compute the factor c in the second derivatives c * weights[i] * weights[j] of the energy.
-
-        Args:
-            deflection: Scaled deflection W at the nodes, shape (n_node,).
-        """
-        displaced_share = self.groups.compression * self._volume(deflection)
-        pressure_per_volume = self.groups.ambient_pressure * self.groups.compression / (1.0 - displaced_share) ** 2
-        return float(self._copies * pressure_per_volume)
-
-    def _volume(self, deflection: Array) -> float:
-        """Compute the integral of the scaled deflection W over the whole film."""
-        return self._copies * float(self.weights @ deflection)
-
-
-EQUAL_TENSION = np.array([1.0, 1.0, 0.0])
-"""Stress (T11, T22, T12) of a tension of one in all directions."""
-
-SHIFT = 5.0
-"""Shift s of the linear solves with bending; see `Bending`.
-
-The shift must lie between 0 and 11.56, which is twice the lowest eigenvalue of the film.
-"""
 
 
 class ElasticFilm:
@@ -233,6 +140,10 @@ class ElasticFilm:
         if self.bending is None:
             return tangent
         return self.bending.extend(tangent)
+
+
+EQUAL_TENSION = np.array([1.0, 1.0, 0.0])
+"""Stress (T11, T22, T12) of a tension of one in all directions."""
 
 
 class Membrane:
@@ -411,6 +322,13 @@ class Membrane:
         return stiffness.reshape(n_element, n_point, 2, 3, 2, 3)
 
 
+BENDING_SHIFT = 5.0
+"""Shift s of the linear solves with bending; see `Bending`.
+
+The shift must lie between 0 and 11.56, which is twice the lowest eigenvalue of the film.
+"""
+
+
 class Bending:
     """Bending energy of a clamped film.
 
@@ -508,8 +426,8 @@ class Bending:
             [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0],
 
         where r is the right-hand side for W, beta is the bending stiffness, L is the matrix of the weak Laplacian, and
-        M is the diagonal mass matrix. The solution W does not depend on the constant s, which is `SHIFT`. With this
-        constant, the matrix can be factorised without pivoting.
+        M is the diagonal mass matrix. The solution W does not depend on the constant s, which is `BENDING_SHIFT`. With
+        this constant, the matrix can be factorised without pivoting.
 
         Args:
             tangent: Matrices for (U1, U2, W), shape (n_element, n_local, 3, n_local, 3).
@@ -519,18 +437,102 @@ class Bending:
         """
         n_element, n_local = self.geometry.nodes.shape
         mass = np.eye(n_local) * self.geometry.mass[:, None]  # M of each element, shape (n_element, n_local, n_local)
-        coupling = np.sqrt(self.stiffness) * (self._laplace - SHIFT * mass)  # symmetric
+        coupling = np.sqrt(self.stiffness) * (self._laplace - BENDING_SHIFT * mass)  # symmetric
 
         # The indices of the unknowns of a node are 0 for U1, 1 for U2, 2 for W and 3 for mu. The array is created with
         # the unknown before the node and then transposed, so that the values of one unknown at all nodes of an element
         # lie side by side in memory.
         matrix = np.zeros((n_element, 4, n_local, 4, n_local)).transpose(0, 2, 1, 4, 3)
         matrix[:, :, :3, :, :3] = tangent
-        matrix[:, :, 2, :, 2] += self.stiffness * (2.0 * SHIFT * self._laplace - SHIFT**2 * mass)
+        matrix[:, :, 2, :, 2] += self.stiffness * (2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * mass)
         matrix[:, :, 2, :, 3] = coupling
         matrix[:, :, 3, :, 2] = coupling
         matrix[:, :, 3, :, 3] = -mass
         return matrix
+
+
+class BackPressure:
+    """Energy of the static pressure and of the trapped air for a given mesh and given dimensionless groups.
+
+    Let V0 be the volume of the closed cavity behind the film, and let p0 be the pressure of the atmosphere. If the film
+    displaces the volume V at constant temperature, the pressure of the trapped air rises by p0 V0 / (V0 - V) - p0
+    (Boyle's law). The energy of the trapped air is -p0 V0 (ln(1 - V / V0) + V / V0).
+
+    As in the theory of plates, the static pressure and the pressure of the air act perpendicular to the undeformed
+    film, and on its undeformed area. In the units of `mechanics.scaling`, the ratio V / V0 is the integral of the
+    deflection W over the film, multiplied by the dimensionless group `compression`.
+
+    Attributes:
+        geometry: Elements of the mesh.
+        groups: Dimensionless groups of the press.
+    """
+
+    def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
+        self.geometry = geometry
+        self.groups = groups
+        # The nodal loads add up to one divided by the number of copies of the mesh that cover the whole film.
+        self._copies = 1.0 / float(geometry.load.sum())
+
+    @cached_property
+    def weights(self) -> Array:
+        """Weights with which nodal deflections are integrated over the meshed part of the film, shape (n_node,)."""
+        return self.geometry.gather(self.geometry.mass)
+
+    def energy(self, deflection: Array) -> float:
+        """Compute the energy of the static pressure and of the trapped air for the meshed part of the film.
+
+        The energy of the whole film is the energy of the trapped air minus the work of the static pressure. The energy
+        of the meshed part is the energy of the whole film divided by the number of copies of the mesh that cover the
+        film.
+
+        Args:
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+
+        Returns:
+            Energy, dimensionless. It is infinite if the film displaces the whole volume of the air.
+        """
+        volume = self._volume(deflection)
+        energy = -self.groups.static_pressure * volume
+        if self.groups.compression != 0.0:
+            displaced_share = self.groups.compression * volume
+            if displaced_share >= 1.0:
+                return np.inf
+            # The energy of the air is divided by p0 V0. In scaled units, the volume V0 of the air is 1 / compression.
+            energy_unit = self.groups.ambient_pressure / self.groups.compression
+            energy += energy_unit * (-np.log1p(-displaced_share) - displaced_share)
+        return float(energy / self._copies)
+
+    def forces(self, deflection: Array) -> Array:
+        """Compute the derivatives of the energy with respect to the deflection of each node.
+
+        Args:
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+
+        Returns:
+            Derivatives, shape (n_node,). They are infinite if the film displaces the whole volume of the air.
+        """
+        # At constant temperature, the pressure p0 of the air increases by p0 x / (1 - x), where x = V / V0 is the
+        # displaced share of the volume of the air.
+        displaced_share = self.groups.compression * self._volume(deflection)
+        if displaced_share >= 1.0:
+            return np.full_like(deflection, np.inf)
+        air_pressure = self.groups.ambient_pressure * displaced_share / (1.0 - displaced_share)
+        pressure = air_pressure - self.groups.static_pressure
+        return pressure * self.weights
+
+    def stiffness(self, deflection: Array) -> float:
+        """Compute the factor c in the second derivatives c * weights[i] * weights[j] of the energy.
+
+        Args:
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+        """
+        displaced_share = self.groups.compression * self._volume(deflection)
+        pressure_per_volume = self.groups.ambient_pressure * self.groups.compression / (1.0 - displaced_share) ** 2
+        return float(self._copies * pressure_per_volume)
+
+    def _volume(self, deflection: Array) -> float:
+        """Compute the integral of the scaled deflection W over the whole film."""
+        return self._copies * float(self.weights @ deflection)
 
 
 def _symmetric_matrix(stress: Array) -> Array:

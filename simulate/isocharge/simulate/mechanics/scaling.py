@@ -17,6 +17,9 @@ bending, can be omitted. Bending is important near the rim and near the probe, a
 film. The effect of bending reaches as far as the bending length sqrt(D / N), where D is the bending stiffness and N is
 the tension force per length. If the pretension and the induced tension are small, the bending stiffness carries the
 load.
+
+The scales of a press also show where a theory is valid. The bending length determines the error of a theory without
+bending, and the amplitude determines whether the strains are small enough for Saint-Venant-Kirchhoff elasticity.
 """
 
 from dataclasses import dataclass, replace
@@ -50,6 +53,26 @@ PLATE_STIFFNESS = 16.0 * np.pi
 
 The unit is the bending stiffness of the plate divided by a^2, where a is the radius of the plate.
 """
+
+
+@dataclass(frozen=True)
+class Theory:
+    """Terms that a theory of the film includes.
+
+    Attributes:
+        bending: Whether the film resists bending.
+    """
+
+    bending: bool
+
+    @property
+    def name(self) -> str:
+        """Name of the theory in engineering terms."""
+        return "nonlinear membrane + bending" if self.bending else "nonlinear membrane"
+
+
+WITH_BENDING = Theory(bending=True)
+"""Theory with all terms, which is the default."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,26 +327,6 @@ MAX_MEMBRANE_BENDING_LENGTH = 0.3
 
 INDUCED_STRAIN = 0.44
 """Radial strain at the rim of a membrane without pretension, in units of the squared amplitude A^2."""
-
-
-@dataclass(frozen=True)
-class Theory:
-    """Terms that a theory of the film includes.
-
-    Attributes:
-        bending: Whether the film resists bending.
-    """
-
-    bending: bool
-
-    @property
-    def name(self) -> str:
-        """Name of the theory in engineering terms."""
-        return "nonlinear membrane + bending" if self.bending else "nonlinear membrane"
-
-
-WITH_BENDING = Theory(bending=True)
-"""Theory with all terms, which is the default."""
 
 
 def bending_length(film: Film, force: float) -> float:

@@ -17,8 +17,10 @@ of the mesh.
 Inside the innermost circle, the points of an element are interpolated linearly between the inner and the outer side of
 the element. The sides of the elements lie on the core polygon, on the boundary of the footprint and on the innermost
 circle. The edges of a polygonal footprint remain straight, so the load is integrated exactly over the footprint. The
-values of fields at the nodes are smooth functions of the position of the probe. The module `point_location` finds the
-element that contains a film point.
+values of fields at the nodes are smooth functions of the position of the probe.
+
+The class `Placement` combines these steps for one or several presses. The module `point_location` finds the element
+that contains a film point.
 """
 
 from collections.abc import Callable
@@ -72,7 +74,7 @@ def distance_coordinate(distance: Array | float) -> Any:
 
     If a press is near the clamp, the fields change strongly within the short distance between the press and the clamp.
     The coordinate stretches this short distance. Polynomials in the coordinate therefore interpolate the fields
-    accurately. The conformal map of the module `placement` is a translation along this coordinate.
+    accurately. The conformal map of the mesh is a translation along this coordinate.
 
     Args:
         distance: Distances of presses from the centre of the film, in film radii.

@@ -1,4 +1,4 @@
-"""Equilibrium of the film under a press, its deflection and stress, and estimates of the errors of its charges.
+"""Equilibrium of the film under a press, its deflection and stress, estimates of its error, and warnings.
 
 Before a press is solved, the press and the film are rotated such that the press lies on the positive x axis. The
 functions that evaluate an equilibrium rotate their results back into the axes of the film. If the film is axisymmetric,
@@ -8,12 +8,12 @@ electrode layouts and all piezoelectric coefficients.
 In the inner part of the film, two quantities indicate the error that the mesh causes: the shapes of the elements, and
 the contribution of the highest polynomial modes to the slopes of the deflection. The estimate is not reliable for
 presses near the rim or for large footprints that are not circular. Under such presses, elements that are too coarse may
-lie far from the elements with the largest stress. The same holds for a pressure on the whole film, which bends also the
-large elements far from the probe. These presses are therefore solved on meshes of increasing polynomial order, until
-two successive meshes result in nearly the same charges. Presses are also solved on several meshes if the required
-accuracy is better than the default accuracy. If the polynomial order of the elements increases by one, the
-error decreases by a factor of three to ten. The difference between the charges of two successive meshes is therefore an
-upper bound of the error on the finer mesh.
+lie far from the elements with the largest stress. The same holds for a pressure on the whole film, which also bends the
+large elements far from the probe. The module `press` therefore solves these presses on meshes of increasing polynomial
+order, until two successive meshes result in nearly the same charges. The module also does so if the required accuracy
+is better than the default accuracy. If the polynomial order of the elements increases by one, the error decreases by a
+factor of three to ten. The difference between the charges of two successive meshes is therefore an upper bound of the
+error on the finer mesh.
 """
 
 from dataclasses import dataclass
@@ -329,13 +329,13 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
     return equilibrium.mesh.locate(to_complex(points) / film.radius * np.exp(-1j * np.arctan2(press_y, press_x)))
 
 
-SAFETY = 2.0
+MESH_ERROR_SAFETY = 2.0
 """Safety factor of the error that is predicted from the elements and their modes, dimensionless.
 
 The factor is too small for presses at distances above 0.6 film radii.
 """
 
-MIN_ERROR = 5e-5
+MIN_MESH_ERROR = 5e-5
 """Smallest relative error of a charge that is reported.
 
 The thin rings and the integration over the electrodes cause an error of this order.
@@ -343,16 +343,6 @@ The thin rings and the integration over the electrodes cause an error of this or
 
 MODE_SHARE_WEIGHT = 0.1
 """Ratio of the relative error of a charge to the share of the highest modes in the slopes, dimensionless."""
-
-PATCH_RINGS = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8)
-"""Radii of the rings on which square patches are placed to compare the charges of two meshes, in film radii."""
-
-WRINKLE_SHARE = 1e-3
-"""Ratio of the compression to the largest stress above which a warning is given, dimensionless."""
-
-
-GROUPS = ("squared_amplitude", "load", "tension", "bending", "poisson")
-"""Attributes of `DimensionlessGroups` that the JSON output contains."""
 
 
 def shape_error(mesh: PlacedMesh) -> float:
@@ -423,14 +413,14 @@ def mesh_error(equilibrium: Equilibrium) -> float:
         equilibrium: The solved press.
 
     Returns:
-        Relative error, which is at least `MIN_ERROR`.
+        Relative error, which is at least `MIN_MESH_ERROR`.
     """
     if equilibrium.proven_error is not None:
-        return max(MIN_ERROR, equilibrium.proven_error)
+        return max(MIN_MESH_ERROR, equilibrium.proven_error)
     mesh = equilibrium.mesh
     slope_of_deflection = node_slopes(equilibrium)[..., 2]
     mode_error = MODE_SHARE_WEIGHT * highest_mode_share(mesh, slope_of_deflection)
-    return max(MIN_ERROR, SAFETY * shape_error(mesh), SAFETY * mode_error)
+    return max(MIN_MESH_ERROR, MESH_ERROR_SAFETY * shape_error(mesh), MESH_ERROR_SAFETY * mode_error)
 
 
 def estimated_error(equilibrium: Equilibrium) -> float:
@@ -444,6 +434,10 @@ def estimated_error(equilibrium: Equilibrium) -> float:
     """
     bending_error = modelling_error(equilibrium.film, equilibrium.probe, equilibrium.force, equilibrium.theory)
     return mesh_error(equilibrium) + bending_error
+
+
+PATCH_RING_RADII = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8)
+"""Radii of the rings on which square patches are placed to compare the charges of two meshes, in film radii."""
 
 
 def relative_difference(one: Equilibrium, other: Equilibrium, patches_per_ring: int = 12) -> float:
@@ -465,7 +459,7 @@ def relative_difference(one: Equilibrium, other: Equilibrium, patches_per_ring: 
     # Centres x + iy of the patches, shape (n_ring, patches_per_ring), mm
     film_radius = one.film.radius
     unit_circle = np.exp(2j * np.pi * np.arange(patches_per_ring) / patches_per_ring)
-    rings_around_centre = film_radius * np.array(PATCH_RINGS)[:, None] * unit_circle
+    rings_around_centre = film_radius * np.array(PATCH_RING_RADII)[:, None] * unit_circle
     ring_around_footprint = complex(*one.at) + one.probe.reach * unit_circle
     patch_centres = np.concatenate([rings_around_centre, ring_around_footprint[None]])
 
@@ -519,6 +513,10 @@ def _patch_charges(
     return np.asarray(mean_stress[..., :2] @ coefficients)
 
 
+WRINKLE_SHARE = 1e-3
+"""Ratio of the compression to the largest stress above which a warning is given, dimensionless."""
+
+
 def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
     """Return warnings about effects in a real film that the theory does not model.
 
@@ -543,6 +541,10 @@ def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
     return tuple(sentences)
 
 
+REPORTED_GROUPS = ("squared_amplitude", "load", "tension", "bending", "poisson")
+"""Attributes of `DimensionlessGroups` that the JSON output contains."""
+
+
 def summary(equilibrium: Equilibrium) -> dict[str, Any]:
     """Return the results of a solved press as a dictionary for JSON output.
 
@@ -562,7 +564,7 @@ def summary(equilibrium: Equilibrium) -> dict[str, Any]:
         "seconds": equilibrium.seconds,
         "estimated_error": finite_or_none(estimated_error(equilibrium)),
         "groups": {
-            **{name: getattr(equilibrium.groups, name) for name in GROUPS},
+            **{name: getattr(equilibrium.groups, name) for name in REPORTED_GROUPS},
             "bending_length": bending_length(equilibrium.film, equilibrium.force),
         },
         "warnings": list(cautions(equilibrium)),

@@ -3,12 +3,13 @@
 The solver chooses the mesh, and solves the press with the selected theory. If the solve with the full load fails, the
 load is applied in steps.
 
-The largest principal stress occurs under the probe, at the surface of the film. For presses within 0.7 film radii of
-the centre, the largest stress hardly depends on the position of the press. The largest stress is therefore computed for
-a press at the centre. For presses closer to the rim, the largest stress increases. At 0.8 film radii, the largest
-stress is 1.4 times the stress at the centre. At 0.93 film radii, the largest stress is 3.7 times the stress at the
-centre. In a membrane, the stress is proportional to F^(2/3), where F is the force. Under a small probe, the stress
-increases slightly more slowly with the force.
+The functions at the end of the module compare the stress of solved presses with a limit, such as the yield stress. The
+largest principal stress occurs under the probe, at the surface of the film. For presses within 0.7 film radii of the
+centre, the largest stress hardly depends on the position of the press. The largest stress is therefore computed for a
+press at the centre. For presses closer to the rim, the largest stress increases. At 0.8 film radii, the largest stress
+is 1.4 times the stress at the centre. At 0.93 film radii, the largest stress is 3.7 times the stress at the centre. In
+a membrane, the stress is proportional to F^(2/3), where F is the force. Under a small probe, the stress increases
+slightly more slowly with the force.
 """
 
 from collections.abc import Sequence
