@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import Circle, Ellipse, Film, Polygon, load_sensor
-from isocharge.simulate.forward.family import HARMONICS, Turns
+from isocharge.simulate.forward.family import DEFAULT_HARMONICS, Turns
 
 EVEN = load_sensor("three-25um-biaxial").film
 UNEVEN = replace(EVEN, pretension=1.0, deviator=(0.3, 0.1))
@@ -17,7 +17,7 @@ IRREGULAR = Polygon.of(np.array([(0.0, 0.0), (3.0, 0.0), (1.0, 2.0)]))
 @pytest.mark.parametrize(
     "probe", [Circle(1.0), IRREGULAR, Ellipse(4.0, 2.0), Polygon.triangle(4.0), Polygon.rectangle(3.0, 3.0)]
 )
-@pytest.mark.parametrize("largest", [HARMONICS, (7, 5, 3, 2, 1)])
+@pytest.mark.parametrize("largest", [DEFAULT_HARMONICS, (7, 5, 3, 2, 1)])
 def test_fourier_series_is_interpolated_exactly(film: Film, probe, largest):
     """The expected values are those of the series itself, with the terms of which the docstring speaks."""
     turns = Turns.spread(film, probe, largest)
@@ -42,4 +42,4 @@ def test_fourier_series_is_interpolated_exactly(film: Film, probe, largest):
 )
 def test_fewer_turns_are_solved_than_all_pairs_of_angles(probe, solves, all_pairs):
     """All pairs are seven directions times the rotations, of which the symmetry of the probe saves some."""
-    assert len(Turns.spread(UNEVEN, probe, HARMONICS).solved) == solves <= all_pairs
+    assert len(Turns.spread(UNEVEN, probe, DEFAULT_HARMONICS).solved) == solves <= all_pairs

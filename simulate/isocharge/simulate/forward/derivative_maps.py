@@ -5,10 +5,12 @@ A change of a property of the film, such as its pretension or an oval clamp, cha
 
     dQ = jacobian @ (Fx, Fy).
 
-The changes of the stress are computed from the factorised tangent of the equilibrium (see `solver.sensitivity`), at a
-few distances and forces. Between the solved presses, they are interpolated as in a forward map. They need fewer solved
-presses than the stress itself, because they are used for small corrections. If the side force is at most 0.2 times the
-force of the press, the terms of second order are smaller than 1 % of dQ.
+The class `FilmSlopes` computes the derivatives with respect to the film, and the class `SideForceMap` those with
+respect to the side force. Both classes compute changes of the stress from the factorised tangent of the equilibrium
+(see `solver.sensitivity`), at a few distances and forces. Between the solved presses, these changes are interpolated as
+in a forward map. The changes need fewer solved presses than the stress itself, because they are used for small
+corrections. If the side force is at most 0.2 times the force of the press, the terms of second order are smaller than
+1 % of dQ.
 
 Each property with two axes, like an ellipse, has two components. Let alpha be the angle from the x axis to axis 1 of
 the property. The components are the size of the property times cos(2 alpha) and sin(2 alpha). A side force has two
@@ -54,18 +56,18 @@ from isocharge.simulate.solver.sensitivity import (
     stress_changes,
 )
 
-TENSION = ("pretension", "tension_difference", "tension_shear")
-"""Mean pretension, half of T11 - T22, and T12, MPa."""
+TENSION_NAMES = ("pretension", "tension_difference", "tension_shear")
+"""Names of the mean pretension, of half of T11 - T22, and of T12, whose unit is MPa."""
 
-STIFFNESS = ("stiffness_x", "stiffness_xy")
-"""Components of ln(E1 / E2), dimensionless."""
+STIFFNESS_NAMES = ("stiffness_x", "stiffness_xy")
+"""Names of the components of ln(E1 / E2), which are dimensionless."""
 
-OVAL = ("oval_x", "oval_xy")
-"""Components of the parameter e of an oval clamp, dimensionless."""
+OVAL_NAMES = ("oval_x", "oval_xy")
+"""Names of the components of the parameter e of an oval clamp, which are dimensionless."""
 
 
 def few_nodes(film: Film, domain: Domain) -> NodeCount:
-    """Return the numbers of distances and forces at which derivatives and approximate charges are solved.
+    """Return the numbers of distances and forces that suffice for derivatives and for approximate charges.
 
     The errors are a few thousandths of the largest value. They depend mainly on the number of forces. Only for presses
     near the clamp, where the distance coordinate is large, more distances are needed.
@@ -108,7 +110,9 @@ class FilmSlopes:
         return cls(forward_map, _solve_fields(forward_map, partial(stress_changes, fields=FILM_FIELDS), executor))
 
     def jacobian(self, contact: Array) -> dict[str, Array]:
-        """Compute the derivatives of the charges with respect to the properties in `TENSION`, `STIFFNESS` and `OVAL`.
+        """Compute the derivatives of the charges with respect to the properties of the film.
+
+        The names of the properties are `TENSION_NAMES`, `STIFFNESS_NAMES` and `OVAL_NAMES`.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
@@ -127,11 +131,11 @@ class FilmSlopes:
         mean_tension, even_tension, odd_tension, *other_fields = np.moveaxis(field_charge, 1, 0)
         tension_unit = (film.young * amplitude_squared(film, contact[:, 2]) + film.pretension)[:, None]
 
-        derivatives = {TENSION[0]: mean_tension / tension_unit}
+        derivatives = {TENSION_NAMES[0]: mean_tension / tension_unit}
         even_and_odd = {
-            TENSION[1:]: (even_tension / tension_unit, odd_tension / tension_unit),
-            STIFFNESS: tuple(other_fields[:2]),
-            OVAL: tuple(other_fields[2:]),
+            TENSION_NAMES[1:]: (even_tension / tension_unit, odd_tension / tension_unit),
+            STIFFNESS_NAMES: tuple(other_fields[:2]),
+            OVAL_NAMES: tuple(other_fields[2:]),
         }
         # The axes of an even field are along and across the direction of the press, at the angle t from the x axis.
         # The axes of an odd field are rotated by 45 degrees from them. Rotate both to the axes x and y.
@@ -152,7 +156,7 @@ class FilmSlopes:
         Raises:
             SceneError: If a press lies outside the domain.
         """
-        mean, difference, shear = (self.jacobian(contact)[name] for name in TENSION)
+        mean, difference, shear = (self.jacobian(contact)[name] for name in TENSION_NAMES)
         # T11 and T22 contribute to the mean pretension and to half of their difference.
         return np.stack([0.5 * (mean + difference), 0.5 * (mean - difference), shear], axis=2)
 

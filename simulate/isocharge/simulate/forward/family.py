@@ -4,7 +4,7 @@ The solved presses are the nodes of the family. For every other press, the stres
 
 On a film that is not axisymmetric, the stress depends on the direction from the centre of the film to the press. Under
 a probe that is not axisymmetric, it also depends on the rotation of the probe relative to this direction. A turn is a
-pair of both angles. In a frame that rotates with the probe, the stress at a node of the mesh is the Fourier series
+pair of these two angles. In a frame that rotates with the probe, the stress at a node of the mesh is the Fourier series
 
     sum c_mk exp(i (2 m d + k r)),
 
@@ -17,6 +17,10 @@ smaller |k| if |m| is larger.
 The presses are solved at the points of a lattice of rank one: the rotations r are evenly spaced over a full turn, and d
 increases by the same step from each rotation to the next. The step is chosen such that no two terms of the series have
 the same values at all points. The values at the points then determine all coefficients.
+
+The other functions of the module prepare and check a family. They choose the numbers of nodes and the mesh, check that
+the presses of a domain can exist, and compare interpolated charges with the charges of direct solves. The class
+`forward_map.ForwardMap` combines these steps.
 """
 
 import math
@@ -150,15 +154,12 @@ def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
     raise AssertionError("a lattice with more turns than pairs of angles separates all harmonics")
 
 
-HARMONICS = (4, 3, 2, 1)
-"""Usual largest harmonics of a family; see `Turns.spread`.
+DEFAULT_HARMONICS = (4, 3, 2, 1)
+"""Default of the largest harmonics of a family; see `Turns.spread`.
 
 On a film of 45 mm radius, the error of a charge is at most 2e-4 under a rectangle of 4 mm by 2 mm if T1 / T2 is 1.7,
 and 3e-4 under a triangle of 4 mm if T1 / T2 is 3.
 """
-
-CHARGE_FLOOR = 0.1
-"""Smallest charge by which an error is divided, in units of the largest charge of the press, dimensionless."""
 
 
 class NodeCount(NamedTuple):
@@ -173,7 +174,7 @@ class NodeCount(NamedTuple):
 
     distances: int
     forces: int
-    largest_harmonics: tuple[int, ...] = HARMONICS
+    largest_harmonics: tuple[int, ...] = DEFAULT_HARMONICS
 
 
 NODE_COUNTS = (
@@ -305,7 +306,9 @@ class Family:
         executor: Executor | None,
         read: Reading,
     ) -> Array:
-        """Compute the stress under the presses of the family, for the rotations within one period of the probe.
+        """Solve the presses of the family, and compute values such as the stress from each of them.
+
+        Only the rotations within one period of the probe are solved.
 
         Args:
             sensor: Sensor with the film, and with the surface at which the stress is read.
@@ -531,6 +534,10 @@ def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check:
     rotated_probe = probe.rotated(check.rotation)
     equilibrium = press(sensor.film, rotated_probe, check.position, check.force, settings)
     return touch_charge(sensor, equilibrium)
+
+
+CHARGE_FLOOR = 0.1
+"""Smallest charge by which an error is divided, in units of the largest charge of the press, dimensionless."""
 
 
 def relative_error(charge: Array, direct_charge: Array) -> float:

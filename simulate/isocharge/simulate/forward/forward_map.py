@@ -485,30 +485,30 @@ For presses within two thirds of the film radius, the error is below 0.5 %.
 """
 
 COARSE_RESOLUTION = Resolution(order=4, around=8, rings=10, rim=2)
-"""Fineness of the mesh of the solves."""
+"""Fineness of the mesh of the coarse map."""
 
-RIM_GAP = 1.2
-"""Smallest gap between the probe and the clamp, in units of the reach of the probe, dimensionless.
+COARSE_RIM_GAP = 1.2
+"""Smallest gap between the probe and the clamp in the coarse map, in units of the reach of the probe, dimensionless.
 
 The coarse mesh does not resolve a narrower gap.
 """
 
-SMALL_PROBE_GAP = 0.042
-"""Smallest gap between a very small probe and the clamp, in units of the radius of the film, dimensionless.
+COARSE_SMALL_PROBE_GAP = 0.042
+"""Smallest gap between a very small probe and the clamp in the coarse map, in film radii, dimensionless.
 
 An element of the coarse mesh would be folded in a narrower gap. The gap decreases by 0.75 of the reach of the probe.
 """
 
-NODE_COUNT = NodeCount(distances=10, forces=4)
-"""Numbers of distances and forces at which presses are solved."""
+COARSE_NODE_COUNT = NodeCount(distances=10, forces=4)
+"""Numbers of distances and forces at which presses are solved for the coarse map."""
 
 
 def outermost_distance(film: Film, probe: Probe) -> float:
     """Return the largest distance of a press from the centre (mm) for which the coarse map is valid.
 
-    See `RIM_GAP` and `SMALL_PROBE_GAP`.
+    See `COARSE_RIM_GAP` and `COARSE_SMALL_PROBE_GAP`.
     """
-    gap = max(RIM_GAP * probe.reach, SMALL_PROBE_GAP * film.inner_radius - 0.75 * probe.reach)
+    gap = max(COARSE_RIM_GAP * probe.reach, COARSE_SMALL_PROBE_GAP * film.inner_radius - 0.75 * probe.reach)
     return film.inner_radius - probe.reach - gap
 
 
@@ -534,5 +534,5 @@ def whole_film_map(
     """
     settings = SolveSettings(resolution=COARSE_RESOLUTION)
     domain = Domain(outermost_distance(sensor.film, probe.under(force_range[1])), force_range)
-    forward_map = ForwardMap.build_unchecked(sensor, probe, domain, NODE_COUNT, settings, executor=executor)
+    forward_map = ForwardMap.build_unchecked(sensor, probe, domain, COARSE_NODE_COUNT, settings, executor=executor)
     return replace(forward_map, error=COARSE_ERROR)
