@@ -2,6 +2,9 @@
 
 The caller divides the work into jobs, and the results are returned in the order of the jobs. The results therefore do
 not depend on the executor, on the number of workers, or on the order in which the workers finish.
+
+The functions `local_workers` and `dask_workers` provide executors. A worker refuses a job if it has another version of
+the code. In a worker, BLAS uses only one thread (`single_threaded_blas`).
 """
 
 import multiprocessing

@@ -20,6 +20,8 @@ converter.
 The noise levels `bench` and `surgery` contain plausible values of the hum, the offset, the bias current and the
 mismatch for environments with weak or strong electrical interference. The values of `bench` and `surgery` were not
 measured. The noise levels `clean` and `reference` contain only noise that does not depend on earlier readings.
+
+A TOML file can describe a further measuring chain. The function `load_amplifier` reads such a file.
 """
 
 import math
@@ -399,7 +401,7 @@ def _decaying_sum(decay: float, inputs: Array, previous: float) -> Array:
     return np.asarray(outputs)
 
 
-BENCH = Amplifier(
+BENCH_AMPLIFIER = Amplifier(
     noise=NOISE_LEVELS["bench"],
     tau=10.0,
     tau_mismatch=0.05,
@@ -415,12 +417,12 @@ BENCH = Amplifier(
 
 AMPLIFIER_LEVELS = {
     **{level: Amplifier(noise=NOISE_LEVELS[level]) for level in ("clean", "reference", "measured")},
-    "bench": BENCH,
-    "surgery": replace(BENCH, noise=NOISE_LEVELS["surgery"], hum=5.0, step=0.5),
+    "bench": BENCH_AMPLIFIER,
+    "surgery": replace(BENCH_AMPLIFIER, noise=NOISE_LEVELS["surgery"], hum=5.0, step=0.5),
 }
 """Amplifier of each noise level."""
 
-KEY_NAMES = {
+AMPLIFIER_FILE_KEYS = {
     "tau": "tau_s",
     "hum": "hum_pC",
     "hum_frequency": "hum_Hz",
@@ -455,7 +457,7 @@ AmplifierFile = defstruct(
     ],
     bases=(Settings,),
     frozen=True,
-    rename=KEY_NAMES,
+    rename=AMPLIFIER_FILE_KEYS,
 )
 """Content of the TOML file, which consists of the parameters of the noise and the attributes of `Amplifier`.
 

@@ -102,7 +102,7 @@ def model_names(root: Path) -> list[str]:
 
 def _released_models() -> Path:
     """Return the folder of the released models in the installed package or at the top of a source checkout."""
-    # In a source checkout, this module is serve/isocharge/serve/model/model_folder.py.
+    # In a source checkout, this module is serve/isocharge/serve/model/model_search.py.
     module = Path(__file__).resolve()
     package_folder = module.parents[1]  # isocharge/serve
     checkout_folder = module.parents[4]
