@@ -23,24 +23,17 @@ STEP = 1.0 / 3.0
 """Step of the difference quotients, in prior standard deviations of the property."""
 
 PROBE_RADIUS = "probe_radius"
-"""Name of the only property that changes the stress and whose derivative does not follow from that of the stress."""
+"""Name of the radius of the probe.
+
+It is the only property for which a second film is solved. The derivatives with respect to all other properties follow
+from the solved film and from `FilmSlopes`.
+"""
 
 UNEVEN_TENSIONS = ("tension_difference", "tension_shear")
-"""Properties that are uneven parts of the pretension, relative to the pretension."""
+"""Names of the properties that describe the uneven part of the pretension, as shares of the mean pretension."""
 
 MAX_LOG_CHANGE = 1.0
 """Largest change of the logarithm of a charge to which a first-order change is applied."""
-
-
-def axisymmetric(sensor: Sensor) -> Sensor:
-    """Return the sensor with an axisymmetric film that has the mean properties of its film."""
-    film = replace(sensor.film, deviator=(0.0, 0.0), young_ratio=1.0, shear=None, oval=0.0)
-    return replace(sensor, film=film)
-
-
-def round_probe(probe: Probe) -> Probe:
-    """Return an axisymmetric probe unchanged, and the circular probe with the same area for any other probe."""
-    return probe if probe.is_axisymmetric else Circle(float(np.sqrt(probe.area / np.pi)))
 
 
 @dataclass(frozen=True)
@@ -106,10 +99,10 @@ class FilmCharges:
         )
 
     def solved(self, values: Array, executor: Executor | None) -> "FilmCharges":
-        """Return the charges of a similar film that is solved under the probe itself, also if it is not circular.
+        """Solve a similar film under the probe itself, even if the probe is not circular, and return its charges.
 
         The interpolation of the new forward map is checked. The derivatives with respect to the properties are not
-        computed again; they stay those of this film.
+        computed again. They remain the derivatives of this film.
 
         Args:
             values: Properties of the film, shape (n_property,).
@@ -117,8 +110,9 @@ class FilmCharges:
         """
         sensor, probe = self.prior.film(values)
         radius, force_range = self.domain.radius, self.domain.force_range
-        # The mesh is that of a middle force. Under the smallest force, an uneven film has errors of up to 0.4 % on it,
-        # which is less than the noise of such small charges, but a mesh for this force takes four times as long.
+        # The mesh is chosen for a middle force. With this mesh, the charges of an uneven film under the smallest force
+        # have errors of up to 0.4 %, which is less than the noise of such small charges. With a mesh for the smallest
+        # force, the solves would take four times as long.
         middle_force = float(np.sqrt(np.prod(force_range)))
         resolution = needed_resolution(sensor.film, probe, nearest_to_clamp(sensor.film, radius), middle_force)
         settings = SolveSettings(resolution=resolution)
@@ -201,7 +195,7 @@ class FilmCharges:
         """Return a sensor with the electrodes and the piezoelectric coefficients of given properties.
 
         Args:
-            values: Properties, shape (n_property,). Those that change the stress are not used.
+            values: Properties, shape (n_property,). The properties that change the stress are not used.
         """
         sensor, _ = self.prior.film(np.where(self.prior.changes_stress, self.values, values))
         return sensor
@@ -265,6 +259,17 @@ class FilmCharges:
         sensors = [changed_film(sensor, self.film.probe, {one.name: change})[0] for change in (step, -step)]
         forward, backward = (_read(self.film, changed).charges(contact) for changed in sensors)
         return np.asarray((forward - backward) / (2.0 * step))
+
+
+def axisymmetric(sensor: Sensor) -> Sensor:
+    """Return the sensor with an axisymmetric film that has the mean properties of its film."""
+    film = replace(sensor.film, deviator=(0.0, 0.0), young_ratio=1.0, shear=None, oval=0.0)
+    return replace(sensor, film=film)
+
+
+def round_probe(probe: Probe) -> Probe:
+    """Return an axisymmetric probe unchanged, and the circular probe with the same area for any other probe."""
+    return probe if probe.is_axisymmetric else Circle(float(np.sqrt(probe.area / np.pi)))
 
 
 def _read(forward_map: ForwardMap, sensor: Sensor) -> ForwardMap:

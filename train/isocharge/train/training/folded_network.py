@@ -1,4 +1,4 @@
-"""Whole network that computes contacts from charges, and its ONNX graph.
+"""Network that computes contacts from charges, in the form in which it is released, and its ONNX graph.
 
 The network has three parts:
 
@@ -18,10 +18,10 @@ For inputs x, the hidden layer l computes h_l = f(h_(l-1) W_l + b_l), where h_0 
 The output layer computes y = h_L V + c + x S from the result h_L of the last hidden layer. The skip layer S maps the
 inputs linearly to the outputs. The hidden layers therefore only need to learn the nonlinear part of the function.
 
-A network has two perceptrons with equally many layers, for the contact and for the misfit. The whitening of the
-features becomes part of their first layers, and the units of the answers become part of their last layers. In a
-prediction for a single press, the overhead of each node of the graph takes more time than the arithmetic. In the graph,
-both perceptrons are therefore joined into one, whose later layers have block-diagonal weights.
+A network has two perceptrons with equally many layers, for the contact and for the misfit. The function `fold` makes
+the whitening of the features a part of their first layers, and the units of the answers a part of their last layers. In
+a prediction for a single press, the overhead of each node of the graph takes more time than the arithmetic. In the
+graph, both perceptrons are therefore joined into one, whose later layers have block-diagonal weights.
 
 Correlations
 ------------
@@ -111,10 +111,6 @@ ACTIVATIONS = {activation.name: activation for activation in (TANH,)}
 """All activations of hidden layers, by name. Training, the ONNX graph and the C export look them up here."""
 
 
-OPSET = 17
-"""Version of the ONNX operators, which runtimes since 2022 support."""
-
-
 @dataclass(frozen=True)
 class ChargeFeatures:
     """Function that computes features from charges Q. The features are the inputs of a network's first layer.
@@ -187,6 +183,9 @@ MEAN = slice(0, 3)
 LOG_STD = slice(3, 6)
 """Columns of the answers with the logarithms of the standard deviations of x and y in mm and of the force in N."""
 
+LOG_FORCE_STD = slice(LOG_STD.stop - 1, LOG_STD.stop)
+"""Column of the answers with the logarithm of the standard deviation of the force."""
+
 LARGEST_LOGARITHM = 50.0
 """Limit of the magnitudes of the logarithms of the force and of the standard deviations.
 
@@ -221,6 +220,10 @@ MISFIT_UNIT = 5.0
 
 The network learns misfits below this value on a linear scale and misfits above this value on a logarithmic scale.
 """
+
+
+OPSET = 17
+"""Version of the ONNX operators, which runtimes since 2022 support."""
 
 
 @dataclass
@@ -291,7 +294,7 @@ class FoldedNetwork:
     def onnx_model(self, number_type: type = np.float32) -> onnx.ModelProto:
         """Return the network as an ONNX model without metadata.
 
-        The nodes after the perceptron convert the answers into the outputs of the graph.
+        The nodes after the perceptrons convert the answers into the outputs of the graph.
 
         Args:
             number_type: NumPy type of the charges, of the constants and of the outputs.
@@ -398,29 +401,6 @@ def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[P
     return builder.add("Gemm", hidden_outputs, builder.constant(block_diag(*weights)), skip_and_bias)
 
 
-TURN = slice(6, 9)
-"""Columns of the outputs of the contact perceptron with the turns, which are the angles minus a right angle.
-
-The means and the logarithms of the standard deviations come before the turns.
-"""
-
-ANGLES_TO_COSINE_ARGUMENTS = np.array(
-    [
-        [1, 0, 1, 1, 1, 1, 1, 1],  # coefficients of a
-        [0, 1, -1, 1, -1, -1, 1, 1],  # coefficients of b
-        [0, 0, 0, 0, -1, 1, -1, 1],  # coefficients of c
-    ],
-    dtype=float,
-)
-"""Matrix, shape (3, 8), from the angles (a, b, c) to the arguments of the eight cosines.
-
-The arguments are a, b, a - b, a + b, a - b - c, a - b + c, a + b - c and a + b + c.
-"""
-
-LOG_FORCE_STD = slice(LOG_STD.stop - 1, LOG_STD.stop)
-"""Column of the answers with the logarithm of the standard deviation of the force."""
-
-
 def fold(perceptron: Perceptron, mean: Array, matrix: Array, answer_map: Layer) -> Perceptron:
     """Fold the whitening of the features and a linear map of the outputs into a perceptron.
 
@@ -449,6 +429,26 @@ def fold(perceptron: Perceptron, mean: Array, matrix: Array, answer_map: Layer) 
         skip=skip,
         activation=perceptron.activation,
     )
+
+
+TURN = slice(6, 9)
+"""Columns of the outputs of the contact perceptron with the turns, which are the angles minus a right angle.
+
+The means and the logarithms of the standard deviations come before the turns.
+"""
+
+ANGLES_TO_COSINE_ARGUMENTS = np.array(
+    [
+        [1, 0, 1, 1, 1, 1, 1, 1],  # coefficients of a
+        [0, 1, -1, 1, -1, -1, 1, 1],  # coefficients of b
+        [0, 0, 0, 0, -1, 1, -1, 1],  # coefficients of c
+    ],
+    dtype=float,
+)
+"""Matrix, shape (3, 8), from the angles (a, b, c) to the arguments of the eight cosines.
+
+The arguments are a, b, a - b, a + b, a - b - c, a - b + c, a + b - c and a + b + c.
+"""
 
 
 def linear_answer_map(domain: Domain) -> Layer:
