@@ -1,4 +1,9 @@
-"""Functions that find the baud rate of a port, receive bytes from the port, and parse the frames."""
+"""Reception of bytes from a port, at a baud rate that is found by trial, and parsing of the frames in these bytes.
+
+The class `ReceivedData` contains the bytes, which do not depend on the format of the frames. The class `Capture`
+contains the frames that a parser of one format has found in the bytes. The same bytes can therefore be parsed in
+several formats.
+"""
 
 import time
 from collections.abc import Callable, Sequence
@@ -98,7 +103,7 @@ def listen(
     Raises:
         PortError: If the port cannot be opened.
     """
-    # Try the baud rates, unless the port has none, as a network port.
+    # Try the baud rates. Some ports, such as network ports, have no baud rate.
     chosen_baud = bauds[0]
     if has_speed(url) and len(bauds) > 1:
         for baud in bauds:

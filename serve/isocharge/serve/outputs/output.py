@@ -1,4 +1,8 @@
-"""Interface that every output implements, queue of a slow output, and description of a kind of output.
+"""Interface of all outputs of records, the declaration of a kind of output, and shared parts of outputs.
+
+Every output implements the interface `Output`. An `OutputKind` declares which targets belong to a kind of output. The
+class `WriterQueue` keeps a slow output from delaying a live stream. `FileOutput` is the base class of outputs that
+write files, and `AddedOutput` wraps an output of another package.
 
 Other packages can add kinds of outputs. Such a package must declare an entry point in the group "isocharge.outputs".
 The entry point must refer to an `OutputKind`.
@@ -22,9 +26,6 @@ from typing import Generic, Protocol, Self, TypeVar
 from isocharge.common.errors import IsochargeError, OutputError
 from isocharge.common.files import AtomicWriter, new_file
 from isocharge.serve.record.record import PredictionRecord
-
-END_TIMEOUT_s = 15.0
-"""Half of the time after which an output of another package that cannot be closed is given up, s."""
 
 
 class Output(Protocol):
@@ -52,21 +53,63 @@ def discard(output: Output) -> None:
     discard_or_close()
 
 
+@dataclass(frozen=True, kw_only=True)
+class OutputContext:
+    """Properties of a stream of records, which are passed to the outputs.
+
+    Attributes:
+        electrodes: Names of the electrodes, in the order of the charges.
+        with_tracking: Whether contacts are tracked, so that the records have the fields of a `Tracking`.
+        with_film: Whether the pretension of the film is estimated, so that the records have the field `film`.
+        is_live: True if the records come from a sensor, which does not wait for the outputs. False if they come from a
+            recording.
+        write_stdout: Function that writes a text to standard output.
+        stdout_is_ready: Function that waits a short time and returns whether standard output would accept a line.
+    """
+
+    electrodes: tuple[str, ...]
+    with_tracking: bool = False
+    with_film: bool = False
+    is_live: bool = False
+    write_stdout: Callable[[str], object] = sys.stdout.write
+    stdout_is_ready: Callable[[], bool] = lambda: True
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputKind:
+    """A kind of output, such as CSV files. The form of a target decides which kind of output is used.
+
+    Attributes:
+        form: Form of the targets, for help and messages, such as `FILE.csv`.
+        accepts: Function that returns whether the text of a target has this form.
+        open: Function that opens the output with the given target. It raises an `IsochargeError` if this is impossible.
+        may_block: Whether `write` may wait. In a live stream, such an output has its own thread and queue.
+        is_standard_output: Whether the output writes to standard output. Only one output of a command may write to
+            standard output. The stream ends when standard output is closed.
+    """
+
+    form: str
+    accepts: Callable[[str], bool]
+    open: Callable[[str, OutputContext], Output]
+    may_block: bool = True
+    is_standard_output: bool = False
+
+
 T = TypeVar("T")
 
-MAX_WAITING = 10_000
-"""Largest number of waiting items. Records of ten seconds at 1 kHz occupy about 10 MB."""
+MAX_WAITING_ITEMS = 10_000
+"""Largest number of items that wait in a `WriterQueue`. Records of ten seconds at 1 kHz occupy about 10 MB."""
 
 CLOSE_TIMEOUT_s = 1.0
-"""Default of `close_timeout_s`, s."""
+"""Default of the argument `close_timeout_s` of a `WriterQueue`, s."""
 
 
 class WriterQueue(Generic[T]):
     """Queue of limited length with a thread that writes the items of the queue.
 
     The producer never waits for a slow consumer. The thread writes the oldest item first. If the consumer is so slow
-    that more than `MAX_WAITING` items are waiting, the oldest items are dropped and counted. A slow consumer therefore
-    receives the newest items.
+    that more than `MAX_WAITING_ITEMS` items are waiting, the oldest items are dropped and counted. A slow consumer
+    therefore receives the newest items.
 
     The queue is a context manager. At the end of the `with` block, the queue is closed.
 
@@ -123,7 +166,7 @@ class WriterQueue(Generic[T]):
             Exception: The exception that `write` has raised in the thread, if there is one.
         """
         self._raise_error()
-        if self._items.qsize() >= MAX_WAITING:
+        if self._items.qsize() >= MAX_WAITING_ITEMS:
             with suppress(Empty):  # the thread has taken all items in the meantime
                 self._items.get_nowait()
                 self._items.task_done()
@@ -171,6 +214,10 @@ class WriterQueue(Generic[T]):
             self._error = error
 
 
+END_TIMEOUT_s = 15.0
+"""Half of the time after which an output of another package that cannot be closed is given up, s."""
+
+
 class AddedOutput:
     """An output of another package, which can neither change records nor keep the command from ending."""
 
@@ -201,28 +248,6 @@ class AddedOutput:
             ending.put(self._output)
         if ending.is_stuck:
             raise RuntimeError(f"it is still not closed after {2.0 * END_TIMEOUT_s:g} s")
-
-
-def output_error(error: Exception, target: str) -> Exception:
-    """Return an error of an output as an error that states its cause and the target.
-
-    Args:
-        error: The error. An `IsochargeError` or an `OSError` states its cause already.
-        target: Target of the output.
-    """
-    if isinstance(error, (IsochargeError, OSError)):
-        return error
-    output_failure = OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
-    output_failure.__cause__ = error
-    return output_failure
-
-
-def is_file_with(suffix: str) -> Callable[[str], bool]:
-    """Return a function that returns whether a target is the path of a file whose name ends with `suffix`.
-
-    A target with a scheme, such as `mqtt://host/touch.csv`, is not a file.
-    """
-    return lambda target: target.endswith(suffix) and "://" not in target
 
 
 class FileOutput:
@@ -259,43 +284,23 @@ class FileOutput:
         self._stack.__exit__(EOFError, EOFError(), None)  # `new_file` removes the file after an error
 
 
-@dataclass(frozen=True, kw_only=True)
-class OutputContext:
-    """Properties of a stream of records, which are passed to the outputs.
+def output_error(error: Exception, target: str) -> Exception:
+    """Return an error of an output as an error that states its cause and the target.
 
-    Attributes:
-        electrodes: Names of the electrodes, in the order of the charges.
-        with_tracking: Whether contacts are tracked, so that the records have the fields of a `Tracking`.
-        with_film: Whether the pretension of the film is estimated, so that the records have the field `film`.
-        is_live: True if the records come from a sensor, which does not wait for the outputs. False if they come from a
-            recording.
-        write_stdout: Function that writes a text to standard output.
-        stdout_is_ready: Function that waits a short time and returns whether standard output would accept a line.
+    Args:
+        error: The error. An `IsochargeError` or an `OSError` states its cause already.
+        target: Target of the output.
     """
-
-    electrodes: tuple[str, ...]
-    with_tracking: bool = False
-    with_film: bool = False
-    is_live: bool = False
-    write_stdout: Callable[[str], object] = sys.stdout.write
-    stdout_is_ready: Callable[[], bool] = lambda: True
+    if isinstance(error, (IsochargeError, OSError)):
+        return error
+    output_failure = OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
+    output_failure.__cause__ = error
+    return output_failure
 
 
-@dataclass(frozen=True, kw_only=True)
-class OutputKind:
-    """A kind of output, such as CSV files. The form of a target decides which kind of output is used.
+def is_file_with(suffix: str) -> Callable[[str], bool]:
+    """Return a function that returns whether a target is the path of a file whose name ends with `suffix`.
 
-    Attributes:
-        form: Form of the targets, for help and messages, such as `FILE.csv`.
-        accepts: Function that returns whether the text of a target has this form.
-        open: Function that opens the output with the given target. It raises an `IsochargeError` if this is impossible.
-        may_block: Whether `write` may wait. In a live stream, such an output has its own thread and queue.
-        is_standard_output: Whether the output writes to standard output. Only one output of a command may write to
-            standard output. The stream ends when standard output is closed.
+    A target with a scheme, such as `mqtt://host/touch.csv`, is not a file.
     """
-
-    form: str
-    accepts: Callable[[str], bool]
-    open: Callable[[str, OutputContext], Output]
-    may_block: bool = True
-    is_standard_output: bool = False
+    return lambda target: target.endswith(suffix) and "://" not in target
