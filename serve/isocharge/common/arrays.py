@@ -32,8 +32,8 @@ Booleans = NDArray[np.bool_]
 Complexes = NDArray[np.complex128]
 """Points of the plane as x + iy."""
 
-COMPRESSION_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""Compression methods that are accepted. NumPy writes no others."""
+NPZ_COMPRESSION_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Compression methods that are accepted in npz files. NumPy writes no others."""
 
 
 def npz_arrays(data: bytes) -> dict[str, np.ndarray]:
@@ -51,7 +51,7 @@ def npz_arrays(data: bytes) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             for entry in archive.infolist():
-                if entry.compress_type not in COMPRESSION_METHODS:
+                if entry.compress_type not in NPZ_COMPRESSION_METHODS:
                     raise ValueError(f"an array has the compression method {entry.compress_type}")
             # An entry that is longer than declared is read only up to its declared length, and fails its checksum.
             unpacked_bytes = sum(entry.file_size for entry in archive.infolist())

@@ -228,6 +228,16 @@ def _first_mistake(value: object, target_type: Any, cause: Exception) -> str:
     return cut(str(cause))
 
 
+_MESSAGE = re.compile(r"^(.*?)(?: - at `\$([^`]*)`)?$", re.DOTALL)
+"""Message of msgspec, and the keys with which it ends."""
+
+_STEP = re.compile(r"\.([^.\[`]+)|\[(\d+|\.\.\.)\]")
+"""One of the keys at the end of a message of msgspec, or an index of a list."""
+
+_WRONG_KEY = re.compile(r"Object (missing required|contains unknown) field `(.*)`$", re.DOTALL)
+"""Message of msgspec about a key that is missing or unknown."""
+
+
 def _describe_mistake(content: object, target_type: Any, error: msgspec.ValidationError) -> str:
     """Return a description of a mistake, with the names of the keys that lead to the wrong value.
 
@@ -274,16 +284,6 @@ def _describe_mistake(content: object, target_type: Any, error: msgspec.Validati
     if kind == "contains unknown":
         return unknown_key(_join(path, name), name, _key_types(value, members))
     return f"key {_join(path, name)!r} is missing"
-
-
-_MESSAGE = re.compile(r"^(.*?)(?: - at `\$([^`]*)`)?$", re.DOTALL)
-"""Message of msgspec, and the keys with which it ends."""
-
-_STEP = re.compile(r"\.([^.\[`]+)|\[(\d+|\.\.\.)\]")
-"""One of these keys, or an index of a list."""
-
-_WRONG_KEY = re.compile(r"Object (missing required|contains unknown) field `(.*)`$", re.DOTALL)
-"""Message of msgspec about a key that is missing or unknown."""
 
 
 def _has_type(value: object, expected_type: Any) -> bool:

@@ -1,6 +1,7 @@
-"""Addresses, TLS certificates and limits of the HTTP server and the gRPC server.
+"""Addresses, TLS certificates and limits of servers.
 
-By default, a server listens on the loopback address, to which only programs on the same machine can connect.
+The HTTP server, the gRPC server and the live page use the classes of this module. By default, a server listens on the
+loopback address, to which only programs on the same machine can connect.
 """
 
 import contextlib
@@ -87,75 +88,6 @@ class Address:
         scheme = "https" if secure else "http"
         _, port, *_ = listening.getsockname()  # the actual port, even if the system has chosen it
         return f"{scheme}://{url_host(self.host)}:{port}"
-
-
-def url_host(host: str) -> str:
-    """Return a host name or an address as it is written in a URL, where an IPv6 address is in square brackets."""
-    return f"[{host}]" if ":" in host else host
-
-
-def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """Parse the text of an IP address, and return None if the text is not an IP address."""
-    try:
-        return ipaddress.ip_address(host)
-    except ValueError:
-        return None
-
-
-def check_exposure(address: Address, *, has_token: bool) -> None:
-    """Check that a server without a token is not reachable from other machines.
-
-    Args:
-        address: Address on which the server listens.
-        has_token: Whether the server has a token that clients must send.
-
-    Raises:
-        InputError: If other machines can connect, but the server has no token.
-    """
-    if not (address.is_private or has_token):
-        raise InputError(f"{address.host} lets other machines in: give --token TOKEN, which they then must send")
-
-
-def _listen_unix(path: Path, backlog: int) -> socket.socket:
-    """Open a listening Unix socket that only its owner can use, and return the socket.
-
-    Args:
-        path: Path of the socket, where no file exists.
-        backlog: Largest number of connections that wait to be accepted.
-
-    Raises:
-        OSError: If the socket cannot be created.
-    """
-    previous_mask = os.umask(0o177)  # only the owner may read and write the file that `bind` creates
-    listening = socket.socket(socket.AF_UNIX)
-    try:
-        listening.bind(str(path))
-        listening.listen(backlog)
-    except OSError:
-        listening.close()
-        raise
-    finally:
-        os.umask(previous_mask)
-    return listening
-
-
-def _remove_stale_socket(path: Path) -> None:
-    """Remove the file of a Unix socket if no server listens on the socket any more.
-
-    If the file does not exist, the function does nothing.
-
-    Raises:
-        ListenError: If the file is not a socket, or if a server listens on the socket.
-    """
-    if not path.exists():
-        return
-    if not path.is_socket():
-        raise ListenError(f"{path}: expected nothing or a left-over socket, found a file; choose another path")
-    with socket.socket(socket.AF_UNIX) as client:
-        error_number = client.connect_ex(str(path))  # 0 if a server accepts the connection
-    if error_number != errno.ECONNREFUSED:  # the system refuses a connection only if no server listens
-        raise ListenError(f"{path}: another server listens there; stop it or choose another path")
-    path.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
@@ -247,3 +179,72 @@ class ServerLimits:
         """
         if size > self.body_bytes:
             raise TooLarge(f"expected a body of at most {self.body_bytes} bytes, got more; send smaller batches")
+
+
+def url_host(host: str) -> str:
+    """Return a host name or an address as it is written in a URL, where an IPv6 address is in square brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
+def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    """Parse the text of an IP address, and return None if the text is not an IP address."""
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None
+
+
+def check_exposure(address: Address, *, has_token: bool) -> None:
+    """Check that a server without a token is not reachable from other machines.
+
+    Args:
+        address: Address on which the server listens.
+        has_token: Whether the server has a token that clients must send.
+
+    Raises:
+        InputError: If other machines can connect, but the server has no token.
+    """
+    if not (address.is_private or has_token):
+        raise InputError(f"{address.host} lets other machines in: give --token TOKEN, which they then must send")
+
+
+def _listen_unix(path: Path, backlog: int) -> socket.socket:
+    """Open a listening Unix socket that only its owner can use, and return the socket.
+
+    Args:
+        path: Path of the socket, where no file exists.
+        backlog: Largest number of connections that wait to be accepted.
+
+    Raises:
+        OSError: If the socket cannot be created.
+    """
+    previous_mask = os.umask(0o177)  # only the owner may read and write the file that `bind` creates
+    listening = socket.socket(socket.AF_UNIX)
+    try:
+        listening.bind(str(path))
+        listening.listen(backlog)
+    except OSError:
+        listening.close()
+        raise
+    finally:
+        os.umask(previous_mask)
+    return listening
+
+
+def _remove_stale_socket(path: Path) -> None:
+    """Remove the file of a Unix socket if no server listens on the socket any more.
+
+    If the file does not exist, the function does nothing.
+
+    Raises:
+        ListenError: If the file is not a socket, or if a server listens on the socket.
+    """
+    if not path.exists():
+        return
+    if not path.is_socket():
+        raise ListenError(f"{path}: expected nothing or a left-over socket, found a file; choose another path")
+    with socket.socket(socket.AF_UNIX) as client:
+        error_number = client.connect_ex(str(path))  # 0 if a server accepts the connection
+    if error_number != errno.ECONNREFUSED:  # the system refuses a connection only if no server listens
+        raise ListenError(f"{path}: another server listens there; stop it or choose another path")
+    path.unlink(missing_ok=True)

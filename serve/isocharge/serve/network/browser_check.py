@@ -1,4 +1,7 @@
-"""Protection against requests from web pages of other sites.
+"""Check of the access to a server: its token, and protection against requests from web pages of other sites.
+
+The class `AccessCheck` refuses a request if the server has a token and the request does not contain it. It also refuses
+requests from web pages of other sites.
 
 A page in a browser can send requests to every address that the browser can reach, including the loopback address. If
 the page sends a form, or a `fetch` with `mode: "no-cors"`, it cannot read the response, but the server executes the
@@ -33,9 +36,8 @@ TRUSTED_FETCH_SITES = (b"same-origin", b"none")
 Browsers send `same-origin` if a page of this server sends the request, and `none` if the user has typed in the address.
 """
 
-
-_TOKEN = re.compile(r"(?! )[ -$&-~]+(?<! )")
-"""Printable ASCII characters without blanks at the ends and without the percent sign."""
+_TOKEN_PATTERN = re.compile(r"(?! )[ -$&-~]+(?<! )")
+"""Accepted token: printable ASCII characters without blanks at the ends and without the percent sign."""
 
 
 class AccessCheck:
@@ -65,7 +67,7 @@ class AccessCheck:
     ) -> None:
         self._allowed_names = frozenset(map(host_name, allowed_hosts))
         self._host_names = self._allowed_names | {"localhost", host.lower()}
-        if token is not None and not _TOKEN.fullmatch(token):
+        if token is not None and not _TOKEN_PATTERN.fullmatch(token):
             raise InputError(
                 "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
                 "meaning in the address of a page; choose another one"
@@ -200,7 +202,7 @@ def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
     return values
 
 
-_NAME = re.compile(r"[a-z0-9_.-]+")
+_HOST_NAME_PATTERN = re.compile(r"[a-z0-9_.-]+")
 """Host name, or IPv4 address, in lower case."""
 
 
@@ -217,7 +219,7 @@ def host_name(text: str) -> str:
     name = text.strip().lower()
     if name.startswith("[") and name.endswith("]"):
         name = name[1:-1]
-    if not _NAME.fullmatch(name) and ip_address(name) is None:
+    if not _HOST_NAME_PATTERN.fullmatch(name) and ip_address(name) is None:
         raise InputError(f"--allow-host: expected a host name without scheme, port and path, got {text!r:.100}")
     return name.removesuffix(".")  # "example.org." is the same host as "example.org"
 

@@ -8,7 +8,8 @@ service ends the call that has waited longest for a message from its client.
 
 The message classes are created from the compiled file `inference.proto` in a separate descriptor pool. A program can
 therefore also import another implementation of the protocol, although the messages of both implementations have the
-same names.
+same names. The functions `read_request` and `write_response` convert the messages of an inference. All other messages
+are converted from and to the JSON objects of the HTTP routes.
 """
 
 import asyncio
@@ -63,7 +64,7 @@ METHODS: dict[str, tuple[type[Any], type[Any]]] = {
 }
 """Class of the request and class of the response, by the name of the method."""
 
-NUMBER_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
+TENSOR_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
 """Field of the contents of a tensor that contains the numbers, by the type of the numbers."""
 
 
@@ -113,7 +114,7 @@ def _input_object(tensor: Any, raw_charges: bytes | None) -> dict[str, Any]:
     # If the request contains both numbers and raw content, the object contains both. The check of the request then
     # refuses the object. It also refuses an unknown number type.
     if tensor.HasField("contents") or raw_charges is None:
-        field = NUMBER_FIELDS.get(tensor.datatype, "fp32_contents")
+        field = TENSOR_FIELDS.get(tensor.datatype, "fp32_contents")
         json_object["data"] = list(getattr(tensor.contents, field))
     return json_object
 
@@ -162,10 +163,10 @@ def write_response(loaded: LoadedVersion, request: InferRequest, outputs: dict[s
 ROUTE_OF_METHOD = {name: route for route in ROUTES for name in route.rpcs}
 """Route of the HTTP server that gives the same answer, by the name of the gRPC method."""
 
-CONTENT_FIELDS = {"ModelConfig": "config", "RepositoryIndex": "models"}
+ANSWER_FIELDS = {"ModelConfig": "config", "RepositoryIndex": "models"}
 """Field of the response that contains the answer, by the name of the method. Other responses are the answer itself."""
 
-STREAM = "ModelStreamInfer"
+STREAM_METHOD = "ModelStreamInfer"
 """Name of the method that receives and sends several messages in one call."""
 
 
@@ -226,9 +227,9 @@ class Service:
     async def _answer(self, name: str, context: grpc.aio.ServicerContext, call: Exchange) -> None:
         """Check the number of open calls and the token, and answer the messages of a call.
 
-        A call of the method `STREAM` may contain any number of messages, and every other call contains one message. The
-        first message must arrive within `header_seconds`, and each later message within `idle_seconds` after the
-        previous response. The client must read each response within `body_seconds`.
+        A call of the method `STREAM_METHOD` may contain any number of messages, and every other call contains one
+        message. The first message must arrive within `header_seconds`, and each later message within `idle_seconds`
+        after the previous response. The client must read each response within `body_seconds`.
 
         Args:
             name: Name of the method.
@@ -251,10 +252,10 @@ class Service:
                     response = self._respond(name, data, call)
                 async with asyncio.timeout(self._limits.body_seconds):
                     await context.write(response)
-                if name != STREAM:
+                if name != STREAM_METHOD:
                     return
                 timeout_s = self._limits.idle_seconds
-            if name != STREAM:
+            if name != STREAM_METHOD:
                 raise RequestError(f"{name}: expected a message, got none")
 
     def _respond(self, name: str, data: bytes, call: Exchange) -> bytes:
@@ -282,7 +283,7 @@ class Service:
         model_version = getattr(request, "model_version", "") or getattr(request, "version", "")
         call.model = self._store.label(model_name, model_version)
 
-        if name == STREAM:
+        if name == STREAM_METHOD:
             response = self._infer_in_stream(request)
         elif name == "ModelInfer":
             response = self._infer(request)
@@ -313,7 +314,7 @@ class Service:
             if name not in ("ServerReady", "ModelReady"):
                 raise
             return {"ready": False}  # gRPC has no status for this answer
-        return {CONTENT_FIELDS[name]: answer} if name in CONTENT_FIELDS else answer
+        return {ANSWER_FIELDS[name]: answer} if name in ANSWER_FIELDS else answer
 
     def _infer(self, request: Any) -> Any:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
@@ -326,14 +327,14 @@ class Service:
 
         If an error occurs, the response contains the error message. An error therefore does not end the stream.
         """
-        _, response_type = METHODS[STREAM]
+        _, response_type = METHODS[STREAM_METHOD]
         status = "OK"
         try:
             response = response_type(infer_response=self._infer(request))
         except Exception as error:  # every error is sent to the client
             _, status = statuses(error)
             response = response_type(error_message=client_message(error))
-        self._traffic.count("grpc", f"{STREAM} message", status)  # `_handle` counts the whole stream as one call
+        self._traffic.count("grpc", f"{STREAM_METHOD} message", status)  # `_handle` counts the whole stream as one call
         return response
 
     @contextmanager

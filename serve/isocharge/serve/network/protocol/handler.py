@@ -1,14 +1,15 @@
-"""ASGI application that answers the HTTP requests of the Open Inference Protocol.
+"""ASGI applications: their base class, and the handler of the requests of the Open Inference Protocol.
 
-The class `Handler` does not depend on the server that receives the requests. A request consists of method, path,
-headers and body. A response consists of status, headers and body. Any thread may answer requests. Most responses take
+The class `Handler` answers the requests of the protocol. It does not depend on the server that receives the requests.
+The function `asgi_app` creates a handler that another program can mount. A request consists of method, path, headers
+and body. A response consists of status, headers and body. Any thread may answer requests. Most responses take
 microseconds to compute, and a response to the largest batch takes milliseconds. Some responses take longer, for example
 because a model is loaded. The method `may_block` returns whether computing the response for a path may take a long
 time.
 
-The base class `Application` is a bare ASGI callable without a framework. One table of routes already selects the
-function for a request, derives the OpenAPI document and names the counters, so that a router, request and response
-classes of a framework would only be called in addition.
+The base class `Application` is a bare ASGI callable without a framework. It is also the base class of the live page.
+The handler needs no router of a framework, because the table `ROUTES` already selects the function for a request and
+the name of its counter.
 """
 
 import asyncio
@@ -32,8 +33,13 @@ Headers = Iterable[tuple[bytes, bytes]]
 """Headers of a request. The names are in lower case, and the values are unchanged."""
 
 Message = MutableMapping[str, Any]
+"""Message or scope of ASGI."""
+
 Receive = Callable[[], Awaitable[Message]]
+"""Type of the function that returns the next part of a request."""
+
 Send = Callable[[Message], Awaitable[None]]
+"""Type of the function that sends a part of a response."""
 
 
 class Application(ABC):

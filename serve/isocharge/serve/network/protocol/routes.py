@@ -30,6 +30,7 @@ EXTENSIONS = (
     "parameters",
     "statistics",
 )
+"""Extensions of the protocol that the servers support."""
 
 PLATFORM = "onnxruntime_onnx"
 """Triton's name for ONNX models."""
