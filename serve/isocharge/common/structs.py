@@ -364,7 +364,7 @@ def _describe_schema(schema: Mapping[str, Any]) -> str:
 
     Args:
         schema: JSON schema that msgspec has derived from a type. If the annotation of the type contains a description,
-            the schema contains it, and it is returned.
+            the schema contains this description, and the function returns it.
     """
     if "description" in schema:
         return str(schema["description"])

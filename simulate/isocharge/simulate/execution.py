@@ -97,7 +97,7 @@ def _result(future: Future[Result]) -> Result:
 
 @contextmanager
 def _executor_errors() -> Iterator[None]:
-    """Convert the exceptions of a `with` block that mean that an executor has lost its workers into WorkersLost.
+    """Convert exceptions of a `with` block into WorkersLost if they mean that an executor has lost its workers.
 
     All other exceptions, such as the exceptions of a job, are raised unchanged.
     """

@@ -127,7 +127,8 @@ NOISE_LEVELS = {
 
 The level `reference` is an assumption. The proportional noise of the level `measured` comes from the data set
 Tactile_Heatmaps of the University of Genoa: a PVDF channel repeats to at most 2 % at equal force in 1,171 recordings.
-For the levels `bench` and `surgery`, the noise model is the part of the amplifier without memory.
+For the levels `bench` and `surgery`, the noise model is the part of the disturbances that does not depend on earlier
+readings.
 """
 
 

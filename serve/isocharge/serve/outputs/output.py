@@ -215,11 +215,11 @@ class WriterQueue(Generic[T]):
 
 
 END_TIMEOUT_s = 15.0
-"""Half of the time after which an output of another package that cannot be closed is given up, s."""
+"""Half of the longest time for which a command waits until an output of another package is closed, s."""
 
 
 class AddedOutput:
-    """An output of another package, which can neither change records nor keep the command from ending."""
+    """Wrapper that prevents an output of another package from changing records and from keeping the command running."""
 
     def __init__(self, output: Output) -> None:
         """Store the output of the other package."""

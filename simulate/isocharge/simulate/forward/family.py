@@ -66,8 +66,8 @@ class Turns:
             (n_turn,), rad. They are zero if the probe is axisymmetric.
         harmonics: Pairs (2 m, k) of the terms of the Fourier series, shape (n_term, 2).
         symmetry_order: Order of the rotational symmetry of the probe: the number of rotations within a full turn that
-            map the probe onto itself. Only the first n_turn / symmetry_order turns are solved. A rotation of the probe
-            by one of its periods adds the same angle to the direction, so that it is the same press.
+            map the probe onto itself. Only the first n_turn / symmetry_order turns are solved. The other turns
+            describe the same presses, with the probe rotated by some of its periods.
     """
 
     direction: Array

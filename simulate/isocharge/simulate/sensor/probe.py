@@ -47,10 +47,13 @@ MIN_LENGTH = 0.02
 """Smallest accepted radius, side, axis or reach of a footprint, mm. A smaller value was probably given in metres."""
 
 CORE_SHARE = 0.45 * math.sqrt(2.0)
-"""Ratio of the distance of a corner of the core polygon from the centroid to that of the boundary, dimensionless."""
+"""Ratio of two distances from the centroid in the same direction, dimensionless.
+
+The ratio is the distance of a corner of the core polygon, divided by the distance of the boundary.
+"""
 
 OUTLINE_POINTS = 1024
-"""Number of points of the outline of a curved footprint, whose area is accurate to 1e-5."""
+"""Number of points of the outline of a curved footprint. The relative error of its area is below 1e-5."""
 
 
 @dataclass(frozen=True)
@@ -356,7 +359,7 @@ class GrowingFinger(Finger):
     """Fingertip whose contact area grows with the force, as that of an elastic sphere does.
 
     Attributes:
-        radius: Radius of the footprint at 1 N, mm. Under the force F, it is larger by the cube root of F / (1 N).
+        radius: Radius of the footprint at 1 N, mm. Under the force F, it is multiplied by the cube root of F / (1 N).
     """
 
     name = "growing-finger"

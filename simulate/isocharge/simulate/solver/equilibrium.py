@@ -254,8 +254,8 @@ def _continuous_slope(equilibrium: Equilibrium) -> Array:
 
     The slope that follows from the solved deflection has small jumps between the elements. Its derivatives within the
     elements do not contain these jumps. The mean bending stress of an electrode would therefore be wrong near the edge
-    of the footprint. For this reason, the slopes that the elements at a node have there are averaged. The slope is zero
-    at the clamped rim.
+    of the footprint. Therefore, the slope at a node is the mean of the slopes of all elements that share the node. The
+    slope is zero at the clamped rim.
 
     Args:
         equilibrium: The solved press.

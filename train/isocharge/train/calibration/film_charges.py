@@ -2,9 +2,9 @@
 
 The charges of the solved film are exact, for any film and any probe. The positions and gains of the electrodes and the
 piezoelectric coefficients only change how the solved stress is read, so their effect is exact as well. The other
-properties change the stress, and their effects are first-order changes. They are computed for an axisymmetric film with
-the mean properties under an axisymmetric probe, because this takes only seconds. If the properties differ much from
-those of the solved film, the film is solved again (`calibrate`).
+properties change the stress, and their effects are first-order changes. The derivatives for these changes are computed
+for an axisymmetric film with the mean properties under an axisymmetric probe, because this computation takes only
+seconds. If the properties differ much from those of the solved film, the film is solved again (`calibrate`).
 """
 
 from concurrent.futures import Executor
@@ -273,5 +273,5 @@ def round_probe(probe: Probe) -> Probe:
 
 
 def _read(forward_map: ForwardMap, sensor: Sensor) -> ForwardMap:
-    """Return the map of a solved film that is read by the electrodes and coefficients of a sensor."""
+    """Return the forward map of a solved film with the electrodes and the piezoelectric coefficients of a sensor."""
     return replace(forward_map, sensor=replace(sensor, film=forward_map.sensor.film))

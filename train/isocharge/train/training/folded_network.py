@@ -457,8 +457,8 @@ def linear_answer_map(domain: Domain) -> Layer:
     The contact perceptron estimates unit coordinates, which the map converts to (x, y, ln F). The perceptron also
     computes the logarithm of the relative standard deviation of the force. The corresponding answer is the logarithm of
     the absolute standard deviation of the force in N. The map therefore adds ln F to the logarithm. The correlations
-    follow from three angles that the perceptron computes. The map converts these angles to eight sums of angles, whose
-    cosines the graph adds to the correlations.
+    follow from three angles that the perceptron computes. The map converts these angles to eight sums of angles.
+    The graph computes the correlations as weighted sums of the cosines of these eight angles.
 
     Args:
         domain: Domain that defines the centre and the scale of the unit coordinates.
