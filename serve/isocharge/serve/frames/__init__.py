@@ -10,5 +10,5 @@ A device file selects the format with the key `format` of its section `[frames]`
 Each format has two classes. The section class declares the further keys of the section `[frames]`, and creates the
 parser. The parser class is derived from `frame.Parser`. A parser receives bytes and does not open a port.
 
-May import: prediction, record, port, flags.
+May import: record, port, model, flags.
 """

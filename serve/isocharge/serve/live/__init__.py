@@ -1,4 +1,4 @@
 """Processing of a live stream, which converts the bytes of a board to prediction records.
 
-May import: tracking, signal_chain, frames, prediction, record, port, flags.
+May import: tracking, signal_chain, frames, record, port, model, flags.
 """

@@ -2,5 +2,5 @@
 
 The shared modules include the model store, the statistics, the limits and the token.
 
-May import: prediction, model.
+May import: model.
 """

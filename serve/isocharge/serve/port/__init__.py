@@ -1,4 +1,4 @@
 """Sources of bytes, such as serial ports, files and recordings, and the times at which the bytes were sent.
 
-May import: nothing else of isocharge.serve.
+May import: model.
 """

@@ -1,4 +1,4 @@
 """The signal chain, whose stages convert the values of a board to touch charges.
 
-May import: frames, prediction, record, flags.
+May import: frames, record, port, model, flags.
 """

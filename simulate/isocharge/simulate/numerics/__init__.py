@@ -1,1 +1,1 @@
-"""Numerical methods that do not depend on the physics of the film, such as interpolation and least squares."""
+"""Numerical methods that do not depend on the physics of the film: interpolation, polygons, and points in a disk."""

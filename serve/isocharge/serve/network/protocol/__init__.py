@@ -2,7 +2,7 @@
 
 This package computes the response to each request and the status of the response.
 
-May import: network, prediction, model.
+May import: network, model.
 
 The two transports, `isocharge.serve.network.http` and `isocharge.serve.network.grpc`, import this package. This package
 does not import the transports.
