@@ -178,16 +178,17 @@ SIDE_FORCE_IS_ODD = np.array([field.odd for field in SIDE_FORCE_FIELDS])
 
 
 def stress_changes(solved: Equilibrium, surface: Surface, fields: Sequence[StressField]) -> Array:
-    """Compute how the scaled stress at the nodes changes, for example by `FILM_FIELDS` or `SIDE_FORCE_FIELDS`.
+    """Compute the changes of the scaled stress that a changed film property or a side force causes at the nodes.
 
-    The press is rotated onto the x axis. The changes are those at fixed points of the rotated film. The unit of a
+    The film is rotated such that the press lies on the positive x axis. The changes refer to fixed points of the
+    rotated film. The unit of a
     tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is the amplitude of the press.
     The function `scaling.side_force_unit` returns the unit of a side force.
 
     Args:
         solved: Press with a circular probe.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
-        fields: Stress fields to be computed.
+        fields: Kinds of changes to be computed, such as `FILM_FIELDS` or `SIDE_FORCE_FIELDS`.
 
     Returns:
         Changes per unit, shape (n_element, n_local, n_field, 3), in the order of the table of a `ForwardMap` with

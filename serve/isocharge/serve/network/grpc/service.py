@@ -8,8 +8,8 @@ service ends the call that has waited longest for a message from its client.
 
 The message classes are created from the compiled file `inference.proto` in a separate descriptor pool. A program can
 therefore also import another implementation of the protocol, although the messages of both implementations have the
-same names. The functions `read_request` and `write_response` convert the messages of an inference. All other messages
-are converted from and to the JSON objects of the HTTP routes.
+same names. The function `read_request` reads a request for an inference, and `write_response` writes its response.
+All other messages are converted from and to the JSON objects of the HTTP routes.
 """
 
 import asyncio
