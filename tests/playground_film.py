@@ -15,7 +15,7 @@ from scipy.fft import dctn
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from isocharge.simulate.forward.forward_map import EVEN_FIELD
 from isocharge.simulate.forward.readout import ElectrodePieces, PieceRule
-from isocharge.simulate.mesh.placement import automorphism_onto
+from isocharge.simulate.mesh.conformal_map import automorphism_onto
 from isocharge.simulate.sensor.sensor_file import film_to_dict
 
 PROBE = Circle(1.0)

@@ -16,7 +16,7 @@ from isocharge.serve import Predictor
 from isocharge.serve.flags import STRESS
 from isocharge.simulate import Circle, ForwardMap, Sensor, load_sensor, noise_model, parse_probe
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
-from isocharge.simulate.forward.forward_map import whole_film_map
+from isocharge.simulate.forward.whole_film import whole_film_map
 from isocharge.simulate.identifiability.mirror_region import has_mirror
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 

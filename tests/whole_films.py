@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from isocharge.simulate import load_sensor
-from isocharge.simulate.forward.forward_map import whole_film_map
+from isocharge.simulate.forward.whole_film import whole_film_map
 from kept import kept
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import Circle, Film, Polygon, Probe, deflection, load_sensor, press, touch_charge
-from isocharge.simulate.solver.equilibrium import estimated_error
+from isocharge.simulate.solver.error_estimate import estimated_error
 
 REASONS = (
     r"press at .* too near .*; press farther inside",

@@ -28,7 +28,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.solver.equilibrium import estimated_error
+from isocharge.simulate.solver.error_estimate import estimated_error
 
 HERE = Path(__file__).parent
 ACCURACY = (HERE.parents[1] / "simulate" / "docs" / "accuracy.md").read_text("utf-8")

@@ -35,12 +35,16 @@ if TYPE_CHECKING:
     from isocharge.simulate.identifiability.working_area import working_area
     from isocharge.simulate.layout.case import DesignCase
     from isocharge.simulate.layout.design import design
-    from isocharge.simulate.measuring_chain import Amplifier, NoiseModel, load_amplifier, noise_model
+    from isocharge.simulate.measuring_chain import Amplifier, load_amplifier, noise_model
     from isocharge.simulate.mechanics.scaling import Theory
     from isocharge.simulate.mesh.blocks import Resolution
+    from isocharge.simulate.noise import NoiseModel
+    from isocharge.simulate.sensor.curved_probes import Circle, Ellipse, Finger, GrowingFinger
     from isocharge.simulate.sensor.film import Film, Piezo
     from isocharge.simulate.sensor.film_properties import FilmPrior, virtual_film
-    from isocharge.simulate.sensor.probe import Circle, Ellipse, Finger, GrowingFinger, Polygon, Probe, parse_probe
+    from isocharge.simulate.sensor.footprint import Probe
+    from isocharge.simulate.sensor.polygon_probe import Polygon
+    from isocharge.simulate.sensor.probe import parse_probe
     from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor
     from isocharge.simulate.sensor.sensor_file import built_in_sensors, load_sensor, write_sensor
     from isocharge.simulate.solver.equilibrium import Equilibrium, deflection, touch_stress

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import Circle, Ellipse, Film, Polygon, load_sensor
-from isocharge.simulate.forward.family import DEFAULT_HARMONICS, Turns
+from isocharge.simulate.forward.family import DEFAULT_HARMONICS
+from isocharge.simulate.forward.turns import Turns
 
 EVEN = load_sensor("three-25um-biaxial").film
 UNEVEN = replace(EVEN, pretension=1.0, deviator=(0.3, 0.1))

@@ -8,7 +8,7 @@ import pytest
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Domain, Resolution, SolveSettings, load_sensor, press, touch_charge
 from isocharge.simulate.forward.family import check_family
-from isocharge.simulate.forward.forward_map import COARSE_ERROR, COARSE_RESOLUTION, outermost_distance
+from isocharge.simulate.forward.whole_film import COARSE_ERROR, COARSE_RESOLUTION, outermost_distance
 from isocharge.simulate.solver.load_case import check_press
 from whole_films import whole_film_map_solved_once
 

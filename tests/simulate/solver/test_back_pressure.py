@@ -24,7 +24,7 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.solver.equilibrium import mesh_error
+from isocharge.simulate.solver.error_estimate import mesh_error
 
 ATMOSPHERE = 0.101325
 """Pressure of the atmosphere, MPa."""

@@ -16,7 +16,8 @@ from isocharge.simulate import (
     press,
     touch_stress,
 )
-from isocharge.simulate.solver.equilibrium import cautions, estimated_error, mesh_error, principal_stress
+from isocharge.simulate.solver.equilibrium import principal_stress
+from isocharge.simulate.solver.error_estimate import cautions, estimated_error, mesh_error
 
 MEMBRANE = Theory(bending=False)
 

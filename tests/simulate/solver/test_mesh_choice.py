@@ -17,7 +17,7 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.solver.equilibrium import estimated_error, mesh_error
+from isocharge.simulate.solver.error_estimate import estimated_error, mesh_error
 from isocharge.simulate.solver.load_case import LoadCase, needs_second_mesh
 from isocharge.simulate.solver.press import needed_resolution
 

@@ -79,7 +79,7 @@ def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit:
         max_force: Largest force, N.
         limit: Limit of the stress, MPa.
     """
-    from isocharge.simulate.solver.press import stress_caution  # a training on a dataset needs no solver
+    from isocharge.simulate.solver.stress_limit import stress_caution
 
     for probe in probes:
         with suppress(IsochargeError):  # the caller computes the same press later, and then reports the error

@@ -23,7 +23,7 @@ from isocharge.simulate import (
 from isocharge.simulate.forward.readout import thermal_charge
 from isocharge.simulate.mechanics.scaling import theory_by_name
 from isocharge.simulate.mechanics.stress import warmed
-from isocharge.simulate.solver.equilibrium import summary
+from isocharge.simulate.solver.error_estimate import summary
 from isocharge.simulate.solver.sensitivity import check_friction, friction_force
 
 

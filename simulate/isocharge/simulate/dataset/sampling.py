@@ -16,7 +16,7 @@ import scipy  # loads each of its subpackages on first use
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError
-from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.footprint import Probe
 
 MAX_SAMPLES = 10_000_000
 """Largest number of presses of a sweep. The files of a dataset with so many presses occupy about 600 MB."""

@@ -8,11 +8,6 @@ coordinates of the family. Presses are solved at Chebyshev nodes in the distance
 at evenly spaced orientations and directions. For every other press, the stress field is interpolated. The charges are
 integrals of the interpolated field over the electrodes. The positions of the electrodes therefore do not affect the
 accuracy of the interpolation. When a map is built, its charges are compared with those of direct solves.
-
-The function `whole_film_map` builds a coarse map that covers nearly the whole film. The coarse map is used, for
-example, to find all presses on the film that cause the same charges as a given press. For such a search, an error of a
-few percent is acceptable in the charges of presses near the clamp. A forward map that is accurate up to the clamp would
-take minutes to build.
 """
 
 from collections.abc import Iterable
@@ -55,8 +50,7 @@ from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.numerics.disk import contacts_at
 from isocharge.simulate.numerics.interpolation import lagrange_values
 from isocharge.simulate.numerics.polygon import to_complex
-from isocharge.simulate.sensor.film import Film
-from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings
 
@@ -476,63 +470,3 @@ class ForwardMap:
         circular_distance = distance_on_circular_film(film, np.abs(position), direction)
         placement = Placement.of(template, self.probe, circular_distance, film.radius, self.layer, rotation)
         return PressMeshes(template, placement, direction, film_oval(film, direction))
-
-
-COARSE_ERROR = 0.05
-"""Largest relative error of a charge of the coarse map, dimensionless.
-
-For presses within two thirds of the film radius, the error is below 0.5 %.
-"""
-
-COARSE_RESOLUTION = Resolution(order=4, around=8, rings=10, rim=2)
-"""Fineness of the mesh of the coarse map."""
-
-COARSE_RIM_GAP = 1.2
-"""Smallest gap between the probe and the clamp in the coarse map, in units of the reach of the probe, dimensionless.
-
-The coarse mesh does not resolve a narrower gap.
-"""
-
-COARSE_SMALL_PROBE_GAP = 0.042
-"""Smallest gap between a very small probe and the clamp in the coarse map, in film radii, dimensionless.
-
-An element of the coarse mesh would be folded in a narrower gap. The gap decreases by 0.75 of the reach of the probe.
-"""
-
-COARSE_NODE_COUNT = NodeCount(distances=10, forces=4)
-"""Numbers of distances and forces at which presses are solved for the coarse map."""
-
-
-def outermost_distance(film: Film, probe: Probe) -> float:
-    """Return the largest distance of a press from the centre (mm) for which the coarse map is valid.
-
-    See `COARSE_RIM_GAP` and `COARSE_SMALL_PROBE_GAP`.
-    """
-    gap = max(COARSE_RIM_GAP * probe.reach, COARSE_SMALL_PROBE_GAP * film.inner_radius - 0.75 * probe.reach)
-    return film.inner_radius - probe.reach - gap
-
-
-def whole_film_map(
-    sensor: Sensor, probe: Probe, force_range: tuple[float, float], *, executor: Executor | None = None
-) -> ForwardMap:
-    """Build a coarse forward map of nearly the whole film.
-
-    The solves of an axisymmetric film take about 3 s of CPU time. Any other film takes much longer, because it is
-    solved in several directions, and meshed completely.
-
-    The error of the interpolation is not computed. The attribute `error` of the map is the constant `COARSE_ERROR`.
-
-    Args:
-        sensor: The sensor.
-        probe: Probe that presses the film.
-        force_range: Smallest and largest force, N.
-        executor: Executor that runs the solves; None for this process.
-
-    Raises:
-        SceneError: If some presses cannot exist.
-        SolveError: If a press has no equilibrium.
-    """
-    settings = SolveSettings(resolution=COARSE_RESOLUTION)
-    domain = Domain(outermost_distance(sensor.film, probe.under(force_range[1])), force_range)
-    forward_map = ForwardMap.build_unchecked(sensor, probe, domain, COARSE_NODE_COUNT, settings, executor=executor)
-    return replace(forward_map, error=COARSE_ERROR)

@@ -32,7 +32,7 @@ from isocharge.simulate.numerics.polygon import (
     to_complex,
     to_corners,
 )
-from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.sensor import Electrode, Readout, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
-from isocharge.simulate.measuring_chain import NoiseModel
+from isocharge.simulate.noise import NoiseModel
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,11 @@ from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion, mirror_region
 from isocharge.simulate.identifiability.working_area import DEFAULT_ERROR, WorkingArea, working_area
-from isocharge.simulate.measuring_chain import NoiseModel, noise_model
+from isocharge.simulate.measuring_chain import noise_model
+from isocharge.simulate.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings
-from isocharge.simulate.sensor.probe import Circle, Probe
+from isocharge.simulate.sensor.curved_probes import Circle
+from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 MAX_SEARCH_RADIUS = 0.9

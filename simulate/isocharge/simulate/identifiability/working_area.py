@@ -29,7 +29,7 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count, linearised
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.nearest_contact import explain, starting_contacts
-from isocharge.simulate.measuring_chain import NoiseModel
+from isocharge.simulate.noise import NoiseModel
 from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, contacts_at, onto_disk, sunflower
 
 FOLD_WIDTH = 0.02

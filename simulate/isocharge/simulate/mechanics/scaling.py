@@ -31,7 +31,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.stress import orthotropic_moduli, rotate_stress, stress, stress_rotation
 from isocharge.simulate.sensor.film import Film
-from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.footprint import Probe
 
 MEMBRANE_STIFFNESS = 1.6
 """Ratio of force to deflection of a membrane with a large pretension, in units of pretension times thickness.

@@ -26,7 +26,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.numerics.interpolation import lobatto_nodes
-from isocharge.simulate.sensor.probe import FootprintTopology
+from isocharge.simulate.sensor.footprint import FootprintTopology
 
 
 @dataclass(frozen=True)

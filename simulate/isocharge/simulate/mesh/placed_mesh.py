@@ -22,7 +22,7 @@ from isocharge.simulate.numerics.interpolation import (
     tensor_basis,
 )
 from isocharge.simulate.sensor.film import Film
-from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.footprint import Probe
 
 UNDEFORMED_RADIUS = 0.5
 """Radius within which the mesh of an oval film is the same as the mesh of a circular film, in film radii."""

@@ -18,11 +18,12 @@ from isocharge.simulate.mechanics.scaling import (
     check_strains,
 )
 from isocharge.simulate.mesh.blocks import Resolution
+from isocharge.simulate.mesh.conformal_map import CLEARANCE
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, distance_on_circular_film, place
-from isocharge.simulate.mesh.placement import CLEARANCE, Placement
+from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Film
-from isocharge.simulate.sensor.probe import Probe
-from isocharge.simulate.solver.equilibrium import shape_error
+from isocharge.simulate.sensor.footprint import Probe
+from isocharge.simulate.solver.error_estimate import shape_error
 
 TOLERANCE = 1e-7
 """Ratio of the out-of-balance force to the load at which a solve has converged, dimensionless.

@@ -1,0 +1,318 @@
+"""Conformal map that places the rings of a mesh on the film, and positions of the sectors and rings.
+
+All lengths are in film radii, and all angles are in radians. The conformal map of the unit disk onto itself is
+
+    Z = (z + c) / (1 + c z),   0 <= c < 1.
+
+The map converts points z of the template plane into film points Z in film radii. The probe lies on the positive x axis
+of the film. The map converts circles into circles. With the parameters
+
+    c  = tanh( (atanh(p + R) + atanh(p - R)) / 2 ),
+    r0 = tanh( (atanh(p + R) - atanh(p - R)) / 2 ),
+
+the map converts the circle |z| = r0 into the circle with the radius R and the centre p, which is the innermost circle
+of the mesh.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Complexes
+from isocharge.simulate.mesh.blocks import Blocks, Resolution
+
+CLEARANCE = 0.4
+"""Gap between the farthest point of a footprint and the enclosing circle, dimensionless.
+
+The unit is the distance of the farthest point from the centre of the circle.
+"""
+
+INNER_GAP_SHARE = 0.25
+"""Largest gap between the footprint and the enclosing circle, in units of the gap between the footprint and the rim."""
+
+OUTER_GAP_SHARE = 0.35
+"""Smallest gap between the enclosing circle and the rim, in units of the gap between the footprint and the rim."""
+
+
+def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
+    """Compute the disk automorphism that maps a circle around the origin onto a given circle.
+
+    The map converts a point z into (z + c) / (1 + c z) with a parameter c. The circle around the origin has the radius
+    r. For points on the x axis, the map adds arctanh(c) to arctanh(z). The map must convert -r and r into the two
+    points at which the given circle intersects the x axis. These two conditions determine c and r.
+
+    Args:
+        centre: Position of the centre of the given circle on the x axis, any shape, in film radii.
+        radius: Radius of the given circle, same shape, in film radii.
+
+    Returns:
+        Parameter c and radius r, each of the shape of `centre`.
+    """
+    # The conditions are right_end = arctanh(c) + arctanh(r) and left_end = arctanh(c) - arctanh(r). Their sum
+    # determines c, and their difference determines r.
+    right_end = np.arctanh(centre + radius)
+    left_end = np.arctanh(centre - radius)
+    map_parameter = np.tanh(0.5 * (right_end + left_end))
+    template_radius = np.tanh(0.5 * (right_end - left_end))
+    return map_parameter, template_radius
+
+
+def distance_coordinate(distance: Array | float) -> Any:
+    """Convert distances from the centre into the coordinate in which fields are interpolated between presses.
+
+    If a press is near the clamp, the fields change strongly within the short distance between the press and the clamp.
+    The coordinate stretches this short distance. Polynomials in the coordinate therefore interpolate the fields
+    accurately. The conformal map of the mesh is a translation along this coordinate.
+
+    Args:
+        distance: Distances of presses from the centre of the film, in film radii.
+
+    Returns:
+        Inverse hyperbolic tangent of the distances, of the shape and type of `distance`.
+    """
+    return np.arctanh(distance)
+
+
+def enclosing_circle(outline: Complexes, centroid: Array, bisection_steps: int = 40) -> tuple[Array, Array]:
+    """Compute for each footprint a circle on the film that encloses the footprint with a gap.
+
+    The centre of the circle is the centroid of the footprint if the circle keeps a minimum distance from the rim. If
+    the circle would be too close to the rim, its centre is shifted towards the centre of the film. The smallest
+    sufficient shift is found by bisection.
+
+    Args:
+        outline: Points x + iy along the boundary of each footprint, shape (..., n), in film radii.
+        centroid: Position of the centroid of each footprint on the x axis, shape (...), in film radii.
+        bisection_steps: Number of bisection steps for the centre of the enclosing circle.
+
+    Returns:
+        Position of the centre of each circle on the x axis, and radius of each circle, each of shape (...), in film
+        radii.
+    """
+    rim_gap = 1.0 - np.abs(outline).max(axis=-1)  # between the footprint and the rim
+    max_extent = 1.0 - OUTER_GAP_SHARE * rim_gap  # largest allowed x coordinate of a circle
+    radius_at_centroid = _enclosing_radius(outline, centroid)
+    centroid_fits = centroid + radius_at_centroid <= max_extent
+    if np.all(centroid_fits):
+        return centroid, radius_at_centroid
+
+    # Bisection for the centre with the largest x coordinate at which the circle fits
+    lower_bound = np.zeros(centroid.shape)
+    upper_bound = centroid.copy()
+    for _ in range(bisection_steps):
+        middle = 0.5 * (lower_bound + upper_bound)
+        middle_fits = middle + _enclosing_radius(outline, middle) <= max_extent
+        lower_bound = np.where(middle_fits, middle, lower_bound)
+        upper_bound = np.where(middle_fits, upper_bound, middle)
+    centre = np.where(centroid_fits, centroid, lower_bound)
+    return centre, _enclosing_radius(outline, centre)
+
+
+def _enclosing_radius(outline: Complexes, centre: Array) -> Array:
+    """Compute the radius of a circle that encloses a footprint with a gap. The centre of the circle is given.
+
+    Args:
+        outline: Points x + iy along the boundary of each footprint, shape (..., n), in film radii.
+        centre: Position of the centre of each circle on the x axis, shape (...), in film radii.
+
+    Returns:
+        Radius, shape (...), in film radii.
+    """
+    rim_gap = 1.0 - np.abs(outline).max(axis=-1)  # between the footprint and the rim
+    reach = np.abs(outline - centre[..., None]).max(axis=-1)
+    gap = np.minimum(CLEARANCE * reach, INNER_GAP_SHARE * rim_gap)
+    return np.asarray(reach + gap)
+
+
+def sector_angles(
+    blocks: Blocks,
+    inner_points: Complexes,
+    inner_extent: Array,
+    centroid: Array,
+    centre: Array,
+    radius: Array,
+    stretch: Array,
+) -> Array:
+    """Compute the angles at which the sides of the sectors meet the innermost circle.
+
+    The sectors divide the rings between the innermost circle and the rim. Their sides begin where rays from the
+    centroid of the footprint meet the circle. The last layer of elements inside the circle connects the circle to an
+    inner boundary. The directions of the rays are a compromise between evenly spaced directions and the directions of
+    given points on the inner boundary. If the gap between these points and the circle is narrow, the rays must pass
+    close to the points, because elements would fold otherwise.
+
+    Args:
+        blocks: The elements.
+        inner_points: Points x + iy on the inner boundary of the last layer, shape (..., 2 * n_meshed + 1), in film
+            radii. They belong to the corners of the core polygon and to the points half-way between the corners.
+        inner_extent: Largest distance of a point of the inner boundary from the centre of the circle, shape (...), in
+            film radii.
+        centroid: Position of the centroid of the footprint on the x axis, shape (...), in film radii.
+        centre: Position of the centre of the circle on the x axis, shape (...), in film radii.
+        radius: Radius of the circle, shape (...), in film radii.
+        stretch: Factor with which `stretch_angles` converts angles on the circle into angles in the template plane,
+            shape (...); see `stretch_on_circle`.
+
+    Returns:
+        Angles in the template plane in increasing order, shape (..., n_sector + 1), rad.
+    """
+    origin = centroid[..., None] + 0j  # common origin of all rays
+    ray_angle = _ray_angles(blocks, inner_points - origin, radius / inner_extent)
+    ray: Complexes = np.exp(1j * ray_angle)  # unit vectors x + iy, shape (..., n_sector + 1)
+    origin_from_centre: Complexes = np.asarray(origin - centre[..., None], dtype=complex)
+    intersection = _intersections_with_circle(origin_from_centre, ray, radius[..., None])
+
+    # Angles of the intersections around the centre of the circle. Each angle is larger than the previous angle, also
+    # where the angle passes pi.
+    first_angle = np.angle(intersection[..., :1])
+    increase = np.mod(np.angle(intersection[..., 1:] / intersection[..., :-1]), 2.0 * np.pi)
+    film_angle = np.concatenate([first_angle, first_angle + np.cumsum(increase, axis=-1)], axis=-1)
+
+    # Convert the angles on the film into angles in the template plane.
+    return stretch_angles(film_angle, stretch)
+
+
+def _intersections_with_circle(origin: Complexes, ray: Complexes, radius: Array) -> Complexes:
+    """Compute the points at which rays from the inside of a circle meet the circle. The centre of the circle is 0.
+
+    Args:
+        origin: Origins of the rays, x + iy.
+        ray: Unit vectors of the rays as complex numbers.
+        radius: Radii of the circles.
+
+    Returns:
+        Points x + iy, in the common shape to which the shapes of all arguments are broadcast.
+    """
+    # The length t of a ray is the positive solution of |origin + t ray|^2 = radius^2.
+    projection = (origin * np.conj(ray)).real
+    length = np.sqrt(projection**2 + radius**2 - np.abs(origin) ** 2) - projection
+    return np.asarray(origin + ray * length)
+
+
+def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array, max_turn: float = 0.2) -> Array:
+    """Compute the directions of the rays that extend from the centroid of the footprint to the sides of the sectors.
+
+    The last layer of elements inside the innermost circle connects the circle to an inner boundary. Each of the given
+    points on the inner boundary has a ray. The direction of the ray is the direction of the point, rotated by a limited
+    angle towards evenly spaced directions. All other rays divide the angle between two such rays into equal parts.
+
+    Args:
+        blocks: The elements.
+        inner_points: Points x + iy on the inner boundary, relative to the centroid, shape (..., n_point): one point for
+            each corner of the core polygon, and one point half-way between each two corners.
+        radius_ratio: Radius of the innermost circle divided by the largest distance of the inner boundary from the
+            centre of the circle, shape (...).
+        max_turn: Largest angle between the side of a sector and the ray through its corner, rad. With larger angles,
+            elements at corners that lie close together would fold.
+
+    Returns:
+        Angles, shape (..., n_sector + 1), rad.
+    """
+    # Angles with equal differences that have the same mean as the angles of the inner points, shape (..., n_point)
+    inner_angle = np.unwrap(np.angle(inner_points), axis=-1)
+    angle_from_first = np.linspace(0.0, 2.0 * np.pi / blocks.copies, inner_angle.shape[-1])
+    mean_difference = np.mean(inner_angle[..., :-1] - angle_from_first[:-1], axis=-1)
+    even_angle = angle_from_first + mean_difference[..., None]
+
+    # Rotate the direction of each inner point towards the even angle. The rotation is small if the circle is close to
+    # the inner points. The function `tanh` limits the rotation to `max_turn`.
+    evenness = 0.5 * np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)[..., None]  # from 0 to 0.5
+    rotation = max_turn * np.tanh(evenness * (even_angle - inner_angle) / max_turn)
+    mixed_angle = inner_angle + rotation
+
+    # Add the rays between the rays of the inner points. Divide each interval into `blocks.n_half_edge` equal parts.
+    fraction = np.arange(blocks.n_half_edge) / blocks.n_half_edge
+    interval = np.diff(mixed_angle, axis=-1)[..., None]
+    angles_in_intervals = mixed_angle[..., :-1, None] + fraction * interval  # shape (..., n_point - 1, n_half_edge)
+    angles = angles_in_intervals.reshape(*mixed_angle.shape[:-1], -1)
+    return np.concatenate([angles, mixed_angle[..., -1:]], axis=-1)
+
+
+def rim_angles(angle: Array, map_parameter: Array, template_radius: Array, grading: float = 0.65) -> Array:
+    """Compute the angles at which the sides of the sectors meet the rim.
+
+    The conformal map compresses the far side of the film, which lies at the angle pi. Therefore the sides of the
+    sectors are shifted towards the angle pi. The angles on the innermost circle already contain a part of the shift.
+
+    Args:
+        angle: Angles on the innermost circle in the template plane, shape (..., n_sector + 1), rad.
+        map_parameter: Parameter c of the conformal map, shape (...).
+        template_radius: Radius of the innermost circle in the template plane, shape (...).
+        grading: Share of the stretching of the conformal map along the rim that the sectors compensate, from 0 to 1.
+
+    Returns:
+        Angles in the template plane, shape (..., n_sector + 1), rad.
+    """
+    # A factor above 1 shifts angles towards pi. A factor below 1 would shift them back, so the factor is at least 1.
+    rim_stretch = ((1.0 + map_parameter) / (1.0 - map_parameter)) ** grading
+    remaining_stretch = rim_stretch / stretch_on_circle(map_parameter, template_radius)
+    return stretch_angles(angle, np.maximum(remaining_stretch, 1.0))
+
+
+def stretch_on_circle(map_parameter: Array, template_radius: Array) -> Array:
+    """Compute the factor with which `stretch_angles` converts angles on the film into angles in the template plane.
+
+    The angles on the film are measured around the centre of the innermost circle.
+
+    Args:
+        map_parameter: Parameter c of the conformal map, shape (...).
+        template_radius: Radius of the innermost circle in the template plane, shape (...).
+
+    Returns:
+        Factors for points on the innermost circle, shape (...), dimensionless.
+    """
+    product = map_parameter * template_radius
+    return np.asarray((1.0 + product) / (1.0 - product))
+
+
+def stretch_angles(angle: Array, factor: Array) -> Array:
+    """Change each angle such that the tangent of half of the angle is multiplied by a factor.
+
+    The conformal map with the parameter c also changes angles in this way. For points at the distance r from the
+    origin, it multiplies the tangent of half of the angle by (1 - c r) / (1 + c r). On the rim, r is 1.
+
+    Args:
+        angle: Angles, shape (..., n), rad.
+        factor: Factor of the tangents, shape (...).
+
+    Returns:
+        Changed angles, shape (..., n), rad. Each angle remains in the same full turn.
+    """
+    full_turns = 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
+    half_angle = 0.5 * (angle - full_turns)
+    return np.asarray(full_turns + 2.0 * np.arctan(factor[..., None] * np.tan(half_angle)))
+
+
+def ring_edges(resolution: Resolution, template_radius: Array, thin_ring_width: Array) -> Array:
+    """Compute the depths of the edges of the rings, from 0 on the innermost circle to 1 on the rim.
+
+    The depth of a point is ln(r / r0) / ln(1 / r0), where r is the distance of the point from the origin of the
+    template plane, and r0 is the radius of the innermost circle. All rings except the thin rings at the rim cover equal
+    ranges of depth. Each thin ring is a third as wide as the previous thin ring.
+
+    Args:
+        resolution: Fineness of the mesh.
+        template_radius: Radius of the innermost circle in the template plane, shape (...).
+        thin_ring_width: Total width of all thin rings in the template plane, shape (...).
+
+    Returns:
+        Depths in increasing order, shape (..., n_ring + 1).
+    """
+    even_edges = np.linspace(0.0, 1.0, resolution.rings + 1)
+    if resolution.rim == 0:
+        return np.broadcast_to(even_edges, (*template_radius.shape, even_edges.size))
+
+    # With the total width t, the thin rings extend from r = 1 - t to r = 1, over which ln(r) increases by about t.
+    # According to the definition of the depth, the depth increases by t / ln(1 / r0).
+    requested_thin_depth = -thin_ring_width / np.log(template_radius)
+    # All thin rings together are at most as deep as each of the other rings. The limit is smooth, because fields at the
+    # nodes are interpolated between presses at different distances.
+    max_thin_depth = 1.0 / (resolution.rings + 1)
+    limited_thin_depth = requested_thin_depth / (1.0 + (requested_thin_depth / max_thin_depth) ** 2) ** 0.5
+    thin_depth = limited_thin_depth[..., None]
+
+    # The even rings share the remaining depth. The part of the thin rings outside edge i is 3^-i of their total depth.
+    edges_of_even_rings = even_edges * (1.0 - thin_depth)
+    edges_of_thin_rings = 1.0 - thin_depth * 3.0 ** -np.arange(1.0, resolution.rim + 1)
+    edges_of_thin_rings[..., -1] = 1.0  # the last ring extends to the rim
+    return np.concatenate([edges_of_even_rings, edges_of_thin_rings], axis=-1)

@@ -1,0 +1,245 @@
+"""Footprint of a probe: the area on which the probe presses, with its pressure and the topology of its mesh.
+
+Points of a footprint are complex numbers x + iy in mm, relative to the centroid of the footprint. The position of a
+probe is the centroid of its footprint.
+
+The mesh of a polygonal footprint consists of blocks with straight sides. A probe whose footprint has a smooth boundary
+is a subclass of `CurvedProbe`. Its footprint contains a core polygon. The mesh of the footprint consists of blocks with
+straight sides in the core polygon, and of blocks with one curved side between the core polygon and the boundary.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+import shapely
+
+from isocharge.common.arrays import Array, Complexes
+from isocharge.common.errors import SceneError
+from isocharge.simulate.numerics.polygon import to_corners
+from isocharge.simulate.sensor.film import check_range
+
+MIN_LENGTH = 0.02
+"""Smallest accepted radius, side, axis or reach of a footprint, mm. A smaller value was probably given in metres."""
+
+CORE_SHARE = 0.45 * math.sqrt(2.0)
+"""Ratio of two distances from the centroid in the same direction, dimensionless.
+
+The ratio is the distance of a corner of the core polygon, divided by the distance of the boundary.
+"""
+
+OUTLINE_POINTS = 1024
+"""Number of points of the outline of a curved footprint. The relative error of its area is below 1e-5."""
+
+
+@dataclass(frozen=True)
+class FootprintTopology:
+    """Number and kind of the mesh blocks that a footprint needs.
+
+    Probes with the same topology use the same mesh template.
+
+    Attributes:
+        n_corner: Number of corners of the core polygon. The core polygon of a polygonal footprint is the whole
+            footprint.
+        is_curved: Whether blocks with a curved outer side lie between the core polygon and the boundary of the
+            footprint.
+        fills_circle: Whether the boundary of the footprint is the innermost circle of the mesh. Otherwise there is a
+            gap between the footprint and the innermost circle.
+    """
+
+    n_corner: int
+    is_curved: bool
+    fills_circle: bool
+
+
+class Probe(ABC):
+    """Base class of all probes. A probe is a body that presses on the film within its footprint.
+
+    The distribution of the pressure over the footprint does not depend on the film. The pressure is uniform unless a
+    subclass overrides `has_uniform_pressure`, `pressure` and `force_share`. Subclasses, such as `Circle`, `Ellipse`,
+    `Finger` and `Polygon`, are frozen dataclasses.
+    """
+
+    @property
+    @abstractmethod
+    def angle(self) -> float:
+        """Rotation of the footprint about its centroid, anticlockwise, rad."""
+
+    @property
+    @abstractmethod
+    def notation(self) -> str:
+        """Notation of this probe without its rotation, which `parse_probe` converts back into the probe."""
+
+    @property
+    @abstractmethod
+    def area(self) -> float:
+        """Area of the footprint, mm^2."""
+
+    @property
+    @abstractmethod
+    def reach(self) -> float:
+        """Distance from the centroid of the footprint to the farthest point of the footprint, mm."""
+
+    @property
+    @abstractmethod
+    def period(self) -> float:
+        """Smallest rotation that maps the footprint onto itself, rad.
+
+        The period of a circle is zero, because every rotation maps a circle onto itself.
+        """
+
+    @property
+    @abstractmethod
+    def topology(self) -> FootprintTopology:
+        """Number and kind of the mesh blocks for this footprint."""
+
+    @property
+    @abstractmethod
+    def outline(self) -> Complexes:
+        """Points x + iy along the boundary, anticlockwise, shape (n,), mm.
+
+        For a polygon, the points are its corners. For a curved footprint, the points lie on the curved boundary.
+        """
+
+    @abstractmethod
+    def core(self, unit: float) -> Complexes:
+        """Return the corners x + iy of the core polygon, anticlockwise.
+
+        The corners of the core polygon of a curved footprint are evenly spaced in the boundary parameter. The parameter
+        of the first corner is half of the spacing.
+
+        Args:
+            unit: Unit of the returned corners, mm.
+
+        Returns:
+            Corners, shape (topology.n_corner,), in multiples of `unit`.
+        """
+
+    @abstractmethod
+    def boundary(self, parameter: Array) -> Complexes:
+        """Return points on the boundary of the footprint, including the rotation by `angle`.
+
+        Args:
+            parameter: Values from 0 to 2 pi, any shape. If the parameter increases, the point moves anticlockwise along
+                the boundary. An increase of the parameter by `period` must rotate the point by `period`.
+
+        Returns:
+            Points x + iy relative to the centroid, of the shape of `parameter`, mm.
+        """
+
+    def rotated(self, angle: float) -> Self:
+        """Return a copy of the probe that is rotated further about its centroid.
+
+        Args:
+            angle: Further rotation, anticlockwise, rad.
+        """
+        if self.is_axisymmetric:  # a rotation does not change a circle
+            return self
+        return replace(self, angle=self.angle + angle)  # type: ignore[type-var]
+
+    grows = False
+    """Whether the footprint becomes larger with the force."""
+
+    def under(self, force: float) -> "Probe":  # noqa: ARG002
+        """Return a probe with the footprint that this probe has under a force (N)."""
+        return self
+
+    def farthest_distance(self, at: tuple[float, float]) -> float:
+        """Return the distance from the centre of the film to the farthest point of the outline, mm.
+
+        Args:
+            at: Position (x, y) of the centroid relative to the centre of the film, mm.
+        """
+        return float(np.abs(complex(*at) + self.outline).max())
+
+    has_uniform_pressure = True
+    """Whether the pressure is the same at all points of the footprint."""
+
+    def pressure(self, points: Complexes) -> Array:
+        """Return the pressure at points of the footprint, divided by the mean pressure.
+
+        Args:
+            points: Points x + iy relative to the centroid, any shape, mm.
+
+        Returns:
+            Relative pressure, of the shape of `points`, dimensionless. Its mean over the footprint is 1, and its centre
+            of pressure is the centroid.
+        """
+        return np.ones(points.shape)
+
+    def force_share(self, corners: Array, at: complex) -> float:
+        """Return the fraction of the force that acts on a convex polygon of the film, from 0 to 1.
+
+        For a curved footprint, the fraction is computed from its outline.
+
+        Args:
+            corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
+            at: Position of the centroid of the footprint as x + iy, mm.
+        """
+        outline = shapely.Polygon(to_corners(at + self.outline))
+        return float(shapely.intersection(shapely.Polygon(corners), outline).area / outline.area)
+
+    @property
+    def is_axisymmetric(self) -> bool:
+        """Whether every rotation maps the footprint onto itself."""
+        return self.period == 0.0
+
+
+class CurvedProbe(Probe):
+    """Base class of probes with a convex footprint whose boundary is smooth.
+
+    A subclass has a field `angle` and implements `boundary`, `notation`, `area`, `reach` and `period`. The class
+    `CurvedProbe` implements all other methods of `Probe`. A subclass may override these methods with closed formulas.
+    """
+
+    @property
+    def topology(self) -> FootprintTopology:
+        """Topology with a core polygon, and a layer of blocks between the core polygon and the boundary.
+
+        The core polygon has the rotational symmetry of the footprint. The layer around a circular footprint reaches up
+        to the innermost circle of the mesh.
+        """
+        # A circle, and a footprint that only a half turn or a full turn maps onto itself, has a core with four corners.
+        n_corner = 4
+        if 0.0 < self.period < 0.9 * math.pi:
+            n_corner = round(math.tau / self.period)
+        return FootprintTopology(n_corner, is_curved=True, fills_circle=self.is_axisymmetric)
+
+    @property
+    def outline(self) -> Complexes:
+        """Points x + iy of the boundary at evenly spaced parameters, shape (OUTLINE_POINTS,), mm."""
+        return self.boundary(2.0 * np.pi * np.arange(OUTLINE_POINTS) / OUTLINE_POINTS)
+
+    def core(self, unit: float) -> Complexes:
+        """Return the corners x + iy of the core polygon in multiples of `unit` (mm), shape (n_corner,)."""
+        n_corner = self.topology.n_corner
+        parameter = 2.0 * np.pi * (np.arange(n_corner) + 0.5) / n_corner
+        return np.asarray(CORE_SHARE * self.boundary(parameter) / unit)
+
+
+def check_angle(angle: float) -> None:
+    """Raise an error if the rotation of a footprint is not a finite number.
+
+    Args:
+        angle: Rotation, rad.
+
+    Raises:
+        SceneError: If `angle` is infinite or not a number.
+    """
+    if not np.isfinite(angle):
+        raise SceneError(f"probe angle: expected a finite number, got {angle}")
+
+
+def check_length(what: str, length: float) -> None:
+    """Raise an error if a length of a footprint is infinite, or so small that it was probably given in metres.
+
+    Args:
+        what: Name of the length in the error message.
+        length: Radius, side, axis or reach of the footprint, mm.
+
+    Raises:
+        SceneError: If `length` is below `MIN_LENGTH` or infinite.
+    """
+    check_range(what, length, (MIN_LENGTH, np.inf), "mm", SceneError)

@@ -1,0 +1,269 @@
+"""Estimates of the errors of a solved press, warnings, and a summary of its results.
+
+In the inner part of the film, two quantities indicate the error that the mesh causes: the shapes of the elements, and
+the contribution of the highest polynomial modes to the slopes of the deflection. The estimate is not reliable for
+presses near the rim or for large footprints that are not circular. Under such presses, elements that are too coarse may
+lie far from the elements with the largest stress. The same holds for a pressure on the whole film, which also bends the
+large elements far from the probe. The module `press` therefore solves these presses on meshes of increasing polynomial
+order, until two successive meshes result in nearly the same charges. The module also does so if the required accuracy
+is better than the default accuracy. If the polynomial order of the elements increases by one, the error decreases by a
+factor of three to ten. The difference between the charges of two successive meshes is therefore an upper bound of the
+error on the finer mesh.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Complexes
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
+from isocharge.common.structs import finite_or_none
+from isocharge.simulate.mechanics.scaling import (
+    bending_length,
+    modelling_error,
+)
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh
+from isocharge.simulate.numerics.interpolation import gauss_reference_square, modal_matrix
+from isocharge.simulate.numerics.polygon import to_corners
+from isocharge.simulate.solver.equilibrium import Equilibrium, deflection, node_slopes, principal_stress, touch_stress
+
+MESH_ERROR_SAFETY = 2.0
+"""Safety factor of the error that is predicted from the elements and their modes, dimensionless.
+
+The factor is too small for presses at distances above 0.6 film radii.
+"""
+
+MIN_MESH_ERROR = 5e-5
+"""Smallest relative error of a charge that is reported.
+
+The thin rings and the integration over the electrodes cause an error of this order.
+"""
+
+MODE_SHARE_WEIGHT = 0.1
+"""Ratio of the relative error of a charge to the share of the highest modes in the slopes, dimensionless."""
+
+
+def shape_error(mesh: PlacedMesh) -> float:
+    """Predict the relative error of a charge from the shapes of the elements.
+
+    The elements approximate the conformal map by polynomials, so the area of the mesh differs slightly from the area of
+    the film. The predicted error is the square root of the relative difference between the area of the mesh and the
+    area of the film. The largest error of a charge of random presses is about a third of the predicted error.
+
+    Args:
+        mesh: Mesh of the press.
+
+    Returns:
+        Predicted error, which is infinite if an element is folded.
+    """
+    geometry = mesh.geometry
+    is_folded = geometry.weights.min() <= 0.0 or geometry.mass.min() <= 0.0
+    if is_folded:
+        return np.inf
+    film_area = np.pi * (1.0 + 0.5 * abs(mesh.oval) ** 2)  # in squared film radii
+    mesh_area = mesh.template.copies * geometry.weights.sum()
+    return float(np.sqrt(abs(mesh_area / film_area - 1.0)))
+
+
+def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
+    """Compute the share of the highest polynomial modes in the slopes of the deflection.
+
+    The slopes in each element are expanded in products of Legendre polynomials. A small share of the polynomials of the
+    highest degree indicates that the mesh is fine enough.
+
+    Args:
+        mesh: Mesh of the press.
+        slope: Gradient of W at the nodes of every element, shape (n_element, n_local, 2).
+
+    Returns:
+        Mean of the shares in all elements, weighted with the areas of the elements and the squares of the slopes.
+    """
+    # Convert the values on the square grid of nodes into coefficients of products of Legendre polynomials in xi and
+    # eta, shape (n_element, 2, n_node, n_node).
+    n_node = mesh.resolution.order + 1
+    nodes_to_modes = modal_matrix(mesh.resolution.order)
+    nodal_slope = slope.transpose(0, 2, 1).reshape(len(slope), 2, n_node, n_node)
+    coefficients = nodes_to_modes @ nodal_slope @ nodes_to_modes.T
+
+    # The power of a mode is the sum of its mean squares in both slopes. The mean square of the Legendre polynomial of
+    # degree n is 1 / (2 n + 1).
+    mean_square = 1.0 / (2.0 * np.arange(n_node) + 1.0)
+    power = (coefficients**2 * np.outer(mean_square, mean_square)).sum(axis=1)  # shape (n_element, n_node, n_node)
+    total_power = power.sum(axis=(1, 2))
+    lower_power = power[:, :-1, :-1].sum(axis=(1, 2))  # of modes without the highest degree in xi and in eta
+    highest_power = total_power - lower_power
+
+    # The share of an element is sqrt(highest power / total power), and its weight is area * total power.
+    area = mesh.geometry.weights.sum(axis=1)
+    weighted_share = area * np.sqrt(np.maximum(highest_power, 0.0) * total_power)
+    total_weight = max(np.sum(area * total_power), 1e-300)  # the limit avoids a division by zero
+    return float(np.sum(weighted_share) / total_weight)
+
+
+def mesh_error(equilibrium: Equilibrium) -> float:
+    """Estimate the relative error that the mesh causes in a charge.
+
+    If the press was solved on two meshes, the estimate is the relative difference between the results on both meshes.
+    If the press was solved on one mesh, the estimate is the larger of two predictions. One is made from the shapes of
+    the elements, and the other from the share of the highest polynomial modes in the slopes.
+
+    Args:
+        equilibrium: The solved press.
+
+    Returns:
+        Relative error, which is at least `MIN_MESH_ERROR`.
+    """
+    if equilibrium.proven_error is not None:
+        return max(MIN_MESH_ERROR, equilibrium.proven_error)
+    mesh = equilibrium.mesh
+    slope_of_deflection = node_slopes(equilibrium)[..., 2]
+    mode_error = MODE_SHARE_WEIGHT * highest_mode_share(mesh, slope_of_deflection)
+    return max(MIN_MESH_ERROR, MESH_ERROR_SAFETY * shape_error(mesh), MESH_ERROR_SAFETY * mode_error)
+
+
+def estimated_error(equilibrium: Equilibrium) -> float:
+    """Estimate the relative error that the mesh and the omitted terms of the theory cause in a charge.
+
+    Args:
+        equilibrium: The solved press.
+
+    Returns:
+        Relative error, which is infinite if the theory cannot describe the film.
+    """
+    bending_error = modelling_error(equilibrium.film, equilibrium.probe, equilibrium.force, equilibrium.theory)
+    return mesh_error(equilibrium) + bending_error
+
+
+PATCH_RING_RADII = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8)
+"""Radii of the rings on which square patches are placed to compare the charges of two meshes, in film radii."""
+
+
+def relative_difference(one: Equilibrium, other: Equilibrium, patches_per_ring: int = 12) -> float:
+    """Compute the largest relative difference between two equilibria of the same press.
+
+    The function compares the deflections at the probe, and the charges that square patches of the film would collect.
+    The charges are compared for a biaxial film and for a uniaxial film. The patches lie on rings around the centre of
+    the film, and on a ring around the footprint. The difference between the two charges of a patch is divided by the
+    largest charge of all patches on the same ring.
+
+    Args:
+        one: First equilibrium.
+        other: Second equilibrium. The differences are relative to its deflection and its charges.
+        patches_per_ring: Number of patches on each ring.
+
+    Returns:
+        Relative difference, dimensionless.
+    """
+    # Centres x + iy of the patches, shape (n_ring, patches_per_ring), mm
+    film_radius = one.film.radius
+    unit_circle = np.exp(2j * np.pi * np.arange(patches_per_ring) / patches_per_ring)
+    rings_around_centre = film_radius * np.array(PATCH_RING_RADII)[:, None] * unit_circle
+    ring_around_footprint = complex(*one.at) + one.probe.reach * unit_circle
+    patch_centres = np.concatenate([rings_around_centre, ring_around_footprint[None]])
+
+    # Largest difference of the charges, relative to the largest charge on the same ring
+    one_charge = _patch_charges(one, patch_centres)
+    other_charge = _patch_charges(other, patch_centres)
+    largest_on_ring = np.maximum(np.abs(other_charge).max(axis=1, keepdims=True), 1e-300)
+    charge_difference = float((np.abs(one_charge - other_charge) / largest_on_ring).max())
+
+    # Relative difference of the deflections at the centroid of the footprint
+    (one_deflection,) = deflection(one, np.array([one.at]))
+    (other_deflection,) = deflection(other, np.array([one.at]))
+    deflection_difference = abs(float(one_deflection / other_deflection) - 1.0)
+    return max(charge_difference, deflection_difference)
+
+
+def _patch_charges(
+    equilibrium: Equilibrium, centres: Complexes, relative_side: float = 1.0 / 15.0, points_per_side: int = 6
+) -> Array:
+    """Compute the charge per area of each square patch, for a biaxial film and for a uniaxial film.
+
+    Args:
+        equilibrium: The solved press.
+        centres: Centres x + iy of the patches, shape (n_ring, n_patch), mm.
+        relative_side: Side of the patches, in film radii.
+        points_per_side: Number of Gauss points along the side of a patch.
+
+    Returns:
+        Charges per area in arbitrary units, shape (n_ring, n_patch, 2). The last axis is the kind of film. The part of
+        a patch outside the film does not contribute.
+    """
+    # Integration points of all patches. The coordinates xi and eta range from -1 to 1.
+    film_radius = equilibrium.film.radius
+    xi, eta, weights = gauss_reference_square(points_per_side)
+    half_side = 0.5 * relative_side * film_radius
+    complex_points = (centres[:, :, None] + half_side * (xi + 1j * eta)).ravel()
+    points = to_corners(complex_points)
+
+    # Stress at the integration points. The stress is set to zero outside the film.
+    is_on_film = np.abs(complex_points) < equilibrium.film.rim_distance(np.angle(complex_points))
+    stress = np.zeros((len(points), 3))
+    stress[is_on_film] = touch_stress(equilibrium, points[is_on_film])
+
+    # Mean over the integration points p, for each ring r, patch a and stress component c. The weights of the reference
+    # square are divided by their sum, which is 4.
+    patch_stress = stress.reshape(*centres.shape, -1, 3)
+    mean_stress = np.einsum("rapc,p->rac", patch_stress, 0.25 * weights)
+
+    # The coefficients d31 and d32 of a biaxial film are equal. On a uniaxial film, d31 is about ten times d32.
+    coefficients = np.array([[1.0, 10.0], [1.0, 1.0]])  # one column for each kind of film
+    return np.asarray(mean_stress[..., :2] @ coefficients)
+
+
+WRINKLE_SHARE = 1e-3
+"""Ratio of the compression to the largest stress above which a warning is given, dimensionless."""
+
+
+def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
+    """Return warnings about effects in a real film that the theory does not model.
+
+    Args:
+        equilibrium: The solved press.
+
+    Returns:
+        One sentence for each warning.
+    """
+    smallest, largest = principal_stress(equilibrium)
+    sentences = []
+    if largest > DEFAULT_STRESS_LIMIT:
+        sentences.append(f"the film is stressed to {largest:.3g} MPa; PVDF yields from {DEFAULT_STRESS_LIMIT:g} MPa on")
+    if smallest < -WRINKLE_SHARE * largest:
+        sentences.append(f"the film is compressed to {smallest:.3g} MPa somewhere; a thin film may wrinkle there")
+    smallest_tension = equilibrium.film.pretension - np.hypot(*equilibrium.film.deviator)
+    if smallest_tension < 0.0:
+        sentences.append(
+            f"without a press, the film is compressed to {smallest_tension:.3g} MPa; if it wrinkles then, the measured "
+            "charges are smaller, because touch charges are computed relative to the flat film"
+        )
+    return tuple(sentences)
+
+
+REPORTED_GROUPS = ("squared_amplitude", "load", "tension", "bending", "poisson")
+"""Attributes of `DimensionlessGroups` that the JSON output contains."""
+
+
+def summary(equilibrium: Equilibrium) -> dict[str, Any]:
+    """Return the results of a solved press as a dictionary for JSON output.
+
+    The dictionary contains the deflection, the theory, the estimated error, the outcome of the solve, the dimensionless
+    groups and the warnings.
+
+    Args:
+        equilibrium: The solved press.
+    """
+    (centre_deflection,) = deflection(equilibrium, np.array([equilibrium.at]))
+    return {
+        "deflection_mm": float(centre_deflection),
+        "theory": equilibrium.theory.name,
+        "status": equilibrium.status,
+        "iterations": equilibrium.iterations,
+        "residual": equilibrium.residual,
+        "seconds": equilibrium.seconds,
+        "estimated_error": finite_or_none(estimated_error(equilibrium)),
+        "groups": {
+            **{name: getattr(equilibrium.groups, name) for name in REPORTED_GROUPS},
+            "bending_length": bending_length(equilibrium.film, equilibrium.force),
+        },
+        "warnings": list(cautions(equilibrium)),
+    }
