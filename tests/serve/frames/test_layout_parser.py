@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from frame_formats import STUFFINGS
 from isocharge.common.errors import DeviceError
-from isocharge.serve import device_from_table
+from isocharge.serve import Frame, device_from_table
 from isocharge.serve.frames.frame_layout import SyncParser
 from layout_encoder import encode_layout
 
@@ -82,6 +82,31 @@ def test_frames_of_sensors_as_their_makers_describe_them(name, data, seq, t_us, 
     assert (frame.seq, frame.t_us) == (seq, t_us)
     assert frame.values == pytest.approx(values)
     assert frame.names == LAYOUTS[name].columns.names
+
+
+COUNTS = st.lists(st.integers(-32768, 32767), min_size=7, max_size=7)
+
+
+def encoded(name, counts):
+    """Return the bytes of a frame whose channels have these values before the scaling."""
+    layout = LAYOUTS[name]
+    values = [count * scale for count, (_, scale) in zip(counts, layout.columns.channels, strict=False)]
+    return encode_layout(layout, Frame(abs(counts[0]), abs(counts[1]), tuple(values)))
+
+
+@settings(derandomize=True)
+@given(st.lists(st.one_of(COUNTS, st.binary(max_size=20), st.just(b"\xaa\x07\x08")), max_size=12), st.integers(1, 50))
+def test_every_byte_is_a_part_of_a_frame_or_counted_as_dropped(parts, step):
+    """After a reset, no byte is stored, and no byte has been counted twice."""
+    layout = LAYOUTS["optoforce_omd"]
+    stream = b"".join(part if isinstance(part, bytes) else encoded("optoforce_omd", part) for part in parts)
+    parser = SyncParser(layout)
+    frames = []
+    for start in range(0, len(stream), step):
+        frames += parser.feed(stream[start : start + step])
+    parser.reset()
+    assert parser.counts.bytes_dropped == len(stream) - layout.length * len(frames)
+    assert parser.counts.frames == len(frames)
 
 
 @pytest.mark.parametrize("name", ["seq", "t_s"])
@@ -168,6 +193,19 @@ def test_datagrams_contain_whole_frames():
     assert parser.sequence_flags(1) == ()
     parser.feed(first + second)
     assert parser.sequence_flags(4) == ("gap",)
+
+
+def test_constant_bytes_are_checked():
+    """The byte after the counter is the length of the frame. Frames of another kind differ in this byte."""
+    text = """
+sync = "7E"
+length = 5
+fields = [{name = "seq", type = "u8"}, {type = "pad", value = "02"}, {name = "A", type = "i16"}]
+"""
+    described = layout(text)
+    frames = SyncParser(described).feed(bytes.fromhex("7E 01 02 10 00  7E 02 09 11 22  7E 03 02 20 00"))
+    assert [(frame.seq, frame.values) for frame in frames] == [(1, (16.0,)), (3, (32.0,))]
+    assert encode_layout(described, Frame(1, 0, (16.0,))) == bytes.fromhex("7E 01 02 10 00")
 
 
 ROBOTIQ = (Path(__file__).parents[2] / "data" / "frames" / "robotiq_ft300.toml").read_text("utf-8")

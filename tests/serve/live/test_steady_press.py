@@ -181,3 +181,13 @@ def test_press_is_refused_after_the_port_was_lost():
     ]
     (reason,) = reasons_of(results)
     assert "the port was lost" in reason
+
+
+def test_an_armed_watch_takes_no_press_that_has_begun():
+    watch = PressWatch(NAMES)
+    results = []
+    for number, reading in enumerate(readings(np.concatenate([rest(1), held(2), rest(1), held(2)]))):
+        if number == 240:  # in the first press
+            watch.arm()
+        results.append(watch.feed(reading))
+    assert phases_of(results) == ["waiting", "settling", "lift", "waiting", "settling", "taken", "lift"]

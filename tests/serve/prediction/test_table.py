@@ -22,6 +22,18 @@ def read(text):
     return read_charges(io.StringIO(text, newline=""), NAMES, "presses.csv")
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "A,B,C\n1,2,3\n4,5,6.5\n",
+        "\n A , B,C \n1, 2,3\n,,\n4,5,65e-1\n",
+        '# of "today\n\nA,B,C\n1,2,3,,\n  # 7,8,9\n4,5,6.5\n',
+    ],
+)
+def test_charges_are_the_same_from_every_kind_of_csv(text):
+    np.testing.assert_array_equal(read(text), [[1, 2, 3], [4, 5, 6.5]])
+
+
 EXPORTS = {
     "Excel in German": "\ufeffx_mm;y_mm;force_N;A;B;C\r\n2;-6;0,2;502,3;244,8;215,8\r\n2;4;0,5;423,2;695,6;507,8\r\n",
     "line with the separator": "sep=;\r\nx_mm;A;B;C\r\n2;502.3;244.8;215.8\r\n2;423.2;695.6;507.8\r\n",

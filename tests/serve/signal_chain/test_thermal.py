@@ -79,6 +79,19 @@ def test_warming_that_is_inseparable_from_force_is_not_subtracted():
     assert warming._is_blind
 
 
+def test_uncertainty_of_the_warming_grows_while_it_is_inseparable_from_force():
+    """A blind time of 10 s. The first estimate after it removes nearly the whole warming of 18 pC."""
+    warming = warming_stage(lambda charge_pC: film_misfit(charge_pC))
+    film_misfit = misfit_of(BIAXIAL)
+    for _ in range(200):
+        warming._estimate(np.ones(4), 0.05)
+    assert warming._is_blind
+    assert warming._variance_pC2 == pytest.approx(10.0 * ThermalRule().wander_pC ** 2)
+    film_misfit = misfit_of(UNIAXIAL)
+    warming._estimate(PRESS + 18.0, 0.05)
+    assert warming._charge_pC == pytest.approx(18.0, rel=0.05)
+
+
 PRESS = UNIAXIAL @ [850.0, 3.0, -2.0]
 """Touch charges of a press on the uniaxial film, shape (4,), pC."""
 

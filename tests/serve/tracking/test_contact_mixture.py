@@ -1,5 +1,6 @@
 """Tests of the contact mixture on a film with a known fold: contacts at x and at 2 FOLD - x have the same charges."""
 
+import json
 import shutil
 from collections.abc import Sequence
 
@@ -16,7 +17,7 @@ from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.tracking.contact_mixture import GAIN_STD, ContactMixture
 from model_files import put_charge_map
-from stage_runner import new_tracker
+from stage_runner import new_tracker, recorded_lines
 from stage_runner import track as track_frame
 
 RADIUS = 6.0
@@ -168,6 +169,22 @@ def model(models, tmp_path):
     folder = shutil.copytree(models / "linear", tmp_path / "linear") / "1"
     put_charge_map(folder, charge_map_bytes(folded_series()))
     return folder
+
+
+def test_records_with_track_have_the_field_other_and_are_repeated_bit_for_bit(model):
+    rows = np.concatenate([np.zeros((10, 3)), noisy_charges(np.zeros(40)), np.zeros((5, 3))])
+    predictor = Predictor(model)
+    lines = recorded_lines(predictor, rows, {"track": {}})
+    assert lines == recorded_lines(predictor, rows, {"track": {}})
+
+    last = json.loads(lines[45])
+    released = json.loads(lines[-1])
+    tracked = last["tracked"]
+    assert abs(tracked["x_mm"] + last["other"]["x_mm"] - 2.0 * FOLD) < 1.0
+    for name in ("x_mm", "y_mm", "force_N"):
+        assert last[name] == tracked[name]
+    assert last["flags"] == []
+    assert (released["tracked"], released["other"]) == (None, None)
 
 
 def test_stream_keeps_its_model_if_the_charges_npz_of_the_next_model_is_damaged(model, models):

@@ -188,3 +188,22 @@ def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
     )
     with pytest.raises(ModelError, match="four electrodes"):
         FilmFollower(model_in(tmp_path, three))
+
+
+def test_contacts_are_corrected_from_the_first_touch(series, tmp_path):
+    rng = np.random.default_rng(8)
+    model = model_in(tmp_path, series)
+    contact, charge = touches(series, np.array([-0.4, 0.0, 0.0]), np.ones(4), rng, 31)
+    before, normalised_before = force_errors(FilmFollower(model), model, contact[1:], charge[1:])
+    after, normalised_after = force_errors(followed(model, charge[:1], rng), model, contact[1:], charge[1:])
+    assert np.mean(after**2) < np.mean(before**2)
+    assert np.mean(np.abs(normalised_before) < 2.0) < 0.1
+    assert np.mean(np.abs(normalised_after) < 2.0) > 0.85
+
+
+def test_touches_that_no_film_explains_make_the_film_lost(series, tmp_path):
+    rng = np.random.default_rng(5)
+    model = model_in(tmp_path, series)
+    _, charge = touches(series, series.calibrated_state, np.ones(4), rng, 40)
+    assert followed(model, charge * rng.uniform(0.7, 1.4, charge.shape), rng).is_lost
+    assert not followed(model, charge, rng).is_lost

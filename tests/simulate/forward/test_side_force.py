@@ -98,6 +98,13 @@ def test_friction_pulls_the_film_inwards_and_sticks_near_the_centre(side_force_m
         np.testing.assert_allclose(row, direct, atol=2e-4)
 
 
+def test_friction_charges_look_like_a_press_farther_outwards(side_force_map):
+    contact = np.array([[3.0, -2.0, 0.5]])
+    change = side_force_map.friction_charges(contact, 0.2)[0]
+    shift = np.linalg.lstsq(side_force_map.film.derivatives(contact)[0], change, rcond=None)[0]
+    assert 0.2 < shift[:2] @ np.array([3.0, -2.0]) / np.hypot(3.0, 2.0) < 0.3
+
+
 def test_a_rotated_side_force_of_a_square_probe_gives_rotated_charges():
     """If a press and its side force are rotated by 90 degrees, each electrode has the charge of its neighbour."""
     sensor = taut("four-25um-biaxial", 0.5)

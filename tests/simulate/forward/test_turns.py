@@ -44,3 +44,13 @@ def test_fourier_series_is_interpolated_exactly(film: Film, probe, largest):
 def test_fewer_turns_are_solved_than_all_pairs_of_angles(probe, solves, all_pairs):
     """All pairs are seven directions times the rotations, of which the symmetry of the probe saves some."""
     assert len(Turns.spread(UNEVEN, probe, DEFAULT_HARMONICS).solved) == solves <= all_pairs
+
+
+@pytest.mark.parametrize("probe", [Ellipse(4.0, 2.0), Polygon.triangle(4.0), Polygon.rectangle(3.0, 3.0)])
+def test_rotation_by_a_period_of_the_probe_is_the_same_press(probe):
+    """Both angles increase by the period. Directions that differ by half a turn are equal."""
+    turns = Turns.spread(UNEVEN, probe, DEFAULT_HARMONICS)
+    n_solved = len(turns.solved)
+    np.testing.assert_allclose(turns.rotation[n_solved:] - turns.rotation[:-n_solved], probe.period)
+    change = turns.direction[n_solved:] - turns.direction[:-n_solved] - probe.period
+    np.testing.assert_allclose(np.sin(change), 0.0, atol=1e-12)

@@ -142,6 +142,19 @@ def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(prob
     assert 0.88 < np.mean(within) <= 0.99
 
 
+def test_bad_press_is_left_out_and_hardly_changes_the_estimate(problem, synthetic):
+    values, _, presses = rig(problem, synthetic, 12, seed=4)
+    good = film_estimate(problem, synthetic, presses)
+    presses.contact[3, 0] += 3.0
+    found = film_estimate(problem, synthetic, presses)
+    assert np.flatnonzero(found.is_bad).tolist() == [3]
+    assert found.press_chi2[3] > 20.0 > good.press_chi2.max()
+    std = np.sqrt(np.diag(good.film.covariance))
+    named = problem.prior.layout.film
+    assert (np.abs(found.film.values - good.film.values)[named] < 1.5 * std[named]).all()
+    assert abs(found.film.value("pretension") - values[0]) < 4.0 * found.film.std("pretension")
+
+
 @pytest.mark.parametrize(("gain", "least", "most"), [(0.002, 0.002, 0.002), (0.015, 0.008, 0.016)])
 def test_noise_is_estimated_and_noisy_presses_are_not_bad(problem, synthetic, gain, least, most):
     _, _, presses = rig(replace(problem, noise=NoiseModel("bench", 1.0, gain)), synthetic, 20, seed=0)

@@ -124,6 +124,16 @@ def test_press_outside_the_domain_is_refused_and_not_saved(problem, synthetic, p
     assert rig.saved == []
 
 
+def test_presses_with_an_unknown_place_or_force_are_taken(problem, synthetic, plan):
+    """The place is unknown with dead weights, and the force with a stage that has no load cell."""
+    rig = SimulatedRig(problem, synthetic, plan, 2)
+    x, y, force = plan[2].contact
+    for contact in ([np.nan, np.nan, force], [x, y, np.nan]):
+        rig.session.take(rig.charge(plan[2].contact), np.array(contact))
+    assert not rig.session.result.estimation.is_bad.any()
+    assert np.isnan(rig.saved[-1].contact).sum() == 3
+
+
 NAN = float("nan")
 
 

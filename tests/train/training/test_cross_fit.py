@@ -103,6 +103,11 @@ def errors_on(fitted, presses):
     return contact_errors(contact, std, presses.contact)
 
 
+def test_the_noise_of_the_channels_is_estimated(fitted_pad):
+    np.testing.assert_allclose(fitted_pad.noise.sigma(np.zeros((1, 4)))[0], NOISE_pC, rtol=0.1)
+    assert (fitted_pad.noise.gain < 0.03).all()
+
+
 def test_errors_are_those_of_weighted_least_squares(fitted_pad, fresh):
     """Weighted least squares has the smallest variance of all linear estimators.
 
