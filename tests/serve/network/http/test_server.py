@@ -184,8 +184,24 @@ def test_connections_above_the_limit_are_refused(limited):
             held = stack.enter_context(connect(server))
             held.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
             held.recv(1000)
+            held.sendall(infer()[:-1])
         assert refused(exchange(server, b"")) == (503, "all 3 connections are taken; try again later")
     wait_until(lambda: is_well(server))
+
+
+def test_connections_between_two_requests_make_room_for_new_ones(limited):
+    server = limited(connections=3)
+    with ExitStack() as stack:
+        answered = [stack.enter_context(connect(server)) for _ in range(3)]
+        for connection in answered:
+            connection.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
+            connection.recv(1000)
+        assert is_well(server)
+        ended, _, _ = select.select(answered, [], [], 5)  # s, less than the time allowed between two requests
+        assert len(ended) == 1
+        (kept, _) = {*answered} - {*ended}
+        kept.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
+        assert statuses(kept.recv(1000)) == [200]
 
 
 def test_idle_connections_leave_open_files_for_new_connections(limited, monkeypatch):

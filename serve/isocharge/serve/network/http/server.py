@@ -55,21 +55,28 @@ class Connection(HttpToolsProtocol):
         self._max_head_bytes = 0  # upper bound of the size of the head that is being parsed
 
     def connection_made(self, transport: Any) -> None:
-        """Begin the connection. If there are too many connections, end the oldest one that has not sent a request.
+        """Begin the connection. If there are too many connections, end one that waits for a request.
 
-        If every other connection has sent a request, the new connection is refused.
+        The earliest deadline selects a connection that has not sent a request before one that was already answered. If
+        every other connection has an open request, the new connection is refused.
         """
         super().connection_made(transport)
         self.deadline = self.loop.time() + self._limits.header_seconds
         if len(self.connections) <= self._limits.connections:
             return
         others: Any = self.connections - {self}  # all connections are of this class
-        unused = [other for other in others if other.cycle is None and not other.transport.is_closing()]
-        if unused:
-            oldest = min(unused, key=lambda other: other.deadline)  # the earliest deadline belongs to the oldest one
-            oldest.transport.abort()
+        idle = [other for other in others if other.is_idle]
+        if idle:
+            min(idle, key=lambda other: other.deadline).transport.abort()
         else:
             self.refuse(503, f"all {self._limits.connections} connections are taken; try again later")
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether the server owes no response to this connection."""
+        if self.cycle is None:
+            return not self.transport.is_closing()
+        return self.cycle.response_complete and not self._is_reading and not self.transport.is_closing()
 
     def data_received(self, data: bytes) -> None:
         """Parse data of the client. Refuse a request whose head, trailers or chunk extensions are too long."""
