@@ -28,6 +28,8 @@ def write(tmp_path):
     [
         ("x_mm,y_mm,force_N,Ladung A [pC],B,C", r"got the header \[.*'Ladung A \[pC\]'.*; missing: \['A'\]"),
         ("x_mm,y_mm,force_N,a,B,C", "rename 'a' to 'A', or remove the column; missing"),
+        ("x_mm,y_mm,force_N,A [pC],B [pC],C [pC]", r"rename 'A \[pC\]' to 'A'"),
+        ("x_mm,y_mm,force_N,A_pC,B_pC,C_pC", "rename 'A_pC' to 'A'"),
         ("x [mm],y_mm,force_N,A,B,C", r"rename 'x \[mm\]' to 'x_mm'"),
         ("x_mm,y_mm,Force (N),A,B,C", r"rename 'Force \(N\)' to 'force_N'"),
         ("x_mm,y_mm,Force_STD,A,B,C", "rename 'Force_STD' to 'force_std'"),

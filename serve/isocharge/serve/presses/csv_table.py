@@ -5,7 +5,8 @@ meaning; rows above it are ignored. If commas separate the columns, the decimal 
 point or a comma, and the same in the whole file. A number such as `1,064` may then be 1.064 or 1064. A file in which no
 number determines the decimal mark is therefore refused.
 
-A row that begins with # is a comment. Blank rows, and a row with the units mm, N and pC below the header, are ignored.
+A row that begins with # is a comment. Blank rows, and a row below the header that has the units mm, N and pC in the
+columns to read, are ignored.
 Blanks before and after a name or a number are also ignored. The texts `nan` and `inf` are not accepted.
 """
 
@@ -84,7 +85,7 @@ class CsvTable(NumberTable):
         line_numbers = array("q")
         numbers = array("d")  # the numbers of the first row, then the numbers of the second row, and so on
         for index, (line_number, cells) in enumerate(self._rows):
-            if index == 0 and _is_row_of_units(cells):
+            if index == 0 and _is_row_of_units([cells[i] for i in column_indices.values() if i < len(cells)]):
                 continue
             if len(line_numbers) == max_rows:  # this row is one row too many
                 self._refuse_row_count(max_rows)
@@ -93,10 +94,12 @@ class CsvTable(NumberTable):
             for name, column_index in column_indices.items():
                 number = self._number(cells[column_index].strip())
                 if number is None:
-                    mark = f"; the decimal mark is {self._mark!r}" if self._mark else ""
+                    cell = cells[column_index].strip()
+                    has_other_mark = self._mark != "" and any(mark in cell for mark in ",." if mark != self._mark)
+                    advice = f"; the decimal mark is {self._mark!r}" if has_other_mark else ""
                     raise self.source.error(
                         f", line {line_number}, column {shown(name)}: expected {rules[name].description}, got "
-                        f"{shown(cells[column_index].strip())}{mark}"
+                        f"{shown(cell)}{advice}"
                     )
                 numbers.append(number)
             if not self._is_mark_certain:
@@ -165,8 +168,8 @@ def csv_text(columns: Mapping[str, Array]) -> str:
 
 
 def _is_row_of_units(cells: list[str]) -> bool:
-    """Return whether the cells of a row are the units of the columns, with or without brackets."""
-    units = {cell.strip().strip("[]()") for cell in cells} - {"°C"}  # a temperature is not read
+    """Return whether cells are the units of charges and other known columns, with or without brackets."""
+    units = {cell.strip().strip("[]()") for cell in cells}
     return "pC" in units and units <= _UNITS
 
 

@@ -182,7 +182,7 @@ class NumberTable(ABC):
         return chosen_rules
 
     def refuse_similar_names(self, columns: Iterable[str], names: Iterable[str]) -> None:
-        """Refuse a column whose name differs from the name of a missing column only by case, brackets or blanks.
+        """Refuse a column whose name differs from that of a missing column by case, brackets, blanks or the unit pC.
 
         Args:
             columns: Names of the columns of the file that are checked.
@@ -191,7 +191,9 @@ class NumberTable(ABC):
         Raises:
             InputError: If a column has such a name.
         """
-        absent_names = {_letters_of(name): name for name in names if name not in self.header}
+        absent_names = {
+            _letters_of(f"{name}{unit}"): name for name in names for unit in ("", "pC") if name not in self.header
+        }
         for column in columns:
             if _letters_of(column) in absent_names:
                 name = absent_names[_letters_of(column)]
