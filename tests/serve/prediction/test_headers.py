@@ -64,8 +64,9 @@ TEXT = f"# Größe\nx_mm,y_mm,force_N,A,B,C\n{ROW}"
 )
 @pytest.mark.parametrize("read", [read_presses, read_charge_file])
 def test_headers_in_other_encodings_are_refused(write, read, data, message):
-    with pytest.raises((PressError, ChargeError), match=message):
+    with pytest.raises((PressError, ChargeError), match=message) as caught:
         read(write(data), NAMES)
+    assert str(caught.value).count("presses.csv") == 1
 
 
 @pytest.mark.parametrize("marks", [1, 2])

@@ -45,7 +45,7 @@ EXPORTS = {
     "0,000000\t502,300000\t244,800000\t215,800000\t\n0,001000\t423,200000\t695,600000\t507,800000\t\n",
     "pandas": ",x_mm,A,B,C\n0,2,502.3,244.8,215.8\n1,2,423.2,695.6,507.8\n",
     "pandas in German": ";A;B;C\n0;5,023e+02;2,448e+02;2,158e+02\n1;4,232e+02;6,956e+02;5,078e+02\n",
-    "row of units of a time, too": "point;t;A;B;C\nname;s;[pC];[pC];[pC]\np1;0;502,3;244,8;215,8\np2;1;423,2;695,6;507,8\n",
+    "units of names, too": "of;t;A;B;C\nname;s;[pC];[pC];[pC]\nP1;0;502,3;244,8;215,8\nP2;1;423,2;695,6;507,8\n",
     "lines above the header": "Date: 2026-11-25, 10:00\n\nt;A;B;C\n10:00;502,3;244,8;215,8\n10:01;423,2;695,6;507,8\n",
 }
 """Exports of other programs that contain the same charges."""

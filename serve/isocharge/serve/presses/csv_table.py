@@ -22,7 +22,7 @@ from itertools import chain, islice
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import shown
+from isocharge.common.errors import InputError, shown
 from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, NumberTable, TableSource
 
 _SEPARATORS = ",;\t|"
@@ -204,6 +204,8 @@ def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
         # The exception contains the part of the file that was decoded last.
         line_number = line_count + cause.object[: cause.start].count(b"\n") + 1
         raise source.error(f", line {line_number}: the byte 0x{cause.object[cause.start]:02x} {advice}") from cause
+    except InputError:  # is a ValueError, too
+        raise
     except ValueError as cause:  # the next line is too long
         raise source.error(f", line {line_count + 1}: not CSV text ({cause})") from cause
 
