@@ -7,6 +7,7 @@ refused.
 
 import codecs
 import os
+import re
 import shlex
 import stat
 import time
@@ -118,7 +119,7 @@ def foreign_kind(name: str, head: bytes) -> str:
         )
     if head.startswith(PARQUET_START):
         return f"a Parquet file; compute its contacts with: isocharge serve predict MODEL {quoted_name}"
-    columns = {column.strip(' "') for column in first_line.decode("utf-8", "replace").strip().split(",")}
+    columns = {column.strip(' "') for column in re.split("[,;|\t]", first_line.decode("utf-8", "replace").strip())}
     if columns & PRESS_COLUMNS:
         return (
             f"a table of presses; compute its contacts with: isocharge serve predict MODEL {quoted_name}; if a board "

@@ -218,7 +218,7 @@ class Recording:
                 kind = foreign_kind(str(path), first_line)
                 if kind:
                     raise RecordingError(f"got {kind}")
-            header = parse_json(first_line.decode(), "first line", RecordingError, _Header)
+            header = parse_json(first_line.decode("utf-8", "replace"), "first line", RecordingError, _Header)
         except (OSError, ValueError) as error:  # RecordingError is a ValueError
             raise RecordingError(
                 f"{path}: expected a recording of `serve stream --record` ({cut(str(error))})"
