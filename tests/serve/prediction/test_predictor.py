@@ -161,8 +161,12 @@ def test_predictor_answers_rightly_in_several_threads(film, predictor):
 
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
-def test_predictor_can_be_copied_and_pickled(film, predictor, copied):
+def test_predictor_can_be_copied_and_pickled(film, predictor, copied, tmp_path, monkeypatch):
+    """Also after the program has changed its working directory, from which the model was loaded."""
     charges = film.charge_pC([1.0], [2.0], [0.5])[0]
-    other = copied(predictor)
+    monkeypatch.chdir(predictor.folder.parent)
+    relative = Predictor(predictor.folder.name)
+    monkeypatch.chdir(tmp_path)
+    other = copied(relative)
     assert other.predict(charges) == predictor.predict(charges)
     assert other._press is not predictor._press

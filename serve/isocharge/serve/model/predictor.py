@@ -64,7 +64,7 @@ class Predictor:
             ModelError: If the model is missing or damaged, or has an unsupported format.
         """
         loaded = load_model(find_model(model, models))
-        self.folder = loaded.folder
+        self.folder = loaded.folder.resolve()
         self.metadata = loaded.metadata
         self.validity = Validity.of(loaded.metadata)
         self._session = loaded.session
@@ -92,7 +92,7 @@ class Predictor:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how `copy` and `pickle` create the predictor again, because the onnxruntime session has no copy."""
-        return _load_again, (type(self), self.folder.resolve(), self._stated_noise)
+        return _load_again, (type(self), self.folder, self._stated_noise)
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
         """Compute the contact of one press. Call `flags` to find out whether the contact is valid.
