@@ -86,6 +86,12 @@ def test_check_of_a_channel_without_a_number():
     json.dumps(asdict(report), allow_nan=False)
 
 
+def test_a_board_that_only_sends_nan_is_not_taken_for_counts():
+    report = examine_received(received(lambda _: b"A:nan,B:nan,C:nan\n"))
+    assert "channel A is nan in 400 frames" in missing(report)
+    assert "counts" not in missing(report)
+
+
 @pytest.mark.parametrize(
     ("board", "message"),
     [

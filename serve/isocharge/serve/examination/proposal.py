@@ -87,7 +87,7 @@ def unit_of(capture: Capture, max_noise_V: float = 0.02) -> str:
         return "pC"
     values, _times_s = capture.values()  # shape (frames, channels)
     finite_values = values[np.isfinite(values)]
-    if bool((finite_values == np.round(finite_values)).all()):
+    if finite_values.size and bool((finite_values == np.round(finite_values)).all()):
         return "counts"
     largest_noise = max(estimate_noise(column) for column in values.T)
     names_state_volts = all(name.endswith("V") for name in capture.names)
