@@ -208,3 +208,13 @@ def test_page_on_another_port_of_an_allowed_host_is_refused():
     with pytest.raises(OriginError, match="Origin: expected a page of this server"):
         check.check("POST", {b"host": b"film.example.org:8000"} | page)
     check.check("POST", {b"host": b"127.0.0.1:8000"} | page)
+
+
+def test_proxy_that_removes_or_adds_the_port_in_the_host_is_accepted():
+    """The setting of nginx is `proxy_set_header Host $host` or `$host:$server_port`."""
+    check = AccessCheck("127.0.0.1", ["film.example.org"])
+    check.check("POST", {b"host": b"film.example.org", b"origin": b"https://film.example.org:8443"})
+    check.check("POST", {b"host": b"film.example.org:443", b"origin": b"https://film.example.org"})
+    for origin in (b"https://film.example.org.evil.example:1", b"http://film.example.org"):
+        with pytest.raises(OriginError, match="Origin: expected a page of this server"):
+            check.check("POST", {b"host": b"film.example.org:443", b"origin": origin})

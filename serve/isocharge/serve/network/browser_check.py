@@ -158,8 +158,8 @@ class AccessCheck:
         A page belongs to this server in two cases:
 
         - Its origin contains the same host and the same port as the header `Host`.
-        - Its host name is one of `allowed_hosts` and differs from the name in the header `Host`. The names differ if a
-          reverse proxy has replaced the header `Host`.
+        - Its host name is one of `allowed_hosts`, and the header `Host` contains another name, or the same name without
+          the port. A reverse proxy has then replaced the header `Host`, or removed the port.
 
         Args:
             origin: Value of the header `Origin`, which is the origin of the page, such as b"http://localhost:8000".
@@ -169,13 +169,15 @@ class AccessCheck:
         if scheme not in ("http", "https"):
             return False
         requested_host = host.decode("latin-1").lower()
-        if page_host == requested_host:
+        default_port = ":443" if scheme == "https" else ":80"  # which proxies may add
+        if requested_host in (page_host, page_host + default_port):
             return True
-        # The following names contain no ports. If the names are equal, only the ports of the page and of the requested
-        # host differ. The page then belongs to another server on the same machine.
+        # The following names contain no ports. If the names are equal and both have a port, the page belongs to another
+        # server on the same machine.
         page_name = _name_in(f"//{page_host}")
         requested_name = _name_in(f"//{requested_host}")
-        return page_name in self._allowed_names and page_name != requested_name
+        is_port_removed = page_host.startswith(f"{requested_host}:")
+        return page_name in self._allowed_names and (page_name != requested_name or is_port_removed)
 
 
 def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
