@@ -153,6 +153,15 @@ def test_a_search_for_a_program_or_a_board_finds_a_page(word):
     assert any(word in text for text in PAGES.values())
 
 
+def test_figures_of_the_readme_are_on_the_pages_that_it_links_to():
+    links = re.findall(r"\[(\d[^\]]*)\]\(([^)#]+\.md)\)", PAGES["README.md"])
+    assert len(links) >= 5
+    for text, page in links:
+        for number, unit in re.findall(r"([\d.]+) (mm|%|us|ms)", text):
+            further = r"( / [\d.]+)*"  # quantiles that share the unit
+            assert re.search(rf"(?<![\d.]){number}{further} {unit}", (ROOT / page).read_text("utf-8")), (text, page)
+
+
 def test_figures_of_the_released_models_are_their_cards():
     rows = re.findall(
         r"^\| `(\S+)` \| within (\S+) mm \| (\S+), (\S+) mm \| (\S+) % \|", PAGES["models/README.md"], re.M
