@@ -74,9 +74,8 @@ class Connection(HttpToolsProtocol):
     @property
     def is_idle(self) -> bool:
         """Whether the server owes no response to this connection."""
-        if self.cycle is None:
-            return not self.transport.is_closing()
-        return self.cycle.response_complete and not self._is_reading and not self.transport.is_closing()
+        is_answered = self.cycle is None or (self.cycle.response_complete and not self._is_reading)
+        return is_answered and not self.transport.is_closing()
 
     def data_received(self, data: bytes) -> None:
         """Parse data of the client. Refuse a request whose head, trailers or chunk extensions are too long."""
