@@ -31,7 +31,7 @@ class TouchRule(Rule, frozen=True, kw_only=True):
         floor_pC: Second part of the touch threshold, pC: the total charge of a press that is equal on all electrodes.
             The touch threshold is the sum of both parts. None stands for 10 pC, or for 0 if the board sends currents.
         release_share: Release threshold, relative to the peak of the press. The release threshold is at least half of
-            the touch threshold. None stands for 0.05, or for 0.2 if the board sends currents, because their integral
+            the touch threshold. None stands for 0.05, or for 0.3 if the board sends currents, because their integral
             does not return to zero exactly.
     """
 
@@ -41,7 +41,7 @@ class TouchRule(Rule, frozen=True, kw_only=True):
 
     def resolved(self, *, has_currents: bool) -> "TouchRule":
         """Return the settings with the default values for a board that sends charges, or currents."""
-        floor_pC, release_share = (0.0, 0.2) if has_currents else (10.0, 0.05)
+        floor_pC, release_share = (0.0, 0.3) if has_currents else (10.0, 0.05)
         return TouchRule(
             sigmas=self.sigmas,
             floor_pC=floor_pC if self.floor_pC is None else self.floor_pC,
