@@ -136,6 +136,19 @@ def test_a_sudden_change_is_followed_after_twenty_touches(series, tmp_path, chan
     assert np.mean(np.abs(normalised) < 2.0) > 0.85
 
 
+def test_touches_that_agree_determine_the_pretension_better_than_touches_of_warm_fingers(series, tmp_path):
+    """The assumed errors of a touch are an upper limit. The touches themselves show how large the errors are."""
+    rng = np.random.default_rng(3)
+    model = model_in(tmp_path, series)
+    contact, charge = touches(series, np.array([0.3, 0.7, -0.8]), np.ones(4), rng, 100)
+    warmth_pC = 10.0 * rng.standard_normal((60, 1))
+    agreeing, warm = followed(model, charge[:60], rng), followed(model, charge[:60] + warmth_pC, rng)
+    assert agreeing.film.pretension_std_MPa < 0.85 * warm.film.pretension_std_MPa
+    for follower in (agreeing, warm):
+        _, normalised = force_errors(follower, model, contact[60:], NOISE.add(charge[60:], rng))
+        assert np.mean(np.abs(normalised) < 2.0) > 0.85
+
+
 def test_reset_forgets_the_touches(series, tmp_path):
     rng = np.random.default_rng(6)
     model = model_in(tmp_path, series)

@@ -129,6 +129,9 @@ are less accurate.
 MEMORY_TOUCHES = 16
 """Number of touches after which the weight of a touch in this mean has decreased to 1/e."""
 
+SMALLEST_ERROR_SCALE = 0.1
+"""Smallest scale of the error covariance of touches, dimensionless."""
+
 
 class FollowRule(Rule, frozen=True, kw_only=True):
     """Settings of the correction for changes of the film, from the section `[follow]` of a device file.
@@ -225,7 +228,8 @@ class FilmFollower:
     def reset(self) -> None:
         """Discard all touches, and assume again that the film has not changed since the calibration."""
         self.is_lost = False
-        self._mean_square = 1.0  # mean squared distance of the latest touches from the predicted touches
+        # Mean squared distance of the latest touches from the predicted touches, relative to the unscaled errors
+        self._mean_square = 1.0
         self._touch_count = 0
         self._latest_touch_s = math.inf
         self._start_estimate()
@@ -276,7 +280,8 @@ class FilmFollower:
 
         The charges of a touch have three errors: their noise, the part of the charges that the charge map does not
         describe, and the deviation of the offset of the touch from the common offset. The noise of the average charges
-        is assumed to be that of a single frame, because a board may filter its signals over the whole touch.
+        is assumed to be that of a single frame, because a board may filter its signals over the whole touch. If the
+        latest touches show that these errors are smaller, their covariance is scaled (`_error_scale`).
 
         Args:
             charge_pC: Average touch charges near the largest force, shape (n_electrode,), pC.
@@ -289,7 +294,8 @@ class FilmFollower:
         touch_offset_pC = self._offset_std_pC * self._offset_ratio
         model_error_pC = self._series.charge_std * charge_pC
         variance_pC2 = self.predictor.metadata.noise.variance(charge_pC) + model_error_pC**2
-        covariance_pC2 = np.diag(variance_pC2) + np.outer(touch_offset_pC, touch_offset_pC)
+        scale = self._error_scale
+        covariance_pC2 = scale * (np.diag(variance_pC2) + np.outer(touch_offset_pC, touch_offset_pC))
         start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
         estimate = robust_estimate(
             self._values,
@@ -306,7 +312,7 @@ class FilmFollower:
         self._touch_count += 1
 
         # Twice the cost is the squared distance, in which large residuals have little weight.
-        self._mean_square += (2.0 * estimate.cost - self._mean_square) / MEMORY_TOUCHES
+        self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / MEMORY_TOUCHES
         at_end = (estimate.state <= self._lowest) | (estimate.state >= self._highest)
         was_lost = self.is_lost
         self.is_lost = self._mean_square > MAX_MEAN_SQUARE or bool(at_end[0] or at_end[self._offset])
@@ -315,6 +321,14 @@ class FilmFollower:
         elif not self.is_lost:
             self._apply_estimate()
             self._conversion_contact = None  # the stored conversion belongs to the earlier state
+
+    @property
+    def _error_scale(self) -> float:
+        """Scale of the error covariance of touches, dimensionless: the mean squared distance of the latest touches.
+
+        The scale does not exceed 1, so that an unexplained change of the film is not taken for larger errors.
+        """
+        return min(max(self._mean_square, SMALLEST_ERROR_SCALE), 1.0)
 
     def _apply_estimate(self) -> None:
         """Correct contacts for the mean of the state, if the pretension may not have changed at all.
@@ -333,7 +347,7 @@ class FilmFollower:
         spread = probability * (1.0 - probability) * np.outer(shift, shift)
         self._applied_state = self._state - probability * shift
         self._applied_covariance = self._covariance - probability * variance * np.outer(gain, gain) + spread
-        self._applied_covariance[self._offset, self._offset] += self._offset_std_pC**2
+        self._applied_covariance[self._offset, self._offset] += self._error_scale * self._offset_std_pC**2
 
     def _values(self, contacts: Array, state: Array) -> ModelValues:
         """Compute the charges of touches and their derivatives.
