@@ -16,6 +16,7 @@ within two reported standard deviations, and the shares within the reported 95 %
 - again, change: a second calibration (`--from`) with 60 touches of unknown place and force, on the film whose
   pretension has changed by this amount (MPa), with the average charges of ten frames.
 - followed, change: after the same touches, frame by frame, by the follower of `serve stream --follow`.
+- followed suddenly, change: after 60 touches on the unchanged film and the first 20 touches after the change.
 - followed, gain: the film has not changed, and one electrode has a gain that is 3 % larger.
 - not followed: the same contacts by the calibrated model.
 
@@ -42,6 +43,7 @@ from isocharge.simulate import Circle, NoiseModel, load_sensor, local_workers
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
 
 TOUCHES = 60
+SUDDEN_TOUCHES = 20
 CONTACTS = 60
 PRESSES = 20
 OFFSET_pC = 10.0
@@ -151,6 +153,9 @@ def film_results(bench: Bench, counts: list[int], frames: int, *, has_all_cases:
         answers = [follower.follow_contact(predictor.predict(row), row) for row in charge]
         results[f"followed, {name}"] = errors(answers, truth)
         if change != 0.0:
+            observe(follower, predictor, np.concatenate([bench.touches(0.0, frames), touches[:SUDDEN_TOUCHES]]))
+            answers = [follower.follow_contact(predictor.predict(row), row) for row in charge]
+            results[f"followed suddenly, {name}"] = errors(answers, truth)
             problem = replace(bench.problem, earlier=result.film.drifted())
             _, again, *_ = bench.calibrated(np.full((TOUCHES, 3), np.nan), touches.mean(axis=1), problem)
             results[f"again, {name}"] = errors([again.predict(row) for row in charge], truth)
