@@ -24,12 +24,15 @@ types: $(VENV)/installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+PYTEST := $(ONE_THREAD) $(COMPILED_ONCE) $(ONE_HEAP) $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
+
 # Some tests wait for a clock or a process, so there is a worker more than the two cores that we count on.
 tests: $(VENV)/installed
-	$(ONE_THREAD) $(COMPILED_ONCE) $(ONE_HEAP) $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -n 3
 
+# The site, and all tests; forty minutes on two cores.
 test-all: docs
-	$(BIN)/python -m pytest -m "slow or not slow"
+	$(PYTEST) -n 2 -m "slow or not slow" --timeout 1800
 
 # The smallest versions that pyproject.toml allows: each extra runs its command, and the base tests pass.
 lower-bounds: $(VENV)/installed
