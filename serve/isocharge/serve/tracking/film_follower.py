@@ -129,8 +129,11 @@ are less accurate.
 MEMORY_TOUCHES = 16
 """Number of touches after which the weight of a touch in this mean has decreased to 1/e."""
 
-SMALLEST_ERROR_SCALE = 0.1
-"""Smallest scale of the error covariance of touches, dimensionless."""
+SMALLEST_ERROR_SCALE = 0.2
+"""Smallest scale of the error covariance of touches, dimensionless.
+
+With a smaller scale, the statement is too narrow for films that the charge map does not describe well.
+"""
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):
