@@ -12,8 +12,7 @@ from isocharge.cli.shared.terminal import say, until_stopped
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
 from isocharge.common.files import bounded_lines
-from isocharge.serve import Predictor, load_device, read_charges, table_records, write_contacts
-from isocharge.serve.live.device import NoiseRule
+from isocharge.serve import Predictor, read_charges, table_records, write_contacts
 from isocharge.serve.prediction.table import read_charge_file
 
 
@@ -42,9 +41,10 @@ def predict_command(
     Example: isocharge serve predict three-25um-biaxial presses.csv > contacts.csv
     """
     predictor = Predictor(model, models=models)
-    noise = load_device(device).rule(NoiseRule)
-    if noise is not None:
-        predictor = predictor.with_noise(noise.white_pC, noise.gain)
+    if device is not None:
+        from isocharge.serve.live.device import load_device, predictor_for  # imports all stages of a stream
+
+        predictor = predictor_for(load_device(device), predictor)
     charge_pC = _read_charges(file, predictor.metadata.electrodes)
     with until_stopped():
         if json:

@@ -38,6 +38,7 @@ from isocharge.common.structs import Settings, convert, read_toml
 from isocharge.serve.flags import FILM
 from isocharge.serve.frames.formats import AutoFrames, Frames
 from isocharge.serve.frames.frame import Frame
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain, Saturation
 from isocharge.serve.signal_chain.hum import Hum
@@ -64,6 +65,12 @@ class NoiseRule(Rule, frozen=True, kw_only=True):
     gain: Share
 
 
+def predictor_for(device: Device, predictor: Predictor) -> Predictor:
+    """Return a predictor for the noise that a device file states, or the same predictor without such a statement."""
+    noise = device.rule(NoiseRule)
+    return predictor if noise is None else predictor.with_noise(noise.white_pC, noise.gain)
+
+
 class Prediction(Stage):
     """Predicts the contact of each frame with the present model, for the noise that the device file states."""
 
@@ -76,9 +83,7 @@ class Prediction(Stage):
     def __init__(self, setup: Setup) -> None:
         """Store the limits within which contacts are valid, which are those of the calibrated film."""
         self._setup = setup
-        noise = setup.device.rule(NoiseRule)
-        if noise is not None:
-            setup.predictor = setup.model.with_noise(noise.white_pC, noise.gain)
+        setup.predictor = predictor_for(setup.device, setup.model)
         self._validity = setup.model.validity
 
     def step(self, frame: Frame) -> None:
