@@ -20,6 +20,8 @@ within two reported standard deviations, and the shares within the reported 95 %
 - followed, gain: the film has not changed, and one electrode has a gain that is 3 % larger.
 - not followed: the same contacts by the calibrated model.
 
+The errors of followed contacts are means over four draws of the noise.
+
 `--gain-noise` is the true noise relative to the charge, which the calibration does not know. Solved charges are stored
 in the folder. Solving a film takes some minutes. `--cases calibrated` leaves all rows out but the first.
 """
@@ -44,6 +46,7 @@ from isocharge.train import CalibrationProblem, calibrate, write_calibration
 
 TOUCHES = 60
 SUDDEN_TOUCHES = 20
+DRAWS = 4
 CONTACTS = 60
 PRESSES = 20
 OFFSET_pC = 10.0
@@ -124,6 +127,33 @@ def observe(follower: FilmFollower, predictor: Predictor, touches: np.ndarray) -
         clock_s += 1.0
 
 
+def followed_errors(
+    bench: Bench, predictor: Predictor, follower: FilmFollower, change: float, gains: np.ndarray, frames: int
+) -> dict[str, dict[str, float]]:
+    """Return the errors of contacts after a change, for one draw of the noise of touches and contacts."""
+    touches = gains * bench.touches(change, frames)
+    truth, charge = bench.later(change)
+    charge = gains * charge
+
+    def errors_after(touches: np.ndarray) -> dict[str, float]:
+        observe(follower, predictor, touches)
+        return errors([follower.follow_contact(predictor.predict(row), row) for row in charge], truth)
+
+    ways = {
+        "not followed": errors([predictor.predict(row) for row in charge], truth),
+        "followed": errors_after(touches),
+    }
+    if change != 0.0:
+        before = bench.touches(0.0, frames)
+        ways["followed suddenly"] = errors_after(np.concatenate([before, touches[:SUDDEN_TOUCHES]]))
+    return ways
+
+
+def mean_values(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Return the mean of each value."""
+    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+
+
 def film_results(bench: Bench, counts: list[int], frames: int, *, has_all_cases: bool) -> dict[str, dict[str, float]]:
     """Return the errors of all cases of one film."""
     results = {}
@@ -145,19 +175,14 @@ def film_results(bench: Bench, counts: list[int], frames: int, *, has_all_cases:
 
     cases = [(f"{change:+g} MPa", change, np.ones(len(GAINS))) for change in bench.films]
     for name, change, gains in (*cases, ("gain", 0.0, GAINS)):
-        touches = gains * bench.touches(change, frames)
-        truth, charge = bench.later(change)
-        charge = gains * charge
-        results[f"not followed, {name}"] = errors([predictor.predict(row) for row in charge], truth)
-        observe(follower, predictor, touches)
-        answers = [follower.follow_contact(predictor.predict(row), row) for row in charge]
-        results[f"followed, {name}"] = errors(answers, truth)
+        draws = [followed_errors(bench, predictor, follower, change, gains, frames) for _ in range(DRAWS)]
+        for way in draws[0]:
+            results[f"{way}, {name}"] = mean_values([draw[way] for draw in draws])
         if change != 0.0:
-            observe(follower, predictor, np.concatenate([bench.touches(0.0, frames), touches[:SUDDEN_TOUCHES]]))
-            answers = [follower.follow_contact(predictor.predict(row), row) for row in charge]
-            results[f"followed suddenly, {name}"] = errors(answers, truth)
             problem = replace(bench.problem, earlier=result.film.drifted())
-            _, again, *_ = bench.calibrated(np.full((TOUCHES, 3), np.nan), touches.mean(axis=1), problem)
+            mean_charge = bench.touches(change, frames).mean(axis=1)
+            _, again, *_ = bench.calibrated(np.full((TOUCHES, 3), np.nan), mean_charge, problem)
+            truth, charge = bench.later(change)
             results[f"again, {name}"] = errors([again.predict(row) for row in charge], truth)
     for name, values in results.items():
         report_progress(name, values)
@@ -198,7 +223,7 @@ def main() -> None:
     summary = {}
     for name in all_results[0]:
         rows = [results[name] for results in all_results]
-        summary[name] = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+        summary[name] = mean_values(rows)
         for key in ("position_mm", "force_percent"):
             values = [row[key] for row in rows]
             summary[name] |= {f"{key}_min": min(values), f"{key}_max": max(values)}
