@@ -157,8 +157,8 @@ def test_host_example_says_what_is_wrong(host, tmp_path):
     assert played(program, tmp_path / "noisy", 1, 2)[0] == 2
 
 
-def run_sketch(export, folder, pins, *options):
-    """What the sketch sends, compiled with a host's Arduino, while its pins read these counts."""
+def run_sketch(export, folder, pins, *options, start_us=0):
+    """What the sketch sends, compiled with a host's Arduino, while its pins read these counts from `start_us` on."""
     objects = []
     for source in sorted(export.glob("*.c")):
         objects.append(folder / f"{source.stem}.o")
@@ -166,7 +166,7 @@ def run_sketch(export, folder, pins, *options):
     ino = f'-DSKETCH="{export / "isocharge_sketch.ino"}"'
     words = ["g++", "-Wall", "-Wextra", "-Werror", *options, ino, "-I", export, "-I", HERE / "board"]
     subprocess.run([*words, HERE / "board" / "run_sketch.cpp", *objects, "-o", folder / "sketch"], check=True)
-    lines = "".join(f"{5000 * (k + 1)} {' '.join(map(str, row))}\n" for k, row in enumerate(pins.tolist()))
+    lines = "".join(f"{start_us + 5000 * (k + 1)} {' '.join(map(str, row))}\n" for k, row in enumerate(pins.tolist()))
     return subprocess.run([folder / "sketch"], input=lines.encode(), capture_output=True, check=True).stdout
 
 
@@ -186,3 +186,15 @@ def test_sketch_prints_our_contacts_and_sends_frames_that_we_read(exports, tmp_p
     frames = BinaryParser().feed(run_sketch(export, tmp_path, pins, "-DSEND_FRAMES=1"))
     assert [frame.values for frame in frames] == [tuple(map(float, row)) for row in pins.tolist()]
     assert [frame.t_us for frame in frames[:2]] == [5000, 10000]
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed")
+def test_clock_of_a_board_that_begins_again_leaves_the_hum_removed(tmp_path):
+    """After 71.6 minutes, `micros` is 0 again. A hum with another phase would look like touches."""
+    device = device_from_table({"hum": {"frequency_Hz": 50.0}}, "x")
+    export = export_c(find_model("three-25um-biaxial"), tmp_path / "c", device) / "arduino" / "isocharge_sketch"
+    times_s = 0.005 * np.arange(2000)
+    hum = 40.0 * np.sin(2.0 * np.pi * (50.0 * times_s + 0.1))
+    pins = np.random.default_rng(1).normal(20.0, 1.0, (2000, 3)) + hum[:, None]
+    printed = run_sketch(export, tmp_path, np.round(pins).astype(int), start_us=2**32 - 5_000_000)
+    assert b"force_N" not in printed

@@ -8,10 +8,10 @@
 
 enum { A0 = 14, A1, A2, A3, A4, A5, A6, A7 };
 
-static unsigned long clock_us;
+static unsigned long clock_us; // begins again at 0 with bit 32, as that of a board
 static int pins[8];
 
-static inline unsigned long micros(void) { return clock_us; }
+static inline unsigned long micros(void) { return (uint32_t)clock_us; }
 
 static inline int analogRead(int pin) { return pins[pin - A0]; }
 

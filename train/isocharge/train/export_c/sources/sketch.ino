@@ -12,19 +12,19 @@
 #endif
 
 static const int PIN[] = {$pins};
-static const unsigned long PERIOD_US = 5000;
+static const uint32_t PERIOD_US = 5000;
 
 static isocharge_chain chain;
-static unsigned long last_us;
+static isocharge_clock board_clock;
 
 void setup()
 {
     Serial.begin(115200);
     isocharge_chain_start(&chain);
-    last_us = micros();
+    isocharge_clock_start(&board_clock);
 }
 
-static void send_frame(const isocharge_reading &reading, unsigned long now_us)
+static void send_frame(const isocharge_reading &reading, uint32_t now_us)
 {
     static isocharge_frame frame;
     static uint8_t bytes[ISOCHARGE_FRAME_BYTES(ISOCHARGE_ELECTRODES)];
@@ -57,16 +57,17 @@ static void print_contact(const isocharge_reading &reading)
 
 void loop()
 {
-    const unsigned long now_us = micros();
+    const uint32_t now_us = micros();
+    double time_s, step_s;
     isocharge_real value[ISOCHARGE_ELECTRODES];
     isocharge_reading reading;
 
-    if (now_us - last_us < PERIOD_US)
+    if (now_us - board_clock.last_us < PERIOD_US)
         return;
+    step_s = isocharge_clock_read(&board_clock, now_us, &time_s);
     for (int k = 0; k < ISOCHARGE_ELECTRODES; ++k)
         value[k] = (isocharge_real)analogRead(PIN[k]);
-    isocharge_chain_advance(&chain, value, 1e-6 * now_us, (isocharge_real)(1e-6 * (now_us - last_us)), 0, &reading);
-    last_us = now_us;
+    isocharge_chain_advance(&chain, value, time_s, (isocharge_real)step_s, 0, &reading);
     if (SEND_FRAMES)
         send_frame(reading, now_us);
     else
