@@ -44,6 +44,8 @@ EXPORTS = {
     "Channels\t3\t\t\t\nSamples\t2\t2\t2\t\n***End_of_Header***\t\t\t\t\nX_Value\tA\tB\tC\tComment\n"
     "0,000000\t502,300000\t244,800000\t215,800000\t\n0,001000\t423,200000\t695,600000\t507,800000\t\n",
     "pandas": ",x_mm,A,B,C\n0,2,502.3,244.8,215.8\n1,2,423.2,695.6,507.8\n",
+    "pandas with decimal commas": 'A,B,C\n"502,3","244,8","215,8"\n"423,2","695,6","507,8"\n',
+    "points and three decimals": "A,B,C\n502.300,244.800,215.800\n423.200,695.600,507.800\n",
     "pandas in German": ";A;B;C\n0;5,023e+02;2,448e+02;2,158e+02\n1;4,232e+02;6,956e+02;5,078e+02\n",
     "units of names, too": "of;t;A;B;C\nname;s;[pC];[pC];[pC]\nP1;0;502,3;244,8;215,8\nP2;1;423,2;695,6;507,8\n",
     "lines above the header": "Date: 2026-11-25, 10:00\n\nt;A;B;C\n10:00;502,3;244,8;215,8\n10:01;423,2;695,6;507,8\n",
@@ -92,7 +94,8 @@ def test_message_about_a_wrong_table_is_short(text, message):
         ("1,2,3\n4,5,6\n", r"missing: \['A', 'B', 'C'\]"),
         ("A\tB\tC\n1,064\t832\t629\n", "every number with the mark ',' may have .*separator of thousands"),
         ("A,B,C\nnC,nC,nC\n1,2,3\n", "line 2, column 'A': expected a charge in pC, got 'nC'$"),
-        ('A,B,C\n"1,064",832,629\n', "line 2, column 'A': .*got '1,064'; the decimal mark is '.'"),
+        ('A,B,C\n"1,064",832,629\n', "every number with the mark ',' may have .*separator of thousands"),
+        ('A,B,C\n832.7,"1,064",1\n', "line 2, column 'B': .*got '1,064'; the decimal mark is '.'"),
         ("A;B;C\n832,7;1.064;1\n", r"column 'B': .*got '1\.064'; the decimal mark is ','"),
         ("A;B;C\n1.064,5;832,7;1\n", r"column 'A': .* got '1\.064,5'"),
         ("pC;nC;pC\nA;B;C\nA;B;C\n1;2;3\n", "line 3, column 'A': expected a charge in pC, got 'A'"),

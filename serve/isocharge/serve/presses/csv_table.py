@@ -1,9 +1,9 @@
 """Reading and writing of columns of numbers as CSV text.
 
 The columns are separated by commas, semicolons, tabs or bars. The header is the first row that contains a name with a
-meaning; rows above it are ignored. If commas separate the columns, the decimal mark is a point. Otherwise, it is a
-point or a comma, and the same in the whole file. A number such as `1,064` may then be 1.064 or 1064. A file in which no
-number determines the decimal mark is therefore refused.
+meaning; rows above it are ignored. The decimal mark is a point or a comma, and the same in the whole file. A number
+such as `1,064` may be 1.064 or 1064. A file in which no number determines the decimal mark is therefore refused. A
+point is always the decimal mark if commas separate the columns.
 
 A row that begins with # is a comment. Blank rows, and a row below the header that has the units mm, N and pC in the
 columns to read, are ignored.
@@ -65,8 +65,8 @@ class CsvTable(NumberTable):
         if header_row is None:
             raise source.error(f": empty; expected {source.expected}")
         super().__init__(header_row[1], source)
-        self._mark = "." if self._separator == "," else ""  # decimal mark; empty until it is known
-        self._is_mark_certain = self._separator == ","
+        self._mark = ""  # decimal mark; empty until it is known
+        self._is_mark_certain = False
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Convert the cells of the requested columns to numbers, row by row.
@@ -103,7 +103,9 @@ class CsvTable(NumberTable):
                     )
                 numbers.append(number)
             if not self._is_mark_certain:
-                self._is_mark_certain = any(_has_decimal_mark(cell.strip(), self._mark) for cell in cells)
+                is_point_between_commas = (self._separator, self._mark) == (",", ".")
+                has_evidence = any(_has_decimal_mark(cell.strip(), self._mark) for cell in cells)
+                self._is_mark_certain = is_point_between_commas or has_evidence
         if self._mark and not self._is_mark_certain:
             raise self.source.error(
                 f": every number with the mark {self._mark!r} may have a decimal mark or a separator of thousands; "
