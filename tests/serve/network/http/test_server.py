@@ -216,11 +216,29 @@ def test_idle_connections_leave_open_files_for_new_connections(limited, monkeypa
 
 
 def test_client_that_does_not_read_is_disconnected(limited):
-    server = limited(body_seconds=0.3)
+    server = limited(header_seconds=0.3, body_seconds=0.3)
     body = orjson.dumps(infer_request([[100.0, 200.0, 300.0]] * 4096))
     with connect(server) as connection, pytest.raises(OSError, match=r"reset|Broken pipe"):
         drip(connection, infer(body=body), 1000)
     assert is_well(server)
+
+
+def test_response_that_ends_after_a_refusal_does_not_extend_the_deadline(limited):
+    server = limited(header_seconds=10.0, idle_seconds=1000.0)
+    with connect(server) as client:
+        client.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
+        client.recv(1000)
+        (connection,) = server._server.server_state.connections
+        has_ended = Event()
+
+        def refuse_and_end_response():
+            connection.refuse(408, "waited too long")
+            connection.on_response_complete()
+            has_ended.set()
+
+        connection.loop.call_soon_threadsafe(refuse_and_end_response)
+        assert has_ended.wait(60)
+        assert connection.deadline < connection.loop.time() + 100.0
 
 
 @pytest.mark.parametrize("protocol", ["h2c", "websocket"])

@@ -129,9 +129,9 @@ class Connection(HttpToolsProtocol):
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
-        """Set the deadline of the next request, unless it has already begun."""
+        """Set the deadline of the next request, unless it has already begun, or the connection was refused."""
         super().on_response_complete()
-        if not self._is_reading:
+        if not (self._is_reading or self.transport.is_closing()):
             self.deadline = self.loop.time() + self._limits.idle_seconds
 
     def close_if_overdue(self, now: float) -> None:
