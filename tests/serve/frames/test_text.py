@@ -37,7 +37,7 @@ def test_documented_teleplot_lines(text, names, values):
     assert names_and_values(f">{text}\r") == (names, values)
 
 
-@pytest.mark.parametrize("text", [">myValue:hello|t", ">trajectory:12.3:45.67|xy", "", "  \r", "# a comment: 12"])
+@pytest.mark.parametrize("text", [">myValue:hello|t", ">trajectory:12.3:45.67|xy", ">path:1:2|xy,clr", "", "  \r", "# a comment: 12"])
 def test_blank_and_comment_lines_are_no_readings(text):
     assert clean_text(text) == ""
 
@@ -127,6 +127,13 @@ NOTATIONS = {
     "{{'A': {a}, 'B': {b}, 'C': {c}}}": "ABC",
     "Reading(A={a}, B={b}, C={c})": "ABC",
     "A:{a};B={b};C {c}": "ABC",
+    ">A:{a},B:{b},C:{c}": "ABC",
+    "> A: {a}, B: {b}, C: {c}": "ABC",
+    ">>> {a}, {b}, {c}": (),
+    "A......{a} B......{b} C......{c}": "ABC",
+    '"{a}","{b}","{c}"': (),
+    '{{"A":"{a}","B":"{b}","C":"{c}","state":"idle"}}': "ABC",
+    '<film A="{a}" B="{b}" C="{c}"/>': "ABC",
     "Q[0]:{a} Q[1]:{b} Q[2]:{c}": ("Q[0]", "Q[1]", "Q[2]"),
     "<A>{a}</A><B>{b}</B><C>{c}</C>": "ABC",
     '{{"q": {{"A": {a}, "B": {b}, "C": {c}}}, "state": "idle 3"}}': "ABC",
@@ -220,6 +227,15 @@ MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready", "load:0x3fff00
 )
 def test_lines_that_are_frames(lines, values):
     assert [frame.values for frame in feed(*lines)] == values
+
+
+@pytest.mark.parametrize("notation", ["A: {} B: 3 pC", "{} 3 pC", "A={}, B=3pC", "A,{},B,3 pC"])
+def test_line_in_another_unit_is_rejected(notation):
+    """An instrument with automatic ranges writes 850 pC and then 1.2 nC."""
+    parser = TextParser()
+    frames = feed(*[notation.format("850 pC")] * 12, notation.format("1.2 nC"), parser=parser)
+    assert {frame.values[0] for frame in frames} == {850.0}
+    assert parser.counts.malformed == 1
 
 
 def test_time_of_day_is_the_clock_which_wraps_at_midnight():

@@ -183,6 +183,7 @@ def test_channel_of_each_electrode(names, channels, picked):
         (("A_mean", "A_std", "B_mean", "B_std", "C_mean", "C_std"), {}, r"\[channels\] A = "),
         (("A", "B", "z"), {}, r"\[channels\] A = "),
         (("ch3", "ch2", "ch1"), {}, r"ch3'.*\[channels\] A = "),
+        (("ch3_v1", "ch2_v1", "ch1_v1"), {}, r"\[channels\] A = "),
         (("adc1 in2", "adc1 in10", "adc1 in1"), {}, r"\[channels\] A = "),
         (("x", "y", "z"), {"A": "zz"}, r'^board\.toml: \[channels\] A = "zz": no channel .* have x, y, z, or 1 to'),
         *(((), {"A": name}, "no channel is called that") for name in ("0", "4", "ch0", "ch4", "ch", "", "-1")),
@@ -194,6 +195,13 @@ def test_unknown_channels_are_refused(names, channels, message):
     stage = Channels(Setup(ELECTRODES, Device(channels=assigned, where="board.toml")))
     with pytest.raises(ChargeError, match=message):
         stage.step(Frame(0, 0, (1.0,) * (len(names) or 3), names=names))
+
+
+@pytest.mark.parametrize("names", [("bat_V", "A", "B", "C"), ("C", "B", "A", "t_mV")])
+def test_units_of_channels_that_are_no_electrodes_do_not_matter(names):
+    frame = Frame(0, 0, (1.0, 2.0, 3.0, 4.0), names=names)
+    Channels(Setup(ELECTRODES)).step(frame)
+    assert frame.sent.tolist() == [names.index(electrode) + 1 for electrode in ELECTRODES]
 
 
 @pytest.mark.parametrize(

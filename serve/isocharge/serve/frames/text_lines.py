@@ -13,7 +13,8 @@ skeleton. Lines with the same skeleton are frames of one layout, in whatever not
 
 A word directly before a number is the name of the number. If different words and numbers alternate, as in `C,7,A,3` and
 `7 C, 3 A`, the words are names, too. Digits in a word, as in `ch3`, are not a number. Words that are neither names nor
-followed by a colon or an equals sign may change from line to line.
+followed by a colon or an equals sign may change from line to line, except units of charge and voltage. Quotes around a
+number have no meaning.
 """
 
 import json
@@ -32,6 +33,8 @@ _INDEX = r"\[\w*\](?!\s*[,;]?\s*(?:$|[^\W\d]))"  # not the value in `C[7] A[3]`,
 _WORD = rf"(?>\w+(?:[./-]\w+)*(?:{_INDEX})*)"
 
 _QUOTED = r'"(?:[^"\\]|\\.)*"' + r"|(?<!\w)'[^']*'(?!\w)"
+
+_QUOTED_NUMBER = r"""(?<!\w)(["'])([-+]?\.?[0-9][0-9.,]*(?:[eE][-+]?[0-9]+)?)\1(?!\s*[:=])"""
 
 _DATE = r"[0-9]{1,4}[-/.][0-9]{1,2}[-/.][0-9]{1,4}[T ,;]+"
 
@@ -70,6 +73,9 @@ _NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
 
 _CHARGE_UNITS = {unit for unit in OTHER_CHARGE_UNITS if unit != "C"}  # C may be the name of an electrode
 
+_TELEPLOT = r">([^\s:>][^:]*):(?:[^|]*;)?(?:([0-9.]+):)?([^:;|]*);?(?:\|.*)?"
+"""Regular expression of a line of Teleplot. The groups are the name, the latest time and the latest value."""
+
 
 def _token_pattern(number: str) -> re.Pattern[str]:
     """Return the regular expression of a part of a line.
@@ -84,9 +90,9 @@ def _token_pattern(number: str) -> re.Pattern[str]:
         rf"|(?P<key>(?<=^\$)\w+|(?:{key}|{_QUOTED})(?=\s*[:=]))"
         rf"|(?P<quoted>{_QUOTED})"
         r"|(?P<hexadecimal>(?<![\w.])[-+]?0[xX][0-9A-Fa-f]{1,16}(?!\w))"
-        rf"|(?P<number>(?<![\w.]){number}(?!\.[0-9])(?=[^\W\d_]*(?!\w)))"
+        rf"|(?P<number>(?<!\w)(?<!\w\.){number}(?!\.[0-9])(?=[^\W\d_]*(?!\w)))"
         rf"|(?P<word>{_WORD})"
-        r"|(?P<mark>\S)"
+        r"|(?P<mark>\.{2,}|\S)"
     )
 
 
@@ -153,12 +159,14 @@ def clean_text(text: str) -> str:
         text = re.sub(r"\x1b\[[0-9;]*m", "", text)  # removes the colours that loggers use
     text = text.strip().replace("\N{MINUS SIGN}", "-")  # programs with some locales, such as Swedish, write this sign
     text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text)  # a sign apart from its number, as in `A: - 3.5`
-    if text[:1] == ">":
-        content, _, flags = text[1:].partition("|")
-        name, _, values = content.partition(":")
-        time, _, value = values.rstrip("; ").rpartition(";")[2].rpartition(":")
+    text = re.sub(_QUOTED_NUMBER, r"\2", text)
+    teleplot = re.fullmatch(_TELEPLOT, text)
+    if text[:1] == ">" and not {"t", "xy"}.isdisjoint(text.rpartition("|")[2].split(",")):
+        return ""
+    if teleplot is not None:
+        name, time, value = teleplot.groups()
         named_time = f"t_ms:{time};" if time else ""
-        return "" if "t" in flags or "xy" in flags else f'{named_time}"{name}":{value}'
+        return f'{named_time}"{name}":{value}'
     if text[:1] == "$" and "*" in text:
         content, _, checksum = text.partition("*")
         if len(checksum) != 2 or int(checksum, 16) != reduce(xor, content[1:].encode(), 0):
@@ -190,6 +198,7 @@ def parse_line(text: str, *, has_header: bool = False) -> Line:
         raise ValueError(f"expected only hexadecimal numbers after the first one, got {text[:100]!r}")
     names, names_with_units = _names(tokens)
 
+    fixed_words = {*names, "pC", *_CHARGE_UNITS}  # a line with another unit has another layout
     skeleton = ""
     word_count = 0
     for previous, token in zip([None, *tokens], tokens, strict=False):
@@ -200,7 +209,8 @@ def parse_line(text: str, *, has_header: bool = False) -> Line:
             skeleton += _CODES["optional blanks"]
         elif token.is_after_blank:
             skeleton += _CODES["blanks"]
-        if token.kind in ("key", "name", "mark") or (token.kind == "word" and token.content in names):
+        is_fixed_word = token.kind == "word" and token.content in fixed_words
+        if token.kind in ("key", "name", "mark") or is_fixed_word:
             skeleton += token.content
         else:
             skeleton += _CODES[number_kind if token.kind == "number" else token.kind]

@@ -1,6 +1,7 @@
 """Assignment of the channels of a frame to the electrodes."""
 
 import re
+from collections.abc import Sequence
 from itertools import takewhile
 from json import dumps
 from operator import itemgetter
@@ -92,10 +93,13 @@ class Channels(Stage):
                 than pC and the gain is not known, if it is not clear to which values the names in a line of text
                 belong, or if the numbers in the names of the channels do not increase.
         """
-        advice = "" if self._allows_any_unit else _unit_advice(frame.names)
         indices = self._matches(frame.names)
-        if all(len(indices_of_electrode) == 1 for indices_of_electrode in indices) and not advice:
-            return tuple(indices_of_electrode[0] for indices_of_electrode in indices)
+        is_each_named_once = all(len(indices_of_electrode) == 1 for indices_of_electrode in indices)
+        # If the channels of the electrodes are known, the units of the other channels do not matter.
+        names = [frame.names[index] for (index,) in indices] if is_each_named_once else frame.names
+        advice = "" if self._allows_any_unit else _unit_advice(names)
+        if is_each_named_once and not advice:
+            return tuple(index for (index,) in indices)
 
         # The names may stand in the line of text in the order of the values, but not beside the values.
         places = self._matches(tuple(word for text in frame.words for word in _words_of(text)))
@@ -205,10 +209,9 @@ def _reversed_without_common_start(texts: list[str]) -> list[str]:
 
 
 def _are_in_order(names: tuple[str, ...]) -> bool:
-    """Return whether the last numbers in names, such as `ch1` and `ch2`, increase, or some name has no number."""
-    numbers = [re.findall("[0-9]+", name) for name in names]
-    last_numbers = [int(digits[-1][-9:]) for digits in numbers if digits]
-    return len(last_numbers) < len(names) or last_numbers == sorted(last_numbers)
+    """Return whether the numbers in names, such as `ch1_v2` and `ch2_v2`, increase, or some name has no number."""
+    numbers = [[int(digits[-9:]) for digits in re.findall("[0-9]+", name)] for name in names]
+    return [] in numbers or numbers == sorted(numbers)
 
 
 def stated_unit(name: str) -> str:
@@ -221,7 +224,7 @@ def stated_unit(name: str) -> str:
     return units.get(last_word.casefold(), "") if other_words else ""
 
 
-def _unit_advice(names: tuple[str, ...]) -> str:
+def _unit_advice(names: Sequence[str]) -> str:
     """Return advice for the first channel whose name states a unit other than pC; empty without such a channel."""
     for name in names:
         unit = stated_unit(name)
