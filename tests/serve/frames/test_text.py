@@ -37,7 +37,9 @@ def test_documented_teleplot_lines(text, names, values):
     assert names_and_values(f">{text}\r") == (names, values)
 
 
-@pytest.mark.parametrize("text", [">myValue:hello|t", ">trajectory:12.3:45.67|xy", ">path:1:2|xy,clr", "", "  \r", "# a comment: 12"])
+@pytest.mark.parametrize(
+    "text", [">myValue:hello|t", ">trajectory:12.3:45.67|xy", ">path:1:2|xy,clr", "", "  \r", "# a comment: 12"]
+)
 def test_blank_and_comment_lines_are_no_readings(text):
     assert clean_text(text) == ""
 

@@ -1,6 +1,7 @@
 """Tests of the search for mistakes in presses that no film explains, and of the errors that name them."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from tests.train.calibration.conftest import rig
 
 from isocharge.common.errors import PressError
 from isocharge.train import calibrate
-from isocharge.train.calibration.diagnosis import find_mistakes
+from isocharge.train.calibration.diagnosis import check_places, find_mistakes
 
 pytestmark = pytest.mark.usefixtures("never_solved")
 
@@ -47,6 +48,18 @@ def test_mistake_in_the_presses_is_found(problem, synthetic, name):
     contact, charge = make_mistake(presses.contact, presses.charge_pC)
     mistakes = find_mistakes(measured_presses(problem, contact, charge), synthetic)
     assert re.search(message, "; ".join(mistakes))
+
+
+def test_places_near_the_rim_of_an_oval_film(problem, synthetic):
+    """The half axes are 45.9 and 44.1 mm."""
+    _, _, presses = rig(problem, synthetic, 12, seed=7)
+    oval_film = replace(problem.sensor.film, oval=0.02)
+    contact = presses.contact.copy()
+    contact[3, :2] = (45.5, 0.0)
+    check_places(measured_presses(problem, contact, presses.charge_pC), oval_film)
+    contact[3, :2] = (0.0, 44.5)
+    with pytest.raises(PressError, match=r"\(0, 44\.5\) mm is off the film, whose radius there is 44\.1 mm"):
+        check_places(measured_presses(problem, contact, presses.charge_pC), oval_film)
 
 
 @pytest.mark.parametrize("name", IMPOSSIBLE)

@@ -129,7 +129,8 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
     if not farthest < film.radius * (1.0 - 1e-6):
         raise SceneError(
             f"probe off the film: centre ({at[0]:.4g}, {at[1]:.4g}) mm, farthest point of {probe.notation} "
-            f"{farthest:.4g} mm from the film's centre, film radius {film.radius:.4g} mm"
+            f"{probe.farthest_distance(at):.4g} mm from the film's centre, the rim "
+            f"{film.rim_distance(np.arctan2(at[1], at[0])):.4g} mm from it there"
         )
     rim_distance = film.radius - farthest
     min_rim_distance = MIN_RIM_DISTANCE * probe.reach

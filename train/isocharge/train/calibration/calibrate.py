@@ -74,7 +74,7 @@ def calibrate(
             the reason if it is found.
     """
     ordered_presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
-    check_places(ordered_presses, problem.sensor.film.radius)
+    check_places(ordered_presses, problem.sensor.film)
     _check_enough_measured(ordered_presses)
     # Presses at the edge may lie outside the working area by their errors.
     is_outside = problem.solved_domain.is_outside(ordered_presses.contact)

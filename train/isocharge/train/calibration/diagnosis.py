@@ -15,6 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import MeasuredPresses
+from isocharge.simulate.sensor.film import Film
 from isocharge.train.calibration.film_charges import FilmCharges
 
 MAX_DEAD_RATIO = 0.02
@@ -69,12 +70,12 @@ Each entry is a description, and the correct coordinates x and y in terms of the
 """
 
 
-def check_places(presses: MeasuredPresses, radius: float) -> None:
+def check_places(presses: MeasuredPresses, film: Film) -> None:
     """Raise an error if a press lies outside the film, or if the positions were probably written in metres.
 
     Args:
         presses: The presses. Positions that were not measured are NaN.
-        radius: Radius of the film, mm.
+        film: The film, which may be oval.
 
     Raises:
         PressError: If a position is outside the film, or if the positions are different but all lie within
@@ -82,12 +83,14 @@ def check_places(presses: MeasuredPresses, radius: float) -> None:
     """
     places = presses.contact[:, :2]
     distance = np.hypot(places[:, 0], places[:, 1])
-    outside_rows = np.flatnonzero(distance >= radius)  # the comparison is False for NaN, an unknown position
+    rim_distance = film.rim_distance(np.arctan2(places[:, 1], places[:, 0]))
+    outside_rows = np.flatnonzero(distance >= rim_distance)  # the comparison is False for NaN, an unknown position
     if outside_rows.size:
         row = outside_rows[0]
         raise PressError(
             f"{presses.row_noun} {presses.lines[row]}: a press at ({places[row, 0]:g}, {places[row, 1]:g}) mm "
-            f"is off the film, whose radius is {radius:g} mm; positions are in mm from the film's centre"
+            f"is off the film, whose radius there is {rim_distance[row]:.4g} mm; positions are in mm from the film's "
+            "centre"
         )
     measured_places = places[np.isfinite(places[:, 0])]
     spread = np.ptp(measured_places, axis=0).max() if len(measured_places) else 0.0  # larger range of x and y
