@@ -104,6 +104,8 @@ def test_a_board_that_only_sends_nan_is_not_taken_for_counts():
         (lambda k: charges()(k) + b"\x07\0" * (k % 4 == 0), "2.0% of the bytes do not belong to good frames"),
         (lambda _: b"", "no bytes were received"),
         (lambda _: b"\xf8\x80\xfe\xff" * 5, "no frames were recognised: try another baud rate"),
+        (lambda _: b"3.1,-2.0,5.2;", "such as b'3.1,-2.0,5.2;', but no frames"),
+        (lambda k: f"#{k} 3.1 -2.0 5.2\n".encode(), "lines of text are not understood, for example '#"),
         (
             lambda k: f"{1e-3 * (k % 7):.4f};{1.65 + 1e-3 * (k % 5):.4f}\n".encode(),
             "seem to be in V: state the charge",

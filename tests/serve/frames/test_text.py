@@ -247,6 +247,10 @@ def test_time_of_day_is_the_clock_which_wraps_at_midnight():
     assert parser.t_us_modulus == 86_400_000_000
 
 
+def test_units_are_no_words_of_a_message():
+    assert len(feed(*["850 pC 3 pC 5 pC"] * 3)) == 3
+
+
 def test_values_that_are_not_numbers_or_out_of_range_are_not_finite():
     frames = feed("A:1,B:nan", "A:ovf,B:-inf", "A:2,B:OVF", "A:3,B:4")
     assert [math.isfinite(value) for frame in frames for value in frame.values] == [

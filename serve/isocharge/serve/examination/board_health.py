@@ -10,7 +10,7 @@ from msgspec import structs
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError, shown
 from isocharge.common.printable_text import printable
-from isocharge.serve.examination.listening import Capture
+from isocharge.serve.examination.listening import Capture, ReceivedData
 from isocharge.serve.examination.press_detector import HeldPress
 from isocharge.serve.port.source import has_speed
 from isocharge.serve.signal_chain.channels import Channels
@@ -113,16 +113,16 @@ CLEAN_SHARE = 0.99
 """Smallest share of bytes in good frames with a good cable and the right baud rate, dimensionless."""
 
 
-def transmission_sentences(capture: Capture, url: str) -> Iterator[str]:
+def transmission_sentences(capture: Capture, received: ReceivedData) -> Iterator[str]:
     """Yield one sentence if no frames were received, or for each fault of the transmission.
 
     Args:
         capture: The frames, with the share of intact bytes and the gaps in the frame numbers.
-        url: The port.
+        received: The bytes of the frames.
     """
     unread_line = shown(capture.parser.unread_line) if capture.parser.unread_line else ""
     advice = "check the cable, and whether the baud rate of the board is exact"
-    if not has_speed(url):
+    if not has_speed(received.url):
         advice = (
             "if a serial server uses the telnet protocol, which doubles each byte 0xFF, set the port of the server to "
             'raw TCP (also called "raw", "TCP server" or "TCP socket")'
@@ -139,9 +139,9 @@ def transmission_sentences(capture: Capture, url: str) -> Iterator[str]:
         )
     elif not capture.frames:
         yield (
-            "bytes were received, but no frames were recognised: try another baud rate with --baud, or describe the "
-            f"format in a device file (--device); {advice}; a board without noise shows its channels only while the "
-            "film is touched"
+            f"bytes were received, such as {shown(received.data[-1])}, but no frames were recognised: try another baud "
+            "rate with --baud, end each line of text with a line feed, or describe the format in a device file "
+            f"(--device); {advice}; a board without noise shows its channels only while the film is touched"
         )
     elif capture.intact_share < CLEAN_SHARE:
         damaged = f"{1.0 - capture.intact_share:.1%} of the bytes do not belong to good frames"

@@ -156,7 +156,7 @@ def examine_received(
     is_proposed = device is ANY_BOARD
     device = _board(received, device)
     capture = read_frames(received, device)
-    missing = list(transmission_sentences(capture, received.url))
+    missing = list(transmission_sentences(capture, received))
     counts = capture.parser.counts
     examination = Examination(
         url=received.url,

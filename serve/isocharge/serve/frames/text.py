@@ -147,8 +147,10 @@ class TextParser(DelimitedParser):
         is_first_line = self._is_first_line
         self._is_first_line = False
         try:
-            text = clean_text(piece.decode())
+            line = piece.decode()
+            text = clean_text(line)
             if not text:
+                self.unread_line = line.strip() or self.unread_line
                 return []
             # The beginning of the first line may be missing. For example, "801.2" may have become the number "1.2".
             if is_first_line and parse_line(text).starts[:1] == (0,):

@@ -198,19 +198,20 @@ def parse_line(text: str, *, has_header: bool = False) -> Line:
         raise ValueError(f"expected only hexadecimal numbers after the first one, got {text[:100]!r}")
     names, names_with_units = _names(tokens)
 
-    fixed_words = {*names, "pC", *_CHARGE_UNITS}  # a line with another unit has another layout
+    units = {"pC", *_CHARGE_UNITS}
     skeleton = ""
     word_count = 0
     for previous, token in zip([None, *tokens], tokens, strict=False):
         is_beside_mark = previous is None or "mark" in (previous.kind, token.kind)
-        if token.kind in ("word", "name") and (previous is None or not is_beside_mark):
+        is_unit = token.content in units
+        if token.kind in ("word", "name") and not is_unit and (previous is None or not is_beside_mark):
             word_count += 1
         if is_beside_mark:
             skeleton += _CODES["optional blanks"]
         elif token.is_after_blank:
             skeleton += _CODES["blanks"]
-        is_fixed_word = token.kind == "word" and token.content in fixed_words
-        if token.kind in ("key", "name", "mark") or is_fixed_word:
+        is_fixed_word = token.kind == "word" and (is_unit or token.content in names)
+        if token.kind in ("key", "name", "mark") or is_fixed_word:  # a line with another unit has another layout
             skeleton += token.content
         else:
             skeleton += _CODES[number_kind if token.kind == "number" else token.kind]
