@@ -27,11 +27,17 @@ FIRST_BANDWIDTH_Hz = 1.0
 MAX_LOOP_GAIN = 0.5
 """Largest gain of the loop in one correction, dimensionless. It keeps the loop stable if readings are rare."""
 
-MAX_DEVIATION_s = 1.0
-"""Largest difference between an arrival time and its prediction, s.
+MAX_DELAY_s = 1.0
+"""Largest time by which an arrival may be later than predicted, s.
 
-After a larger difference, the fit starts again, because the clock of the device was set or the device was reset. A
-larger difference between the wall clock and the monotonic time of the host means that the wall clock was set.
+After a longer delay, the fit starts again, because the clock of the device was set or the device was reset. A larger
+difference between the wall clock and the monotonic time of the host means that the wall clock was set.
+"""
+
+MAX_LEAD_s = 0.3
+"""Largest time by which an arrival may be earlier than predicted, s.
+
+A reading cannot arrive before it was taken, so the limit is smaller than that of a delay.
 """
 
 
@@ -109,7 +115,7 @@ class DeviceClock:
         elapsed_s = chunk.elapsed_since(previous)
         self._monotonic_s += elapsed_s
         wall_jump_s = chunk.timestamp - previous.timestamp - elapsed_s
-        if abs(wall_jump_s) > MAX_DEVIATION_s:
+        if abs(wall_jump_s) > MAX_DELAY_s:
             self._fitted_host_s += wall_jump_s
             self._latest_host_s += wall_jump_s
             if self._chunk_arrival_s is not None:
@@ -129,9 +135,10 @@ class DeviceClock:
         predicted_s = self._predict(self._device_us)
 
         # No reading can be taken long after its arrival, so a clock was set. All chunks of a file have the same arrival
-        # time, which contains no information about the clock.
+        # time, which contains no information about the clock. A provisional fit may be early by the length of a chunk.
         is_new_arrival = self._chunk_arrival_s not in (None, arrival_s)
-        if self._fitted_us is not None and is_new_arrival and predicted_s - arrival_s > MAX_DEVIATION_s:
+        has_fit = self._fitted_us is not None and not self._is_fit_provisional
+        if has_fit and is_new_arrival and predicted_s - arrival_s > MAX_LEAD_s:
             self._fitted_us = None  # discards the fit
             step_us = 0  # the time since the previous reading is unknown
 
@@ -166,8 +173,8 @@ class DeviceClock:
             return  # the provisional fit of `stamp` remains
 
         delay_s = arrival_s - self._predict(self._device_us)  # positive if the chunk arrived later than predicted
-        was_clock_set = abs(delay_s) > MAX_DEVIATION_s
-        if was_clock_set:
+        was_clock_set = abs(delay_s) > MAX_DELAY_s
+        if was_clock_set and not self._is_fit_provisional:
             self._latest_host_s = -math.inf  # allows the host time of the next reading to be earlier
         # A provisional fit relies on the arrival of only one chunk. A fit that begins at this arrival replaces it.
         if was_clock_set or self._is_fit_provisional:
