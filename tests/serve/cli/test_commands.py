@@ -167,7 +167,7 @@ def test_sigusr1_requests_a_new_tare(models, run):
     signals = (interrupt(signal.SIGUSR1) for _ in range(1))
     rows = chain(rest(0.0, 400), filter(None, signals), rest(5.0, 400))
     with TcpBoard(rows) as board:
-        words = ["--count", 780, "--models", models]
+        words = ["--count", 680, "--models", models]
         records = records_of(run("stream", "linear", "--port", board.url, *words).stdout)
     assert records[150]["tare_pC"] == {"A": 0.0, "B": 1.0, "C": 2.0}
     assert records[-1]["tare_pC"]["A"] > 3.0

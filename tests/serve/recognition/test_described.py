@@ -201,7 +201,9 @@ def test_notations_of_public_firmware_are_text(path):
     assert values.shape[1] == 3
 
 
-@pytest.mark.parametrize("line", ["G1 X{:.1f}Y2Z3 ;layer", "no numbers {:.0f}x", "v1.2.{:.0f} <- ok"])
+@pytest.mark.parametrize(
+    "line", ["G1 X{:.1f}Y2Z3 ;layer", "no numbers {:.0f}x", "v1.2.{:.0f} <- ok", "1.5,{:.0f}\x1f2.5,3.5,4.5"]
+)
 def test_printable_bytes_are_never_a_binary_format(line):
     rng = np.random.default_rng(0)
     data = "".join(line.format(value) + "\r\n" for value in rng.normal(500, 100, 400)).encode()

@@ -43,6 +43,9 @@ from isocharge.serve.frames.text_lines import Line, clean_text, header_names, li
 MAX_LINE_LENGTH = 4096
 """Length of the longest line that is parsed, bytes."""
 
+CONTROL_CHARACTERS = bytes({*range(32)} - {*b"\t\x1b"})
+"""Bytes that have no meaning at the ends of a line, such as the zero at the end of a C string, or STX and ETX."""
+
 MAX_CYCLE_LINES = 64
 """Largest number of lines that make one frame, and of lines that are kept as possible headers."""
 
@@ -147,7 +150,7 @@ class TextParser(DelimitedParser):
         is_first_line = self._is_first_line
         self._is_first_line = False
         try:
-            line = piece.decode()
+            line = piece.strip(CONTROL_CHARACTERS).decode()
             text = clean_text(line)
             if not text:
                 self.unread_line = line.strip() or self.unread_line

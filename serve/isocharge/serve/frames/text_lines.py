@@ -36,6 +36,11 @@ _QUOTED = r'"(?:[^"\\]|\\.)*"' + r"|(?<!\w)'[^']*'(?!\w)"
 
 _QUOTED_NUMBER = r"""(?<!\w)(["'])([-+]?\.?[0-9][0-9.,]*(?:[eE][-+]?[0-9]+)?)\1(?!\s*[:=])"""
 
+_COMMANDS = r"(?:\x1b\[[0-9;?]*[A-Za-z])+"
+
+_COLOURS = rf"\x1b\[[0-9;]*m|^{_COMMANDS}|{_COMMANDS}$"
+"""Regular expression of the colours that loggers use, and of commands to a terminal at the ends of a line."""
+
 _DATE = r"[0-9]{1,4}[-/.][0-9]{1,2}[-/.][0-9]{1,4}[T ,;]+"
 
 _SECONDS = r"[0-9]{2}(?:\.[0-9]+(?:,[0-9]{3}(?=\]))?|,[0-9]{3}(?=\s))?"  # 56, 56.789, 56.789,012] or 56,789
@@ -156,14 +161,19 @@ def clean_text(text: str) -> str:
         ValueError: If the checksum of a sentence is wrong.
     """
     if "\x1b" in text:
-        text = re.sub(r"\x1b\[[0-9;]*m", "", text)  # removes the colours that loggers use
+        text = re.sub(_COLOURS, "", text)
+    if not text.isascii():
+        text = re.sub(r"[^\S\t]", " ", text)  # some programs write blanks of fixed width
     text = text.strip().replace("\N{MINUS SIGN}", "-")  # programs with some locales, such as Swedish, write this sign
     text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text)  # a sign apart from its number, as in `A: - 3.5`
-    text = re.sub(_QUOTED_NUMBER, r"\2", text)
-    teleplot = re.fullmatch(_TELEPLOT, text)
-    if text[:1] == ">" and not {"t", "xy"}.isdisjoint(text.rpartition("|")[2].split(",")):
-        return ""
-    if teleplot is not None:
+    if '"' in text or "'" in text:
+        text = re.sub(_QUOTED_NUMBER, r"\2", text)
+    if text[:1] == ">":
+        if not {"t", "xy"}.isdisjoint(text.rpartition("|")[2].split(",")):
+            return ""
+        teleplot = re.fullmatch(_TELEPLOT, text)
+        if teleplot is None:
+            return text
         name, time, value = teleplot.groups()
         named_time = f"t_ms:{time};" if time else ""
         return f'{named_time}"{name}":{value}'

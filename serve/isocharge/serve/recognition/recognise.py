@@ -164,13 +164,13 @@ def _fields(parts: Sequence[Part]) -> tuple[Field, ...]:
     return tuple(fields)
 
 
-def is_text(chunks: Sequence[bytes], min_share: float = 0.95) -> bool:
+def is_text(chunks: Sequence[bytes], min_share: float = 0.85) -> bool:
     """Return whether bytes are text, which is never a binary format.
 
     Args:
         chunks: The bytes.
-        min_share: Smallest share of printable characters in text. The other bytes may be damaged, or letters that are
-            not ASCII.
+        min_share: Smallest share of printable characters in text. The other bytes may be damaged, letters that are not
+            ASCII, or control characters at the ends of the lines.
     """
     data = b"".join(chunks)
     other_bytes = data.translate(None, delete=printable.encode() + b"\x1b")
