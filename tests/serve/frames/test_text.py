@@ -116,6 +116,8 @@ NOTATIONS = {
     "A = {a} | B = {b} | C = {c} |": "ABC",
     "A -> {a}, B -> {b}, C -> {c}": "ABC",
     "A: {a} nC, B: {b} nC, C: {c} nC": ("A_nC", "B_nC", "C_nC"),
+    "A nC: {a} B nC: {b} C nC: {c}": ("A_nC", "B_nC", "C_nC"),
+    "A [nC]: {a}, B [nC]: {b}, C [nC]: {c}": ("ch1_nC", "ch2_nC", "ch3_nC"),
     "A,{a},B,{b},C,{c}": "ABC",
     "A;{a};B;{b};C;{c};OK": "ABC",
     '"A",{a},"B",{b},"C",{c}': "ABC",

@@ -290,7 +290,8 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     - If only one of several numbers has a name, the name is a label of the line and is removed. This applies if the
       name is a word or belongs to the first number. Names of counters and clocks are kept.
 
-    A unit of charge or voltage other than pC directly behind a number is added to its name, as in `A_nC`.
+    A unit of charge or voltage other than pC directly behind a number, or between the name of a number and the number,
+    is added to its name, as in `A_nC`.
 
     Args:
         tokens: Parts of the line.
@@ -301,10 +302,16 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     outer_names = [["", "", *path][-2] for path in paths]
     words = {token.name for token in tokens if token.kind == "word"}
     parts = [token for token in tokens if token.content not in ":="]
-    units = [
+    following_units = [
         following.content
         for token, following in pairwise([*parts, _Token("mark", "", 0, False)])
         if token.kind in _NUMBER_KINDS
+    ]
+    # The first word after the previous number is a name, or the unit of the previous number.
+    preceding_units = [[token.name.strip("[]") for token in path[1:]] for path in _paths(tokens)]
+    units = [
+        next((unit for unit in (following, *preceding) if unit in _CHARGE_UNITS), "")
+        for following, preceding in zip(following_units, preceding_units, strict=True)
     ]
 
     names = [name or outer_name for name, outer_name in zip(_unique(inner_names), _unique(outer_names), strict=True)]
@@ -320,7 +327,7 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     if any(token.kind == "name" for token in tokens):
         names = [_NAMES_OF_TIMES.get(kind) or next(alternating_names) for kind in kinds]
     names_with_units = [
-        f"{name or f'ch{number}'}_{unit}" if unit in _CHARGE_UNITS - set(names) else name
+        f"{name or f'ch{number}'}_{unit}" if unit and unit not in names else name
         for number, (name, unit) in enumerate(zip(names, units, strict=True), start=1)
     ]
     return names, names_with_units
