@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from drawn_contacts import draw_contacts
 from isocharge.cli.main import app
+from isocharge.common.errors import ChargeError
 from isocharge.serve import Frame, Predictor, device_from_table
 from isocharge.serve.live.device import create_stages
 from isocharge.serve.signal_chain.stage import Setup
@@ -83,3 +84,15 @@ def test_device_file_with_noise_widens_the_contacts_of_a_stream_and_of_predict(r
     board.write_text("[noise]\ngain = 0.015\n")
     result = CliRunner().invoke(app, ["serve", "predict", NAME, str(presses), "--json", "--device", str(board)])
     assert json.loads(result.stdout)["x_std_mm"] == pytest.approx(expected.x_std_mm, rel=1e-5)
+
+
+@pytest.mark.parametrize("noise", [(-1.0, 0.0), (np.nan, 0.0), (1.0, np.inf), (1.0, -0.01)])
+def test_noise_that_is_no_standard_deviation_is_refused(released, noise):
+    with pytest.raises(ChargeError, match=r"noise: (white_pC|gain): expected a number from 0"):
+        released.with_noise(*noise)
+
+
+def test_charges_of_the_stated_white_noise_are_no_touch(released):
+    noise_pC = np.random.default_rng(0).normal(0.0, 20.0, (100, 4))
+    assert released.validity.is_touch(noise_pC).all()
+    assert not released.with_noise(20.0, 0.002).validity.is_touch(noise_pC).any()

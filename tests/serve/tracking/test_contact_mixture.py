@@ -187,6 +187,18 @@ def test_records_with_track_have_the_field_other_and_are_repeated_bit_for_bit(mo
     assert (released["tracked"], released["other"]) == (None, None)
 
 
+def test_mixture_uses_the_noise_that_the_device_file_states(model):
+    """With the noise of the training, a noise of 5 % would explain no contact in many frames."""
+    stated = {"white_pC": 2.0, "gain": 0.05}
+    clean = noisy_charges(np.full(200, -4.0))
+    rng = np.random.default_rng(0)
+    noisy = clean + np.sqrt(ModelNoise(name="bench", **stated).variance(clean)) * rng.standard_normal(clean.shape)
+    lines = recorded_lines(Predictor(model), np.concatenate([np.zeros((10, 3)), noisy]), {"track": {}, "noise": stated})
+    tracked = [json.loads(line)["tracked"] for line in lines[30:]]
+    normalised = [(contact["x_mm"] + 4.0) / contact["x_std_mm"] for contact in tracked]
+    assert np.sqrt(np.mean(np.square(normalised))) < 1.5
+
+
 def test_stream_keeps_its_model_if_the_charges_npz_of_the_next_model_is_damaged(model, models):
     first = Predictor(models / "linear")
     stream = TouchStream(first, device_from_table({"track": {}}, "b"))

@@ -17,7 +17,7 @@ from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.film_follower import FilmFollower
-from isocharge.simulate import noise_model
+from isocharge.simulate import NoiseModel, noise_model
 from model_files import put_charge_map
 
 NOISE = noise_model("reference")
@@ -52,8 +52,14 @@ def series() -> ChargeSeries:
     )
 
 
-def model_in(folder, series: ChargeSeries) -> SimpleNamespace:
-    """Return a model of the calibrated film that searches for the nearest contact, and write its charge map."""
+def model_in(folder, series: ChargeSeries, noise=NOISE) -> SimpleNamespace:
+    """Return a model of the calibrated film that searches for the nearest contact, and write its charge map.
+
+    Args:
+        folder: Folder of the model.
+        series: Charge map of the film.
+        noise: Noise that a device file states.
+    """
     shutil.copy(GOLDEN, folder)
     put_charge_map(folder, charge_map_bytes(series))
     calibrated = series.at_state(series.calibrated_state)
@@ -72,7 +78,7 @@ def model_in(folder, series: ChargeSeries) -> SimpleNamespace:
         return Contact(float(contact[0]), float(contact[1]), force, std[0], std[1], std[2] * force, 0.0)
 
     return SimpleNamespace(
-        folder=folder, metadata=SimpleNamespace(electrodes=series.electrodes, noise=NOISE), predict=predict
+        folder=folder, metadata=SimpleNamespace(electrodes=series.electrodes, noise=NOISE), noise=noise, predict=predict
     )
 
 
@@ -120,6 +126,24 @@ def test_changes_of_the_film_and_of_a_gain_are_followed(series, tmp_path, change
     if change_MPa:
         before, _ = force_errors(FilmFollower(model), model, contact[50:], charge[50:])
         assert np.sqrt(np.mean(before**2)) > 0.08
+
+
+def test_film_is_followed_with_the_noise_that_the_device_file_states(series, tmp_path):
+    """With the noise of the training, the film would be lost, or its pretension wrong by many standard deviations.
+
+    All frames of a touch have the same noise, because the board filters its signals.
+    """
+    rng = np.random.default_rng(4)
+    noise = NoiseModel("bench", 5.0, 0.02)
+    model = model_in(tmp_path, series, noise)
+    _, charge = touches(series, np.array([0.3, 0.7, -0.8]), np.ones(4), rng, 80)
+    follower = FilmFollower(model)
+    for number, row in enumerate(noise.add(charge, rng)):
+        follower.observe_frame(row, model.predict(row), (), float(number))
+        follower.observe_frame(None, None, (), number + 0.5)
+        assert not follower.is_lost
+    assert abs(follower.film.pretension_MPa - 1.3) < 2.0 * follower.film.pretension_std_MPa
+    assert follower.film.pretension_std_MPa < 0.2
 
 
 @pytest.mark.parametrize("change_MPa", [0.3, -0.3])

@@ -11,6 +11,7 @@ and writes the contact into an existing array, which is faster in a loop.
 import logging
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError
+from isocharge.common.structs import convert
 from isocharge.serve.flags import BEYOND
 from isocharge.serve.model.contact import Contact, Contacts
 from isocharge.serve.model.metadata import ModelNoise
@@ -42,6 +44,8 @@ class Predictor:
         folder: Version folder of the model.
         metadata: Metadata of the model, such as the sensor, the electrodes, the working area and the measured errors.
         validity: Domain in which the model is valid. `validity.batch_flags` returns the flags of a batch.
+        noise: Noise of the charges for which the standard deviations are stated: that of the training, or that of
+            `with_noise`.
 
     Example:
         >>> from isocharge.serve import Predictor
@@ -71,7 +75,7 @@ class Predictor:
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
         self._press_lock = threading.Lock()  # held while a method uses the memory of `_press`
         self._has_warned = False
-        self._stated_noise: ModelNoise | None = None
+        self.noise = loaded.metadata.noise
 
     def with_noise(self, white_pC: float, gain: float) -> "Predictor":
         """Return a predictor of the same model whose standard deviations are those for another noise of the charges.
@@ -84,15 +88,24 @@ class Predictor:
         Args:
             white_pC: Standard deviation of the part of the noise that does not depend on the charge, pC.
             gain: Standard deviation of the part that is proportional to the charge, relative to the charge.
+
+        Raises:
+            ChargeError: If a standard deviation is not a finite number from 0.
         """
+        stated = {"name": "stated", "white_pC": white_pC, "gain": gain}
+        return self._with_stated_noise(convert(stated, ModelNoise, "noise", ChargeError))
+
+    def _with_stated_noise(self, noise: ModelNoise) -> "Predictor":
+        """Return a predictor of the same model for another noise. A touch must also exceed this noise."""
         new_predictor = object.__new__(type(self))
         new_predictor.__dict__.update(self.__dict__)
-        new_predictor._stated_noise = ModelNoise(name="stated", white_pC=white_pC, gain=gain)
+        new_predictor.noise = noise
+        new_predictor.validity = replace(self.validity, white_pC=noise.white_pC)
         return new_predictor
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how `copy` and `pickle` create the predictor again, because the onnxruntime session has no copy."""
-        return _load_again, (type(self), self.folder, self._stated_noise)
+        return _load_again, (type(self), self.folder, self.noise)
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
         """Compute the contact of one press. Call `flags` to find out whether the contact is valid.
@@ -115,8 +128,8 @@ class Predictor:
                 press.write(*as_press(charge_pC, self.metadata.electrodes))
             press.run()
             contact = Contact(*press.read())
-        if self._stated_noise is not None:
-            contacts = self._with_stated_noise(self._stated_noise, as_batch([values], self.metadata.electrodes))
+        if self.noise is not self.metadata.noise:
+            contacts = self._predict_with_noise(as_batch([values], self.metadata.electrodes))
             contact = Contact(*np.asarray(contacts, float)[0].tolist())
 
         if not self._has_warned and BEYOND in self.flags(contact):
@@ -176,23 +189,22 @@ class Predictor:
             ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
         """
         charges = as_batch(charge_pC, self.metadata.electrodes)
-        if self._stated_noise is not None:
-            return self._with_stated_noise(self._stated_noise, charges)
+        if self.noise is not self.metadata.noise:
+            return self._predict_with_noise(charges)
         return self._predict(charges)
 
-    def _with_stated_noise(self, noise: ModelNoise, charge_pC: Singles) -> Contacts:
-        """Compute the contacts of n presses, with the covariance for another noise of the charges.
+    def _predict_with_noise(self, charge_pC: Singles) -> Contacts:
+        """Compute the contacts of n presses, with the covariance for the noise of `with_noise`.
 
         Each charge is raised and lowered by the standard deviation of its additional noise. Half of the difference
         between the two contacts is the effect of the additional noise of this charge (central difference).
 
         Args:
-            noise: Noise of the charges.
             charge_pC: Touch charges, shape (n, electrodes), pC.
         """
         contacts = self._predict(charge_pC)
         model_variance = self.metadata.noise.variance(charge_pC.astype(float))
-        extra_variance = np.maximum(noise.variance(charge_pC.astype(float)) - model_variance, 0.0)
+        extra_variance = np.maximum(self.noise.variance(charge_pC.astype(float)) - model_variance, 0.0)
         effects = []  # changes of x, mm, y, mm, and the force, N, each of shape (n, 3)
         for column, extra_std in enumerate(np.sqrt(extra_variance).T):
             step = np.zeros_like(charge_pC)
@@ -245,15 +257,14 @@ class Predictor:
         )
 
 
-def _load_again(predictor_class: type[Predictor], folder: Path, noise: ModelNoise | None) -> Predictor:
+def _load_again(predictor_class: type[Predictor], folder: Path, noise: ModelNoise) -> Predictor:
     """Load a predictor from its folder, with the noise of `with_noise`.
 
     Raises:
         ModelError: If the model is no longer in the folder, or is damaged.
     """
     predictor = predictor_class(folder)
-    predictor._stated_noise = noise
-    return predictor
+    return predictor if noise == predictor.noise else predictor._with_stated_noise(noise)
 
 
 def _describe(value: object) -> str:

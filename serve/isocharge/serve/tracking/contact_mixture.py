@@ -287,7 +287,7 @@ class ContactMixture:
 
         Args:
             charges: Charges of every contact on the film.
-            noise: Noise of the charges of a frame, with which the model was trained.
+            noise: Noise of the charges of a frame.
         """
         self.charges = charges
         self._noise = noise

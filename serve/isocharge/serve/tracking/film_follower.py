@@ -296,7 +296,7 @@ class FilmFollower:
         self._covariance += (np.diag(self._initial_std**2) - self._covariance) / FADING_TOUCHES
         touch_offset_pC = self._offset_std_pC * self._offset_ratio
         model_error_pC = self._series.charge_std * charge_pC
-        variance_pC2 = self.predictor.metadata.noise.variance(charge_pC) + model_error_pC**2
+        variance_pC2 = self.predictor.noise.variance(charge_pC) + model_error_pC**2
         scale = self._error_scale
         covariance_pC2 = scale * (np.diag(variance_pC2) + np.outer(touch_offset_pC, touch_offset_pC))
         start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
@@ -410,7 +410,7 @@ class FilmFollower:
 
         # An error of the state shifts the contact whose charges are nearest to the converted charges. The norm is that
         # of the noise of the charges.
-        weight = 1.0 / np.sqrt(self.predictor.metadata.noise.variance(calibrated_pC))[:, None]
+        weight = 1.0 / np.sqrt(self.predictor.noise.variance(calibrated_pC))[:, None]
         contact_by_state = np.linalg.pinv(weight * slopes_pC) @ (weight * present.by_state[0])  # shape (3, n_state)
         contact_by_state[2] *= contact.force_N  # from ln F to F
         covariance = contact_by_state @ self._applied_covariance @ contact_by_state.T

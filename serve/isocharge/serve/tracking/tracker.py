@@ -128,7 +128,7 @@ class Tracker(Stage):
         if predictor is not None and setup.device.rule(FollowRule) is None:
             charges = read_charge_map(predictor.folder, predictor.metadata.electrodes)  # None without the file
             if charges is not None and charges.is_folded:
-                self._mixture = ContactMixture(charges, predictor.metadata.noise)
+                self._mixture = ContactMixture(charges, predictor.noise)
                 # A contact of the mixture is valid in the whole area for which the file describes the charges.
                 self._mixture_validity = replace(predictor.validity, corners_mm=charges.corners_mm)
         self._time_s = 0.0  # time of the latest frame on a clock that is never set back
