@@ -130,7 +130,7 @@ def test_file_that_is_not_an_onnx_model_is_refused_with_its_cause(own_model, dam
         (lambda _: "{", "golden.json: expected JSON, got"),
         (lambda _: "{}", "golden.json: key 'sha256' is missing; the file is damaged"),
         (lambda _: "[]", "golden.json: expected a table"),
-        (lambda table: json.dumps(table | {"inputs": {"charge_pC": [[1.0, 2.0]]}}), r"charges of shape \(n, 3\)"),
+        (lambda table: json.dumps(table | {"inputs": {"charge_pC": [[1.0, 2.0]] * 8}}), r"charges of shape \(n, 3\)"),
     ],
 )
 def test_damaged_golden_json_is_refused(own_model, damage, message):

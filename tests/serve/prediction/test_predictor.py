@@ -73,6 +73,7 @@ def test_predict_takes_any_kind_of_numbers(predictor, kind):
         ([math.inf, 0.0, -math.inf], r"'A' \(inf\), 'C' \(-inf\)"),
         ([1.0, 2.0, 1e39], r"'C' \(1e\+39\)"),
         ((q for q in (1.0, 2.0, math.nan)), "as numbers"),
+        (np.ma.array([1.0, 2.0, 3.0], mask=[False, True, False]), "as numbers"),
     ],
 )
 def test_predict_refuses_wrong_charges(predictor, charge_pC, message):
@@ -85,6 +86,7 @@ def test_predict_refuses_wrong_charges(predictor, charge_pC, message):
     [
         (np.zeros((2, 4)), r"rows of 3 charges \('A', 'B', 'C'\), shape \(n, 3\), got an array of shape \(2, 4\)"),
         ([[1.0, 2.0, 3.0], [1.0, 2.0]], "in each row"),
+        (np.ma.array([[1.0, 2.0, 3.0]], mask=[[False, True, False]]), "as numbers"),
         ([[1.0, 2.0, 3.0], [1.0, math.nan, math.inf]], r"in row 1 .* for electrode 'B' \(nan\), 'C' \(inf\)"),
     ],
 )

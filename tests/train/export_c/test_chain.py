@@ -43,6 +43,7 @@ BOARDS = {
         "saturation": {"limit_pC": 900.0},
     },
     "hum": {"hum": {"frequency_Hz": 60.0, "settle_s": 0.3}, "leak": {"tau_s": 10.0}},
+    "hum of which a period has many frames": {"hum": {"frequency_Hz": 3.0}},
     "no tare": {"tare": {"on": False}},
     "short tare": {"tare": {"frames": 7, "noise_limit_pC": 3.0}, "touch": {"sigmas": 4.0, "floor_pC": 5.0}},
     "warming": {"common_mode": {}},

@@ -25,7 +25,7 @@ from isocharge.common.errors import ModelError
 from isocharge.common.files import read_needed, sha256_of
 from isocharge.common.structs import Finite, NotNegative, Text, read_json
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.session import CORRELATION, INPUT, run
+from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS, run
 
 RELATIVE_TOLERANCE = 1e-5
 """Largest difference of two outputs, relative to max(|output|, floor), dimensionless."""
@@ -171,7 +171,14 @@ def read_golden(path: Path) -> Golden:
         with np.errstate(over="ignore"):
             outputs = {name: np.array(rows, np.float32) for name, rows in content.outputs.items()}
             charge_pC = np.array(content.inputs[INPUT], np.float32)
-    except (ModelError, ValueError, KeyError) as error:  # rows of different lengths, or no charges
+        for name, width in OUTPUTS.items():
+            sizes = (*outputs[name].shape, len(content.tolerance.floor[name]))
+            if sizes != (len(charge_pC), width, width):
+                raise ValueError(
+                    f"{name}: expected {len(charge_pC)} rows of {width} numbers, and {width} floors, got an array of "
+                    f"shape {sizes[:-1]} and {sizes[-1]} floors"
+                )
+    except (ModelError, ValueError, KeyError) as error:  # rows of different lengths, or a missing entry
         where = "" if isinstance(error, ModelError) else f"{path}: "
         raise ModelError(f"{where}{error}; the file is damaged: copy or export the model again") from error
     return Golden(
@@ -225,16 +232,11 @@ def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> No
         where: Name or file of the model, for error messages.
 
     Raises:
-        ModelError: If an output is missing, has another shape or differs by more than the tolerance. The message names
-            the largest difference of this output.
+        ModelError: If an output differs by more than the tolerance. The message names the largest difference of this
+            output.
     """
     for name, rows in outputs.items():
-        expected = golden.outputs.get(name, np.zeros((0, 0), np.float32)).astype(float)
-        if rows.shape != expected.shape:
-            raise ModelError(
-                f"{where}: {name}: expected the shape {expected.shape} (golden.json), got {rows.shape}; copy or export "
-                "the model again"
-            )
+        expected = golden.outputs[name].astype(float)
         # Below its floor, a value has a constant tolerance, because a relative tolerance would approach 0.
         tolerance = golden.relative_tolerance * np.maximum(np.abs(expected), golden.floors[name])
         with np.errstate(invalid="ignore"):

@@ -255,7 +255,8 @@ def _as_numbers(charge_pC: ArrayLike, expected: str, shape: tuple[str | int, ...
         charges = np.asarray(charge_pC)
     except ValueError as error:  # rows of different lengths
         raise ChargeError(f"expected {expected} in each row, got {charge_pC!r:.200} ({error})") from error
-    if charges.dtype.kind not in "fiu":  # neither floats nor signed or unsigned integers
+    # Numbers are floats, signed or unsigned integers. The array has lost the mask of a masked array.
+    if charges.dtype.kind not in "fiu" or np.ma.is_masked(charge_pC):
         raise ChargeError(f"expected {expected} as numbers (pC), got {charge_pC!r:.200}")
     if charges.ndim != len(shape) or charges.shape[-1] != shape[-1]:
         raise ChargeError(f"expected {expected}, got an array of shape {charges.shape}")

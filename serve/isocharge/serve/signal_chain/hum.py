@@ -5,8 +5,8 @@ second to settle after a step of 850 pC. Instead, this module estimates the hum 
 (Widrow and others, "Adaptive noise cancelling", 1975; normalised least mean squares). The hum in each channel is a sine
 wave of known frequency, whose amplitude and phase change slowly.
 
-The estimate of the hum is updated with the differences of consecutive frames, because a touch changes these differences
-only briefly. Each difference is clipped. The filter does not delay the signal.
+The estimate of the hum is updated with the differences of frames that are close in time, because a touch changes these
+differences only briefly. Each difference is clipped. The filter does not delay the signal.
 """
 
 import cmath
@@ -43,10 +43,11 @@ class Hum(Stage):
     The hum of a channel is the real part of a product of two complex numbers. The first number is the phasor of the
     channel. The magnitude of the phasor is the amplitude of the hum, and its angle is the phase of the hum. The second
     number is a unit phasor, exp(2 pi i f t), that turns with the mains frequency f. The phasor of the channel is
-    estimated from the differences between consecutive frames, which contain little of the touch charge.
+    estimated from the differences between frames, which contain little of the touch charge. A frame is compared with
+    the previous one, or with an earlier one if the unit phasor has hardly changed since then.
 
     The estimate follows the method of normalised least mean squares (Widrow and others 1975). Let z be the change of
-    the unit phasor between two frames. In each frame, the phasor of the channel is changed by
+    the unit phasor between the two frames. The phasor of the channel is changed by
 
         gain * error * conjugate(z) / |z|^2,
 
@@ -62,8 +63,10 @@ class Hum(Stage):
         """Begin with an estimate of zero hum."""
         self._rule = setup.device.rule(HumRule) or HumRule()
         self._phasor_pC: Complexes = np.zeros(len(setup.electrodes), dtype=complex)  # amplitude and phase by channel
-        self._unit_phasor = 1.0 + 0.0j  # phasor of magnitude 1 that turns with the mains frequency
-        self._previous_pC: Array | None = None  # charges of the previous frame
+        # The frame with which the next frame is compared: its unit phasor, its charges, and the time since then
+        self._unit_phasor = 1.0 + 0.0j
+        self._compared_pC: Array | None = None
+        self._waited_s = 0.0
 
     def step(self, frame: Frame) -> None:
         """Subtract the hum from a frame, and update the estimate of the hum."""
@@ -75,24 +78,31 @@ class Hum(Stage):
         phasor_step = unit_phasor - self._unit_phasor
         squared_step = phasor_step.real * phasor_step.real + phasor_step.imag * phasor_step.imag
 
-        # The estimate needs a previous frame. If the unit phasor has hardly changed, the change contains little hum.
-        if self._previous_pC is not None and squared_step > MIN_SQUARED_STEP:
+        self._waited_s += frame.dt_s
+
+        # If the unit phasor has hardly changed, the change of the charges contains little hum.
+        has_turned = squared_step > MIN_SQUARED_STEP
+        if self._compared_pC is not None and has_turned:
             expected_change_pC = (self._phasor_pC * phasor_step).real
-            error_pC = raw_pC - self._previous_pC - expected_change_pC
+            error_pC = raw_pC - self._compared_pC - expected_change_pC
             # Clipping limits the influence of a touch, which may change the charges by more than the hum.
             clipped_error_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
             # The charges contain only the real part of the product. With a gain of 1, a frame therefore corrects only
             # half of the error of the phasor on average. With the factor 2, the time constant is `settle_s`.
-            gain = min(1.0, 2.0 * frame.dt_s / rule.settle_s)
+            gain = min(1.0, 2.0 * self._waited_s / rule.settle_s)
             correction_per_error = gain / squared_step * phasor_step.conjugate()
             self._phasor_pC = self._phasor_pC + clipped_error_pC * correction_per_error
-        self._unit_phasor = unit_phasor
-        self._previous_pC = raw_pC
+        # Within a tenth of a period, the unit phasor turns enough. After nearly whole periods, it does not.
+        is_late = 10.0 * rule.frequency_Hz * self._waited_s > 1.0
+        if self._compared_pC is None or has_turned or is_late:
+            self._unit_phasor = unit_phasor
+            self._compared_pC = raw_pC
+            self._waited_s = 0.0
         frame.charge_pC = raw_pC - (self._phasor_pC * unit_phasor).real
 
     def reset(self) -> None:
-        """Keep the estimate of the hum, but do not compare the next frame with the latest frame."""
-        self._previous_pC = None
+        """Keep the estimate of the hum, but do not compare the next frame with an earlier one."""
+        self._compared_pC = None
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:

@@ -68,7 +68,7 @@ void isocharge_chain_start(isocharge_chain *chain)
 #if ISOCHARGE_HUM_ON
     EACH(k) chain->hum_re[k] = chain->hum_im[k] = 0;
     chain->turn_re = 1;
-    chain->turn_im = 0;
+    chain->turn_im = chain->hum_waited_s = 0;
 #endif
     forget_tare(chain);
 }
@@ -85,7 +85,7 @@ void isocharge_chain_tare(isocharge_chain *chain)
 }
 
 #if ISOCHARGE_HUM_ON
-/* Subtract the hum from charges, and learn it from their steps. */
+/* Subtract the hum from charges, and learn it from their changes since a frame shortly before. */
 static void remove_hum(isocharge_chain *chain, const real raw_pC[N], real quiet_pC[N], double t_s, real dt_s)
 {
     const double cycles = ISOCHARGE_HUM_FREQUENCY_HZ * t_s;
@@ -93,9 +93,11 @@ static void remove_hum(isocharge_chain *chain, const real raw_pC[N], real quiet_
     const real re = (real)cos(phase), im = (real)sin(phase);
     const real step_re = re - chain->turn_re, step_im = im - chain->turn_im;
     const real norm = step_re * step_re + step_im * step_im;
+    const int turned = norm > (real)ISOCHARGE_HUM_MIN_SQUARED_STEP;
 
-    if (chain->hum_running && norm > (real)ISOCHARGE_HUM_MIN_SQUARED_STEP) {
-        const real share = smaller(1, 2 * dt_s / (real)ISOCHARGE_HUM_SETTLE_S) / norm;
+    chain->hum_waited_s += dt_s;
+    if (chain->hum_running && turned) {
+        const real share = smaller(1, 2 * chain->hum_waited_s / (real)ISOCHARGE_HUM_SETTLE_S) / norm;
         EACH(k)
         {
             const real change = raw_pC[k] - chain->hum_raw_pC[k];
@@ -106,14 +108,14 @@ static void remove_hum(isocharge_chain *chain, const real raw_pC[N], real quiet_
             chain->hum_im[k] -= error * share * step_im;
         }
     }
-    chain->turn_re = re;
-    chain->turn_im = im;
-    chain->hum_running = 1;
-    EACH(k)
-    {
-        chain->hum_raw_pC[k] = raw_pC[k];
-        quiet_pC[k] = raw_pC[k] - (chain->hum_re[k] * re - chain->hum_im[k] * im);
+    if (!chain->hum_running || turned || 10 * (real)ISOCHARGE_HUM_FREQUENCY_HZ * chain->hum_waited_s > 1) {
+        chain->turn_re = re;
+        chain->turn_im = im;
+        chain->hum_running = 1;
+        chain->hum_waited_s = 0;
+        EACH(k) chain->hum_raw_pC[k] = raw_pC[k];
     }
+    EACH(k) quiet_pC[k] = raw_pC[k] - (chain->hum_re[k] * re - chain->hum_im[k] * im);
 }
 #endif
 

@@ -41,8 +41,9 @@ typedef struct {
     isocharge_real invalid_s; /* time of the invalid frames since the last valid one */
 #if ISOCHARGE_HUM_ON
     isocharge_real hum_re[ISOCHARGE_ELECTRODES], hum_im[ISOCHARGE_ELECTRODES]; /* amplitude and phase, pC */
-    isocharge_real turn_re, turn_im;                                           /* the mains at the frame before */
-    isocharge_real hum_raw_pC[ISOCHARGE_ELECTRODES];                           /* charges of the frame before */
+    isocharge_real turn_re, turn_im;                 /* the mains at the frame that is compared */
+    isocharge_real hum_raw_pC[ISOCHARGE_ELECTRODES]; /* its charges */
+    isocharge_real hum_waited_s;                     /* time since then */
     int hum_running;
 #endif
 #if ISOCHARGE_TARE_ON
