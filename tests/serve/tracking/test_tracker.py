@@ -140,6 +140,22 @@ def test_reported_std_adapts_to_a_board_whose_noise_differs_from_the_training(no
     assert 0.33 < np.mean(squared_errors) / np.mean(reported_variances) < 2.0
 
 
+@pytest.mark.parametrize(("rate_Hz", "lost_share"), [(200.0, 0.3), (100.0, 0.5), (30.0, 0.0)])
+def test_irregular_times_and_the_beginning_of_a_slide_are_not_taken_for_noise(rate_Hz, lost_share):
+    """A slide of 200 mm/s. With second differences for regular times, the ratio of squares would be 0.02 to 0.17."""
+    normalised = []
+    for _ in range(20):
+        path, t = slide(200.0, rate_Hz)
+        is_received = RNG.random(t.size) >= lost_share
+        path, t = path[is_received], t[is_received]
+        tracker = new_tracker(lasting=0.0)
+        for contact, position, t_s in zip(noisy_contacts(path, correlation=0.0), path, t, strict=True):
+            tracked, _ = track(tracker, contact, t_s)
+            if 0.4 < t_s < 0.6:
+                normalised.append((tracked.x_mm - position.real) / tracked.x_std_mm)
+    assert 0.4 < np.mean(np.square(normalised)) < 1.5
+
+
 @pytest.mark.parametrize("speed", [5.0, 50.0, 200.0])
 def test_slide_is_tracked_without_lag_and_better_than_by_any_moving_average(speed):
     path, t = slide(speed)

@@ -137,11 +137,14 @@ class NoiseEstimate:
         """Start with the noise that the model states."""
         self.relative_variance = 1.0
         self._frames = 1  # the noise that the model states has the weight of one frame
-        self._latest: list[Array] = []  # the latest values, at most three
+        self._latest: list[Array] = []  # the latest values and their times, at most three arrays of shape (4,)
         self._latest_s = -math.inf
 
     def update(self, measured: Array, covariance: Array, t_s: float) -> None:
-        """Update the estimate, a mean over all frames, with the second difference of the latest three values.
+        """Update the estimate, a mean over all frames, with the deviation of the latest values from a steady motion.
+
+        The value in the middle of three frames is compared with the interpolation between the two others. The frames
+        may have any times. A contact that starts or stops deviates as well, so large deviations are limited.
 
         Args:
             measured: Measured x, y and ln F, shape (3,).
@@ -151,14 +154,17 @@ class NoiseEstimate:
         if t_s - self._latest_s < NOISE_INTERVAL_s:
             return
         self._latest_s = t_s
-        self._latest = [*self._latest[-2:], measured]
+        self._latest = [*self._latest[-2:], np.append(measured, t_s)]
         if len(self._latest) < 3:
             return
-        (difference,) = np.diff(self._latest, n=2, axis=0)
-        variance_factor = 6.0 * difference.size  # 1 + 2^2 + 1 for each of the values
-        relative_square = float(difference @ np.linalg.solve(covariance, difference)) / variance_factor
+        first, middle, last = self._latest
+        share = (middle[-1] - first[-1]) / (last[-1] - first[-1])
+        deviation = (middle - (1.0 - share) * first - share * last)[:-1]
+        variance_factor = (1.0 + (1.0 - share) ** 2 + share**2) * deviation.size
+        relative_square = float(deviation @ np.linalg.solve(covariance, deviation)) / variance_factor
         self._frames += 1
-        self.relative_variance += (relative_square - self.relative_variance) / self._frames
+        limited_square = min(relative_square, 3.0**2 * self.relative_variance)
+        self.relative_variance += (limited_square - self.relative_variance) / self._frames
 
 
 class MotionFilter:
