@@ -170,15 +170,15 @@ class Leak(OffsetStage):
             dt_s = frame.dt_s
             innovation_pC = self._innovation_pC(output_pC, np.exp(-dt_s / self._tau_s))
             surplus_pC = innovation_pC - self._inflow.pC_per_s * dt_s  # new touch charge and noise
-            self._charge_pC = self._charge_pC + surplus_pC
             if self._previous.is_contact:
                 self._inflow.pause()
-            else:  # any charge is an error, and therefore decays to zero
+            else:  # any earlier charge is an error, and therefore decays to zero
                 self._charge_pC = self._charge_pC * math.exp(-dt_s / self._rule.relax_s)
                 if self._inflow.hold_s > 0.0 or not self._rule.learn:
                     self._inflow.hold_s -= dt_s
                 else:
                     self._inflow.learn(surplus_pC, frame.noise_pC, dt_s)
+            self._charge_pC = self._charge_pC + surplus_pC
         self._previous = frame
         self._output_pC = output_pC
         frame.charge_pC = self._charge_pC

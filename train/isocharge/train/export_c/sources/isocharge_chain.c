@@ -205,7 +205,7 @@ static void learn_inflow(isocharge_chain *chain, const real surplus_pC[N], real 
 static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s)
 {
     static const real tau_s[N] = ISOCHARGE_LEAK_TAU_S;
-    const real relax = EXP(-dt_s / (real)ISOCHARGE_LEAK_RELAX_S);
+    const real relax = chain->contact ? 1 : EXP(-dt_s / (real)ISOCHARGE_LEAK_RELAX_S); /* of an earlier charge */
     real surplus_pC[N];
 
     EACH(k)
@@ -213,7 +213,7 @@ static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s
         const real innovation_pC = output_pC[k] - EXP(-dt_s / tau_s[k]) * chain->output_pC[k];
 
         surplus_pC[k] = innovation_pC - chain->inflow[k] * dt_s;
-        chain->charge_pC[k] += surplus_pC[k];
+        chain->charge_pC[k] = relax * chain->charge_pC[k] + surplus_pC[k];
         chain->output_pC[k] = output_pC[k];
     }
     if (chain->contact) {
@@ -222,7 +222,6 @@ static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s
         chain->hold_s = (real)ISOCHARGE_LEAK_HOLD_OFF_S;
         return;
     }
-    EACH(k) chain->charge_pC[k] *= relax;
     if (chain->hold_s > 0 || !ISOCHARGE_LEAK_LEARN)
         chain->hold_s -= dt_s;
     else
