@@ -3,7 +3,7 @@
 A charge amplifier is a leaky integrator with the time constant tau = R C. After a step of the charge, the output of the
 amplifier decays by a factor of e within the time tau. The output v of the amplifier at reading n is
 
-    v[n] = exp(-dt / tau) v[n-1] + g (q[n] - q[n-1]) + b dt,
+    v[n] = a v[n-1] + (g (q[n] - q[n-1]) + b dt) (1 + a) / 2,        a = exp(-dt / tau),
 
 where q is the charge of the film, g is the gain, b is the bias current, and dt is the time between two readings. The
 charge of the film is the sum of the touch charge and the pyroelectric charge. To the output of the amplifier, the
@@ -165,12 +165,11 @@ class Measurement:
         # There is no touch before the measurement, so the film has only its pyroelectric charge.
         self._film_charge = self.pyro_charge_per_K * self._film_temperature
 
-        # The stationary output satisfies output = decay * output + bias / rate for each channel. Without a leak, there
-        # is no stationary output, and the output starts at zero.
+        # The leak of the stationary output equals the bias current. Without a leak, there is no stationary output, and
+        # the output starts at zero.
         self._output = np.zeros_like(self.gain)
         if math.isfinite(amplifier.tau):
-            decay = np.exp(-1.0 / (rate * self.leak_time))  # factor of the output from one reading to the next
-            self._output = self.bias / (1.0 - decay) / rate
+            self._output = self.bias * self.leak_time
 
     def __call__(self, charge: Array) -> Array:
         """Simulate the readings of the next block of touch charges.
@@ -256,8 +255,10 @@ class Measurement:
         bias_charge = self.bias / self.rate  # charge of the bias current between two readings, shape (n_electrode,)
         inputs = self.gain * changes + bias_charge
 
-        # Each channel has its own time constant. Its filter is output[n] = decay * output[n - 1] + inputs[n].
+        # Each channel has its own time constant. Its filter is output[n] = decay * output[n - 1] + inputs[n]. A charge
+        # that arrives between two readings has decayed by (1 + decay) / 2 on average.
         decays = np.exp(-1.0 / (self.rate * self.leak_time))
+        inputs *= 0.5 * (1.0 + decays)
         channels = zip(decays.tolist(), inputs.T, self._output.tolist(), strict=True)
         output = np.stack([_decaying_sum(*channel) for channel in channels], axis=1)
         self._output = output[-1]

@@ -14,9 +14,13 @@ TAU_S = 2.0
 
 
 def amplifier_output(charge_pC):
-    """Compute the output of an amplifier, v[n] = a v[n-1] + q[n] - q[n-1], by its impulse response, shape (n,), pC."""
+    """Compute the output of an amplifier, shape (n,), pC, if the charge is linear between two frames.
+
+    With a constant current i between the frames, dv/dt = i - v / tau has the solution v[n] = a v[n-1] + i tau (1 - a).
+    """
     n = np.arange(len(charge_pC))
-    impulse_response = np.exp(-n / (RATE_HZ * TAU_S))
+    interval = 1.0 / (RATE_HZ * TAU_S)  # relative to the time constant
+    impulse_response = np.exp(-n * interval) * -np.expm1(-interval) / interval
     return np.convolve(np.diff(charge_pC, prepend=0.0), impulse_response)[: len(n)]
 
 
@@ -68,6 +72,28 @@ def test_held_press_keeps_its_charge_despite_the_leak():
     assert contact[held].all()
     assert not contact[2250:].any()
     np.testing.assert_allclose(charge_pC[2900:], 0.0, atol=0.05)
+
+
+@pytest.mark.parametrize("rate_Hz", [10.0, 30.0, 200.0, 1000.0])
+@pytest.mark.parametrize("tau_s", [1.0, 10.0])
+def test_press_has_its_charge_at_any_rate(rate_Hz, tau_s):
+    """A current of 400 pC / 30 ms flows for 30 ms. The equation dv/dt = i - v / tau is solved in closed form.
+
+    Presses at random times between two frames have the correct charge on average. The charge that arrives in the first
+    frame of the touch must not decay like the charge at rest, and has decayed in the amplifier for half a frame.
+    """
+    rise_s = 0.03
+    charges = []
+    for begin_s in 3.0 + np.linspace(0.0, 1.0, 5, endpoint=False) / rate_Hz:
+        t = np.arange(0.0, 6.0, 1.0 / rate_Hz)
+        charging_s = np.clip(t - begin_s, 0.0, rise_s)
+        decay = np.exp(-np.maximum(t - begin_s - rise_s, 0.0) / tau_s)
+        output_pC = 400.0 / rise_s * tau_s * -np.expm1(-charging_s / tau_s) * decay
+        chain = StageRunner(tare={"frames": 10}, leak={"tau_s": tau_s})
+        for t_s, row_pC in zip(t, output_pC, strict=True):
+            reading = chain.advance(np.full(3, row_pC), t_s, min(t_s, 1.0 / rate_Hz))
+        charges.append(reading.charge_pC[0])
+    assert np.mean(charges) == pytest.approx(400.0, rel=3e-3 if rate_Hz * tau_s < 50.0 else 5e-4)
 
 
 def test_inflow_is_learned_out_of_contact():

@@ -3,10 +3,11 @@
 A charge amplifier is a leaky integrator with the time constant tau = R C. The touch charge q follows from its output v
 frame by frame,
 
-    q[n] = q[n-1] + i[n] - b dt,        i[n] = v[n] - a v[n-1],        a = exp(-dt / tau),
+    q[n] = q[n-1] + i[n] - b dt,        i[n] = (v[n] - a v[n-1]) 2 / (1 + a),        a = exp(-dt / tau),
 
 where i is the innovation and b is the inflow (pC/s), a slow current into the amplifier because of offset, bias and slow
-warming. The inflow is estimated from the innovation, because an estimate from the output v would diverge.
+warming. A charge that arrives between two frames has decayed by (1 + a) / 2 on average. The inflow is estimated from
+the innovation, because an estimate from the output v would diverge.
 
 A board that sends currents sends the innovation itself, i[n] = v[n]. Its charge is the sum of the currents. If the
 device file states a leak, the sum decays with the time constant tau, q[n] = a q[n-1] + i[n] - b dt.
@@ -155,9 +156,7 @@ class Leak(OffsetStage):
         """Replace the output of the amplifiers by the touch charge, in which the leak of the amplifiers is corrected.
 
         The output v of an amplifier decays with its time constant tau. The innovation i of frame n is the difference
-        between the output and the decayed previous output,
-
-            i[n] = v[n] - exp(-dt / tau) v[n-1].
+        between the output and the decayed previous output, in which the decay of the new charge is corrected.
 
         The innovation consists of the inflow b dt (a slow current into the amplifier), noise and new touch charge. The
         touch charge is therefore q[n] = q[n-1] + i[n] - b dt. Out of contact, the touch charge also decays to zero, and
@@ -191,7 +190,7 @@ class Leak(OffsetStage):
             output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
             decay: Share of a charge that the leak leaves until this frame, shape (n_electrode,), dimensionless.
         """
-        return output_pC - decay * self._output_pC
+        return (output_pC - decay * self._output_pC) * 2.0 / (1.0 + decay)
 
     def add_warming(self, warming_pC: Array | float) -> None:
         """Subtract the warming from the touch charge that the stage integrates."""

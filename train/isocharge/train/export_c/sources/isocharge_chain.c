@@ -210,7 +210,8 @@ static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s
 
     EACH(k)
     {
-        const real innovation_pC = output_pC[k] - EXP(-dt_s / tau_s[k]) * chain->output_pC[k];
+        const real decay = EXP(-dt_s / tau_s[k]);
+        const real innovation_pC = (output_pC[k] - decay * chain->output_pC[k]) * 2 / (1 + decay);
 
         surplus_pC[k] = innovation_pC - chain->inflow[k] * dt_s;
         chain->charge_pC[k] = relax * chain->charge_pC[k] + surplus_pC[k];
