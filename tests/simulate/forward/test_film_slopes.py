@@ -11,11 +11,14 @@ from isocharge.simulate import (
     FilmPrior,
     FilmSlopes,
     Polygon,
+    SolveSettings,
     load_sensor,
     press,
     touch_charge,
 )
 from isocharge.simulate.mechanics.stress import warmed
+from isocharge.simulate.solver.equilibrium import nodal_stress
+from isocharge.simulate.solver.sensitivity import FILM_FIELDS, stress_changes
 
 PROBE = Circle(1.0)
 
@@ -83,3 +86,19 @@ def test_temperature_jacobian_equals_the_difference_of_warmed_films(film_slopes)
 def test_film_slopes_of_a_square_probe_raises_a_scene_error(film_slopes):
     with pytest.raises(SceneError, match="properties of a film: expected a circular probe"):
         FilmSlopes.build(replace(film_slopes.film, probe=Polygon.rectangle(2.0, 2.0)))
+
+
+def test_the_pretension_also_changes_the_stress_under_a_static_pressure_before_the_contact():
+    """The touch stress is the difference from the stress before the contact, which depends on the pretension, too."""
+    film = replace(load_sensor("four-25um-biaxial").film, pretension=0.8, static_pressure=5e-5)
+    solved = press(film, PROBE, (5.0, 0.0), 0.5)
+    settings = SolveSettings(resolution=solved.mesh.resolution, layer=solved.mesh.layer)
+    stresses = []
+    for pretension in (0.85, 0.75):
+        changed = press(replace(film, pretension=pretension), PROBE, (5.0, 0.0), 0.5, settings, start=solved)
+        stresses.append(film.young * changed.groups.squared_amplitude * nodal_stress(changed))
+    expected = (stresses[0] - stresses[1]) / 0.1
+    (change,) = np.moveaxis(stress_changes(solved, "middle", FILM_FIELDS[:1]), 2, 0)
+    stress_unit = film.young * solved.groups.squared_amplitude
+    change *= stress_unit / (stress_unit + film.pretension)
+    np.testing.assert_allclose(change, expected, atol=1e-2 * np.abs(expected).max())

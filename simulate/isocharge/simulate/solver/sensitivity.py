@@ -161,6 +161,8 @@ def _add_side_load(solved: Equilibrium, value: float, direction: tuple[float, fl
         value: Number of units.
         direction: Unit vector (x, y) of the side load.
     """
+    if solved.force == 0.0:  # before the contact, there is no probe
+        return solved
     load_x, load_y = solved.groups.side_load
     direction_x, direction_y = direction
     side_load = (load_x + value * direction_x, load_y + value * direction_y)
@@ -194,6 +196,10 @@ def stress_changes(solved: Equilibrium, surface: Surface, fields: Sequence[Stres
         Changes per unit, shape (n_element, n_local, n_field, 3), in the order of the table of a `ForwardMap` with
         several fields. The last two axes are the field and the stress component (S11, S22, S12).
     """
+    if solved.rest is not None:  # the touch stress is the difference from the stress before the contact
+        before_contact = stress_changes(solved.rest, surface, fields)
+        return stress_changes(replace(solved, rest=None), surface, fields) - before_contact
+
     # Even and odd fields have different fixed displacements on the line of symmetry. Therefore the tangent is
     # factorised once for all even fields, and once for all odd fields.
     with single_threaded_blas():
