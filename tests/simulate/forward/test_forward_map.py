@@ -266,3 +266,22 @@ def test_family_interpolates_fields_that_change_over_the_distance_to_the_clamp()
     weights = family.weights(distance.astype(complex), np.ones(300), np.zeros(300))
     found = weights @ np.log(1.0 - (family.distance / 45.0) ** 2)
     np.testing.assert_allclose(found, np.log(1.0 - (distance / 45.0) ** 2), atol=1e-5)
+
+
+def test_derivatives_of_a_small_sensor_are_those_of_a_large_one_in_other_units(near_map):
+    """The equations have no length of their own, so a sensor of a tenth of the size has a hundredth of the charges."""
+    large = near_map.sensor
+    electrodes = tuple(Electrode(one.name, 0.1 * np.array(one.corners)) for one in large.electrodes)
+    film = replace(large.film, radius=0.1 * large.film.radius, thickness=0.1 * large.film.thickness)
+    small = replace(large, film=film, electrodes=electrodes)
+    low, high = near_map.domain.force_range
+    radius = 0.1 * near_map.domain.radius
+    small_map = ForwardMap.build(
+        small, Circle(0.1 * near_map.probe.radius), radius, (0.01 * low, 0.01 * high), near_map.settings
+    )
+    contact, _ = draw(near_map, 20, seed=5)
+    contact[:, :2] *= 0.9
+    expected = near_map.derivatives(contact) * [0.1, 0.1, 0.01]
+    slope = small_map.derivatives(contact * [0.1, 0.1, 0.01])
+    largest = np.abs(expected).max(axis=(0, 1))
+    np.testing.assert_allclose(slope / largest, expected / largest, atol=1e-6)

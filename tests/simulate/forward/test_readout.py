@@ -237,3 +237,13 @@ def test_thermal_charge():
     sensor = replace(sensor, calibration=Calibration(gain={"T": 0.5}))
     np.testing.assert_allclose(thermal_charge(sensor, 0.1), [-27.0, 0.5 * -24.0], rtol=1e-12)
     np.testing.assert_allclose(thermal_charge(sensor, -0.2), [54.0, 24.0], rtol=1e-12)
+
+
+def test_thermal_charge_of_a_clamped_film_contains_the_charge_of_its_changed_tension():
+    """A film that cannot expand has the plane stress -E alpha / (1 - nu) per kelvin in all directions."""
+    sensor = load_sensor("four-25um-uniaxial")
+    film = replace(sensor.film, expansion=(1e-4, 1e-4))
+    sensor = replace(sensor, film=film, piezo=Piezo(20.0, 2.0, pyro=-30.0))
+    stress = -film.young * 1e-4 / (1.0 - film.poisson)  # MPa/K
+    expected = 9.0 * 0.5 * (-30.0 + (20.0 + 2.0) * stress)
+    np.testing.assert_allclose(thermal_charge(sensor, 0.5), np.full(4, expected), rtol=1e-12)

@@ -14,7 +14,10 @@ from isocharge.common.contact_domain import LIMIT_TOLERANCE, Domain
 from isocharge.common.errors import ChargeError, SceneError
 
 STEPS = (0.05, 0.05, 1e-3)
-"""Steps of the central differences in x and y (mm) and in ln F (dimensionless), where F is the force."""
+"""Steps of the central differences in x and y (mm) and in ln F (dimensionless), where F is the force.
+
+The steps in x and y are those for a probe with a radius of 1 mm.
+"""
 
 
 class ChargeMap(Protocol):

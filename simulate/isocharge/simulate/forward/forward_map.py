@@ -22,7 +22,7 @@ from isocharge.common.contact_domain import Domain, as_contacts
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SolveError
 from isocharge.simulate.execution import in_order, single_threaded_blas
-from isocharge.simulate.forward.charge_map import differences
+from isocharge.simulate.forward.charge_map import STEPS, differences
 from isocharge.simulate.forward.family import (
     Family,
     NodeCount,
@@ -263,7 +263,13 @@ class ForwardMap:
         """
         contact = self.domain.check(contact, "forward map")
         n_stepped = len(contact) * 2 * contact.shape[1]  # two steps of each variable
-        return differences(partial(self._unchecked_charges, orientation=np.zeros(n_stepped)), contact)
+
+        # The charges change within the width of the footprint, so the steps of a small probe are shorter.
+        min_force, _ = self.domain.force_range
+        footprint_scale = min(1.0, self.probe.under(min_force).half_width)
+        x_step, y_step, log_force_step = STEPS
+        steps = (x_step * footprint_scale, y_step * footprint_scale, log_force_step)
+        return differences(partial(self._unchecked_charges, orientation=np.zeros(n_stepped)), contact, steps)
 
     def stress_charges_by_force(self, position: Array) -> Array:
         """Compute the charges that the stress causes at given positions, for all forces of the family at once.

@@ -19,7 +19,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.errors import SensorError
-from isocharge.simulate.mechanics.stress import rotate_stress
+from isocharge.simulate.mechanics.stress import rotate_stress, tension_change
 from isocharge.simulate.mesh.placed_mesh import from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.point_location import locate_points
@@ -122,12 +122,10 @@ class ElectrodePieces:
             sensor: Sensor with the electrodes, the readout, the gains and the piezoelectric coefficients.
         """
         nominal = cls.covering(sensor.electrodes, sensor.readout)
-        # The factor 2 accounts for s12 and s21, which contribute equally.
-        coefficients = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
         return replace(
             nominal,
             corners=to_complex(sensor.calibration.place(to_corners(nominal.corners))),
-            charge_per_stress=sensor.gains[nominal.electrode, None] * coefficients * nominal.charge_per_stress,
+            charge_per_stress=sensor.gains[nominal.electrode, None] * sensor.piezo.charge_per_stress * nominal.charge_per_stress,
         )
 
     def rules(self, probe: Probe, position: Complexes, counts: tuple[int, int] = MAP_COUNTS) -> Iterator[PieceRule]:
@@ -145,7 +143,6 @@ class ElectrodePieces:
         Yields:
             The integration points of some of the pairs of a press and a piece.
         """
-        half_width = probe.area / (np.pi * probe.reach)  # the radius of a circle
         near_count, distant_count = counts
         press, piece = (grid.ravel() for grid in np.indices((position.size, len(self.corners))))
         corners = self.corners[piece]
@@ -155,7 +152,7 @@ class ElectrodePieces:
             radius = np.abs(corners - centre[:, None]).max(axis=1)
             is_near = np.abs(position[press] - centre) < NEAR_DISTANCE * (radius + probe.reach)
             sides = np.abs(np.roll(corners, -1, axis=1) - corners)
-            is_halved = is_near & (sides.max(axis=1) > NEAR_SIDE * half_width)
+            is_halved = is_near & (sides.max(axis=1) > NEAR_SIDE * probe.half_width)
             for count, selected in ((near_count, is_near & ~is_halved), (distant_count, ~is_near)):
                 indices = np.flatnonzero(selected)
                 block = 50_000 // count**2  # with more points, the working arrays would exceed 100 MB
@@ -317,13 +314,13 @@ def contact_charges(sensor: Sensor, probe: Probe, contact: Array, orientation: A
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:
-    """Compute the pyroelectric charge that a uniform change of the temperature causes.
+    """Compute the charge that a uniform change of the temperature of the film causes without a touch.
 
-    The clamp is assumed to expand like the film. If the clamp expands differently, the pretension of the film also
-    changes. The module `mechanics.stress` computes the change of the pretension.
+    The charge is the pyroelectric charge of a free film and, if the film has expansion coefficients, the charge of the
+    change of its pretension in a ring of constant temperature.
 
     Args:
-        sensor: Sensor with the electrodes and the pyroelectric coefficient.
+        sensor: Sensor with the electrodes, the film and its coefficients.
         step: Change of the temperature, K, positive if the film becomes warmer. The charge of a PVDF film with a
             positive coefficient d31 decreases if the film becomes warmer.
 
@@ -331,7 +328,8 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
         Charges, shape (n_electrode,), pC. They are proportional to the areas of the electrodes.
     """
     areas = np.array([electrode.area for electrode in sensor.electrodes])
-    return sensor.calibration.read(sensor.gains * areas * sensor.piezo.pyro * step)
+    tension_charge = sensor.piezo.charge_per_stress @ tension_change(sensor.film, step, 0.0)  # pC/mm^2
+    return sensor.calibration.read(sensor.gains * areas * (sensor.piezo.pyro * step + tension_charge))
 
 
 def _area_pieces(electrode: Electrode) -> Iterator[tuple[Array, float, Array]]:

@@ -126,8 +126,7 @@ class PressedFilm:
         meshes = fields.meshes_under(position, np.zeros(1))
 
         # One matrix product interpolates the stress and converts it into charge per area, for all nodes.
-        piezo = fields.sensor.piezo
-        charge_per_stress = np.array([piezo.d31, piezo.d32, 2.0 * piezo.d12])
+        charge_per_stress = fields.sensor.piezo.charge_per_stress
         coefficients = rotate_stress(np.eye(3), direction[:, None]) @ charge_per_stress  # shape (n, 3)
         n_solved = len(fields.table)
         table = np.moveaxis(fields.table.reshape(n_solved, -1, 3), 2, 1).reshape(3 * n_solved, -1)

@@ -202,6 +202,11 @@ class Piezo:
     pyro: float = 0.0
     d12: float = 0.0
 
+    @property
+    def charge_per_stress(self) -> Array:
+        """Charge density per stress (s11, s22, s12), shape (3,), pC/N. The shear stresses s12 and s21 are equal."""
+        return np.array([self.d31, self.d32, 2.0 * self.d12])
+
     def __post_init__(self) -> None:
         """Check the coefficients.
 

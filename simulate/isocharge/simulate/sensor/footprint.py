@@ -83,6 +83,11 @@ class Probe(ABC):
         """Distance from the centroid of the footprint to the farthest point of the footprint, mm."""
 
     @property
+    def half_width(self) -> float:
+        """Half of the width of a narrow footprint, or the radius of a circle, mm."""
+        return self.area / (math.pi * self.reach)
+
+    @property
     @abstractmethod
     def period(self) -> float:
         """Smallest rotation that maps the footprint onto itself, rad.
