@@ -197,6 +197,15 @@ def test_ambiguous_pairs_are_mirror_images_in_the_fold_line(forces):
     assert (np.diff(pairs.outer_radius) >= 0.0).all()
 
 
+def test_ambiguous_pairs_of_a_small_film_are_those_of_a_large_one():
+    large = folded_map()
+    small = FunctionMap(lambda contact: large.charges(contact * [20.0, 20.0, 1.0]), large.electrodes, Domain(0.25, FORCES))
+    pairs = find_ambiguous_pairs(large, REFERENCE, 0.5, places=100)
+    small_pairs = find_ambiguous_pairs(small, REFERENCE, 0.5, places=100)
+    assert len(pairs) > 0
+    np.testing.assert_allclose(20.0 * small_pairs.second[:, :2], pairs.second[:, :2], atol=1e-6)
+
+
 def test_no_ambiguous_pairs_where_a_charge_distinguishes_the_sides():
     assert len(find_ambiguous_pairs(folded_map(0.3), REFERENCE, 0.5, places=400)) == 0
 

@@ -8,7 +8,7 @@ import pytest
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, load_sensor, press
-from isocharge.simulate.solver.stress_limit import force_within_stress, largest_stress, stress_caution
+from isocharge.simulate.solver.stress_limit import force_within_stress, largest_stress, stress_caution, yield_force
 
 FILM = load_sensor("four-25um-biaxial").film
 TIP = Circle(1.0)
@@ -59,3 +59,10 @@ def test_force_within_stress_reaches_the_stress_limit():
         SceneError, match=r"stress limit: expected more than 8\.\d+ MPa, which 0\.05 N under circle:1\.0"
     ):
         force_within_stress(FILM, TIP, 5.0, (0.05, 2.0))
+
+
+def test_yield_force_of_a_taut_film_lies_in_the_range_of_forces():
+    """With 30 MPa, the stress hardly grows at first, so a secant through the ends of the range leads far beyond it."""
+    taut = replace(FILM, pretension=30.0)
+    force = yield_force(taut, [TIP], (1e-3, 20.0))
+    assert largest_stress(taut, TIP, force) == pytest.approx(45.0, rel=2e-3)

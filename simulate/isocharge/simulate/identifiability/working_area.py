@@ -144,7 +144,10 @@ INDISTINGUISHABLE_SIGMAS = 3.0
 """Difference of the charges below which two contacts are indistinguishable, in standard deviations of the noise."""
 
 MIN_DISTANCE = 1.0
-"""Smallest distance between the contacts of an ambiguous pair, mm."""
+"""Smallest distance between the contacts of an ambiguous pair, mm. On a small film, `MIN_RELATIVE_DISTANCE` counts."""
+
+MIN_RELATIVE_DISTANCE = 0.1
+"""Smallest distance between the contacts of an ambiguous pair if the domain is small, in radii of the domain."""
 
 MIN_DISTANCE_SIGMAS = 6.0
 """Smallest distance between the contacts of an ambiguous pair, in standard deviations of the position.
@@ -234,7 +237,8 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     contact = contacts_at(position, force)
     charge = charge_map.charges(contact)
     position_std = limits_at(charge_map, contact, noise).position
-    min_distance = np.maximum(MIN_DISTANCE, MIN_DISTANCE_SIGMAS * position_std)
+    smallest_distance = min(MIN_DISTANCE, MIN_RELATIVE_DISTANCE * charge_map.domain.radius)
+    min_distance = np.maximum(smallest_distance, MIN_DISTANCE_SIGMAS * position_std)
     sigma = noise.sigma(charge)
     start = starting_contacts(charge_map, charge, sigma, starts=STARTS)
 

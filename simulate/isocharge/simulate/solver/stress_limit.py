@@ -67,8 +67,8 @@ def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAUL
 def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tuple[float, float]) -> float:
     """Compute the largest force within a range for which the stress in the film does not exceed a limit.
 
-    The equation ln(stress / limit) = 0 is solved for the logarithm of the force by the secant method. The relative
-    error of the force is below 0.1 %.
+    The equation ln(stress / limit) = 0 is solved for the logarithm of the force by Brent's method, which does not leave
+    the range. The relative error of the force is below 0.1 %.
 
     Args:
         film: The film.
@@ -94,7 +94,7 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
         return max_force
 
     def log_stress_ratio(log_force: float) -> float:
-        """Compute ln(stress / limit), which is nearly a linear function of the logarithm of the force.
+        """Compute ln(stress / limit), which is zero at the limit.
 
         Args:
             log_force: Logarithm of the force in N.
@@ -102,9 +102,7 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
         stress = largest_stress(film, probe, float(np.exp(log_force)))
         return float(np.log(stress / limit))
 
-    # The secant method ends after a step of 1 %, when its error is about 0.01 %.
-    log_force = scipy.optimize.newton(log_stress_ratio, np.log(min_force), x1=np.log(max_force), tol=0.01)
-    return float(np.exp(log_force))
+    return float(np.exp(scipy.optimize.brentq(log_stress_ratio, np.log(min_force), np.log(max_force), xtol=1e-3)))
 
 
 def yield_force(film: Film, probes: Sequence[Probe], force_range: tuple[float, float]) -> float | None:
