@@ -102,3 +102,18 @@ def test_the_pretension_also_changes_the_stress_under_a_static_pressure_before_t
     stress_unit = film.young * solved.groups.squared_amplitude
     change *= stress_unit / (stress_unit + film.pretension)
     np.testing.assert_allclose(change, expected, atol=1e-2 * np.abs(expected).max())
+
+
+def test_stiffness_of_an_orthotropic_film_changes_relative_to_its_own_axes():
+    film = replace(load_sensor("four-25um-biaxial").film, pretension=0.8, young_ratio=2.0, axis=0.3)
+    solved = press(film, PROBE, (5.0, 0.0), 0.5)
+    settings = SolveSettings(resolution=solved.mesh.resolution, layer=solved.mesh.layer)
+    stresses = []
+    for log_ratio in (0.01, -0.01):
+        changed_film = replace(film, young_ratio=2.0 * np.exp(log_ratio))
+        changed = press(changed_film, PROBE, (5.0, 0.0), 0.5, settings, start=solved)
+        stresses.append(nodal_stress(changed))
+    expected = (stresses[0] - stresses[1]) / 0.02
+    even, odd = np.moveaxis(stress_changes(solved, "middle", FILM_FIELDS[3:5]), 2, 0)
+    change = np.cos(0.6) * even + np.sin(0.6) * odd  # axis 1 lies at 0.3 rad to the direction of the press
+    np.testing.assert_allclose(change, expected, atol=5e-3 * np.abs(expected).max())

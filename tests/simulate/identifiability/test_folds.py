@@ -199,7 +199,9 @@ def test_ambiguous_pairs_are_mirror_images_in_the_fold_line(forces):
 
 def test_ambiguous_pairs_of_a_small_film_are_those_of_a_large_one():
     large = folded_map()
-    small = FunctionMap(lambda contact: large.charges(contact * [20.0, 20.0, 1.0]), large.electrodes, Domain(0.25, FORCES))
+    small = FunctionMap(
+        lambda contact: large.charges(contact * [20.0, 20.0, 1.0]), large.electrodes, Domain(0.25, FORCES)
+    )
     pairs = find_ambiguous_pairs(large, REFERENCE, 0.5, places=100)
     small_pairs = find_ambiguous_pairs(small, REFERENCE, 0.5, places=100)
     assert len(pairs) > 0

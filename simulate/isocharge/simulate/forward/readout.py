@@ -125,7 +125,9 @@ class ElectrodePieces:
         return replace(
             nominal,
             corners=to_complex(sensor.calibration.place(to_corners(nominal.corners))),
-            charge_per_stress=sensor.gains[nominal.electrode, None] * sensor.piezo.charge_per_stress * nominal.charge_per_stress,
+            charge_per_stress=sensor.gains[nominal.electrode, None]
+            * sensor.piezo.charge_per_stress
+            * nominal.charge_per_stress,
         )
 
     def rules(self, probe: Probe, position: Complexes, counts: tuple[int, int] = MAP_COUNTS) -> Iterator[PieceRule]:

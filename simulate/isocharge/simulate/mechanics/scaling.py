@@ -164,7 +164,7 @@ class DimensionlessGroups:
             tension=film.pretension / (film.young * squared_amplitude),
             bending=slenderness(film) / squared_amplitude if bending else 0.0,
             poisson=film.poisson,
-            anisotropy=_anisotropy(film, squared_amplitude, angle),
+            anisotropy=press_frame_anisotropy(film, squared_amplitude, angle),
             side_load=(side_load.real, side_load.imag),
             static_pressure=film.static_pressure / pressure_unit,
             ambient_pressure=AMBIENT_PRESSURE / pressure_unit,
@@ -221,7 +221,7 @@ def scaled_stress(scaled_strain: Array, groups: DimensionlessGroups) -> Array:
     return stress(scaled_strain, groups.poisson, groups.anisotropy.moduli)
 
 
-def _anisotropy(film: Film, squared_amplitude: float, angle: float) -> Anisotropy:
+def press_frame_anisotropy(film: Film, squared_amplitude: float, angle: float) -> Anisotropy:
     """Compute the direction-dependent properties of a film in the axes of a press.
 
     The first axis of the press points from the centre of the film to the press.

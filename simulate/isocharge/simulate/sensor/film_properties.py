@@ -159,10 +159,10 @@ def _changed_mechanics(film: Film, value: Mapping[str, float]) -> Film:
     """Change the mechanical properties of a film; see `changed_film`."""
     pretension = value[PRETENSION.name]
     difference, shear = film.deviator
-    log_ratio, axis = _increased(
+    log_ratio, axis = increased(
         math.log(film.young_ratio), film.axis, complex(value["stiffness_x"], value["stiffness_xy"])
     )
-    oval, oval_axis = _increased(film.oval, film.oval_axis, complex(value["oval_x"], value["oval_xy"]))
+    oval, oval_axis = increased(film.oval, film.oval_axis, complex(value["oval_x"], value["oval_xy"]))
     return replace(
         film,
         pretension=pretension,
@@ -179,7 +179,7 @@ def _changed_mechanics(film: Film, value: Mapping[str, float]) -> Film:
     )
 
 
-def _increased(size: float, axis: float, addition: complex) -> tuple[float, float]:
+def increased(size: float, axis: float, addition: complex) -> tuple[float, float]:
     """Add to a quantity size * exp(2 i axis), and return its new size and axis. The new size is not negative."""
     if addition == 0.0:  # without rounding errors
         return size, axis

@@ -33,6 +33,8 @@ While the probe is lifted, the directions of the slip and of the side force are 
 the lifting.
 """
 
+import cmath
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -43,11 +45,11 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
 from isocharge.simulate.execution import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.scaling import Anisotropy, side_force_unit
-from isocharge.simulate.mechanics.stress import stress_rotation
+from isocharge.simulate.mechanics.scaling import Anisotropy, press_frame_anisotropy, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface
+from isocharge.simulate.sensor.film_properties import increased
 from isocharge.simulate.solver.assembly import SolveTangent, assembly, factor_tangent
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
 
@@ -91,21 +93,20 @@ def _add_tension(solved: Equilibrium, value: float, direction: tuple[float, floa
 
 
 def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equilibrium:
-    """Make the film orthotropic.
+    """Change the moduli along the axes of the film.
 
     Args:
         solved: The press.
-        log_ratio: Value of ln(E1 / E2). To first order, E1 = E (1 + log_ratio / 2) and E2 = E (1 - log_ratio / 2).
-        angle: Angle from the direction of the press to axis 1 of the film, rad.
+        log_ratio: Addition to ln(E1 / E2).
+        angle: Angle from the direction of the press to axis 1 of the addition, rad.
     """
-    # Change of the elasticity matrix divided by E, in the axes of the film
-    plane_modulus = 1.0 / (1.0 - solved.groups.poisson**2)
-    change_along_axis_1 = 0.5 * log_ratio * plane_modulus
-    change_in_film_axes = np.diag([change_along_axis_1, -change_along_axis_1, 0.0])
-
-    # Rotate the change into the frame of the press.
-    rotation = stress_rotation(angle)
-    moduli = solved.groups.anisotropy.moduli + rotation @ change_in_film_axes @ rotation.T
+    film = solved.film
+    x, y = solved.at
+    direction = math.atan2(y, x)
+    addition = cmath.rect(log_ratio, 2.0 * (direction + angle))
+    new_log_ratio, axis = increased(math.log(film.young_ratio), film.axis, addition)
+    changed_film = replace(film, young_ratio=math.exp(new_log_ratio), axis=axis)
+    moduli = press_frame_anisotropy(changed_film, solved.groups.squared_amplitude, direction).moduli
     return _with_anisotropy(solved, replace(solved.groups.anisotropy, moduli=moduli))
 
 
