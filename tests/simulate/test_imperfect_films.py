@@ -85,6 +85,11 @@ def test_presses_beyond_the_rim_of_an_oval_film_raise_error(at):
         press(replace(SENSOR.film, pretension=1.0, oval=0.02), PROBE, at, 0.1)
 
 
+def test_probe_wider_than_an_oval_film_raises_error():
+    with pytest.raises(SceneError, match=r"probe off the film: .* 42 mm from the film's centre, the rim 40\.5 mm"):
+        press(replace(SENSOR.film, pretension=1.0, oval=0.1), Circle(42.0), (0.0, 0.0), 0.1)
+
+
 def test_crosstalk_adds_a_share_of_the_charges_of_the_other_electrodes():
     solved = press(SENSOR.film, PROBE, AT, FORCE)
     own = touch_charge(SENSOR, solved)

@@ -25,7 +25,7 @@ from isocharge.simulate.forward.charge_map import ChargeMap, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import contact_charges
 from isocharge.simulate.mechanics.scaling import amplitude_squared
-from isocharge.simulate.numerics.disk import contacts_at, onto_disk, sunflower
+from isocharge.simulate.numerics.disk import contacts_at, sunflower
 from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film
 
@@ -164,7 +164,7 @@ class ChargeSpline:
             SceneError: If a press lies outside the domain.
         """
         contact = self.domain.check(contact, "table")
-        position = onto_disk(contact[:, :2], self.domain.radius)  # the check allows for rounding errors
+        position = contact[:, :2]
 
         # Each charge is a weighted sum of the scaled charges at the forces of the splines. Only the weights depend on
         # the force. The derivatives of the weights with respect to ln F are computed by central differences.
