@@ -30,6 +30,21 @@ def test_charges_agree_with_the_simulator(field, film):
     assert np.sqrt(np.mean(relative_error**2)) < 2.0 * field.charge_std
 
 
+@pytest.mark.parametrize("forces", [(0.2, 1.0), (0.2, 0.5, 1.0, 1.8)])
+@pytest.mark.parametrize("scatter", [0.0, 0.01])
+def test_presses_with_few_forces_determine_no_higher_powers_of_the_force(film, forces, scatter):
+    """A series of a higher degree would agree at these forces, but be wrong by the size of the charge between them."""
+    rng = np.random.default_rng(0)
+    contact = draw_contacts(rng, DOMAIN, 6000)
+    contact[:, 2] = rng.choice(forces, 6000) * np.exp(scatter * rng.standard_normal(6000))
+    presses = LabelledPresses(contact, film.charges(contact))
+    series = fit_charge_series(DOMAIN, film.electrodes, presses[600:], presses[:600])
+    between = draw_contacts(rng, Domain(8.0, (min(forces), max(forces))), 500)
+    assert rms(series.charges(between) / film.charges(between) - 1.0) < 0.01
+    slopes = film.derivatives(between)[:, :, 2]
+    assert rms(series.derivatives(between)[:, :, 2] / slopes - 1.0) < 0.05
+
+
 def test_too_few_presses_are_refused():
     few = LabelledPresses(draw_contacts(np.random.default_rng(0), DOMAIN, 50), np.ones((50, 3)))
     with pytest.raises(TrainingError, match="expected at least 448 presses"):

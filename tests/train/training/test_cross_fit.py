@@ -354,6 +354,16 @@ def test_intact_presses_are_accepted():
     usable_presses(with_channel(1, lambda charge: charge[:, 0] * (1.0 + 0.01 * JITTER)))
 
 
+def test_model_of_three_channels_fits_presses_like_those_of_its_training(fresh, tmp_path):
+    """Three charges always fit a plane exactly, but the misfit that the network states is not exactly zero."""
+    fitted = fit_presses(presses_on_l().of_electrodes(CHANNELS[:3], "pad"), "pad", QUICKER)
+    _, _, misfit = fitted.predict(fresh.charge[:, :3])
+    assert np.mean(misfit > evaluate(fitted)["misfit_p99"]) < 0.03
+    predictor = Predictor(release(fitted, tmp_path / "pad").folder)
+    new_presses = measured_presses(fresh.contact[:200], fresh.charge[:200, :3], CHANNELS[:3])
+    assert "misfit" not in check_presses(predictor, new_presses).verdict
+
+
 @pytest.mark.slow
 def test_a_real_pad_is_learned_better_than_by_boosted_trees():
     """The data are TactileFSI (SDU Soft Robotics, CC BY 4.0), of which a fifth of the places is held out.

@@ -106,9 +106,8 @@ def fit_charge_series(
 
     # Try the degrees until the error is small enough, or the presses are too few.
     best_series: ChargeSeries | None = None
-    has_one_force = domain.force_range[0] == domain.force_range[1]  # determines no slope in the force
     for degree, largest_force_degree in candidate_degrees:
-        force_degree = 0 if has_one_force else largest_force_degree
+        force_degree = determined_degree(unit_contact[:, 2], largest_force_degree)
         fewest = FEWEST_PER_TERM * series_term_count(degree, force_degree)
         if fewest > len(presses):
             if best_series is None:
@@ -167,10 +166,28 @@ def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
         Coefficients of the Chebyshev polynomials, shape (SIZE_DEGREE + 1,).
     """
     size = np.maximum(np.linalg.norm(charge, axis=1), LOWEST_CHARGE)
-    degree = min(SIZE_DEGREE, np.unique(unit_log_force).size - 1)
+    degree = determined_degree(unit_log_force, SIZE_DEGREE)
     coefficients = np.zeros(SIZE_DEGREE + 1)
     coefficients[: degree + 1] = chebyshev.chebfit(unit_log_force, np.log(size), degree)
     return coefficients
+
+
+def determined_degree(coordinate: Array, largest: int, smallest_singular_value: float = 0.1) -> int:
+    """Return the degree, up to `largest`, of a polynomial that values at given coordinates determine.
+
+    For example, values at three coordinates, or close to them, determine a polynomial of the degree 2. A polynomial of
+    a higher degree could have any value between these coordinates.
+
+    Args:
+        coordinate: Coordinates, scaled to [-1, 1], shape (n,).
+        largest: Largest degree.
+        smallest_singular_value: Smallest singular value of the matrix of the Chebyshev polynomials, divided by the root
+            of n, with which a degree counts as determined. For evenly distributed coordinates, it is above 0.3.
+    """
+    terms = chebyshev.chebvander(coordinate, largest)
+    moments = terms.T @ terms / len(coordinate)
+    smallest_eigenvalues = [np.linalg.eigvalsh(moments[:count, :count])[0] for count in range(1, largest + 2)]
+    return int(np.flatnonzero(np.array(smallest_eigenvalues) >= smallest_singular_value**2)[-1])
 
 
 def series_term_count(degree: int, force_degree: int) -> int:
