@@ -114,6 +114,29 @@ def test_domain_is_not_reduced_by_a_fold_outside():
     assert invertible_domain(field, presses, REFERENCE) == (field.domain, ())
 
 
+def test_probable_fold_of_presses_with_two_probes_is_stated():
+    """The charges of the second probe are smaller by 2 % at the edge, so that no series describes both probes."""
+    charges = charges_folded_at(3.0)
+    has_second_probe = np.random.default_rng(1).random(3000) < 0.5
+
+    def of_two_probes(x, y, force):
+        return charges(x, y, force) * (1.0 - 0.02 * has_second_probe * np.hypot(x, y) / 8.0)[:, None]
+
+    field, presses = fit_field(of_two_probes)
+    domain, (caution,) = invertible_domain(field, presses, REFERENCE)
+    assert domain == field.domain
+    assert "probably folds beyond about 3 mm" in caution
+    assert "trained for 8 mm" in caution
+
+
+def test_spurious_folds_of_a_poor_fit_are_not_stated(film):
+    contact = draw_contacts(np.random.default_rng(0), DOMAIN, 600)
+    presses = LabelledPresses(contact, film.charges(contact))
+    field = fit_charge_series(DOMAIN, film.electrodes, presses[60:], presses[:60])
+    assert field.charge_std > 1e-3
+    assert invertible_domain(field, presses, REFERENCE) == (DOMAIN, ())
+
+
 def test_fold_near_the_centre_is_refused():
     field, presses = fit_field(charges_folded_at(1.2))
     with pytest.raises(DatasetError, match=r"folds 1\.\d+ mm from the centre, of 8 mm asked for"):

@@ -26,7 +26,7 @@ import numpy as np
 import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count, linearised
+from isocharge.simulate.forward.charge_map import ChargeMap, LinearisedMap, check_electrode_count, linearised
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.nearest_contact import explain, starting_contacts
 from isocharge.simulate.noise import NoiseModel
@@ -364,10 +364,11 @@ def working_area(
     Raises:
         SceneError: If the map has fewer than three electrodes.
     """
-    from isocharge.simulate.forward.charge_spline import with_fast_derivatives  # imports the solver
-
     check_electrode_count(len(charge_map.electrodes))
-    charge_map = with_fast_derivatives(charge_map)
+    if not isinstance(charge_map, LinearisedMap):
+        from isocharge.simulate.forward.charge_spline import with_fast_derivatives  # imports the solver
+
+        charge_map = with_fast_derivatives(charge_map)
     search_radius = charge_map.domain.radius
     min_force, max_force = charge_map.domain.force_range
     middle_force = float(np.sqrt(min_force * max_force))

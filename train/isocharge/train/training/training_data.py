@@ -84,7 +84,13 @@ class TrainingData:
 
 
 MAX_ERROR_OF_CERTAIN_FOLD = 3e-4
-"""Largest relative error of the fitted charges at which a fold counts as certain. A poor fit has spurious folds."""
+"""Largest relative error of the fitted charges at which a fold counts as certain.
+
+A poor fit has spurious folds, in the outer fifth of the domain.
+"""
+
+PROBABLE_FOLD_RATIO = 0.7
+"""Ratio of the radius of a fold of a poor fit to the radius of the domain below which the fold is probable."""
 
 SEARCHED_RADIUS_RATIO = 0.98
 """Ratio of the radius within which folds are searched for to the radius of the domain.
@@ -102,7 +108,7 @@ def invertible_domain(
 
     At a fold, the map from contacts to charges turns back, so that contacts on both sides of the fold have the same
     charges. If an accurate fit shows a fold, the disk is reduced to the radius of the fold, and a sentence states this.
-    Otherwise, the disk is the domain of the field.
+    Otherwise, the disk is the domain of the field. A sentence also states a probable fold of a poor fit.
 
     Args:
         field: Charge field that was fitted to the presses.
@@ -116,12 +122,18 @@ def invertible_domain(
         DatasetError: If the radius of the disk is less than `SMALLEST_SHARE` of the radius of the field.
     """
     requested_radius = field.domain.radius
-    if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
-        return field.domain, ()
     area = working_area(within(field, SEARCHED_RADIUS_RATIO * requested_radius), noise, search_pairs=False)
     fold_radius = float(f"{area.unambiguous_radius:.6g}")
     if not np.isfinite(area.fold_radius) or fold_radius >= requested_radius:
         return field.domain, ()
+    if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
+        caution = (
+            f"the map from contacts to charges probably folds beyond about {fold_radius:.2g} mm: two contacts give the "
+            f"same charges there, and the model, which is trained for {requested_radius:g} mm, confuses them; a fit "
+            f"with an error of {100.0 * field.charge_std:.2g} % does not show where: take more presses, of one probe"
+        )
+        is_probable = fold_radius < PROBABLE_FOLD_RATIO * requested_radius
+        return field.domain, (caution,) if is_probable else ()
 
     if fold_radius < SMALLEST_SHARE * requested_radius:
         raise DatasetError(
