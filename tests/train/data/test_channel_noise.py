@@ -6,21 +6,34 @@ import pytest
 from isocharge.train.data.channel_noise import ChannelNoise
 
 
+def estimated_over_true_noise(contacts, repetitions, gain, seed):
+    """Estimate the noise of charges of a strongly curved function, and divide it by the true noise (rms)."""
+    rng = np.random.default_rng(seed)
+    contact = np.repeat(rng.uniform(-1.0, 1.0, (contacts, 3)), repetitions, axis=0)
+    shape = np.exp(-2.0 * (contact[:, :1] - [-0.7, 0.0, 0.7]) ** 2 - contact[:, 1:2] ** 2)
+    charge = 2000.0 * shape * np.exp(1.2 * contact[:, 2:])
+    true_std = np.hypot(1.0, gain * charge)
+    estimated = ChannelNoise.estimate(charge + rng.standard_normal(charge.shape) * true_std, contact)
+    return np.sqrt(np.mean((estimated.sigma(charge) / true_std) ** 2, axis=0))
+
+
 @pytest.mark.parametrize("repetitions", [2, 3, 10])
 @pytest.mark.parametrize("gain", [0.002, 0.015])
 def test_noise_of_repeated_contacts_is_estimated_within_ten_percent(repetitions, gain):
-    """The charges depend on the contact by a strongly curved function, which planes do not describe."""
-    ratios = []
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        contact = np.repeat(rng.uniform(-1.0, 1.0, (600 // repetitions, 3)), repetitions, axis=0)
-        shape = np.exp(-2.0 * (contact[:, :1] - [-0.7, 0.0, 0.7]) ** 2 - contact[:, 1:2] ** 2)
-        charge = 2000.0 * shape * np.exp(1.2 * contact[:, 2:])
-        noisy = charge + rng.standard_normal(charge.shape) * np.hypot(1.0, gain * charge)
-        size = np.median(charge, axis=0)
-        ratios.append(ChannelNoise.estimate(noisy, contact).sigma(size[None])[0] / np.hypot(1.0, gain * size))
+    ratios = [estimated_over_true_noise(600 // repetitions, repetitions, gain, seed) for seed in range(8)]
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.03)
     assert np.std(ratios) < 0.1
+
+
+def test_noise_of_thirty_presses_at_ten_contacts_is_estimated_within_fifteen_percent():
+    ratios = [estimated_over_true_noise(10, 3, 0.014, seed) for seed in range(16)]
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.15)
+    assert np.std(np.mean(ratios, axis=1)) < 0.2  # of the mean over the channels
+
+
+def test_noise_of_contacts_that_are_not_repeated_is_hardly_overestimated():
+    """Planes instead of quadratic functions state 5.8 times the noise."""
+    assert 0.9 < np.mean(estimated_over_true_noise(1000, 1, 0.014, seed=0)) < 1.5
 
 
 def test_copies_of_presses_show_no_noise():

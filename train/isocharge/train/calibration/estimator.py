@@ -60,7 +60,7 @@ FORCE_SCATTERS = ((0.0, 0.8), (0.01, 0.1), (0.03, 0.1))
 POSITION_RATIOS = ((1.0, 0.8), (3.0, 0.1), (8.0, 0.1))
 """Errors of the positions relative to the stated ones, with their prior probabilities."""
 
-NOISE_RATIOS = ((1.0, 0.6), (2.0, 0.1), (4.0, 0.1), (8.0, 0.1), (16.0, 0.1))
+NOISE_RATIOS = ((1.0, 0.6), *((2.0 ** (step / 2), 0.05) for step in range(1, 9)))
 """Noise that is proportional to the charge, relative to that of a good amplifier, with its prior probabilities."""
 
 MIN_WEIGHT = 1e-6
@@ -271,22 +271,22 @@ def _estimate_with_errors(
 
     # The estimate of each hypothesis follows from the linearised problem at the most probable unknowns so far.
     used_data, used_contact = data[is_used], log_contact[is_used]
+    probable = all_hypotheses
     for _ in range(2):
         model = model_values(charges, layout, used_data, unknowns, used_contact)
         evidence = {
             errors: _Evidence.of(model, stated[is_used].with_errors(errors), used_contact, unknowns, prior)
-            for errors in {one.errors for one in all_hypotheses}
+            for errors in {one.errors for one in probable}
         }
-        fits = [evidence[one.errors].fit(one) for one in all_hypotheses]
+        fits = [evidence[one.errors].fit(one) for one in probable]
         weight = softmax([one.log_evidence for one in fits])
-        weight[weight < MIN_WEIGHT] = 0.0
-        means = np.tile(prior.mean, (len(fits), 1))
-        covariance = np.zeros((len(unknowns),) * 2)
-        for row in np.flatnonzero(weight):
-            hypothesis = all_hypotheses[row]
-            means[row], one_covariance = evidence[hypothesis.errors].posterior(hypothesis, fits[row])
-            covariance += weight[row] / weight.sum() * one_covariance
+        rows = np.flatnonzero(weight >= MIN_WEIGHT)
+        probable, fits, weight = [probable[row] for row in rows], [fits[row] for row in rows], weight[rows]
+        means, covariances = zip(
+            *(evidence[one.errors].posterior(one, fit) for one, fit in zip(probable, fits, strict=True)), strict=True
+        )
         mean = np.average(means, axis=0, weights=weight)
+        covariance = np.average(covariances, axis=0, weights=weight)
         covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)
         used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
         unknowns = _bounded(mean, layout)
@@ -296,8 +296,9 @@ def _estimate_with_errors(
     final = linearise(charges, layout, data, unknowns, log_contact)
     final_residual, _ = final.eliminated()
     final_chi2 = (final_residual**2).sum(axis=1)
-    best_hypothesis = all_hypotheses[best]
-    film = FilmEstimate(layout, unknowns, covariance, best_hypothesis.errors.noise)
+    gain_variance = np.average([one.errors.noise.gain**2 for one in probable], weights=weight)
+    noise = NoiseModel("presses", stated.noise.white, float(np.sqrt(gain_variance)))
+    film = FilmEstimate(layout, unknowns, covariance, noise)
     return Estimation(
         charges=charges,
         film=film,
@@ -306,7 +307,7 @@ def _estimate_with_errors(
         press_chi2=np.divide(final_chi2, redundancy, out=np.full(len(data), np.nan), where=redundancy > 0),
         chi2=fits[best].chi2,
         redundancy=float(redundancy[is_used].sum()),
-        hypothesis=best_hypothesis,
+        hypothesis=probable[best],
     )
 
 

@@ -1,9 +1,10 @@
 """Estimation of the noise in measured presses from the presses themselves.
 
-For each press, a plane is fitted to the charges of its neighbours, which are the presses with the most similar
-positions and forces. The plane predicts the charges of the press. The residuals of the prediction are attributed to the
-noise of the channels, although they also contain the errors of the measured positions and forces. The variance of the
-noise of a channel is modelled as white^2 + (gain * Q)^2, with the charge Q and two parameters, white and gain.
+For each press, a quadratic function is fitted to the charges of its neighbours, which are the presses with the most
+similar positions and forces. The function predicts the charges of the press. The residuals of the prediction are
+attributed to the noise of the channels, although they also contain the errors of the measured positions and forces.
+The variance of the noise of a channel is modelled as white^2 + (gain * Q)^2, with the charge Q and two parameters,
+white and gain.
 """
 
 from dataclasses import dataclass
@@ -18,12 +19,12 @@ from isocharge.simulate import NoiseModel, noise_model
 from isocharge.train.data.contact_errors import rounded
 
 NEIGHBOURS = 16
-"""Number of contacts to which a plane is fitted, which is four times the number of its coefficients."""
+"""Number of contacts to which a quadratic function is fitted, which has ten coefficients."""
 
-MIN_REPEATED_PRESSES = 100
+MIN_REPEATED_PRESSES = 20
 """Number of presses at repeated contacts from which the noise is estimated from these presses only.
 
-The standard deviation of the noise of a channel is then known to about 10 %."""
+The standard deviation of the noise of a channel is then known to about 20 %."""
 
 SAME_CONTACT_DECIMALS = 3
 """Decimals of the unit coordinates in which two contacts agree if they count as the same contact."""
@@ -78,10 +79,10 @@ class ChannelNoise:
 
         Rows that are copies of other rows are left out, because they contain no further noise. If contacts are
         repeated, the residuals are the differences between the repeated charges and their means. They contain only
-        noise. Otherwise, a plane through the neighbours of a press estimates the charges of the press without noise.
-        The residuals are then the differences between the measured and the estimated charges, and also contain the
-        curvature of the map from contacts to charges. The white noise and the noise of the gain are fitted to these
-        residuals. Both kinds of noise have lower limits.
+        noise. Otherwise, a quadratic function that is fitted to the neighbours of a press estimates the charges of the
+        press without noise. The residuals are then the differences between the measured and the estimated charges, and
+        also contain what a quadratic function cannot describe. The white noise and the noise of the gain are fitted to
+        these residuals. Both kinds of noise have lower limits.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
@@ -168,7 +169,7 @@ class ChannelNoise:
 
 @dataclass(frozen=True)
 class LocalPlanes:
-    """One plane for each contact, which is fitted to the nearest other contacts.
+    """One plane for each contact: the tangent of a quadratic function that is fitted to the nearest other contacts.
 
     Presses with the same contact are averaged.
 
@@ -187,11 +188,11 @@ class LocalPlanes:
 
     @classmethod
     def fit(cls, unit_contact: Array, values: Array) -> "LocalPlanes":
-        """For each contact, fit a plane to the values of its neighbours by least squares.
+        """For each contact, fit a quadratic function to the values of its neighbours by least squares.
 
-        The plane is a linear function from the unit coordinates of a contact to the k values. The values at the contact
-        itself are not used in the fit, so that its residual is independent of the plane. The residuals are scaled so
-        that their variance is equal to that of the noise of the values.
+        The function leads from the unit coordinates of a contact to the k values, and the plane is its linear part at
+        the contact. The values at the contact itself are not used in the fit, so that its residual is independent of
+        the plane. The residuals are scaled so that their variance is equal to that of the noise of the values.
 
         Args:
             unit_contact: Contacts in unit coordinates, shape (n, 3).
@@ -204,14 +205,16 @@ class LocalPlanes:
         distance, nearest = cKDTree(contact).query(contact, min(NEIGHBOURS + 1, len(contact)))
         neighbours = nearest[:, 1:]  # the nearest contact is the contact itself
         offsets = contact[neighbours] - contact[:, None]
-        # The constant and the offsets of the neighbours, shape (n, number of neighbours, 1 + number of coordinates)
-        columns = np.concatenate([np.ones_like(offsets[:, :, :1]), offsets], axis=2)
+        # The constant, the offsets of the neighbours, and their products, shape (n, number of neighbours, 10)
+        first, second = np.triu_indices(offsets.shape[2])
+        products = offsets[:, :, first] * offsets[:, :, second]
+        columns = np.concatenate([np.ones_like(offsets[:, :, :1]), offsets, products], axis=2)
         # The pseudoinverse contains the weights of the neighbours in the least-squares solution.
         weights = np.linalg.pinv(columns)
-        # The first coefficient is the value at the contact, and the others are the slopes; shape (n, 4, k).
+        # The first coefficient is the value at the contact, and the next three are the slopes; shape (n, 10, k).
         coefficients = weights @ mean_value[neighbours]
         value = coefficients[:, 0]
-        slope = coefficients[:, 1:].swapaxes(1, 2)  # shape (n, k, 3)
+        slope = coefficients[:, 1 : 1 + offsets.shape[2]].swapaxes(1, 2)  # shape (n, k, 3)
 
         # A residual contains the noise of the mean value and the noise of the plane.
         plane_variance = (weights[:, 0] ** 2 / press_count[neighbours]).sum(axis=1)
