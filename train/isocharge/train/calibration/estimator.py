@@ -270,6 +270,7 @@ def _estimate_with_errors(
     is_used = ~is_bad
 
     # The estimate of each hypothesis follows from the linearised problem at the most probable unknowns so far.
+    # The second round considers only the hypotheses that are possible after the first.
     used_data, used_contact = data[is_used], log_contact[is_used]
     probable = all_hypotheses
     for _ in range(2):
@@ -282,9 +283,8 @@ def _estimate_with_errors(
         weight = softmax([one.log_evidence for one in fits])
         rows = np.flatnonzero(weight >= MIN_WEIGHT)
         probable, fits, weight = [probable[row] for row in rows], [fits[row] for row in rows], weight[rows]
-        means, covariances = zip(
-            *(evidence[one.errors].posterior(one, fit) for one, fit in zip(probable, fits, strict=True)), strict=True
-        )
+        posteriors = [evidence[one.errors].posterior(one, fit) for one, fit in zip(probable, fits, strict=True)]
+        means, covariances = zip(*posteriors, strict=True)
         mean = np.average(means, axis=0, weights=weight)
         covariance = np.average(covariances, axis=0, weights=weight)
         covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)

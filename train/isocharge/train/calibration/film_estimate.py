@@ -196,7 +196,7 @@ class FilmEstimate:
         layout: Order of the unknowns.
         values: Most probable values, shape (n_unknown,).
         covariance: Covariance, shape (n_unknown, n_unknown).
-        noise: Most probable noise of the charges.
+        noise: Noise of the charges, averaged over the hypotheses.
     """
 
     layout: Layout
