@@ -48,6 +48,9 @@ K) and 10 W/(m^2 K). The value of the heat transfer coefficient is typical of fr
 PositiveOrInfinite = Annotated[float, Meta(gt=0.0, description="a positive number or inf")]
 """Type of a positive parameter that may be infinite."""
 
+Mismatch = Annotated[float, Meta(ge=0.0, le=0.2, description="a number from 0 to 0.2")]
+"""Type of a relative standard deviation that is so small that no drawn factor is negative."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Amplifier:
@@ -79,8 +82,8 @@ class Amplifier:
 
     noise: NoiseModel
     tau: PositiveOrInfinite = math.inf
-    tau_mismatch: NotNegative = 0.0
-    gain_mismatch: NotNegative = 0.0
+    tau_mismatch: Mismatch = 0.0
+    gain_mismatch: Mismatch = 0.0
     hum: NotNegative = 0.0
     hum_frequency: Positive = 50.0
     offset: NotNegative = 0.0

@@ -66,3 +66,9 @@ def test_yield_force_of_a_taut_film_lies_in_the_range_of_forces():
     taut = replace(FILM, pretension=30.0)
     force = yield_force(taut, [TIP], (1e-3, 20.0))
     assert largest_stress(taut, TIP, force) == pytest.approx(45.0, rel=2e-3)
+
+
+def test_yield_force_of_a_small_film_is_not_rounded_to_zero():
+    small = replace(FILM, radius=1.0, thickness=5e-4)
+    force = yield_force(small, [Circle(0.02)], (1e-6, 1e-3))
+    assert largest_stress(small, Circle(0.02), force) == pytest.approx(45.0, rel=2e-3)

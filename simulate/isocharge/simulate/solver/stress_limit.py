@@ -116,7 +116,7 @@ def yield_force(film: Film, probes: Sequence[Probe], force_range: tuple[float, f
         force_range: Smallest and largest force, N.
 
     Returns:
-        Force, N, rounded to 0.001 N; None if the film does not yield within the range of forces.
+        Force, N, rounded to four digits; None if the film does not yield within the range of forces.
     """
     min_force, max_force = force_range
     smallest_force = max_force  # stays at this value if the film does not yield
@@ -128,4 +128,4 @@ def yield_force(film: Film, probes: Sequence[Probe], force_range: tuple[float, f
         except SolveError:
             continue
         smallest_force = min(smallest_force, probe_force)
-    return round(smallest_force, 3) if smallest_force < max_force else None
+    return float(f"{smallest_force:.4g}") if smallest_force < max_force else None
