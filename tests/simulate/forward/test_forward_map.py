@@ -102,6 +102,7 @@ def test_footprint_grows_with_the_cube_root_of_the_force(near_electrodes):
     largest = np.abs(expected).max(axis=1, keepdims=True)
     assert (np.abs(growing.charges(contact) - expected) / largest).max() < 1e-3
     assert (np.abs(ChargeSpline.of(growing).charges(contact) - expected) / largest).max() < 1e-3
+    assert not growing.charges(np.zeros((1, 3))).any()
     fixed = ForwardMap.build(sensor, Finger(2.0), **wide_range)
     assert (np.abs(fixed.charges(contact) - expected) / largest).max() > 0.01, "the radius does not matter"
 

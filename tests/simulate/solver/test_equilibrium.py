@@ -8,6 +8,7 @@ import pytest
 from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     Circle,
+    GrowingFinger,
     Polygon,
     Resolution,
     SolveSettings,
@@ -33,6 +34,8 @@ MEMBRANE = Theory(bending=False)
         ),
         (Polygon.rectangle(10.0, 1.0), (39.9, 5.0), 1.0, r"off the film: centre \(39\.9, 5\) mm, .* rectangle"),
         (Circle(1.0), (np.nan, 0.0), 1.0, r"probe off the film: centre \(nan, 0\) mm"),
+        (GrowingFinger(1.0), (0.0, 0.0), 1e-6, r"growing-finger:1\.0 under 1e-06 N: expected a radius of at least"),
+        (GrowingFinger(1.0), (0.0, 0.0), -1.0, r"growing-finger:1\.0 under -1 N: expected a radius .* press with more"),
         (
             Circle(1.0),
             (0.0, 0.0),

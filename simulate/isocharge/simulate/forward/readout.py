@@ -300,12 +300,12 @@ def contact_charges(sensor: Sensor, probe: Probe, contact: Array, orientation: A
         Charges without crosstalk, shape (n, n_electrode), pC.
     """
     charge = np.zeros((len(contact), len(sensor.electrodes)))
-    if sensor.piezo.d33 == 0.0:
+    if sensor.piezo.d33 == 0.0 or not len(contact):
         return charge
 
     # The contact pressure acts only on electrodes under the probe. Presses far from all electrodes cause no charge.
     position = contact[:, 0] + 1j * contact[:, 1]
-    largest_reach = probe.under(float(contact[:, 2].max(initial=0.0))).reach
+    largest_reach = probe.under(float(contact[:, 2].max())).reach
     distances = relative_distances(sensor.part_circles, largest_reach, position)
     presses_near_electrodes = np.flatnonzero((distances < 1.0).any(axis=1))
     for press_index in presses_near_electrodes:

@@ -14,10 +14,11 @@ from typing import ClassVar
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
+from isocharge.common.errors import SceneError
 from isocharge.simulate.numerics.interpolation import gauss_line
 from isocharge.simulate.numerics.polygon import area_in_disk, to_complex
 from isocharge.simulate.sensor.film import tidy
-from isocharge.simulate.sensor.footprint import CurvedProbe, check_angle, check_length
+from isocharge.simulate.sensor.footprint import MIN_LENGTH, CurvedProbe, check_angle, check_length
 
 
 @dataclass(frozen=True)
@@ -145,8 +146,18 @@ class GrowingFinger(Finger):
     grows = True
 
     def under(self, force: float) -> Finger:
-        """Return the fingertip with the radius that it has under a force (N)."""
-        return Finger(self.radius * float(np.cbrt(force)))
+        """Return the fingertip with the radius that it has under a force (N).
+
+        Raises:
+            SceneError: If the force is so small that the radius is below `MIN_LENGTH`, or if it is not positive.
+        """
+        radius = self.radius * float(np.cbrt(force))
+        if not radius >= MIN_LENGTH:
+            raise SceneError(
+                f"{self.notation} under {force:.4g} N: expected a radius of at least {MIN_LENGTH:g} mm, got "
+                f"{radius:.4g} mm; press with more force"
+            )
+        return Finger(radius)
 
 
 @dataclass(frozen=True)
