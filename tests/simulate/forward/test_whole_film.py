@@ -8,7 +8,7 @@ import pytest
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Domain, Resolution, SolveSettings, load_sensor, press, touch_charge
 from isocharge.simulate.forward.family import check_family
-from isocharge.simulate.forward.whole_film import COARSE_ERROR, COARSE_RESOLUTION, outermost_distance
+from isocharge.simulate.forward.whole_film import COARSE_ERROR, COARSE_RESOLUTION, outermost_distance, whole_film_map
 from isocharge.simulate.solver.load_case import check_press
 from whole_films import whole_film_map_solved_once
 
@@ -32,6 +32,16 @@ def test_coarse_map_agrees_with_direct_solves_up_to_the_clamp(pretension):
         at = (distance * np.cos(0.7), distance * np.sin(0.7))
         direct = touch_charge(sensor, press(sensor.film, Circle(1.0), at, force, FINER))
         np.testing.assert_allclose(coarse.charges(np.array([[*at, force]]))[0], direct, rtol=error)
+
+
+def test_coarse_map_of_a_taut_film_is_accurate_over_a_wide_range_of_forces():
+    """Between 0.005 and 5 N, the charges of this film change from the square of the force to its power of 2/3."""
+    sensor = replace(SENSOR, film=replace(SENSOR.film, pretension=2.0))
+    coarse = whole_film_map(sensor, Circle(1.0), (0.005, 5.0))
+    for contact in ((9.0, -5.0, 0.026), (-25.0, 16.0, 0.015)):
+        direct = touch_charge(sensor, press(sensor.film, Circle(1.0), contact[:2], contact[2], FINER))
+        difference = coarse.charges(np.array([contact]))[0] - direct
+        assert np.abs(difference).max() < 0.02 * np.abs(direct).max()
 
 
 def test_coarse_map_leaves_a_gap_of_more_than_the_probe_radius_to_the_clamp():

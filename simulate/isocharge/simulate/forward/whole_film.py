@@ -5,6 +5,7 @@ such a search, an error of a few percent is acceptable in the charges of presses
 accurate up to the clamp would take minutes to build.
 """
 
+import math
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -38,8 +39,11 @@ COARSE_SMALL_PROBE_GAP = 0.042
 An element of the coarse mesh would be folded in a narrower gap. The gap decreases by 0.75 of the reach of the probe.
 """
 
-COARSE_NODE_COUNT = NodeCount(distances=10, forces=4)
-"""Numbers of distances and forces at which presses are solved for the coarse map."""
+COARSE_DISTANCES = 10
+"""Number of distances at which presses are solved for the coarse map."""
+
+MIN_COARSE_FORCES = 4
+"""Smallest number of forces at which presses are solved for the coarse map, which has one for each factor of e."""
 
 
 def outermost_distance(film: Film, probe: Probe) -> float:
@@ -72,6 +76,9 @@ def whole_film_map(
         SolveError: If a press has no equilibrium.
     """
     settings = SolveSettings(resolution=COARSE_RESOLUTION)
-    domain = Domain(outermost_distance(sensor.film, probe.under(force_range[1])), force_range)
-    forward_map = ForwardMap.build_unchecked(sensor, probe, domain, COARSE_NODE_COUNT, settings, executor=executor)
+    min_force, max_force = force_range
+    domain = Domain(outermost_distance(sensor.film, probe.under(max_force)), force_range)
+    n_force = max(MIN_COARSE_FORCES, math.ceil(math.log(max_force / min_force)))
+    count = NodeCount(COARSE_DISTANCES, n_force)
+    forward_map = ForwardMap.build_unchecked(sensor, probe, domain, count, settings, executor=executor)
     return replace(forward_map, error=COARSE_ERROR)
