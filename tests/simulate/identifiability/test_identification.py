@@ -84,3 +84,8 @@ def test_search_radius_is_reduced_if_charges_cannot_be_interpolated(monkeypatch)
     monkeypatch.setattr(ForwardMap, "build", build)
     assert map_to_search(SENSOR, Circle(1.0), (0.05, 2.0)) == "a map"
     assert asked == pytest.approx(12.0617 * np.array([1.0, 0.9, 0.81]), rel=1e-4)
+
+
+def test_probe_without_room_to_move_raises_scene_error():
+    with pytest.raises(SceneError, match=r"circle:41\.0: expected a reach below 40\.5 mm"):
+        identify(SENSOR, Circle(41.0))

@@ -260,10 +260,19 @@ def search_radius(sensor: Sensor, probe: Probe) -> float:
     Args:
         sensor: Sensor with the electrodes.
         probe: Probe that presses the film.
+
+    Raises:
+        SceneError: If the probe is so large that there is no such disk.
     """
+    largest_reach = MAX_SEARCH_RADIUS * sensor.film.inner_radius
+    if probe.reach >= largest_reach:
+        raise SceneError(
+            f"{probe.notation}: expected a reach below {largest_reach:.4g} mm, so that the probe can move on this "
+            f"film, got {probe.reach:.4g} mm; use a smaller probe"
+        )
     corners = [sensor.calibration.place(np.array(electrode.corners)) for electrode in sensor.electrodes]
     outermost = float(np.hypot(*np.concatenate(corners).T).max())
-    return min(outermost, MAX_SEARCH_RADIUS * sensor.film.inner_radius - probe.reach)
+    return min(outermost, largest_reach - probe.reach)
 
 
 def map_to_search(
