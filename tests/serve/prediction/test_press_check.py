@@ -111,6 +111,8 @@ def test_verdict_needs_three_presses(predictor, measure, count, fits):
     check = check_presses(predictor, measure(count, seed=4))
     assert check.fits is fits
     assert fits or check.verdict == f"too few presses to say: {count} can be compared, 3 are needed"
+    far = check_presses(predictor, measure(count, seed=4, shift_mm=(1.0, 0.0)))
+    assert any("shifted" in note for note in far.notes) == (count >= 3)  # one wrong press is no common shift
 
 
 def test_bad_press_is_reported_and_excluded(predictor, measure):

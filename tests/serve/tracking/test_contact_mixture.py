@@ -163,6 +163,18 @@ def test_charges_of_no_contact_are_not_tracked_and_saturated_frames_are_ignored(
     assert track_frame(tracker, MODEL_CONTACT, 0.2, ("saturated",), np.full(3, 1e5)) == (last_tracked, None)
 
 
+def test_frames_before_a_gap_do_not_change_the_contact_after_it():
+    """At 1 kHz, a step has several frames. The charges before the gap are those of another contact."""
+    before, after = noisy_charges(np.full(12, -5.0)), noisy_charges(np.full(10, -2.0))
+    mixture = ContactMixture(folded_series(), NOISE)
+    for number, charge_pC in enumerate(before):
+        mixture.update(charge_pC, 1e-3 * number)
+    first, *_ = mixture.update(after[0], 0.4)
+    contact = first.contact(0.0)
+    assert mixture.time_s == 0.4
+    assert abs(contact.x_mm + 2.0) < 3.0 * contact.x_std_mm
+
+
 @pytest.fixture
 def model(models, tmp_path):
     """A model with the file `charges.npz` of its film."""

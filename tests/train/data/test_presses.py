@@ -70,6 +70,12 @@ def test_dataset_that_a_network_cannot_be_trained_on_is_refused(dataset, change,
         presses_of(change(dataset))
 
 
+def test_a_simulated_dataset_with_one_force_is_refused(dataset):
+    """The model would answer 1 N to every press, with a standard deviation of nearly zero."""
+    with pytest.raises(DatasetError, match="expected presses with different forces, got 1 N in all of 6000"):
+        TrainingData.of(with_samples(dataset, force_N=np.ones(6000)))
+
+
 def test_a_measured_dataset_is_refused_where_simulated_presses_are_expected(dataset):
     with pytest.raises(DatasetError, match=r"expected simulated presses, got a measured dataset.*fit_presses"):
         TrainingData.of(replace(dataset, manifest={}))

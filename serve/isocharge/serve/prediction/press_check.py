@@ -207,7 +207,8 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     if is_bad.any():
         bad_lines = row_words(np.array(errors.lines)[is_bad].tolist(), errors.row_noun)
         notes.append(f"{bad_lines}: nothing like the other presses, left out; look at it")
-    notes += _common_notes(agreement)
+    if fits is not None:
+        notes += _common_notes(agreement)
     return PressCheck(
         model=metadata.label,
         presses=len(presses),

@@ -315,6 +315,8 @@ class ContactMixture:
             The contacts that explain the charges at `time_s`, in descending order of their probability. The list is
             empty if no contact explains the charges.
         """
+        # Frames before a gap in the middle of a step may belong to another contact.
+        self._frames = [(charge, time) for charge, time in self._frames if t_s - time < 2.0 * NOISE_INTERVAL_s]
         self._frames.append((charge_pC, t_s))
         if t_s - self._step_begin_s < NOISE_INTERVAL_s:
             return self._hypotheses

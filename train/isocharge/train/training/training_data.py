@@ -65,18 +65,25 @@ class TrainingData:
         """Convert a simulated dataset to training data.
 
         Raises:
-            DatasetError: If the dataset has too few presses or electrodes, or is measured.
+            DatasetError: If the dataset has too few presses or electrodes, only one force, or is measured.
         """
         if is_measured(dataset):
             raise DatasetError(
                 "expected simulated presses, got a measured dataset, whose manifest has no settings of a simulator; "
                 "train with `isocharge train fit DATASET`, or with `fit_presses` in Python"
             )
+        presses = presses_of(dataset)
+        first_force_N = presses.contact[0, 2]
+        if (presses.contact[:, 2] == first_force_N).all():
+            raise DatasetError(
+                f"expected presses with different forces, got {first_force_N:g} N in all of {len(presses)}: a network "
+                "would answer this force to every press; sweep a range of forces"
+            )
         return cls(
             sensor=dataset.sensor,
             probes=tuple(sorted({str(probe) for probe in dataset.samples.probe})),
             domain=domain_of(dataset),
-            presses=presses_of(dataset),
+            presses=presses,
             sha256=dataset.sha256,
             outside=None if dataset.outside is None else LabelledPresses.of(dataset.outside),
             yield_force_N=dataset.manifest.get(YIELD_FORCE),
