@@ -17,6 +17,7 @@ import pytest
 from infer_requests import BODY, INFER, infer_request
 from isocharge.serve.network.address import ServerLimits, Tls
 from isocharge.serve.network.browser_check import AccessCheck
+from isocharge.serve.network.http.server import Connection
 from isocharge.serve.network.protocol import Handler
 
 LOAD = b"POST /v2/repository/models/linear/load HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\n\r\n"
@@ -221,6 +222,21 @@ def test_client_that_does_not_read_is_disconnected(limited):
     with connect(server) as connection, pytest.raises(OSError, match=r"reset|Broken pipe"):
         drip(connection, infer(body=body), 1000)
     assert is_well(server)
+
+
+def test_client_that_fills_the_buffers_at_once_is_disconnected(limited, monkeypatch):
+    begin = Connection.connection_made
+
+    def begin_with_full_buffers(connection, transport):
+        begin(connection, transport)
+        connection.flow.pause_writing()
+
+    monkeypatch.setattr(Connection, "connection_made", begin_with_full_buffers)
+    server = limited(body_seconds=0.3)
+    with connect(server) as client:
+        client.settimeout(10)
+        client.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
+        assert everything(client) == b""
 
 
 def test_response_that_ends_after_a_refusal_does_not_extend_the_deadline(limited):

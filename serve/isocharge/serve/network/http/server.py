@@ -61,7 +61,9 @@ class Connection(HttpToolsProtocol):
         every other connection has an open request, the new connection is refused.
         """
         super().connection_made(transport)
-        self.deadline = self.loop.time() + self._limits.header_seconds
+        now = self.loop.time()
+        self.deadline = now + self._limits.header_seconds
+        self._write_deadline = now + self._limits.body_seconds
         if len(self.connections) <= self._limits.connections:
             return
         others: Any = self.connections - {self}  # all connections are of this class
