@@ -150,9 +150,7 @@ class Line(NamedTuple):
 def clean_text(text: str) -> str:
     """Return the part of a line that may contain numbers; empty for a blank line, a comment or a text of Teleplot.
 
-    A Teleplot line has the form `>name:time:value;time:value§unit|flags`. Only its latest value is returned, as in
-    `t_ms:1000;"name":801.2§unit`. A sentence in the style of NMEA 0183 has the form `$NAME,1.5,2.5*3A`. Its checksum is
-    the exclusive or of all bytes between `$` and `*`.
+    Colours, quotes around numbers and other notations without a meaning are removed.
 
     Args:
         text: The line.
@@ -169,20 +167,41 @@ def clean_text(text: str) -> str:
     if '"' in text or "'" in text:
         text = re.sub(_QUOTED_NUMBER, r"\2", text)
     if text[:1] == ">":
-        if not {"t", "xy"}.isdisjoint(text.rpartition("|")[2].split(",")):
-            return ""
-        teleplot = re.fullmatch(_TELEPLOT, text)
-        if teleplot is None:
-            return text
-        name, time, value = teleplot.groups()
-        named_time = f"t_ms:{time};" if time else ""
-        return f'{named_time}"{name}":{value}'
+        return _teleplot_content(text)
     if text[:1] == "$" and "*" in text:
-        content, _, checksum = text.partition("*")
-        if len(checksum) != 2 or int(checksum, 16) != reduce(xor, content[1:].encode(), 0):
-            raise ValueError(f"expected the checksum of the sentence, got {text[-100:]!r}")
-        return content
+        return _sentence_content(text)
     return "" if text[:1] == "#" else text
+
+
+def _teleplot_content(text: str) -> str:
+    """Return the latest value of a line of Teleplot; empty for a text or a point in a plane.
+
+    A Teleplot line has the form `>name:time:value;time:value§unit|flags`. The result has the form
+    `t_ms:1000;"name":801.2§unit`. A line that only begins like one of Teleplot is returned as it is.
+    """
+    flags = text.rpartition("|")[2].split(",")
+    if "t" in flags or "xy" in flags:
+        return ""
+    teleplot = re.fullmatch(_TELEPLOT, text)
+    if teleplot is None:
+        return text
+    name, time, value = teleplot.groups()
+    named_time = f"t_ms:{time};" if time else ""
+    return f'{named_time}"{name}":{value}'
+
+
+def _sentence_content(text: str) -> str:
+    """Return a sentence in the style of NMEA 0183, such as `$NAME,1.5,2.5*3A`, without its checksum.
+
+    The checksum is the exclusive or of all bytes between `$` and `*`, as two hexadecimal digits.
+
+    Raises:
+        ValueError: If the checksum is wrong.
+    """
+    content, _, checksum = text.partition("*")
+    if len(checksum) != 2 or int(checksum, 16) != reduce(xor, content[1:].encode(), 0):
+        raise ValueError(f"expected the checksum of the sentence, got {text[-100:]!r}")
+    return content
 
 
 def parse_line(text: str, *, has_header: bool = False) -> Line:

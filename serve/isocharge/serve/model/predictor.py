@@ -119,6 +119,26 @@ class Predictor:
         Raises:
             ChargeError: If the number of charges is wrong, or a charge is not finite.
         """
+        if self.noise is self.metadata.noise:
+            contact = self._predict_one(charge_pC)
+        else:
+            contacts = self._predict_with_noise(as_press(charge_pC, self.metadata.electrodes)[np.newaxis])
+            contact = Contact(*np.asarray(contacts, float)[0].tolist())
+
+        if not self._has_warned and BEYOND in self.flags(contact):
+            self._has_warned = True
+            self._warn(charge_pC, contact)
+        return contact
+
+    def _predict_one(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
+        """Compute the contact of one press, with the standard deviations for the noise of the training.
+
+        Args:
+            charge_pC: Touch charges, shape (electrodes,), pC.
+
+        Raises:
+            ChargeError: If the number of charges is wrong, or a charge is not finite.
+        """
         values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
         press = self._press
         with self._press_lock:
@@ -127,15 +147,7 @@ class Predictor:
                 # The slow conversion `as_press` accepts more number types. Its errors name the electrode.
                 press.write(*as_press(charge_pC, self.metadata.electrodes))
             press.run()
-            contact = Contact(*press.read())
-        if self.noise is not self.metadata.noise:
-            contacts = self._predict_with_noise(as_batch([values], self.metadata.electrodes))
-            contact = Contact(*np.asarray(contacts, float)[0].tolist())
-
-        if not self._has_warned and BEYOND in self.flags(contact):
-            self._has_warned = True
-            self._warn(charge_pC, contact)
-        return contact
+            return Contact(*press.read())
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the reasons why a contact may be wrong: `outside`, `beyond`, `misfit` and `stress`.

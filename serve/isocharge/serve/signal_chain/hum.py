@@ -63,10 +63,10 @@ class Hum(Stage):
         """Begin with an estimate of zero hum."""
         self._rule = setup.device.rule(HumRule) or HumRule()
         self._phasor_pC: Complexes = np.zeros(len(setup.electrodes), dtype=complex)  # amplitude and phase by channel
-        # The frame with which the next frame is compared: its unit phasor, its charges, and the time since then
-        self._unit_phasor = 1.0 + 0.0j
-        self._compared_pC: Array | None = None
-        self._waited_s = 0.0
+        # The reference is the frame with which the next frame is compared: its unit phasor, its charges, and its age.
+        self._reference_phasor = 1.0 + 0.0j
+        self._reference_pC: Array | None = None
+        self._elapsed_s = 0.0
 
     def step(self, frame: Frame) -> None:
         """Subtract the hum from a frame, and update the estimate of the hum."""
@@ -75,34 +75,34 @@ class Hum(Stage):
         rule = self._rule
         raw_pC = frame.charge_pC
         unit_phasor = cmath.exp(2j * math.pi * rule.frequency_Hz * frame.clock_s)
-        phasor_step = unit_phasor - self._unit_phasor
+        phasor_step = unit_phasor - self._reference_phasor
         squared_step = phasor_step.real * phasor_step.real + phasor_step.imag * phasor_step.imag
 
-        self._waited_s += frame.dt_s
+        self._elapsed_s += frame.dt_s
 
         # If the unit phasor has hardly changed, the change of the charges contains little hum.
         has_turned = squared_step > MIN_SQUARED_STEP
-        if self._compared_pC is not None and has_turned:
+        if self._reference_pC is not None and has_turned:
             expected_change_pC = (self._phasor_pC * phasor_step).real
-            error_pC = raw_pC - self._compared_pC - expected_change_pC
+            error_pC = raw_pC - self._reference_pC - expected_change_pC
             # Clipping limits the influence of a touch, which may change the charges by more than the hum.
             clipped_error_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
             # The charges contain only the real part of the product. With a gain of 1, a frame therefore corrects only
             # half of the error of the phasor on average. With the factor 2, the time constant is `settle_s`.
-            gain = min(1.0, 2.0 * self._waited_s / rule.settle_s)
+            gain = min(1.0, 2.0 * self._elapsed_s / rule.settle_s)
             correction_per_error = gain / squared_step * phasor_step.conjugate()
             self._phasor_pC = self._phasor_pC + clipped_error_pC * correction_per_error
-        # Within a tenth of a period, the unit phasor turns enough. After nearly whole periods, it does not.
-        is_late = 10.0 * rule.frequency_Hz * self._waited_s > 1.0
-        if self._compared_pC is None or has_turned or is_late:
-            self._unit_phasor = unit_phasor
-            self._compared_pC = raw_pC
-            self._waited_s = 0.0
+        # The unit phasor turns enough within a tenth of a period, except if the frames are nearly whole periods apart.
+        is_old = self._elapsed_s > 0.1 / rule.frequency_Hz
+        if self._reference_pC is None or has_turned or is_old:
+            self._reference_phasor = unit_phasor
+            self._reference_pC = raw_pC
+            self._elapsed_s = 0.0
         frame.charge_pC = raw_pC - (self._phasor_pC * unit_phasor).real
 
     def reset(self) -> None:
         """Keep the estimate of the hum, but do not compare the next frame with an earlier one."""
-        self._compared_pC = None
+        self._reference_pC = None
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:

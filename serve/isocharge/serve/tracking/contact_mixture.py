@@ -303,25 +303,27 @@ class ContactMixture:
         self._next_search_s = -math.inf  # earliest time of the next search over the whole film
 
     def update(self, charge_pC: Array, t_s: float) -> list[ContactHypothesis]:
-        """Process the next frame, and return the contacts that explain the charges.
+        """Process the next frame, and return the contacts that explain the charges of the latest update.
 
-        The mixture is updated only once in each step, with the mean charges of the frames of the step.
+        The frames within `NOISE_INTERVAL_s` are one step. The mixture is updated once in each step, with the mean
+        charges of the frames of the step.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
             t_s: Time of the frame on a clock that is never set back, s.
 
         Returns:
-            The contacts that explain the charges at `time_s`, in descending order of their probability. The list is
-            empty if no contact explains the charges.
+            The contacts at the time `time_s` of the latest update, in descending order of their probability. The list
+            is empty if no contact explains the charges.
         """
-        # Frames before a gap in the middle of a step may belong to another contact.
+        # After a gap in the stream, the frames of a step that was not complete may belong to another contact.
         self._frames = [(charge, time) for charge, time in self._frames if t_s - time < 2.0 * NOISE_INTERVAL_s]
         self._frames.append((charge_pC, t_s))
         if t_s - self._step_begin_s < NOISE_INTERVAL_s:
             return self._hypotheses
 
-        # The frame noise of the n frames is independent, so its variance is divided by n. The slow noise is the same.
+        # The frame noise of the n frames is independent, so its variance is divided by n. The slow noise is the same in
+        # all frames of a step.
         mean_pC = np.mean([charge for charge, _ in self._frames], axis=0)
         time_s = float(np.mean([time for _, time in self._frames]))
         variance_pC2 = self._noise.variance(mean_pC) / len(self._frames) + (SLOW_NOISE_STD * mean_pC) ** 2

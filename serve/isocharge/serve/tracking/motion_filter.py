@@ -144,7 +144,8 @@ class NoiseEstimate:
         """Update the estimate, a mean over all frames, with the deviation of the latest values from a steady motion.
 
         The value in the middle of three frames is compared with the interpolation between the two others. The frames
-        may have any times. A contact that starts or stops deviates as well, so large deviations are limited.
+        may have any times. A contact that starts or stops also deviates, although it has no more noise. A deviation of
+        more than three standard deviations therefore counts as three.
 
         Args:
             measured: Measured x, y and ln F, shape (3,).

@@ -262,17 +262,18 @@ def search_radius(sensor: Sensor, probe: Probe) -> float:
         probe: Probe that presses the film.
 
     Raises:
-        SceneError: If the probe is so large that there is no such disk.
+        SceneError: If the probe is so large that it cannot move on the film.
     """
-    largest_reach = MAX_SEARCH_RADIUS * sensor.film.inner_radius
-    if probe.reach >= largest_reach:
+    # Every point of the probe must lie within this distance from the centre.
+    largest_distance = MAX_SEARCH_RADIUS * sensor.film.inner_radius
+    if probe.reach >= largest_distance:
         raise SceneError(
-            f"{probe.notation}: expected a reach below {largest_reach:.4g} mm, so that the probe can move on this "
-            f"film, got {probe.reach:.4g} mm; use a smaller probe"
+            f"{probe.notation}: expected a probe that can move on this film, which reaches less than "
+            f"{largest_distance:.4g} mm from its centroid, got {probe.reach:.4g} mm; use a smaller probe"
         )
     corners = [sensor.calibration.place(np.array(electrode.corners)) for electrode in sensor.electrodes]
-    outermost = float(np.hypot(*np.concatenate(corners).T).max())
-    return min(outermost, largest_reach - probe.reach)
+    outermost_corner = float(np.hypot(*np.concatenate(corners).T).max())
+    return min(outermost_corner, largest_distance - probe.reach)
 
 
 def map_to_search(

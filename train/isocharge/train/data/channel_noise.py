@@ -79,10 +79,10 @@ class ChannelNoise:
 
         Rows that are copies of other rows are left out, because they contain no further noise. If contacts are
         repeated, the residuals are the differences between the repeated charges and their means. They contain only
-        noise. Otherwise, a quadratic function that is fitted to the neighbours of a press estimates the charges of the
-        press without noise. The residuals are then the differences between the measured and the estimated charges, and
-        also contain what a quadratic function cannot describe. The white noise and the noise of the gain are fitted to
-        these residuals. Both kinds of noise have lower limits.
+        noise. Otherwise, the residuals are the differences between the charges of a press and the values of a quadratic
+        function, which is fitted to the neighbours of the press. They contain the noise and the error of the quadratic
+        approximation. The white noise and the noise of the gain are fitted to the residuals. Both kinds of noise have
+        lower limits.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
@@ -190,7 +190,7 @@ class LocalPlanes:
     def fit(cls, unit_contact: Array, values: Array) -> "LocalPlanes":
         """For each contact, fit a quadratic function to the values of its neighbours by least squares.
 
-        The function leads from the unit coordinates of a contact to the k values, and the plane is its linear part at
+        The function maps the unit coordinates of a contact to the k values. The plane is the tangent of the function at
         the contact. The values at the contact itself are not used in the fit, so that its residual is independent of
         the plane. The residuals are scaled so that their variance is equal to that of the noise of the values.
 

@@ -173,14 +173,14 @@ def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
 
 
 def determined_degree(coordinate: Array, largest: int, smallest_singular_value: float = 0.1) -> int:
-    """Return the degree, up to `largest`, of a polynomial that values at given coordinates determine.
+    """Return the largest degree of a polynomial that values at the given coordinates determine.
 
-    For example, values at three coordinates, or close to them, determine a polynomial of the degree 2. A polynomial of
-    a higher degree could have any value between these coordinates.
+    For example, values at three coordinates, or close to them, determine a polynomial of the degree 2. They do not
+    determine the values of a polynomial of a higher degree between these coordinates.
 
     Args:
         coordinate: Coordinates, scaled to [-1, 1], shape (n,).
-        largest: Largest degree.
+        largest: Upper bound of the result.
         smallest_singular_value: Smallest singular value of the matrix of the Chebyshev polynomials, divided by the root
             of n, with which a degree counts as determined. For evenly distributed coordinates, it is above 0.3.
     """
