@@ -8,7 +8,6 @@ import pytest
 
 from isocharge.common.errors import OutputError, OutputExists
 from isocharge.common.files import AtomicWriter, bounded_lines, new_file, read_whole
-from isocharge.serve.presses.number_table import parse_number
 
 
 def test_a_file_is_read_whole(tmp_path):
@@ -63,13 +62,3 @@ def test_lines_are_bounded():
     assert list(bounded_lines(io.StringIO("a\nbc\nd"), 3)) == ["a\n", "bc\n", "d"]
     with pytest.raises(ValueError, match="longer than 2 characters"):
         list(bounded_lines(io.StringIO("a\nbc\n"), 2))
-
-
-@pytest.mark.parametrize("text", ["1_0", "\u0663", "", "0x10", "1,5"])
-def test_what_is_no_number(text):
-    with pytest.raises(ValueError, match=r"number|float"):
-        parse_number(text)
-
-
-def test_what_is_a_number():
-    assert [parse_number(text) for text in ("10", " 1e3 ", "-.5", "+7.")] == [10.0, 1000.0, -0.5, 7.0]

@@ -93,8 +93,7 @@ def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = t
     Returns:
         The timing of each contender, in the order of `contenders`.
     """
-    turn_count = ROUNDS * max(len(contenders), 1)  # not 0, so that no division by zero occurs
-    turn_ns = round(seconds * 1e9 / turn_count)
+    turn_ns = round(seconds * 1e9 / (ROUNDS * len(contenders)))
     durations: list[list[int]] = [[] for _ in contenders]
     for round_number in track(range(ROUNDS), "measuring", ROUNDS):
         is_warm_up = round_number == 0

@@ -1,8 +1,8 @@
 """What the tests of the commands share."""
 
-import io
+import os
 import signal
-import sys
+import tempfile
 from functools import partial
 from itertools import chain, islice
 from types import SimpleNamespace
@@ -35,19 +35,25 @@ def frames(tmp_path_factory, film):
 
 
 @pytest.fixture
-def run(capfd, monkeypatch):
+def run(capfd):
     """A function that runs a command in this process; an error of ours is raised. SIGTERM acts as in `main`."""
     previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
 
     def invoke(*arguments, stdin=b""):
-        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(stdin)))
+        with tempfile.TemporaryFile() as file:
+            file.write(stdin)
+            file.seek(0)
+            os.dup2(file.fileno(), 0)
         capfd.readouterr()
         with pytest.raises(SystemExit) as ended:
             app(["serve", *map(str, arguments)])
         printed = capfd.readouterr()
         return SimpleNamespace(exit_code=int(ended.value.code or 0), stdout=printed.out, stderr=printed.err)
 
+    original_stdin = os.dup(0)
     yield invoke
+    os.dup2(original_stdin, 0)
+    os.close(original_stdin)
     signal.signal(signal.SIGTERM, previous_handler)
 
 

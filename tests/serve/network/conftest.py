@@ -1,9 +1,15 @@
 """Fixtures with certificates for servers and clients on this machine."""
 
+import asyncio
 import ssl
+from contextlib import contextmanager
+from threading import Thread
 
 import pytest
 import trustme
+import uvloop
+
+from isocharge.serve.network.grpc import grpc_server
 
 
 @pytest.fixture(scope="session")
@@ -28,3 +34,28 @@ def trusted(authority):
     context = ssl.create_default_context()
     authority.configure_trust(context)
     return context
+
+
+@pytest.fixture(scope="session")
+def start_grpc():
+    """Return a context manager that runs the gRPC server of a handler in the event loop of another thread."""
+
+    @contextmanager
+    def start(handler, **settings):
+        loop = uvloop.new_event_loop()
+        thread = Thread(target=loop.run_forever)
+        thread.start()
+        server = grpc_server(handler, "127.0.0.1", 0, **settings)
+        try:
+            url = asyncio.run_coroutine_threadsafe(server.__aenter__(), loop).result()
+            try:
+                yield url
+            finally:
+                asyncio.run_coroutine_threadsafe(server.__aexit__(None, None, None), loop).result()
+        finally:
+            asyncio.run_coroutine_threadsafe(loop.shutdown_default_executor(), loop).result()
+            loop.call_soon_threadsafe(loop.stop)
+            thread.join()
+            loop.close()
+
+    return start

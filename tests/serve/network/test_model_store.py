@@ -19,7 +19,6 @@ from onnx import helper, numpy_helper
 from infer_requests import BODY, INFER
 from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.network.browser_check import AccessCheck
-from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.grpc.service import SERVICE
 from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import open_model_store
@@ -224,11 +223,11 @@ def test_log_has_the_messages_of_python_loggers(lines):
     assert "ValueError: a value" in failure["traceback"]
 
 
-def test_log_has_a_line_for_each_grpc_call(store, lines):
+def test_log_has_a_line_for_each_grpc_call(store, lines, start_grpc):
     app = Handler(store, None, Traffic(RequestLog(lines.append)), AccessCheck(token=SECRET))
     with_secret = [("authorization", f"Bearer {SECRET}")]
     with (
-        grpc_server(app, "127.0.0.1", 0) as url,
+        start_grpc(app) as url,
         grpc.insecure_channel(url.removeprefix("grpc://")) as channel,
     ):
         ask = {name: channel.unary_unary(f"/{SERVICE}/{name}") for name in ("ModelReady", "ModelInfer")}

@@ -10,14 +10,13 @@ import tritonclient.http.aio
 from tritonclient.utils import InferenceServerException
 
 from isocharge.serve import Predictor
-from isocharge.serve.network.grpc import grpc_server
 
 
 @pytest.fixture(params=("http", "grpc"))
-def client(request, handler, start_http):
+def client(request, handler, start_http, start_grpc):
     if request.param == "grpc":
         with (
-            grpc_server(handler, "127.0.0.1", 0) as url,
+            start_grpc(handler) as url,
             tritonclient.grpc.InferenceServerClient(url.removeprefix("grpc://")) as stock,
         ):
             yield stock
@@ -132,10 +131,10 @@ def test_tritonclient_statistics(client, module, film):
     assert len(plain(client.get_inference_statistics()).popitem()[1]) == 2
 
 
-def test_tritonclient_stream_infer(handler, film, tmp_path):
+def test_tritonclient_stream_infer(handler, film, tmp_path, start_grpc):
     values = charges(film)
     answers = []
-    with grpc_server(handler, "127.0.0.1", 0) as url:
+    with start_grpc(handler) as url:
         client = tritonclient.grpc.InferenceServerClient(url.removeprefix("grpc://"))
         client.start_stream(lambda result, error: answers.append((result, error)))
         for name in ("linear", "cubic", "linear"):

@@ -87,24 +87,10 @@ def test_each_caution_about_a_file_of_presses_is_printed_once(tmp_path, command)
     assert err.count("caution: ") == 1
 
 
-def test_a_version_that_appears_during_the_training_costs_no_model(dataset_folder, tmp_path, command, monkeypatch):
-    """Two trainings with the same output run at the same time."""
-    (tmp_path / "short.toml").write_text(SHORT_CONFIG)
-    words = ("train", "fit", dataset_folder, "--config", tmp_path / "short.toml", "-o", tmp_path / "m")
-
-    def train_slowly(*arguments):
-        monkeypatch.undo()
-        assert command(*words)[0] == 0
-        return fit(*arguments)
-
-    monkeypatch.setattr(fit_command, "fit", train_slowly)
-    code, _, err = command(*words)
-    assert code == 0, err
-    assert "m/1 was written during the training: this model becomes " in err
-    assert load_model(tmp_path / "m" / "2").metadata.version == 2
+OBSTACLES = {"m": "a file", "m/config.pbtxt": "a model of another sensor", "m/1": "the same version"}
 
 
-@pytest.mark.parametrize("obstacle", ["m", "m/config.pbtxt"], ids=["a file", "a model of another sensor"])
+@pytest.mark.parametrize("obstacle", OBSTACLES, ids=OBSTACLES.values())
 def test_a_training_whose_release_is_refused_costs_no_model(obstacle, dataset_folder, tmp_path, command, monkeypatch):
     (tmp_path / "short.toml").write_text(SHORT_CONFIG)
 

@@ -19,7 +19,6 @@ from isocharge.serve import Examination, Port, Predictor, device_from_table, exa
 from isocharge.serve.examination.electrode_check import ElectrodeCheck, check_electrodes, corrected_table
 from isocharge.serve.examination.listening import BAUDS
 from isocharge.serve.port.serial_line import Request
-from isocharge.serve.presses.number_table import parse_number
 
 HEAD = "Written by `isocharge serve doctor` from what came through a port; the keys are in serve/docs/device_file.md."
 """First line of a device file."""
@@ -198,10 +197,10 @@ def _parse_gain(text: str) -> Any:
     """
     try:
         if "=" not in text:
-            return parse_number(text)
+            return float(text)
         pairs = (part.partition("=") for part in text.split(","))
-        return {electrode.strip(): parse_number(number.strip()) for electrode, _equals_sign, number in pairs}
-    except ValueError as error:  # from `parse_number`
+        return {electrode.strip(): float(number) for electrode, _equals_sign, number in pairs}
+    except ValueError as error:
         raise InputError(
             f"--pc-per-unit: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}"
         ) from error

@@ -4,8 +4,8 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext, suppress
+from collections.abc import AsyncIterator, Iterator
+from contextlib import ExitStack, asynccontextmanager, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -94,13 +94,9 @@ def http_command(
             log.warning("refused: %s", reason)
         handler = Handler(store, traffic=traffic, access=access)
         server = HttpServer(handler, address, handler.limits, traffic, tls=tls)
-        with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:  # empty without gRPC
+        with closing(server), _signals(server, store):
             _log_loaded_models(store)
-            announce(server.url)
-            if grpc_url:
-                announce(grpc_url)
-            with _signals(server, store):
-                server.run()
+            server.run(beside=_announced(server, handler, host, grpc_port, tls))
 
 
 def _log_loaded_models(store: ModelStore) -> None:
@@ -122,7 +118,7 @@ def _signals(server: HttpServer, store: ModelStore) -> Iterator[None]:
     with ExitStack() as stack:
         for number in (signal.SIGTERM, signal.SIGINT):
             stack.enter_context(on_signal(number, server.stop))
-        stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(load_all, server.stop)))
+        stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(load_all)))
         yield
 
 
@@ -162,19 +158,28 @@ def _traffic(log_format: str) -> Iterator[Traffic]:
         yield traffic
 
 
-def _grpc(handler: Handler, host: str, port: int | None, tls: Tls | None) -> AbstractContextManager[str]:
-    """Return a context manager that runs the gRPC server and yields its address.
+@asynccontextmanager
+async def _announced(
+    server: HttpServer, handler: Handler, host: str, grpc_port: int | None, tls: Tls | None
+) -> AsyncIterator[None]:
+    """Print the address of the HTTP server, run the gRPC server, and print its address, too (context manager).
 
     Args:
-        handler: Handler of the HTTP server, whose models, limits and token are used.
-        host: Name or address on which the server listens.
-        port: Port of the gRPC server; None for no gRPC server. The yielded address is then empty.
+        server: The HTTP server.
+        handler: Handler of the HTTP server, whose models, limits and token are used by the gRPC server.
+        host: Name or address on which the gRPC server listens.
+        grpc_port: Port of the gRPC server; None for no gRPC server.
         tls: Certificate and key; None for no TLS.
     """
-    if port is None:
-        return nullcontext("")
+    if grpc_port is None:
+        announce(server.url)
+        yield
+        return
     # The core of gRPC reads this variable when it is imported. It would print errors that are reported anyway.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
     with require("grpc"):
         from isocharge.serve.network.grpc import grpc_server
-    return grpc_server(handler, host, port, tls)
+    async with grpc_server(handler, host, grpc_port, tls) as grpc_url:
+        announce(server.url)
+        announce(grpc_url)
+        yield

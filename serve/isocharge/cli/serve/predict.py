@@ -1,7 +1,6 @@
 """`isocharge serve predict`: compute contacts from the charges in a file."""
 
 import sys
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
 
@@ -9,17 +8,14 @@ import typer
 
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.terminal import say, until_stopped
-from isocharge.common.arrays import Array
-from isocharge.common.errors import InputError
-from isocharge.common.files import bounded_lines
-from isocharge.serve import Predictor, read_charges, table_records, write_contacts
+from isocharge.serve import Predictor, table_records, write_contacts
 from isocharge.serve.prediction.table import read_charge_file
 
 
 def predict_command(
     model: ModelArgument,
     file: Annotated[
-        str,
+        Path,
         typer.Argument(
             metavar="FILE.csv",
             help="CSV or Parquet file with the electrodes' names in the header and a press in each row, charges in pC; "
@@ -45,7 +41,7 @@ def predict_command(
         from isocharge.serve.live.device import load_device, predictor_for  # imports all stages of a stream
 
         predictor = predictor_for(load_device(device), predictor)
-    charge_pC = _read_charges(file, predictor.metadata.electrodes)
+    charge_pC = read_charge_file(file, predictor.metadata.electrodes, say)
     with until_stopped():
         if json:
             for record in table_records(charge_pC, predictor):
@@ -53,26 +49,3 @@ def predict_command(
         else:
             write_contacts(charge_pC, predictor, sys.stdout)
             sys.stdout.flush()
-
-
-def _read_charges(file: str, electrodes: tuple[str, ...]) -> Array:
-    """Read the charges of n presses, and return the charges in the order of the electrodes, shape (n, electrodes), pC.
-
-    Args:
-        file: Path of a CSV or Parquet file; `-` for CSV text on stdin.
-        electrodes: Names of the electrodes.
-
-    Raises:
-        InputError: If the charges cannot be read.
-    """
-    if file != "-":
-        return read_charge_file(Path(file), electrodes, say)
-    try:
-        # In contrast to `sys.stdin`, this wrapper removes a byte order mark and does not convert line ends.
-        text = TextIOWrapper(sys.stdin.buffer, encoding="utf-8-sig", newline="")
-        try:
-            return read_charges(bounded_lines(text), electrodes, "stdin", say)
-        finally:
-            text.detach()  # otherwise the wrapper closes stdin
-    except OSError as error:
-        raise InputError(f"stdin: cannot be read ({error.strerror or error}); expected CSV text") from error

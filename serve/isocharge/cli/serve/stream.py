@@ -221,6 +221,11 @@ def stream_command(
     recorder = Recorder(record, predictor.metadata.label, board.table, name) if record else None
     stream = RecordedStream(touch, recorder)
     has_expired = Event()
+
+    def load_latest() -> Predictor:
+        """Load the latest version of the model, and check that this machine computes its golden vectors."""
+        return Predictor(load_checked_model(find_model(model, models)).folder)
+
     outputs: Outputs | None = None  # until the port is open
     with ExitStack() as stack:  # closes the contexts in reverse order
         stack.enter_context(until_stopped())
@@ -239,8 +244,7 @@ def stream_command(
 
         # The handlers of the signals only request changes, which the stream carries out later.
         stack.enter_context(on_signal(signal.SIGUSR1, stream.request_tare))
-        request_latest_model = partial(stream.request_model, partial(_load_latest, model, models))
-        stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(request_latest_model)))
+        stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(partial(stream.request_model, load_latest))))
 
         outputs = stack.enter_context(command_outputs(output, touch, is_live=source.is_live))
         writers: list[RecordWriter] = [outputs.write]
@@ -270,23 +274,6 @@ def stream_command(
     is_without_result = has_no_frames and has_expired.is_set()
     if is_recording_incomplete or outputs.has_incomplete_file or is_without_result:
         raise typer.Exit(1)
-
-
-def _load_latest(model: str, models: Path | None) -> Predictor:
-    """Load the latest version of a model, and check that this machine computes the outputs in its golden vectors.
-
-    Args:
-        model: Name or path of the model.
-        models: Value of `--models`; None if the option is not given.
-    """
-    folder = find_model(model, models)
-    load_checked_model(folder)
-    return Predictor(folder)
-
-
-def _load_labelled(label: str, models: Path | None) -> Predictor:
-    """Load the version of a model with the label `NAME/VERSION`, which is read from a recording."""
-    return Predictor(find_labelled_model(label, models))
 
 
 def replay_command(
@@ -323,7 +310,7 @@ def replay_command(
     # The function `play` yields the records. If the model was changed during the recording, `play` changes the model,
     # too, unless the user has chosen one model for the whole recording.
     touch = TouchStream(predictor, board, frame_id=recording.name or None)
-    load = None if model else partial(_load_labelled, models=models)
+    load = None if model else lambda label: Predictor(find_labelled_model(label, models))
     play = partial(replay, recording, touch, real_time=real_time, load=load)
 
     outputs = command_outputs(output, touch, is_live=False)

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
-from urllib.parse import urlsplit
 
 import typer
 from msgspec import structs
@@ -112,16 +111,11 @@ def page_address(live: str) -> Address:
     Raises:
         InputError: If `live` has another form.
     """
-    place = live if ":" in live else f"{LOOPBACK}:{live}"
-    try:
-        url = urlsplit(f"//{place}")
-        if not url.hostname or url.port is None or url.netloc != place:
-            raise ValueError("expected a host and a port")
-        return Address(url.hostname, url.port)
-    except ValueError as error:  # also if the port is no number up to 65535
-        raise InputError(
-            f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}"
-        ) from error
+    host, _, port = live.rpartition(":")
+    is_port = port.isdecimal() and len(port) <= len("65535") and int(port) <= 65535
+    if not is_port:
+        raise InputError(f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}")
+    return Address(host.strip("[]") or LOOPBACK, int(port))
 
 
 @contextmanager

@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from isocharge.common.errors import InputError
-from isocharge.serve.presses.number_table import parse_number
 
 SensorArgument = Annotated[
     str, typer.Argument(metavar="SENSOR", help="Name of a built-in sensor, or a TOML file that describes one.")
@@ -114,7 +113,7 @@ def parse_pair(text: str, expected: str) -> tuple[float, float]:
         InputError: If the text is not two numbers separated by a comma.
     """
     try:
-        first, second = (parse_number(part.strip()) for part in text.split(","))
+        first, second = (float(part) for part in text.split(","))
     except ValueError as error:
         raise InputError(f"{expected}, got {text!r}") from error
     return first, second
@@ -127,7 +126,7 @@ def parse_radius_mm(text: str) -> float:
         InputError: If the text is not a number.
     """
     try:
-        return parse_number(text)
+        return float(text)
     except ValueError as error:
         raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error
 

@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
 from pty import STDERR_FILENO, STDIN_FILENO, STDOUT_FILENO
 from threading import Event
 from typing import Any
@@ -215,17 +216,8 @@ def stop_timer(seconds: float | None, has_expired: Event) -> Iterator[None]:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
-def _interrupt() -> None:
-    """Stop the command as Ctrl-C does.
-
-    Raises:
-        KeyboardInterrupt: Always.
-    """
-    raise KeyboardInterrupt
-
-
-def unless_hung_up(act: Callable[[], object], stop: Callable[[], object] = _interrupt) -> Callable[[], object]:
-    """Return a handler of SIGHUP that calls `act`, or stops the command if its terminal has been closed.
+def unless_hung_up(act: Callable[[], object]) -> Callable[[], None]:
+    """Return a handler of SIGHUP that calls `act`, or stops the command as Ctrl-C does if its terminal has been closed.
 
     The user sends SIGHUP to request the action. The system sends the same signal when the terminal is closed. If a
     standard stream that was a terminal at the start of the command is not a terminal any more, the terminal has been
@@ -233,7 +225,6 @@ def unless_hung_up(act: Callable[[], object], stop: Callable[[], object] = _inte
 
     Args:
         act: Function that the handler calls while the terminal is open.
-        stop: Function that the handler calls if the terminal has been closed. By default, it raises KeyboardInterrupt.
     """
     terminals = [descriptor for descriptor in STANDARD_DESCRIPTORS if os.isatty(descriptor)]
 
@@ -243,7 +234,7 @@ def unless_hung_up(act: Callable[[], object], stop: Callable[[], object] = _inte
         if is_open:
             act()
         else:
-            stop()
+            signal.raise_signal(signal.SIGINT)
 
     return act_or_stop
 
@@ -334,12 +325,13 @@ def _progress_bars() -> Iterator[Listener]:
     console = Console(stderr=True, markup=False, emoji=False)
     columns = Progress.get_default_columns()
     with Progress(*columns, "{task.fields[note]}", console=console, transient=True) as bars:
-        bar_of_title: dict[str, TaskID] = {}
+
+        @cache
+        def bar_of(title: str) -> TaskID:
+            return bars.add_task(title, total=None, note="")
 
         def update_bar(title: str, done: int, total: int, note: str) -> None:
             """Show in the bar with the given title that `done` of `total` steps are complete.
-
-            If there is no bar with this title, create it.
 
             Args:
                 title: Title of the work, which identifies its bar.
@@ -347,11 +339,6 @@ def _progress_bars() -> Iterator[Listener]:
                 total: Number of all steps.
                 note: Text that is shown after the bar.
             """
-            shown_title = printable(title)
-            shown_note = printable(note)
-            if shown_title not in bar_of_title:
-                bar_of_title[shown_title] = bars.add_task(shown_title, total=total, note=shown_note)
-
-            bars.update(bar_of_title[shown_title], completed=done, total=total, note=shown_note)
+            bars.update(bar_of(printable(title)), completed=done, total=total, note=printable(note))
 
         yield update_bar

@@ -189,12 +189,8 @@ def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
     Raises:
         RequestError: If the header `Host` is repeated (RFC 9112, 3.2). A proxy could have checked the other value.
     """
-    pairs = list(headers)
-    values = dict(pairs)
-    if len(values) == len(pairs):  # no header is repeated
-        return values
-    values = {}
-    for name, value in pairs:
+    values: dict[bytes, bytes] = {}
+    for name, value in headers:
         if name not in values:
             values[name] = value
         elif name == b"host":

@@ -11,7 +11,7 @@ first appears as a common scale factor of all forces and as a common shift of al
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any
 
@@ -140,13 +140,13 @@ class PressCheck:
         agreement = self.agreement
         degrees = agreement.degrees
         common = agreement.common
-        values = {
+        values: dict[str, Any] = {
             "each": [self.errors.row(press) for press in range(self.presses)],
             "model": self.model,
             "presses": self.presses,
             "counted": self.compared,
-            "position_mm": None if self.position_mm is None else asdict(self.position_mm),
-            "force_percent": None if self.force_percent is None else asdict(self.force_percent),
+            "position_mm": self.position_mm,
+            "force_percent": self.force_percent,
             "chi_squared": agreement.chi_squared,
             "degrees_of_freedom": degrees,
             "chi_squared_per_degree": agreement.chi_squared / degrees if degrees else None,
@@ -161,7 +161,7 @@ class PressCheck:
             "notes": self.notes,
             "verdict": self.verdict,
         }
-        return {name: plain_values(value) for name, value in values.items()}
+        return dict(plain_values(values))
 
 
 def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:

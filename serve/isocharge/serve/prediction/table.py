@@ -57,7 +57,8 @@ def read_charge_file(path: Path, electrodes: tuple[str, ...], warn: Callable[[st
     """Read the charges from a CSV or Parquet file.
 
     Args:
-        path: The file. It is read as Parquet if its name ends in `.parquet`, and as CSV otherwise.
+        path: The file. It is read as Parquet if its name ends in `.parquet`, and as CSV otherwise. The path `-` is
+            standard input.
         electrodes: Names of the columns that are read. The file may contain other columns.
         warn: Function that is called with a warning in words if the file contains other columns.
 

@@ -165,7 +165,7 @@ def csv_text(columns: Mapping[str, Array]) -> str:
     writer.writerow(columns)  # the keys of `columns`, which are the names
     rows = np.column_stack(list(columns.values()))  # shape (n, n_column)
     for row in rows.tolist():
-        writer.writerow("" if math.isnan(value) else repr(value) for value in row)
+        writer.writerow("" if math.isnan(value) else value for value in row)
     return buffer.getvalue()
 
 

@@ -151,17 +151,14 @@ class MeasuredPresses:
         Raises:
             PressError: If an array has another shape.
         """
-        press_count = len(self.lines)
-        expected_shapes: dict[str, tuple[int, ...]] = {
-            "contact": (press_count, len(CONTACT)),
-            "charge_pC": (press_count, len(self.electrodes)),
-            "position_std_mm": (press_count,),
-            "force_std": (press_count,),
-        }
-        for name, shape in expected_shapes.items():
-            given_shape = getattr(self, name).shape
-            if given_shape != shape:
-                raise PressError(f"{name}: expected an array of shape {shape}, got {given_shape}")
+        n = len(self.lines)
+        expected = ((n, len(CONTACT)), (n, len(self.electrodes)), (n,), (n,))
+        shapes = tuple(array.shape for array in (self.contact, self.charge_pC, self.position_std_mm, self.force_std))
+        if shapes != expected:
+            raise PressError(
+                "contact, charge_pC, position_std_mm and force_std: expected arrays of the shapes "
+                f"{expected}, got {shapes}"
+            )
 
     def _check_values(self) -> None:
         """Check the values of all presses.

@@ -9,6 +9,7 @@ import io
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from pty import STDIN_FILENO
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
@@ -22,6 +23,9 @@ from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, Numb
 
 if TYPE_CHECKING:
     from pyarrow import DataType
+
+STDIN = Path("-")
+"""Path that stands for standard input, from which CSV text is read."""
 
 SUFFIX = ".parquet"
 """End of the names of Parquet files."""
@@ -148,7 +152,7 @@ def open_table(
 
     Args:
         path: The file. A Parquet file must be a regular file. A CSV file must be text in UTF-8, with or without a byte
-            order mark.
+            order mark. The path `-` is standard input.
         names: Names of columns that have a meaning.
         error_class: Class of the error that is raised for every mistake in the file.
         expected: Description of the expected header, for error messages.
@@ -160,7 +164,8 @@ def open_table(
         error_class: If the file cannot be read, either when it is opened or when the block reads the columns.
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
-    source = TableSource(names, str(path), error_class, expected)
+    is_stdin = path == STDIN
+    source = TableSource(names, "stdin" if is_stdin else str(path), error_class, expected)
     kind = "Parquet" if is_parquet(path) else "CSV"
     try:
         if is_parquet(path):
@@ -169,13 +174,15 @@ def open_table(
             with open_regular(path) as file:
                 yield ParquetTable(file, source)
         else:
-            with path.open(encoding="utf-8-sig", newline="") as text:  # the CSV reader handles the line ends
+            file_or_descriptor = STDIN_FILENO if is_stdin else path
+            # The CSV reader handles the line ends.
+            with open(file_or_descriptor, encoding="utf-8-sig", newline="", closefd=not is_stdin) as text:
                 yield CsvTable(bounded_lines(text), source)
     except IsochargeError:  # some errors of isocharge, such as OutputError, inherit from OSError
         raise
     except OSError as cause:
         raise error_class(
-            f"{path}: cannot be read ({cause.strerror or cause}); expected a {kind} file of presses"
+            f"{source.where}: cannot be read ({cause.strerror or cause}); expected a {kind} file of presses"
         ) from cause
 
 

@@ -21,7 +21,7 @@ from isocharge.common.errors import InputError
 from isocharge.serve.model.session import OUTPUTS
 from isocharge.serve.network.address import ServerLimits, Tls
 from isocharge.serve.network.browser_check import AccessCheck
-from isocharge.serve.network.grpc import grpc_server, server
+from isocharge.serve.network.grpc import server
 from isocharge.serve.network.grpc.service import METHODS, SERVICE, Service
 from isocharge.serve.network.protocol import Handler
 
@@ -29,13 +29,13 @@ PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inferenc
 
 
 @pytest.fixture
-def serve(store):
+def serve(store, start_grpc):
     """Return a function that starts a server with given limits, and returns a function that opens channels to it."""
     with ExitStack() as stack:
 
         def start(token=None, **limits):
             handler = Handler(store, ServerLimits(**limits), access=AccessCheck(token=token))
-            url = stack.enter_context(grpc_server(handler, "127.0.0.1", 0)).removeprefix("grpc://")
+            url = stack.enter_context(start_grpc(handler)).removeprefix("grpc://")
             # Each channel has its own connection.
             own = ("grpc.use_local_subchannel_pool", 1)
             return lambda *options: stack.enter_context(grpc.insecure_channel(url, [own, *options]))
@@ -115,16 +115,16 @@ def test_calls_need_the_token(serve):
         assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
 
 
-def test_server_with_tls(handler, authority, tls_files):
+def test_server_with_tls(handler, start_grpc, authority, tls_files):
     trusted = grpc.ssl_channel_credentials(authority.cert_pem.bytes())
     with (
-        grpc_server(handler, "127.0.0.1", 0, tls=Tls(tls_files / "both.pem")) as url,
+        start_grpc(handler, tls=Tls(tls_files / "both.pem")) as url,
         grpc.secure_channel(url.removeprefix("grpcs://"), trusted) as channel,
     ):
         assert call(channel, "ServerLive").live
     with (
         pytest.raises(InputError, match="not a certificate"),
-        grpc_server(handler, "127.0.0.1", 0, tls=Tls(tls_files / "none.pem")),
+        start_grpc(handler, tls=Tls(tls_files / "none.pem")),
     ):
         pass
 
@@ -192,9 +192,9 @@ def test_silent_calls_are_closed(serve, silent_call, name, messages):
     assert refusal(call) == "DEADLINE_EXCEEDED"
 
 
-def test_silent_connection_is_closed(store):
+def test_silent_connection_is_closed(store, start_grpc):
     """The limit is `header_seconds`, not the default of gRPC, which is two minutes."""
-    with grpc_server(Handler(store, ServerLimits(header_seconds=0.1)), "127.0.0.1", 0) as url:
+    with start_grpc(Handler(store, ServerLimits(header_seconds=0.1))) as url:
         host, port = url.removeprefix("grpc://").split(":")
         with socket.create_connection((host, int(port)), timeout=6.0) as silent:
             while silent.recv(1000):

@@ -172,8 +172,8 @@ def _refuse_options(context: typer.Context, names: Sequence[str], reason: str) -
 def _release(fitted: Fitted, version_folder: Path) -> Release:
     """Write a trained network as a version of a model.
 
-    If another process has written this version during the training, the next free version is written. If the folder of
-    the model refuses the version for another reason, the version is written to a new temporary folder.
+    If the folder of the model refuses the version, for example because another process has written this version during
+    the training, the version is written to a new temporary folder.
 
     Args:
         fitted: The network.
@@ -183,17 +183,12 @@ def _release(fitted: Fitted, version_folder: Path) -> Release:
         IsochargeError: If the folder refuses the version. The message names the temporary folder.
     """
     model_folder = version_folder.parent
-    version = int(version_folder.name)
+    write = partial(release, fitted, version=int(version_folder.name), command=this_command())
     try:
-        return release(fitted, model_folder, version=version, command=this_command())
+        return write(model_folder)
     except (OutputExists, OutputError, ModelError) as error:
-        if not version_folder.exists():
-            temporary_folder = Path(mkdtemp(prefix="isocharge-"), model_folder.resolve().name)
-            kept = release(fitted, temporary_folder, version=version, command=this_command())
-            raise type(error)(f"{error}. The trained model is kept in {kept.folder}") from error
-        next_folder = version_folder.with_name(f"{version + 1}")
-        say(f"caution: {version_folder} was written during the training: this model becomes {next_folder}")
-        return _release(fitted, next_folder)
+        kept = write(Path(mkdtemp(prefix="isocharge-"), model_folder.resolve().name))
+        raise type(error)(f"{error}. The trained model is kept in {kept.folder}") from error
 
 
 def _is_sensor(argument: Path) -> bool:

@@ -1,24 +1,18 @@
-"""gRPC server that makes a `Service` available on a port. The server runs in its own event loop.
+"""gRPC server that makes a `Service` available on a port.
 
 No thread waits for the messages of an open call. A call that sends no messages therefore does not delay other clients.
 """
 
-import asyncio
-from collections.abc import Coroutine, Iterator
-from contextlib import contextmanager
-from threading import Thread
-from typing import Any, TypeVar
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 import grpc
 import grpc.aio
-import uvloop
 
 from isocharge.common.errors import ListenError
 from isocharge.serve.network.address import ServerLimits, Tls, url_host
 from isocharge.serve.network.grpc.service import Service
 from isocharge.serve.network.protocol import Handler
-
-T = TypeVar("T")
 
 MAX_CALLS_PER_CONNECTION = 100
 """Largest number of open calls on one connection. HTTP/2 recommends at least this number.
@@ -30,9 +24,9 @@ MIN_PING_MS = 5000
 """Shortest time between two keep-alive pings of a client, ms. A client that pings more often is disconnected."""
 
 
-@contextmanager
-def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> Iterator[str]:
-    """Return a context manager that runs a gRPC server until the `with` block ends.
+@asynccontextmanager
+async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> AsyncIterator[str]:
+    """Return a context manager that runs a gRPC server in the present event loop until the `async with` block ends.
 
     Args:
         handler: Handler of the HTTP server. The gRPC server uses its models, limits and token. Clients send the token
@@ -48,69 +42,29 @@ def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) 
         ListenError: If the address is in use or cannot be used.
         InputError: If a TLS file cannot be used.
     """
-    scheme = "grpcs" if tls else "grpc"
-    with _event_loop() as loop:
-        server, actual_port = _run_in(loop, _start(handler, f"{url_host(host)}:{port}", tls))
-        try:
-            yield f"{scheme}://{url_host(host)}:{actual_port}"
-        finally:
-            _run_in(loop, server.stop(handler.limits.grace_seconds))
-
-
-@contextmanager
-def _event_loop() -> Iterator[asyncio.AbstractEventLoop]:
-    """Return a context manager that runs an event loop in a separate thread until the `with` block ends.
-
-    Yields:
-        The event loop.
-    """
-    loop = uvloop.new_event_loop()
-    thread = Thread(target=loop.run_forever, name="grpc")
-    thread.start()
-    try:
-        yield loop
-    finally:
-        _run_in(loop, loop.shutdown_default_executor())  # waits for the calls that are answered in other threads
-        loop.call_soon_threadsafe(loop.stop)
-        thread.join()  # the loop must not be closed before it has stopped
-        loop.close()
-
-
-def _run_in(loop: asyncio.AbstractEventLoop, coroutine: Coroutine[Any, Any, T]) -> T:
-    """Run a coroutine in the event loop of another thread, wait until it has ended, and return its result."""
-    future = asyncio.run_coroutine_threadsafe(coroutine, loop)
-    return future.result()
-
-
-async def _start(handler: Handler, address: str, tls: Tls | None) -> tuple[grpc.aio.Server, int]:
-    """Start a gRPC server, and return the server and the port on which it listens.
-
-    Args:
-        handler: Handler of the HTTP server. The gRPC server uses its models, limits and token.
-        address: Address `host:port` on which to listen. The port 0 selects a free port.
-        tls: Certificate and private key for TLS, or None for a server without TLS.
-
-    Raises:
-        ListenError: If the address is in use or cannot be used.
-        InputError: If a TLS file cannot be used.
-    """
     limits = handler.limits
+    address = f"{url_host(host)}:{port}"
     # The service limits the number of open calls to `connections`. If a new call exceeds this limit, the service ends a
     # waiting call instead of refusing the new call. grpcio would refuse the new call, so its own limit must be higher.
     server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=2 * limits.connections)
     server.add_generic_rpc_handlers((Service(handler).handlers(),))
     try:
         if tls is None:
-            port = server.add_insecure_port(address)
+            scheme = "grpc"
+            actual_port = server.add_insecure_port(address)
         else:
+            scheme = "grpcs"
             credentials = grpc.ssl_server_credentials([tls.key_and_certificate()])
-            port = server.add_secure_port(address, credentials)
+            actual_port = server.add_secure_port(address, credentials)
     except RuntimeError as error:
         raise ListenError(
             f"cannot listen on {address} for gRPC: {error}; choose another --grpc-port or --host"
         ) from error
     await server.start()
-    return server, port
+    try:
+        yield f"{scheme}://{url_host(host)}:{actual_port}"
+    finally:
+        await server.stop(limits.grace_seconds)
 
 
 def _options(limits: ServerLimits) -> list[tuple[str, int]]:

@@ -31,16 +31,8 @@ from google.protobuf.message_factory import GetMessageClass
 from isocharge.common.errors import ModelError, RequestError, TooMany
 from isocharge.common.structs import convert
 from isocharge.serve.network.metrics import Exchange
-from isocharge.serve.network.model_store import LoadedVersion
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.protocol.inference import (
-    FLAGS,
-    InferBody,
-    InferRequest,
-    Rows,
-    answer_inference,
-    binary_tensor,
-)
+from isocharge.serve.network.protocol.inference import InferBody, answer_inference
 from isocharge.serve.network.protocol.response import client_message, statuses
 from isocharge.serve.network.protocol.routes import ROUTES, Request
 
@@ -127,37 +119,22 @@ def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
     return {name: True for name in ("shared_memory_region", "classification") if name in tensor.parameters}
 
 
-def write_response(loaded: LoadedVersion, request: InferRequest, outputs: dict[str, Rows]) -> Any:
-    """Convert the outputs of a model to a ModelInferResponse.
-
-    If an output was requested as a binary tensor, its values are sent as raw contents. The values of every other output
-    are sent as a list of texts or numbers.
+def write_response(content: dict[str, Any], binary_tensors: list[bytes]) -> Any:
+    """Convert the content of an HTTP response to a ModelInferResponse.
 
     Args:
-        loaded: Version of the model that was run.
-        request: The request, which states which outputs are sent as binary tensors.
-        outputs: Values of the requested outputs by their names, each of shape (n, width).
+        content: Content of the HTTP response. If an output contains its values, they become a list of texts or numbers.
+        binary_tensors: Outputs that are sent as raw contents.
     """
-    tensors: list[dict[str, Any]] = []
-    raw_contents: list[bytes] = []
-    for name, rows in outputs.items():
-        is_text = name == FLAGS
-        tensor: dict[str, Any] = {"name": name, "datatype": "BYTES" if is_text else "FP32", "shape": rows.shape}
-        if request.outputs[name]:
-            raw_contents.append(binary_tensor(rows))
-        elif is_text:
-            tensor["contents"] = {"bytes_contents": [text.encode() for text in rows.ravel().tolist()]}
-        else:
-            tensor["contents"] = {"fp32_contents": rows.ravel().tolist()}
-        tensors.append(tensor)
+    for tensor in content["outputs"]:
+        tensor.pop("parameters", None)  # the raw contents themselves have a length
+        values = tensor.pop("data", None)
+        if isinstance(values, list):
+            tensor["contents"] = {"bytes_contents": [text.encode() for text in values]}
+        elif values is not None:
+            tensor["contents"] = {"fp32_contents": values.tolist()}
     _, response_type = METHODS["ModelInfer"]
-    return response_type(
-        model_name=loaded.metadata.name,
-        model_version=loaded.version,
-        id=request.id,
-        outputs=tensors,
-        raw_output_contents=raw_contents,
-    )
+    return response_type(**content, raw_output_contents=binary_tensors)
 
 
 ROUTE_OF_METHOD = {name: route for route in ROUTES for name in route.rpcs}
@@ -205,7 +182,7 @@ class Service:
             context: Context of the call, from which messages are read and to which responses are written.
         """
         # If the client disconnects, this coroutine is cancelled, and the status is not changed.
-        call = Exchange("grpc", name, "CANCELLED")
+        call = Exchange("grpc", name, "CANCELLED", client=context.peer())
         start_ns = time.perf_counter_ns()
         message = ""
         try:
@@ -218,8 +195,6 @@ class Service:
             call.error = type(error).__name__
         finally:
             call.duration_us = (time.perf_counter_ns() - start_ns) / 1000
-            if self._traffic.log is not None:  # only the log needs the client
-                call.client = context.peer()
             self._traffic.count_and_log(call)
         if message:
             await context.abort(grpc.StatusCode[str(call.status)], message)

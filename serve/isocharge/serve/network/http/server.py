@@ -12,7 +12,7 @@ import asyncio
 import math
 import resource
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractAsyncContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any, NoReturn
@@ -122,19 +122,13 @@ class Connection(HttpToolsProtocol):
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """Remove the deadline, because the request is complete."""
+        """Remove the deadline, because the request is complete. After the response, uvicorn limits the idle time."""
         self._is_reading = False
         self._pending_bytes = 0
         self.deadline = math.inf
         if self.cycle is not None and self.cycle.response_complete:  # the application has not read the whole body
             self.deadline = self.loop.time() + self._limits.idle_seconds
         super().on_message_complete()
-
-    def on_response_complete(self) -> None:
-        """Set the deadline of the next request, unless it has already begun, or the connection was refused."""
-        super().on_response_complete()
-        if not (self._is_reading or self.transport.is_closing()):
-            self.deadline = self.loop.time() + self._limits.idle_seconds
 
     def close_if_overdue(self, now: float) -> None:
         """End the connection if a deadline has passed. If a request has begun, the client receives the reason.
@@ -253,10 +247,19 @@ class HttpServer:
         self.url = address.url(self._socket, secure=tls is not None)
         traffic.open.labels("http").set_function(lambda: len(self._server.server_state.connections))
 
-    def run(self) -> None:
-        """Answer requests until `stop` is called, and then finish the requests that have already begun."""
+    def run(self, beside: AbstractAsyncContextManager[Any] | None = None) -> None:
+        """Answer requests until `stop` is called, and then finish the requests that have already begun.
+
+        Args:
+            beside: Context that is open while the server runs, such as a gRPC server in the same event loop.
+        """
+
+        async def serve() -> None:
+            async with beside or nullcontext():
+                await self._server.serve([self._socket])
+
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-            runner.run(self._server.serve([self._socket]))
+            runner.run(serve())
 
     def stop(self) -> None:
         """End the method `run` as soon as the open requests are finished or, if called again, without finishing them.

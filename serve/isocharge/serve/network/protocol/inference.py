@@ -10,7 +10,7 @@ Some clients send `null` for every field that is not given. All optional fields 
 import struct
 import time
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import orjson
@@ -83,21 +83,6 @@ Rows = np.ndarray[Any, Any]
 ResponseType = TypeVar("ResponseType")
 
 
-class InferRequest(NamedTuple):
-    """Request for an inference, which contains charges and the names of the requested outputs.
-
-    Attributes:
-        id: Identifier that is repeated in the response. It is empty if the request has no identifier.
-        charge_pC: Charges, shape (n, electrodes), pC.
-        outputs: Whether each requested output is sent as a binary tensor, by the name of the output, in the order in
-            which the response contains the outputs.
-    """
-
-    id: str
-    charge_pC: Singles
-    outputs: dict[str, bool]
-
-
 def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, bytes]:
     """Read a request for an inference from the body of an HTTP request.
 
@@ -126,35 +111,28 @@ def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, byt
     return parse_json(body[:json_length], "", RequestError, InferBody), body[json_length:]
 
 
-def _check_request(body: InferBody, binary: bytes, loaded: LoadedVersion, max_presses: int) -> InferRequest:
-    """Check whether a request fits the requested model, and return the values that the model needs to answer it.
+def _requested_outputs(body: InferBody) -> dict[str, bool]:
+    """Return whether each requested output is sent as a binary tensor, by the name of the output.
 
-    The result contains the charges of the presses as an array, and the names of the outputs that the response contains.
+    The outputs are in the order of the response. If a request contains no names of outputs, all outputs of the model
+    are returned.
 
     Args:
-        body: Content of the JSON text.
-        binary: Bytes that follow the JSON text. If the input has the parameter `binary_data_size`, these bytes are the
-            charges.
-        loaded: Version of the model that is requested. If the request contains no names of outputs, all outputs of the
-            model are returned.
-        max_presses: Largest number of presses in one request.
+        body: Content of the request.
 
     Raises:
-        RequestError: If the request does not fit the model.
-        ChargeError: If a charge is not finite.
-        TooLarge: If the request contains more than `max_presses` presses.
+        RequestError: If an output is requested twice.
     """
     default_is_binary = bool(body.parameters and body.parameters.binary_data_output)
-    outputs = dict.fromkeys(OUTPUTS, default_is_binary)
-    if body.outputs:
-        outputs = {}
-        for output in body.outputs:
-            stated_choice = (output.parameters or Parameters()).binary_data
-            outputs[output.name] = default_is_binary if stated_choice is None else stated_choice
-        if len(outputs) < len(body.outputs):
-            raise RequestError("outputs: expected each name once")
-    charges = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, max_presses)
-    return InferRequest(body.id or "", charges, outputs)
+    if not body.outputs:
+        return dict.fromkeys(OUTPUTS, default_is_binary)
+    outputs: dict[str, bool] = {}
+    for output in body.outputs:
+        stated_choice = (output.parameters or Parameters()).binary_data
+        outputs[output.name] = default_is_binary if stated_choice is None else stated_choice
+    if len(outputs) < len(body.outputs):
+        raise RequestError("outputs: expected each name once")
+    return outputs
 
 
 def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...], max_presses: int) -> Singles:
@@ -234,7 +212,7 @@ def answer_inference(
     loaded: LoadedVersion,
     max_presses: int,
     read: Callable[[], tuple[InferBody, bytes]],
-    write: Callable[[LoadedVersion, InferRequest, dict[str, Rows]], ResponseType],
+    write: Callable[[dict[str, Any], list[bytes]], ResponseType],
 ) -> ResponseType:
     """Read a request, run the model, and return the response. The request is counted with its duration.
 
@@ -243,7 +221,8 @@ def answer_inference(
         max_presses: Largest number of presses in one request.
         read: Function that returns the content of the request and the binary input, or raises an error if the request
             cannot be read.
-        write: Function that converts the requested outputs to the response.
+        write: Function that converts the content of the response and its binary tensors to the response. The content
+            is the JSON object that an HTTP response contains. Its numbers are arrays, and its texts are lists.
 
     Raises:
         IsochargeError: If `read` raises this error, if the request does not fit the model, or if the model fails.
@@ -251,11 +230,21 @@ def answer_inference(
     clock_ns = time.perf_counter_ns
     start_ns = clock_ns()
     try:
-        request = _check_request(*read(), loaded, max_presses)
-        outputs = dict[str, Rows](run(loaded.model.session, request.charge_pC))
-        if FLAGS in request.outputs:
+        body, binary = read()
+        requested_outputs = _requested_outputs(body)
+        charge_pC = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, max_presses)
+        outputs = dict[str, Rows](run(loaded.model.session, charge_pC))
+        if FLAGS in requested_outputs:
             outputs[FLAGS] = _flags(loaded, outputs)
-        response = write(loaded, request, {name: outputs[name] for name in request.outputs})
+        content: dict[str, Any] = {"model_name": loaded.metadata.name, "model_version": loaded.version}
+        if body.id:
+            content["id"] = body.id
+        binary_tensors: list[bytes] = []
+        content["outputs"] = [
+            _output_tensor(name, outputs[name], binary_tensors if is_binary else None)
+            for name, is_binary in requested_outputs.items()
+        ]
+        response = write(content, binary_tensors)
     except Exception:
         loaded.statistics.count_refused(clock_ns() - start_ns)
         raise
@@ -267,40 +256,44 @@ def answer_inference(
     return response
 
 
-def write_answer(loaded: LoadedVersion, request: InferRequest, outputs: dict[str, Rows]) -> tuple[bytes, int | None]:
+def write_answer(content: dict[str, Any], binary_tensors: list[bytes]) -> tuple[bytes, int | None]:
     """Return the body of the HTTP response to an inference.
 
     Args:
-        loaded: Version of the model that was run.
-        request: The request, which states which outputs are sent as binary tensors.
-        outputs: Values of the requested outputs by their names, each of shape (n, width).
+        content: Content of the JSON text.
+        binary_tensors: Outputs that are sent as binary tensors.
 
     Returns:
         Two values. The first value is the body, which is a JSON text that may be followed by binary tensors. The second
         value is the length of the JSON text, bytes, or None if no binary tensors follow.
     """
-    tensors: list[dict[str, Any]] = []
-    binary_tensors: list[bytes] = []
-    for name, rows in outputs.items():
-        is_text = name == FLAGS
-        tensor: dict[str, Any] = {"name": name, "datatype": "BYTES" if is_text else "FP32", "shape": rows.shape}
-        if request.outputs[name]:
-            binary_tensors.append(binary_tensor(rows))
-            tensor["parameters"] = {"binary_data_size": len(binary_tensors[-1])}
-        else:
-            values = rows.ravel()
-            tensor["data"] = values.tolist() if is_text else values  # orjson writes arrays of numbers only
-        tensors.append(tensor)
-    content: dict[str, Any] = {"model_name": loaded.metadata.name, "model_version": loaded.version, "outputs": tensors}
-    if request.id:
-        content["id"] = request.id
     json_text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
     if not binary_tensors:
         return json_text, None
     return b"".join([json_text, *binary_tensors]), len(json_text)
 
 
-def binary_tensor(rows: Rows) -> bytes:
+def _output_tensor(name: str, rows: Rows, binary_tensors: list[bytes] | None) -> dict[str, Any]:
+    """Return the JSON object that describes an output in the response.
+
+    Args:
+        name: Name of the output.
+        rows: Values of the output.
+        binary_tensors: List to which the values are appended as a binary tensor. None if the object itself contains the
+            values.
+    """
+    is_text = name == FLAGS
+    tensor: dict[str, Any] = {"name": name, "datatype": "BYTES" if is_text else "FP32", "shape": rows.shape}
+    if binary_tensors is None:
+        values = rows.ravel()
+        tensor["data"] = values.tolist() if is_text else values  # orjson writes arrays of numbers only
+    else:
+        binary_tensors.append(_binary_tensor(rows))
+        tensor["parameters"] = {"binary_data_size": len(binary_tensors[-1])}
+    return tensor
+
+
+def _binary_tensor(rows: Rows) -> bytes:
     """Convert the values of an output to a little-endian binary tensor.
 
     Numbers are written as float32. Each text is preceded by its length in bytes, which is written as a 32-bit unsigned
