@@ -178,9 +178,9 @@ def test_metadata_of_models(attack):
 
 def test_headers_of_csv_files(attack):
     def read(names):
-        with checked_terminal():
+        with checked_terminal(), warnings_to_stderr():
             header = ",".join(["A", "B", "C", *names])
-            read_charges([header, "1,2,3,4,5,6"], ("A", "B", "C"), names[0], say)
+            read_charges([header, "1,2,3,4,5,6"], ("A", "B", "C"), names[0])
 
     attack("foreign csv", read, foreign_names, 2_000)
 

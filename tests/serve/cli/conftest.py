@@ -12,6 +12,7 @@ import pytest
 
 from boards import TcpBoard, interrupt, taps
 from isocharge.cli.main import app
+from isocharge.cli.shared.terminal import warnings_to_stderr
 from isocharge.serve import Frame, encode_frame
 
 
@@ -45,7 +46,7 @@ def run(capfd):
             file.seek(0)
             os.dup2(file.fileno(), 0)
         capfd.readouterr()
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as ended, warnings_to_stderr():
             app(["serve", *map(str, arguments)])
         printed = capfd.readouterr()
         return SimpleNamespace(exit_code=int(ended.value.code or 0), stdout=printed.out, stderr=printed.err)

@@ -7,10 +7,11 @@ import numpy as np
 import typer
 
 from isocharge.cli.shared.options import JsonOption, ModelArgument, ModelsOption
-from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
+from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.terminal import say, show_result
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses
+from isocharge.serve.presses.measured_presses import read_presses
 
 MAX_ROWS = 40
 """Largest number of presses in the table. If there are more, the presses with the largest errors are listed."""
@@ -42,16 +43,17 @@ def check_command(
     Example: isocharge serve check three-25um-biaxial presses.csv --position-std 0.05
     """
     predictor = Predictor(model, models=models)
-    check = check_presses(predictor, read_press_file(file, predictor.metadata.electrodes, position_std_mm, force_std))
+    presses = read_presses(file, predictor.metadata.electrodes, position_std_mm=position_std_mm, force_std=force_std)
+    check = check_presses(predictor, presses)
     result = check.to_dict()
     if not json:
         del result["each"]
         summaries = {name: result.pop(name) for name in ("position_mm", "force_percent")}
         errors = {name: summary for name, summary in summaries.items() if summary is not None}
-        presses = [
+        worst_presses = [
             {check.errors.row_noun: row["line"]} | {name: row[name] for name in SHOWN} for row in _worst_presses(check)
         ]
-        result = {"each": presses, "errors": errors} | result
+        result = {"each": worst_presses, "errors": errors} | result
         if check.std_factor is not None:
             result["std_factor"] = f"{check.std_factor.statement}, if they were not used for the model"
     show_result(result, json=json)

@@ -9,6 +9,7 @@ import numpy as np
 import typer
 from matplotlib.figure import Figure
 
+from isocharge.cli.shared.options import RecordingArgument
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.errors import RecordingError
 from isocharge.serve import PredictionRecord, Recording
@@ -17,7 +18,7 @@ from isocharge.simulate.plots.figure import INK, check_picture, new_figure, save
 
 
 def plot_command(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Recording of `isocharge serve stream --record`.")],
+    file: RecordingArgument,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="PICTURE", help="New picture to draw: .png, .svg or .pdf.")
     ],

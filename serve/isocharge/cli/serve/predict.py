@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption
-from isocharge.cli.shared.terminal import say, until_stopped
+from isocharge.cli.shared.terminal import until_stopped
 from isocharge.serve import Predictor, table_records, write_contacts
 from isocharge.serve.prediction.table import read_charge_file
 
@@ -41,7 +41,7 @@ def predict_command(
         from isocharge.serve.live.device import load_device, predictor_for  # imports all stages of a stream
 
         predictor = predictor_for(load_device(device), predictor)
-    charge_pC = read_charge_file(file, predictor.metadata.electrodes, say)
+    charge_pC = read_charge_file(file, predictor.metadata.electrodes)
     with until_stopped():
         if json:
             for record in table_records(charge_pC, predictor):

@@ -21,7 +21,14 @@ from isocharge.cli.shared.live_page import (
     TokenOption,
     live_page,
 )
-from isocharge.cli.shared.options import BaudOption, DeviceOption, ModelArgument, ModelsOption, WaitOption
+from isocharge.cli.shared.options import (
+    BaudOption,
+    DeviceOption,
+    ModelArgument,
+    ModelsOption,
+    RecordingArgument,
+    WaitOption,
+)
 from isocharge.cli.shared.port_hints import no_frames_advice_added, no_frames_hint
 from isocharge.cli.shared.terminal import (
     on_signal,
@@ -277,7 +284,7 @@ def stream_command(
 
 
 def replay_command(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Recording of `isocharge serve stream --record`.")],
+    file: RecordingArgument,
     model: Annotated[
         str | None,
         typer.Option("--model", metavar="MODEL", help="Model to use, name or path. (default: that of the recording)"),

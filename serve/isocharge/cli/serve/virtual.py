@@ -11,6 +11,7 @@ import typer
 
 from isocharge.cli.shared.forward_maps import ROUNDING_MARGIN, ProbeOption
 from isocharge.cli.shared.options import SensorArgument
+from isocharge.cli.shared.press_options import RadiusOption
 from isocharge.cli.shared.terminal import announce, say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import film_charges, measure_function, random_script
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
@@ -43,10 +44,7 @@ def virtual_command(
     force_max: Annotated[
         float, typer.Option("--force-max", min=0.05, help="Largest force of a random press, N; the smallest is 0.05 N.")
     ] = DEFAULT_PLAYED_FORCE_RANGE[1],
-    radius: Annotated[
-        float,
-        typer.Option("--radius", metavar="MM", help="Largest distance of a random press from the centre, mm."),
-    ] = DEFAULT_RADIUS,
+    radius: RadiusOption = DEFAULT_RADIUS,
     rest: Annotated[
         float,
         typer.Option(

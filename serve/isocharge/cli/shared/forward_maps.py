@@ -19,6 +19,14 @@ from isocharge.simulate.sensor.probe import PROBE_HELP
 
 ProbeOption = Annotated[str, typer.Option("--probe", metavar="SHAPE", help=PROBE_HELP)]
 
+DEFAULT_PROBE = "circle:1.0"
+"""Notation of the probe if `--probe` is not given."""
+
+ProbesOption = Annotated[
+    list[str] | None,
+    typer.Option("--probe", metavar="SHAPE", help=f"{PROBE_HELP} May be repeated. (default: {DEFAULT_PROBE})"),
+]
+
 ROUNDING_MARGIN = 1.0 + 1e-6
 """Factor by which the radius and the largest force of a forward map are increased, because rounding may move the
 outermost presses beyond them."""

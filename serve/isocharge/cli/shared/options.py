@@ -13,6 +13,10 @@ SensorArgument = Annotated[
 
 ModelArgument = Annotated[str, typer.Argument(metavar="MODEL", help="Name of a model, or path of a model folder.")]
 
+RecordingArgument = Annotated[
+    Path, typer.Argument(metavar="FILE", help="Recording of `isocharge serve stream --record`.")
+]
+
 ForceOption = Annotated[float, typer.Option("--force", metavar="N", help="Force of the press, N; positive pushes.")]
 
 ForceRangeOption = Annotated[

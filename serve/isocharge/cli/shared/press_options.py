@@ -1,13 +1,9 @@
-"""Options of commands for files of measured presses, and the function that reads such a file."""
+"""Options of commands for files of measured presses."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
-
-from isocharge.cli.shared.terminal import say
-from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses
-from isocharge.serve.presses.number_table import ignored_columns_message
 
 SensorOption = Annotated[
     str,
@@ -35,19 +31,12 @@ ForceStdOption = Annotated[
     ),
 ]
 
-
-def read_press_file(
-    file: Path, electrodes: tuple[str, ...] | None, position_std_mm: float = 0.1, force_std: float = 0.01
-) -> MeasuredPresses:
-    """Read a file of measured presses, and print which of its columns are ignored.
-
-    Args:
-        file: CSV or Parquet file.
-        electrodes: Names of the electrodes; None if all columns without another meaning are electrodes.
-        position_std_mm: Standard deviation of x and y for presses without one in the file, mm.
-        force_std: Standard deviation of the force for presses without one in the file, relative to the force.
-    """
-    presses = read_presses(file, electrodes, position_std_mm=position_std_mm, force_std=force_std)
-    if presses.ignored:
-        say(ignored_columns_message(str(file), presses.ignored))
-    return presses
+EarlierOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--from",
+        metavar="FOLDER",
+        help="Start from the film of the calibration in this folder, which may have drifted since. (default: the film "
+        "of the sensor file)",
+    ),
+]

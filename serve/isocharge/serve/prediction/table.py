@@ -6,7 +6,7 @@ no contact is reported for the row.
 """
 
 import csv
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TextIO
@@ -20,7 +20,7 @@ from isocharge.serve.model.contact import Contact
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.serve.presses.csv_table import CsvTable
-from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, TableSource, ignored_columns_message
+from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, TableSource
 from isocharge.serve.presses.table_file import open_table
 from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
 
@@ -28,19 +28,13 @@ MAX_CHARGE_ROWS = 10_000_000
 """Largest number of rows of a file of charges."""
 
 
-def read_charges(
-    lines: Iterable[str],
-    electrodes: tuple[str, ...],
-    where: str,
-    warn: Callable[[str], None] = lambda _: None,
-) -> Array:
+def read_charges(lines: Iterable[str], electrodes: tuple[str, ...], where: str) -> Array:
     """Read the charges from the lines of a CSV text.
 
     Args:
         lines: Lines of the text. Lines may end in CRLF. Blank lines and lines that begin with # are ignored.
         electrodes: Names of the columns that are read. The text may contain other columns.
         where: Name of the file, for error messages.
-        warn: Function that is called with a warning in words if the text contains other columns.
 
     Returns:
         Charges in the order of `electrodes`, shape (n, electrodes), pC.
@@ -50,17 +44,16 @@ def read_charges(
             `MAX_CHARGE_ROWS`.
     """
     table = CsvTable(lines, TableSource(electrodes, where, ChargeError, _expected_header(electrodes)))
-    return _read_electrode_charges(table, electrodes, warn)
+    return _read_electrode_charges(table, electrodes)
 
 
-def read_charge_file(path: Path, electrodes: tuple[str, ...], warn: Callable[[str], None] = lambda _: None) -> Array:
+def read_charge_file(path: Path, electrodes: tuple[str, ...]) -> Array:
     """Read the charges from a CSV or Parquet file.
 
     Args:
         path: The file. It is read as Parquet if its name ends in `.parquet`, and as CSV otherwise. The path `-` is
             standard input.
         electrodes: Names of the columns that are read. The file may contain other columns.
-        warn: Function that is called with a warning in words if the file contains other columns.
 
     Returns:
         Charges in the order of `electrodes`, shape (n, electrodes), pC.
@@ -71,7 +64,7 @@ def read_charge_file(path: Path, electrodes: tuple[str, ...], warn: Callable[[st
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     with open_table(path, electrodes, ChargeError, _expected_header(electrodes)) as table:
-        return _read_electrode_charges(table, electrodes, warn)
+        return _read_electrode_charges(table, electrodes)
 
 
 def _expected_header(electrodes: tuple[str, ...]) -> str:
@@ -79,13 +72,12 @@ def _expected_header(electrodes: tuple[str, ...]) -> str:
     return f"a header with one column for each of the electrodes {electrodes} and charges in pC"
 
 
-def _read_electrode_charges(table: NumberTable, electrodes: tuple[str, ...], warn: Callable[[str], None]) -> Array:
+def _read_electrode_charges(table: NumberTable, electrodes: tuple[str, ...]) -> Array:
     """Read the charges of the given electrodes from an open table.
 
     Args:
         table: The table. Its header must contain the names of the electrodes.
         electrodes: Names of the electrodes.
-        warn: Function that is called with a warning in words if the table contains other columns.
 
     Returns:
         Charges in the order of `electrodes`, shape (n, electrodes), pC.
@@ -95,11 +87,7 @@ def _read_electrode_charges(table: NumberTable, electrodes: tuple[str, ...], war
             `MAX_CHARGE_ROWS`.
     """
     charge_rule = replace(CHARGE_RULE, may_be_empty=False)  # a model needs the charges of all electrodes
-    rule_of_each_electrode = dict.fromkeys(electrodes, charge_rule)
-    column_rules = table.choose_columns(rule_of_each_electrode)
-    ignored_names = [name for name in table.header if name not in electrodes]
-    if ignored_names:
-        warn(ignored_columns_message(table.source.where, ignored_names))
+    column_rules = table.choose_columns(dict.fromkeys(electrodes, charge_rule))
     columns = table.read(column_rules, MAX_CHARGE_ROWS)
     return np.column_stack([columns.values[name] for name in electrodes])
 

@@ -5,6 +5,7 @@ float64 arrays in which NaN stands for an empty cell. All other checks are in th
 therefore leads to the same message in every format.
 """
 
+import logging
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -15,6 +16,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import InputError, shown
+
+log = logging.getLogger(__name__)
 
 MAX_COLUMNS = 1_000
 """Largest number of columns of a file."""
@@ -159,6 +162,8 @@ class NumberTable(ABC):
     ) -> dict[str, ColumnRule]:
         """Choose the columns to read: all required columns, and the optional columns that the file contains.
 
+        A warning lists all other columns of the file, which are ignored.
+
         Args:
             required: Rules of the required columns, by the names of the columns.
             optional: Rules of the optional columns, by the names of the columns.
@@ -179,6 +184,9 @@ class NumberTable(ABC):
         repeated_names = [name for name in chosen_rules if self.header.count(name) > 1]
         if repeated_names:
             self._refuse_header("repeated", repeated_names)
+        ignored_names = [name for name in self.header if name not in chosen_rules]
+        if ignored_names:
+            log.warning("%s: ignored columns: %s", self.source.where, shown(ignored_names))
         return chosen_rules
 
     def refuse_similar_names(self, columns: Iterable[str], names: Iterable[str]) -> None:
@@ -245,13 +253,3 @@ class NumberTable(ABC):
 def _letters_of(name: str) -> str:
     """Return the letters and digits of a name in lower case."""
     return re.sub(r"[\W_]+", "", name.casefold())
-
-
-def ignored_columns_message(where: str, names: Sequence[str]) -> str:
-    """Return a message that lists the ignored columns of a file.
-
-    Args:
-        where: Name of the file.
-        names: Names of the ignored columns.
-    """
-    return f"{where}: ignored columns: {shown(list(names))}"

@@ -13,6 +13,7 @@ from isocharge.cli.shared.options import (
     StressLimitOption,
     WorkersOption,
 )
+from isocharge.cli.shared.press_options import RadiusOption
 from isocharge.cli.shared.terminal import say, show_result, shown_progress
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
@@ -26,9 +27,7 @@ from isocharge.simulate.layout.design import design
 def design_command(
     sensor: SensorArgument,
     output: NewFolderOption,
-    radius: Annotated[
-        float, typer.Option("--radius", metavar="MM", help="Largest distance of a press from the film's centre, mm.")
-    ],
+    radius: RadiusOption,
     electrodes: Annotated[
         int, typer.Option("--electrodes", metavar="N", help="Number of electrodes, 3 to 8, including kept ones.")
     ],

@@ -1,14 +1,14 @@
 """Command `isocharge simulate sweep`, which writes a dataset of many simulated presses."""
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from isocharge.cli.shared.forward_maps import executor_for, sweep_radius, warn_of_stress
+from isocharge.cli.shared.forward_maps import DEFAULT_PROBE, ProbesOption, executor_for, sweep_radius, warn_of_stress
 from isocharge.cli.shared.options import (
     ClusterOption,
     ForceRangeOption,
+    NewFolderOption,
     RadiusOption,
     SensorArgument,
     StressLimitOption,
@@ -18,24 +18,12 @@ from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.files import refuse_existing
 from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
-from isocharge.simulate.sensor.probe import PROBE_HELP
 
 
 def sweep_command(
     sensor: SensorArgument,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="DIR",
-            help="New folder for the dataset, which must not exist yet.",
-        ),
-    ],
-    probe: Annotated[
-        list[str] | None,
-        typer.Option("--probe", metavar="SHAPE", help=f"{PROBE_HELP} May be repeated. (default: circle:1.0)"),
-    ] = None,
+    output: NewFolderOption,
+    probe: ProbesOption = None,
     radius: RadiusOption = f"{DEFAULT_RADIUS}",
     force: ForceRangeOption = DEFAULT_FORCE_RANGE,
     samples: Annotated[int, typer.Option("--samples", help="Number of presses of all probes together.")] = 20_000,
@@ -53,7 +41,7 @@ def sweep_command(
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
     film_sensor = load_sensor(sensor)
-    probes = [parse_probe(text) for text in probe or ["circle:1.0"]]
+    probes = [parse_probe(text) for text in probe or [DEFAULT_PROBE]]
 
     refuse_existing(output)
     _, max_force = force

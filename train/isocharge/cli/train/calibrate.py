@@ -11,17 +11,17 @@ import typer
 from isocharge.cli.shared.forward_maps import ProbeOption
 from isocharge.cli.shared.options import JsonOption, StressLimitOption, worker_count
 from isocharge.cli.shared.press_options import (
+    EarlierOption,
     ForceStdOption,
     PositionStdOption,
     RadiusOption,
     SensorOption,
-    read_press_file,
 )
 from isocharge.cli.shared.terminal import say, show, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
 from isocharge.serve.model.model_folder import load_model
-from isocharge.serve.presses.measured_presses import MeasuredPresses
+from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses
 from isocharge.serve.presses.std_factor import StdFactor
 from isocharge.simulate import load_sensor, local_workers, parse_probe
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
@@ -65,14 +65,7 @@ def calibrate_command(
         ),
     ] = 0,
     stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
-    earlier: Annotated[
-        Path | None,
-        typer.Option(
-            "--from",
-            metavar="FOLDER",
-            help="Start from the calibration in this folder, allowing for drift since then. (default: the sensor file)",
-        ),
-    ] = None,
+    earlier: EarlierOption = None,
     held_out: Annotated[
         Path | None,
         typer.Option(
@@ -106,7 +99,9 @@ def calibrate_command(
         local_workers(worker_count(None)) as executor,
     ):
         presses, held_out_presses = (
-            None if path is None else read_press_file(path, problem.electrodes, position_std_mm, force_std)
+            None
+            if path is None
+            else read_presses(path, problem.electrodes, position_std_mm=position_std_mm, force_std=force_std)
             for path in (file, held_out)
         )
         if earlier is not None:

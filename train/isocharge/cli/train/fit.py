@@ -9,13 +9,19 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import simulated_presses, sweep_radius, warn_of_stress
-from isocharge.cli.shared.options import ConfigOption, JsonOption
-from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, read_press_file
+from isocharge.cli.shared.forward_maps import (
+    DEFAULT_PROBE,
+    ProbesOption,
+    simulated_presses,
+    sweep_radius,
+    warn_of_stress,
+)
+from isocharge.cli.shared.options import ConfigOption, JsonOption, RadiusOption
+from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, ModelError, OutputError, OutputExists
-from isocharge.serve import ModelMetadata
+from isocharge.serve import ModelMetadata, read_presses
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import (
     Dataset,
@@ -24,7 +30,6 @@ from isocharge.simulate import (
     parse_probe,
     read_dataset,
 )
-from isocharge.simulate.sensor.probe import PROBE_HELP
 from isocharge.train import FitConfig, Fitted, TrainingData, fit, fit_presses, load_config, release
 from isocharge.train.data.presses import is_measured, measured_presses_of
 from isocharge.train.model_release.release import Release
@@ -43,9 +48,6 @@ VersionOption = Annotated[
     int,
     typer.Option("--version", min=1, help="Version of the model, which is the name of the folder in models/NAME."),
 ]
-
-DEFAULT_PROBE = "circle:1.0"
-"""Notation of the probe if `--probe` is not given."""
 
 
 def fit_command(
@@ -69,21 +71,8 @@ def fit_command(
             "sensor, and 96,000 if it has more than four electrodes. (default: the sensor of DATASET)",
         ),
     ] = None,
-    probe: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--probe", metavar="SHAPE", help=f"With --sensor: {PROBE_HELP} May be repeated. (default: {DEFAULT_PROBE})"
-        ),
-    ] = None,
-    radius: Annotated[
-        str,
-        typer.Option(
-            "--radius",
-            metavar="MM|auto",
-            help="With --sensor: largest distance of a press from the film's centre, mm; or auto: the working area, "
-            "where the charges determine the position to 1 mm.",
-        ),
-    ] = f"{DEFAULT_RADIUS}",
+    probe: ProbesOption = None,
+    radius: RadiusOption = f"{DEFAULT_RADIUS}",
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
     config: ConfigOption = None,
@@ -137,7 +126,7 @@ def fit_command(
         electrodes = loaded_dataset.sensor.electrode_names
         train = partial(_fit_dataset, loaded_dataset)
     else:  # a file or a pipe
-        presses = read_press_file(dataset, None, position_std_mm, force_std)
+        presses = read_presses(dataset, position_std_mm=position_std_mm, force_std=force_std)
         electrodes = presses.electrodes
         say(f"{dataset}: {len(presses)} presses of the channels {', '.join(electrodes)}")
         sensor_name = output.resolve().name  # this sensor has no other name than that of the model

@@ -12,7 +12,13 @@ import typer
 from isocharge.cli.shared.forward_maps import ProbeOption
 from isocharge.cli.shared.options import BaudOption, DeviceOption, StressLimitOption, worker_count
 from isocharge.cli.shared.port_hints import no_frames_advice_added
-from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption, RadiusOption, SensorOption
+from isocharge.cli.shared.press_options import (
+    EarlierOption,
+    ForceStdOption,
+    PositionStdOption,
+    RadiusOption,
+    SensorOption,
+)
 from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
@@ -71,15 +77,7 @@ def press_command(
         ),
     ] = 0.5,
     stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
-    earlier: Annotated[
-        Path | None,
-        typer.Option(
-            "--from",
-            metavar="FOLDER",
-            help="Propose presses for the film of this earlier calibration, which may have drifted since. "
-            "(default: the film of the sensor file)",
-        ),
-    ] = None,
+    earlier: EarlierOption = None,
 ) -> None:
     """Record presses on a film at a port, and write them to a file of measured presses.
 

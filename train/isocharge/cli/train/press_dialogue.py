@@ -160,24 +160,23 @@ class Dialogue:
         self._session = session
         self._events = events
         self._electrodes = electrodes
-        self._said_phase = ""  # the instruction that was printed last, unless a sentence followed
+        self._latest_sentence = ""
 
     def _say(self, sentence: str) -> None:
-        """Print a sentence, after which the instruction of the present phase may be repeated."""
-        self._said_phase = ""
+        """Print a sentence."""
+        self._latest_sentence = sentence
         say(sentence)
 
     def _say_phase(self, watched: WatchResult) -> None:
-        """Print the instruction of the present phase and the reason for it, if they are new.
+        """Print the instruction of the present phase and the reason for it, unless they were printed last.
 
         In a phase without an instruction, for example the phase of a steady press, nothing is printed.
         """
         if watched.phase in PHASE_TEXTS:
             reason = f" ({watched.reason})" if watched.reason else ""
             phase_text = f"   {PHASE_TEXTS[watched.phase]}{reason}"
-            if phase_text != self._said_phase:
-                say(phase_text)
-            self._said_phase = phase_text
+            if phase_text != self._latest_sentence:
+                self._say(phase_text)
 
     def _say_steady(self, press: SteadyPress) -> None:
         """Print the charges of a steady press."""

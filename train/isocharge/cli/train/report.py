@@ -7,11 +7,10 @@ import typer
 
 from isocharge.cli.shared.forward_maps import ProbeOption
 from isocharge.cli.shared.options import JsonOption, ModelsOption, NewFolderOption
-from isocharge.cli.shared.press_options import read_press_file
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
-from isocharge.serve import find_model
+from isocharge.serve import find_model, read_presses
 from isocharge.simulate import Dataset, load_sensor, parse_probe, read_dataset
 from isocharge.train.data.presses import dataset_of
 from isocharge.train.report import QUICK, Settings, write_report
@@ -104,5 +103,5 @@ def _read_dataset(path: Path, sensor: str | None, probe: str) -> Dataset:
     if sensor is None:
         raise InputError(f"{path}: expected --sensor SENSOR with a file of measured presses, got no sensor; add it")
     described_sensor = load_sensor(sensor)
-    presses = read_press_file(path, described_sensor.electrode_names)
+    presses = read_presses(path, described_sensor.electrode_names)
     return dataset_of(presses, described_sensor, parse_probe(probe))
