@@ -257,12 +257,11 @@ def _temporary_path(path: Path) -> Path:
 
 
 @contextmanager
-def as_output_errors(path: Path, advice: str = "choose another output") -> Iterator[None]:
+def as_output_errors(path: Path) -> Iterator[None]:
     """If the `with` block raises an OSError, raise an OutputError instead.
 
     Args:
         path: Path of the output, for the error message.
-        advice: Text for the error message that states what the user can do.
 
     Raises:
         OutputError: If the block raises an OSError that is neither an error of isocharge nor a broken pipe.
@@ -273,7 +272,7 @@ def as_output_errors(path: Path, advice: str = "choose another output") -> Itera
         # An error of isocharge already has a message for the user. A broken pipe is not an error of this output.
         if isinstance(error, IsochargeError | BrokenPipeError):
             raise
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}; {advice}") from error
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another output") from error
 
 
 def remove_empty(folders: Iterable[Path]) -> None:

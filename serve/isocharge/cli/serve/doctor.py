@@ -12,7 +12,7 @@ from serial.tools import list_ports
 from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption, WaitOption
 from isocharge.cli.shared.terminal import say, show, show_json, show_result
 from isocharge.common.errors import InputError, IsochargeError
-from isocharge.common.files import refuse_existing, write_whole
+from isocharge.common.files import as_output_errors, refuse_existing, write_whole
 from isocharge.common.printable_text import printable
 from isocharge.common.toml_text import to_toml
 from isocharge.serve import Examination, Port, Predictor, device_from_table, examine, load_device
@@ -238,12 +238,10 @@ def _write_device_file(path: Path, examination: Examination, model: str) -> None
         model: Name of the model for the printed command.
 
     Raises:
-        InputError: If the file cannot be written.
+        OutputError: If the file cannot be written.
     """
-    try:
+    with as_output_errors(path):
         write_whole(path, device_text(examination).encode())
-    except OSError as error:
-        raise InputError(f"--write {path}: cannot be written ({error.strerror}); choose another path") from error
     if examination.missing:
         say("put the settings that are missing above into the file")
     if "offset" in examination.device.get("gain", {}):  # the charges of the film at rest

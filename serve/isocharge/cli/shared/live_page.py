@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -203,7 +204,7 @@ class PageFeed:
         self._last_state_s = 0.0
         self._latest_record: PredictionRecord | None = None
         if stream is not None:
-            page.act = self._carry_out
+            page.act = partial(self._carry_out, stream)
 
     def write(self, record: PredictionRecord) -> None:
         """Add a record to the page. From time to time, also update the state of the stream."""
@@ -230,7 +231,7 @@ class PageFeed:
             recording_failed=recorder is not None and recorder.failed,
         )
 
-    def _carry_out(self, action: "Action") -> None:
+    def _carry_out(self, stream: RecordedStream, action: "Action") -> None:
         """Carry out a request of the page to write a marker, to begin or end a recording, or to measure a new tare.
 
         Raises:
@@ -238,9 +239,6 @@ class PageFeed:
         """
         from isocharge.serve.viewer.live_page import Marker, Record
 
-        stream = self._stream
-        if stream is None:
-            return
         if isinstance(action, Marker):
             marker = recording.Marker(time.time(), action.text)
             stream.request_marker(marker)

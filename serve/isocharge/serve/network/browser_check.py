@@ -214,9 +214,7 @@ def host_name(text: str) -> str:
         InputError: If the text is not a host name or an IP address, for example because it also contains a scheme, a
             port or a path.
     """
-    name = text.strip().lower()
-    if name.startswith("[") and name.endswith("]"):
-        name = name[1:-1]
+    name = text.strip().lower().strip("[]")
     if not _HOST_NAME_PATTERN.fullmatch(name) and ip_address(name) is None:
         raise InputError(f"--allow-host: expected a host name without scheme, port and path, got {text!r:.100}")
     return name.removesuffix(".")  # "example.org." is the same host as "example.org"

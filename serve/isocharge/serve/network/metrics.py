@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cache
 from typing import Any
 
 import onnxruntime as ort
@@ -223,13 +222,12 @@ class Traffic:
         """Create the metrics of a server that has not received any request."""
         self.log = log
         self.registry = CollectorRegistry(auto_describe=False)
-        requests = Counter(
+        self._requests = Counter(
             "isocharge_requests",
             "Requests that were answered or refused.",
             ("transport", "route", "status"),
             registry=self.registry,
         )
-        self._requests_of = cache(requests.labels)  # there are few combinations of labels
         self.open = Gauge(
             "isocharge_open",
             "Open connections of HTTP and open calls of gRPC.",
@@ -248,7 +246,7 @@ class Traffic:
             route: Name of the route.
             status: HTTP status, or name of the gRPC status.
         """
-        self._requests_of(transport, route, status).inc()
+        self._requests.labels(transport, route, status).inc()
 
     def count_and_log(self, exchange: Exchange) -> None:
         """Count a request that was answered, and log the request if there is a log."""

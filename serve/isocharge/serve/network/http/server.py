@@ -52,7 +52,6 @@ class Connection(HttpToolsProtocol):
         self._traffic = traffic
         self._is_reading = False  # whether a request has begun and is not complete
         self._pending_bytes = 0  # bytes since the latest complete head, part of a body, or complete request
-        self._max_head_bytes = 0  # upper bound of the size of the head that is being parsed
 
     def connection_made(self, transport: Any) -> None:
         """Begin the connection. If there are too many connections, end one that waits for a request.
@@ -82,7 +81,6 @@ class Connection(HttpToolsProtocol):
     def data_received(self, data: bytes) -> None:
         """Parse data of the client. Refuse a request whose head, trailers or chunk extensions are too long."""
         self._pending_bytes += len(data)
-        self._max_head_bytes = self._pending_bytes
         super().data_received(data)
         if self._pending_bytes > self._limits.header_bytes:
             self.refuse(431, self._too_long_message())
@@ -106,12 +104,10 @@ class Connection(HttpToolsProtocol):
 
     def on_headers_complete(self) -> None:
         """Check the size of the complete head, and set the deadline of the body."""
-        # The exact size takes time. It is only computed if the data of the head and of the body together are long.
-        if self._max_head_bytes > self._limits.header_bytes:
-            separator_bytes = len(b": \r\n")
-            head_bytes = len(self.url) + sum(len(name) + len(value) + separator_bytes for name, value in self.headers)
-            if head_bytes > self._limits.header_bytes:
-                self._refuse_and_stop(431, self._too_long_message())
+        separator_bytes = len(b": \r\n")
+        head_bytes = len(self.url) + sum(len(name) + len(value) + separator_bytes for name, value in self.headers)
+        if head_bytes > self._limits.header_bytes:
+            self._refuse_and_stop(431, self._too_long_message())
         self._pending_bytes = 0
         self.deadline = self.loop.time() + self._limits.body_seconds
         super().on_headers_complete()

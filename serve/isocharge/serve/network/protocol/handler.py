@@ -195,22 +195,18 @@ class Handler(Application):
         start_ns = time.perf_counter_ns()
         response = super().answer(method, path, headers, body)
         route, model, version = match_path(path)
-        label = "unknown" if route is None else route.paths[0]  # all paths of a route are counted under the first path
-        self.traffic.count("http", label, response.status)
-        log = self.traffic.log
-        if log is not None:  # the properties of the exchange are only determined for the log
-            exchange = Exchange(
-                transport="http",
-                route=label,
-                status=response.status,
-                model=self.store.label(model, version),
-                error=response.error,
-                duration_us=(time.perf_counter_ns() - start_ns) / 1000,
-                bytes_in=len(body),
-                bytes_out=len(response.body),
-                client=client,
-            )
-            log.write_exchange(exchange)
+        exchange = Exchange(
+            transport="http",
+            route="unknown" if route is None else route.paths[0],  # all paths are counted under the first path
+            status=response.status,
+            model=self.store.label(model, version),
+            error=response.error,
+            duration_us=(time.perf_counter_ns() - start_ns) / 1000,
+            bytes_in=len(body),
+            bytes_out=len(response.body),
+            client=client,
+        )
+        self.traffic.count_and_log(exchange)
         return response
 
     def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:

@@ -7,7 +7,7 @@ messages of the gRPC service have the same fields as the JSON objects that the f
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.resources import files
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import orjson
 from prometheus_client import generate_latest
@@ -31,6 +31,8 @@ EXTENSIONS = (
     "statistics",
 )
 """Extensions of the protocol that the servers support."""
+
+T = TypeVar("T")
 
 PLATFORM = "onnxruntime_onnx"
 """Triton's name for ONNX models."""
@@ -62,9 +64,9 @@ class Request(NamedTuple):
         """Loaded version of the model in the path. ModelNotFound is raised if the version is not loaded."""
         return self.store.get(self.model, self.version)
 
-    def object(self) -> dict[str, Any]:
-        """Return the JSON object in the body, which is empty if there is no body."""
-        return parse_json(self.body or b"{}", "", RequestError, dict[str, Any])
+    def content(self, target_type: type[T]) -> T:
+        """Convert the JSON object in the body to a type. Without a body, the object is empty."""
+        return parse_json(self.body or b"{}", "", RequestError, target_type)
 
 
 class Route(NamedTuple):
@@ -117,13 +119,13 @@ def _show_index(request: Request) -> list[dict[str, str]]:
 
     If the body contains `ready: true`, the index contains only the loaded versions.
     """
-    body = parse_json(request.body or b"{}", "", RequestError, IndexBody)
-    return [row for row in request.store.index() if row["state"] == "READY" or not body.ready]
+    only_ready = request.content(IndexBody).ready
+    return [row for row in request.store.index() if row["state"] == "READY" or not only_ready]
 
 
 def _load(request: Request) -> dict[str, Any]:
     """Read the files of a model again, and return an empty object."""
-    if request.object().get("parameters") not in (None, {}):
+    if request.content(dict[str, Any]).get("parameters") not in (None, {}):
         raise RequestError(
             "load: parameters are not supported; put the files into the model's folder and load it again"
         )
@@ -132,7 +134,7 @@ def _load(request: Request) -> dict[str, Any]:
 
 
 def _unload(request: Request) -> dict[str, Any]:
-    request.object()  # refuses a body that is not an object
+    request.content(dict)  # refuses a body that is not an object
     request.store.unload(request.model)
     return {}
 
