@@ -32,9 +32,8 @@ def test_a_misspelt_name_is_an_attribute_error(package):
         module.calibrat  # noqa: B018
 
 
-def test_a_sweep_imports_no_part_of_a_stream():
-    """The command needs only the table of presses."""
+def test_a_sweep_imports_no_part_of_serve():
     code = """import sys, isocharge.cli.simulate.sweep
 print(sorted({".".join(name.split(".")[:3]) for name in sys.modules if name.startswith("isocharge.serve.")}))"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "['isocharge.serve.presses']\n"
+    assert done.stdout == "[]\n"

@@ -26,7 +26,6 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import count, repeat
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -214,67 +213,77 @@ def _first_mistake(value: object, target_type: Any, cause: Exception) -> str:
         cause: Exception of msgspec. Its message is returned if `msgspec.convert` accepts the value, as 1e999 in JSON.
     """
     try:
-        return cut(str(cause)) if _has_type(value, target_type) else _describe_mistake(value, target_type, "")
+        msgspec.convert(value, target_type)
+    except msgspec.ValidationError as error:
+        try:
+            return _describe_mistake(value, target_type, error)
+        except (
+            LookupError,
+            ValueError,
+            StopIteration,
+        ):  # a key of the file imitates the keys in the message of msgspec
+            return cut(str(error))
     except RecursionError:
         return "nested too deeply"
+    return cut(str(cause))
 
+
+_MESSAGE = re.compile(r"^(.*?)(?: - at `\$([^`]*)`)?$", re.DOTALL)
+"""Message of msgspec, and the keys with which it ends."""
+
+_STEP = re.compile(r"\.([^.\[`]+)|\[(\d+|\.\.\.)\]")
+"""One of the keys at the end of a message of msgspec, or an index of a list."""
 
 _WRONG_KEY = re.compile(r"Object (missing required|contains unknown) field `(.*)`$", re.DOTALL)
 """Message of msgspec about a key that is missing or unknown."""
 
 
-def _describe_mistake(value: Any, expected_type: Any, path: str) -> str:
-    """Return a description of the first mistake in a value, with the names of the keys that lead to the mistake.
+def _describe_mistake(content: object, target_type: Any, error: msgspec.ValidationError) -> str:
+    """Return a description of a mistake, with the names of the keys that lead to the wrong value.
+
+    The message of msgspec ends with these keys, as in "Expected `float`, got `str` - at `$.parts[1].gain[...]`". A
+    number is an index of a list, and three points are any key of a dictionary.
 
     Args:
-        value: Value from TOML or JSON, which msgspec cannot convert to the expected type.
-        expected_type: The expected type.
-        path: Names of the keys that lead to the value; empty for the whole file.
+        content: Value from TOML or JSON.
+        target_type: Type to which the value could not be converted.
+        error: Exception of msgspec. If `__post_init__` of a struct has raised an exception, it is the cause of `error`.
     """
-    for key, item, item_type in _items(value, expected_type):
-        if not _has_type(item, item_type):
-            item_path = f"{path}[{key}]" if isinstance(key, int) else _join(path, key)
-            return _describe_mistake(item, item_type, item_path)
+    message, steps = _MESSAGE.findall(str(error))[0]  # without keys if the content itself is wrong
+    value: Any = content
+    expected_type = target_type
+    path = ""
+    for name, index in _STEP.findall(steps):
+        members = list(_union_members(expected_type))
+        key: str | int = name
+        if name:
+            expected_type = _key_types(value, members)[name]
+        elif index.isdigit():
+            (item_types,) = (get_args(member) for member in members if get_origin(member) in (list, tuple))
+            is_uniform = len(item_types) == 1 or Ellipsis in item_types
+            key = int(index)
+            expected_type = item_types[0 if is_uniform else key]
+        else:
+            (expected_type,) = (get_args(member)[1] for member in members if get_origin(member) is dict)
+            key = next(key for key, item in value.items() if not _has_type(item, expected_type))
+        value = value[key]
+        path = f"{path}[{key}]" if isinstance(key, int) else _join(path, key)
 
-    # All items have the expected types, so the value itself is wrong.
-    try:
-        msgspec.convert(value, expected_type)
-    except msgspec.ValidationError as error:
-        message = str(error)
-        cause = error.__cause__  # an exception of `__post_init__` of a struct
+    members = list(_union_members(expected_type))
+    wrong_key = _WRONG_KEY.match(message)
+    cause = error.__cause__
     if isinstance(cause, WrongKey):
         key_path = _join(path, cause.key)
         return f"{key_path}: {cause}" if str(cause) else f"key {key_path!r} is missing"
     if cause is not None:
         return f"{_prefix(path)}{cause}"
-    wrong_key = _WRONG_KEY.match(message)
     if wrong_key is None:
         expected = _describe_schema(msgspec.json.schema(expected_type))
         return f"{_prefix(path)}expected {expected}, got {shown(value)}"
     kind, name = wrong_key.groups()
     if kind == "contains unknown":
-        return unknown_key(_join(path, name), name, _key_types(value, expected_type))
+        return unknown_key(_join(path, name), name, _key_types(value, members))
     return f"key {_join(path, name)!r} is missing"
-
-
-def _items(value: object, expected_type: Any) -> Iterator[tuple[str | int, Any, Any]]:
-    """Yield the key, the value and the expected type of each item of a table or a list.
-
-    Keys that the type does not declare are left out. A value that is neither a table nor a list has no items.
-
-    Args:
-        value: Value from TOML or JSON.
-        expected_type: Type of the value, which may be a union.
-    """
-    for member in _union_members(expected_type):
-        item_types: Any = get_args(member)
-        if isinstance(value, dict) and get_origin(member) is dict:
-            yield from zip(value, value.values(), repeat(item_types[1]))
-        if isinstance(value, list) and get_origin(member) in (list, tuple):
-            yield from zip(count(), value, repeat(item_types[0]))  # all items have the same type
-    if isinstance(value, dict):
-        key_types = _key_types(value, expected_type)
-        yield from ((key, value[key], key_types[key]) for key in value if key in key_types)
 
 
 def _has_type(value: object, expected_type: Any) -> bool:
@@ -286,7 +295,7 @@ def _has_type(value: object, expected_type: Any) -> bool:
     return True
 
 
-def _key_types(table: Mapping[str, Any], expected_type: Any) -> dict[str, Any]:
+def _key_types(table: Mapping[str, Any], members: Iterable[Any]) -> dict[str, Any]:
     """Return the types of the keys that a table may have.
 
     A struct is a class that declares the keys of a table. If several structs are possible, the table has a key that
@@ -294,12 +303,9 @@ def _key_types(table: Mapping[str, Any], expected_type: Any) -> dict[str, Any]:
 
     Args:
         table: Table from TOML or JSON.
-        expected_type: Type that the table may have. If it is no struct and no union with a struct, there are no keys.
+        members: Types that the table may have. Types that are no structs are ignored.
     """
-    members = _union_members(expected_type)
     structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
-    if not structs:
-        return {}
     tags = [struct.__struct_config__.tag for struct in structs]
     tag_key = structs[0].__struct_config__.tag_field  # all structs of a union have the same tag key
     types = {} if tag_key is None else {tag_key: Literal[tuple(tags)]}
