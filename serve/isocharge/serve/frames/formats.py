@@ -3,16 +3,12 @@
 Each format has a section class, which declares the keys of the format and creates the parser.
 """
 
-import re
 from collections.abc import Mapping
 
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import Frame, Parser
 from isocharge.serve.frames.frame_layout import FrameLayout, FrameSection
 from isocharge.serve.frames.text import TextParser
-
-_PIECE = re.compile(rb"[^\0\n]*[\0\n]|[^\0\n]+")
-"""Bytes up to the next byte that ends a binary frame (zero) or a line of text (line feed), including this byte."""
 
 
 class AutoParser(Parser):
@@ -33,24 +29,23 @@ class AutoParser(Parser):
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
-        Until the format is recognised, the data are split into pieces. A piece ends with a zero byte or a line feed,
-        because every frame ends with one of these two bytes. Each piece is passed to the parsers of all formats. The
-        first parser that finds a frame receives all further data, and the other parsers are dropped.
+        Until the format is recognised, the data are passed to the parsers of all formats. The first parser that finds a
+        frame receives all further data, and the other parsers are dropped. The description of the format and the moduli
+        of the counter and the clock are copied from the parser in each call, because the parser may determine them only
+        after many frames.
         """
-        is_recognised = len(self._candidates) == 1
-        if is_recognised:
-            return self._feed_recognised(self._candidates[0], data)
-        for match in _PIECE.finditer(data):
-            piece = match.group()
-            self.counts.bytes_dropped += len(piece)  # has no effect after recognition, which replaces these counters
-            for candidate in self._candidates:
-                frames = candidate.feed(piece)
-                if frames:  # the format is recognised, and the rest of the data is passed to this parser alone
-                    self._candidates = (candidate,)
-                    self.counts = candidate.counts
-                    rest = data[match.end() :]
-                    return frames + self._feed_recognised(candidate, rest)
-                self.unread_line = candidate.unread_line or self.unread_line
+        for parser in self._candidates:
+            frames = parser.feed(data)
+            if frames:
+                self._candidates = (parser,)
+                self.counts = parser.counts
+                self.format = parser.format
+                self.seq_modulus = parser.seq_modulus
+                self.t_us_modulus = parser.t_us_modulus
+                return frames
+            self.unread_line = parser.unread_line or self.unread_line
+        if len(self._candidates) > 1:  # a recognised parser counts its bytes itself
+            self.counts.bytes_dropped += len(data)
         return []
 
     def reset(self) -> None:
@@ -61,22 +56,6 @@ class AutoParser(Parser):
         super().reset()
         for candidate in self._candidates:
             candidate.reset()
-
-    def _feed_recognised(self, parser: Parser, data: bytes) -> list[Frame]:
-        """Pass data to the parser of the recognised format, and return the frames that the parser finds.
-
-        In each call, the description of the format and the moduli of the counter and the clock are copied from the
-        parser. The values are copied repeatedly, because the parser may determine them only after many frames.
-
-        Args:
-            parser: Parser of the recognised format.
-            data: The next bytes.
-        """
-        frames = parser.feed(data)
-        self.format = parser.format
-        self.seq_modulus = parser.seq_modulus
-        self.t_us_modulus = parser.t_us_modulus
-        return frames
 
 
 class TextFrames(FrameSection, tag="text", frozen=True):
