@@ -80,7 +80,7 @@ def test_close_waits_for_a_slow_consumer():
         time.sleep(0.4)
         written.append(line)
 
-    with WriterQueue(write_slowly) as queue:
+    with closing(WriterQueue(write_slowly)) as queue:
         for line in "abcd":
             queue.put(line)
     assert written == ["a", "b", "c", "d"]

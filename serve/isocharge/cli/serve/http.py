@@ -148,7 +148,7 @@ def _traffic(log_format: str) -> Iterator[Traffic]:
     if log_format == "text":
         yield Traffic()  # counters without a log of requests
         return
-    with WriterQueue(write_stderr) as line_queue:
+    with closing(WriterQueue(write_stderr)) as line_queue:
         request_log = RequestLog(line_queue.put)
         logging.basicConfig(level=logging.WARNING, handlers=[request_log], force=True)
         logging.getLogger("isocharge").handlers.clear()  # its messages also reach `request_log`

@@ -37,16 +37,23 @@ CHANGE_BLOCKS = 5
 """Number of blocks within which a touch changes the values, which is half a second."""
 
 
-def touched_blocks(levels: Array, noise: Array) -> Booleans:
-    """Return in which blocks something touches the film, shape (blocks,).
+def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tuple[Array, Booleans]:
+    """Return the median of each channel in each block, and in which blocks something touches the film.
 
     The stage `Touch` of a stream detects the touches. While nothing touches the film, the charges at rest are the
     levels half a second ago. A slow change is therefore no touch.
 
     Args:
-        levels: Median of each channel in each block, shape (blocks, channels), in any unit.
-        noise: Noise of each channel in one frame, shape (channels,).
+        values: Values of the channels, shape (n, channels), in any unit.
+        times_s: Times since the first frame, shape (n,), s.
+        min_noise: Smallest noise of a channel, in the unit of the values.
+
+    Returns:
+        The medians, shape (blocks, channels), and whether each block is touched, shape (blocks,). The median of a
+        channel without finite values is 0, so that the channel is not touched.
     """
+    levels = np.nan_to_num(block_medians(values, times_s))
+    noise = np.maximum(channel_noise(values), min_noise)
     channels = tuple(map(str, range(len(noise))))
     detector = Touch(Setup(channels, Device(rules={TouchRule: BLOCK_RULE}), has_any_sign=True))
     is_contact = np.zeros(len(levels), dtype=bool)
@@ -58,7 +65,7 @@ def touched_blocks(levels: Array, noise: Array) -> Booleans:
         frame.noise_pC = noise
         detector.step(frame)
         is_contact[number] = frame.is_contact
-    return is_contact
+    return levels, is_contact
 
 
 BLOCK_RULE = TouchRule(sigmas=26.0, floor_pC=0.0)
@@ -99,21 +106,15 @@ def find_touch(
     Returns:
         The channel with the largest total change. None if the film is not touched, or if the time is too short.
     """
-    blocks = block_medians(values, times_s)  # shape (blocks, channels)
-    if len(blocks) <= CHANGE_BLOCKS + 1:
+    levels, is_touched = touched_blocks(values, times_s, min_noise_pC if unit_is_pC else 0.0)
+    if len(levels) == 0:
         return None
-    # Smooth the blocks with the median of three consecutive blocks. A channel without finite values is not touched.
-    smoothed = np.nan_to_num(np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0), posinf=0.0, neginf=0.0)
-    noise = channel_noise(values)
-    if unit_is_pC:
-        noise = np.maximum(noise, min_noise_pC)
-    is_touched = touched_blocks(smoothed, noise)
-    total_changes = np.ptp(smoothed, axis=0)
+    total_changes = np.ptp(levels, axis=0)
     is_slow_touch = unit_is_pC and bool((total_changes > max_slow_change_pC).any())
     if not (is_touched.any() or is_slow_touch):
         return None
     column = int(np.argmax(total_changes))
-    begin_block = int(np.argmax(is_touched)) + 1  # smoothing has removed the first block
+    begin_block = int(np.argmax(is_touched))
     return TouchFound(column, float(total_changes[column]), BLOCK_S * begin_block)
 
 
@@ -212,10 +213,7 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     Returns:
         The press; None if no such press is found.
     """
-    levels = block_medians(values, times_s)  # shape (blocks, channels)
-    if not np.isfinite(levels).all():
-        return None
-    is_touched = touched_blocks(levels, channel_noise(values))
+    levels, is_touched = touched_blocks(values, times_s)
     if not is_touched.any():
         return None
 

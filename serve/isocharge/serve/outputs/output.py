@@ -21,7 +21,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, Queue
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from isocharge.common.errors import IsochargeError, OutputError
 from isocharge.common.files import AtomicWriter, new_file
@@ -111,8 +111,6 @@ class WriterQueue(Generic[T]):
     that more than `MAX_WAITING_ITEMS` items are waiting, the oldest items are dropped and counted. A slow consumer
     therefore receives the newest items.
 
-    The queue is a context manager. At the end of the `with` block, the queue is closed.
-
     Attributes:
         lost: Number of items that were dropped without being written.
     """
@@ -142,14 +140,6 @@ class WriterQueue(Generic[T]):
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)  # a write may hang forever
         self._thread.start()
-
-    def __enter__(self) -> Self:
-        """Return the queue itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the queue."""
-        self.close()
 
     @property
     def is_stuck(self) -> bool:
@@ -231,21 +221,24 @@ class AddedOutput:
 
     def close(self) -> None:
         """Close the output."""
-        self._end(lambda output: output.close())
+        self._end(self._output.close)
 
     def discard(self) -> None:
         """Discard the output, because the records are incomplete."""
-        self._end(discard)
+        self._end(lambda: discard(self._output))
 
-    def _end(self, end: Callable[[Output], None]) -> None:
+    def _end(self, end: Callable[[], None]) -> None:
         """Call a function that ends the output in another thread, because the function may never return.
 
         Raises:
             Exception: The error of the function.
             RuntimeError: If the function does not return in time.
         """
-        with WriterQueue(end, close_timeout_s=END_TIMEOUT_s) as ending:
-            ending.put(self._output)
+        ending: WriterQueue[Callable[[], None]] = WriterQueue(
+            lambda end_output: end_output(), close_timeout_s=END_TIMEOUT_s
+        )
+        ending.put(end)
+        ending.close()
         if ending.is_stuck:
             raise RuntimeError(f"it is still not closed after {2.0 * END_TIMEOUT_s:g} s")
 
