@@ -173,18 +173,6 @@ def test_touches_that_agree_determine_the_pretension_better_than_touches_of_warm
         assert np.mean(np.abs(normalised) < 2.0) > 0.85
 
 
-def test_reset_forgets_the_touches(series, tmp_path):
-    rng = np.random.default_rng(6)
-    model = model_in(tmp_path, series)
-    _, charge = touches(series, np.array([0.3, 0.0, 0.0]), np.ones(4), rng, 20)
-    follower = followed(model, charge, rng)
-    assert follower.film.touches == 20
-    follower.reset()
-    assert follower.film == FilmFollower(model).film
-    raw = model.predict(charge[0])
-    assert follower.follow_contact(raw, charge[0]) == raw
-
-
 def test_stage_counts_a_touch_with_invalid_frames_once_and_flags_the_corrected_contact(series, tmp_path):
     rng = np.random.default_rng(1)
     model = model_in(tmp_path, series)

@@ -30,14 +30,9 @@ HEADER = struct.Struct("<BHIBB")
 CRC = struct.Struct("<H")
 """Format of the checksum CRC-16/CCITT-FALSE, which has the polynomial 0x1021 and the initial value 0xFFFF."""
 
-MAX_CHARGES = 255
-"""Largest number of charges in a frame, because one byte contains the number."""
-
-MAX_FRAME_LENGTH = HEADER.size + MAX_CHARGES * 4 + CRC.size
-"""Length of the longest frame before byte stuffing, bytes."""
-
-MAX_STUFFED_LENGTH = MAX_FRAME_LENGTH + 1 + MAX_FRAME_LENGTH // 254
-"""Length of the longest frame after byte stuffing, without its delimiter, bytes."""
+MAX_STUFFED_LENGTH = cobs.max_encoded_length(HEADER.size + 255 * 4 + CRC.size)
+"""Length of the longest frame after byte stuffing, without its delimiter, bytes. It contains 255 charges, because one
+byte contains their number."""
 
 
 def encode_frame(frame: Frame) -> bytes:

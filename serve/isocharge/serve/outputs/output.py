@@ -83,7 +83,6 @@ class OutputKind:
         form: Form of the targets, for help and messages, such as `FILE.csv`.
         accepts: Function that returns whether the text of a target has this form.
         open: Function that opens the output with the given target. It raises an `IsochargeError` if this is impossible.
-        may_block: Whether `write` may wait. In a live stream, such an output has its own thread and queue.
         is_standard_output: Whether the output writes to standard output. Only one output of a command may write to
             standard output. The stream ends when standard output is closed.
     """
@@ -91,7 +90,6 @@ class OutputKind:
     form: str
     accepts: Callable[[str], bool]
     open: Callable[[str, OutputContext], Output]
-    may_block: bool = True
     is_standard_output: bool = False
 
 

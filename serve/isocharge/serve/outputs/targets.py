@@ -149,7 +149,7 @@ class Outputs:
             queue: WriterQueue[PredictionRecord] | None = None
             # A live stream must not wait for a slow consumer, so its records are written by another thread. Only
             # standard output can report that its reader is slow.
-            if self._context.is_live and kind.may_block:
+            if self._context.is_live:
                 is_ready = self._context.stdout_is_ready if kind.is_standard_output else lambda: True
                 queue = WriterQueue(output.write, is_ready)
             self._writers[target] = output.write if queue is None else queue.put

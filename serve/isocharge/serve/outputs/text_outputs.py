@@ -155,5 +155,4 @@ UDP = OutputKind(
     form=f"{SCHEME}HOST:PORT",
     accepts=lambda target: target.startswith(SCHEME),
     open=lambda target, _: UdpOutput(target),  # the output does not depend on the stream
-    may_block=False,
 )

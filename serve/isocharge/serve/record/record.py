@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, ge
 
 from msgspec import Struct, structs
 
+from isocharge.serve.model.contact import Contact
+
 Kind = Literal["number", "integer", "boolean", "text", "words", "charges", "object"]
 """Kind of a value. `words` is a list of texts, `charges` has a number for each electrode, and `object` has fields."""
 
@@ -265,25 +267,11 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
 RECORD_FIELDS: tuple[Field, ...] = fields_of(PredictionRecord)
 """All fields of a record, in their order."""
 
-CONTACT_FIELDS = (
-    "x_mm",
-    "y_mm",
-    "force_N",
-    "x_std_mm",
-    "y_std_mm",
-    "force_std_N",
-    "misfit",
-    "xy_correlation",
-    "xF_correlation",
-    "yF_correlation",
-)
-"""Names of the fields that a model computes, in the order of its outputs."""
-
-UNKNOWN_CONTACT: dict[str, Any] = dict.fromkeys(CONTACT_FIELDS)
-"""Values of the `CONTACT_FIELDS` if nothing was computed."""
+UNKNOWN_CONTACT: dict[str, Any] = dict.fromkeys(Contact._fields)
+"""Values of the fields of a contact if nothing was computed."""
 
 NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
-"""Values of the `CONTACT_FIELDS` if nothing touches."""
+"""Values of the fields of a contact if nothing touches."""
 
 
 @cache

@@ -213,10 +213,6 @@ class FilmFollower:
             np.array([-radius_mm, -radius_mm, math.log(smallest_N)]),
             np.array([radius_mm, radius_mm, math.log(largest_N)]),
         )
-        self.reset()
-
-    def reset(self) -> None:
-        """Discard all touches, and assume again that the film has not changed since the calibration."""
         self.is_lost = False
         # Mean squared distance of the latest touches from the predicted touches, relative to the unscaled errors
         self._mean_square = 1.0
