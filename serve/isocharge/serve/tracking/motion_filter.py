@@ -44,11 +44,6 @@ _CHANGE_COUNT = np.array([[0, 1, 1, 2], [1, 0, 2, 1], [1, 2, 0, 1], [2, 1, 1, 0]
 _INTEGRATION = np.eye(6, k=3)
 """Matrix that adds the rates to the values."""
 
-_ACCELERATION_PATTERNS = np.stack(
-    [np.diag([1.0] * 3 + [0.0] * 3), np.eye(6, k=3) + np.eye(6, k=-3), np.diag([0.0] * 3 + [1.0] * 3)]
-)
-"""Covariances of the values, of the values with the rates, and of the rates, shape (3, 6, 6)."""
-
 MEAN_MODE_TIME_s = 0.7
 """Mean time after which a position or a force that is held starts to change, or the reverse, s."""
 
@@ -63,6 +58,11 @@ _KEPT = np.eye(6) * np.concatenate([np.ones((4, 3)), 1.0 - IS_HELD], axis=1)[:, 
 
 HELD_DRIFT = 5e-4
 """Increase of the variance of a held value per second, mm^2/s or 1/s. A held finger drifts by 0.02 mm in a second."""
+
+_HELD_DRIFT_DENSITY = np.diag([HELD_DRIFT] * 3 + [0.0] * 3)
+"""Increase of the covariance of a state per second because of this drift, shape (6, 6)."""
+
+_IDENTITY = np.eye(3)
 
 ACCELERATION_DENSITY = 150.0
 """Spectral density of the acceleration of a slow contact, mm^2/s^3."""
@@ -103,12 +103,13 @@ def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float) -
     Returns:
         Covariances of x, y, ln F and their rates, shape (n, 6, 6).
     """
-    density = np.full((len(velocity_mm_per_s), 1, 2, 3), force_density)
+    density = np.full((len(velocity_mm_per_s), 3), force_density)
     squared_speed = (velocity_mm_per_s**2).sum(axis=1)
-    density[..., POSITION] = (ACCELERATION_DENSITY + SPEED_CHANGE_RATE * squared_speed)[:, None, None, None]
-    integrals = np.array([dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s])
-    unit_covariance = (integrals @ _ACCELERATION_PATTERNS.reshape(3, -1)).reshape(6, 6)
-    return np.asarray(unit_covariance * density.reshape(-1, 1, 6))
+    density[:, POSITION] = (ACCELERATION_DENSITY + SPEED_CHANGE_RATE * squared_speed)[:, None]
+    # Covariance of a value and its rate for a unit density
+    unit_covariance = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
+    blocks = unit_covariance[:, None, :, None] * (density[:, :, None] * _IDENTITY)[:, None, :, None]
+    return np.asarray(blocks.reshape(-1, 6, 6))
 
 
 def mixture_moments(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
@@ -211,7 +212,7 @@ class MotionFilter:
 
         # The rate of a held value is that of a movement that would begin now: zero on average.
         noise = _IS_MOVING * process_noise(mean[:, VELOCITY], FORCE_ACCELERATION_DENSITY, dt_s)
-        noise += _HELD_RATE_COVARIANCE + HELD_DRIFT * dt_s * _ACCELERATION_PATTERNS[0]
+        noise += _HELD_RATE_COVARIANCE + dt_s * _HELD_DRIFT_DENSITY
         transition = _KEPT + dt_s * _INTEGRATION * _IS_MOVING
         self.mean = (transition @ mean[:, :, None])[:, :, 0]
         self.covariance = transition @ covariance @ transition.swapaxes(1, 2) + noise
