@@ -22,6 +22,8 @@ import struct
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from isocharge.common.errors import InputError
 
 DEFLECTION_STD_m = 5e-3
@@ -175,17 +177,11 @@ def _pose_covariance(x_std_m: float, y_std_m: float, xy_correlation: float) -> l
         y_std_m: Standard deviation of y, m.
         xy_correlation: Correlation of the errors of x and y, dimensionless.
     """
-    covariance = [0.0] * 36
-    diagonal = slice(0, 36, 7)  # neighbouring elements of the diagonal are 7 positions apart
-    rotation_variances = [ROTATION_VARIANCE_rad2] * 3
-    covariance[diagonal] = [x_std_m**2, y_std_m**2, DEFLECTION_STD_m**2, *rotation_variances]
-
-    x_with_y = 1  # row 0, column 1
-    y_with_x = 6  # row 1, column 0
-    xy_covariance = x_std_m * y_std_m * xy_correlation
-    covariance[x_with_y] = xy_covariance
-    covariance[y_with_x] = xy_covariance
-    return covariance
+    position_variances = [x_std_m**2, y_std_m**2, DEFLECTION_STD_m**2]
+    covariance = np.diag(position_variances + [ROTATION_VARIANCE_rad2] * 3)
+    covariance[[0, 1], [1, 0]] = x_std_m * y_std_m * xy_correlation  # of x and y
+    values: list[float] = covariance.ravel().tolist()
+    return values
 
 
 def string_message(text: str) -> bytes:
