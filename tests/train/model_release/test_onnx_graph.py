@@ -14,10 +14,10 @@ from tests.train.random_networks import random_network
 from isocharge.common.errors import ModelError, TrainingError
 from isocharge.serve import find_model
 from isocharge.serve.model.session import OUTPUTS as SESSION_OUTPUTS
+from isocharge.serve.model.validity import MISFIT_LIMIT
 from isocharge.simulate import noise_model
 from isocharge.train.model_release.onnx_graph import check_graph, read_graph, write_graph
 from isocharge.train.training.config import NetworkConfig
-from isocharge.train.training.folded_network import MISFIT_UNIT
 from isocharge.train.training.network import InverseNetwork, fold_network
 
 REFERENCE = noise_model("reference")
@@ -105,7 +105,7 @@ def test_folded_network_gives_the_answers_of_pytorch(split):
     contact[:, 2] = np.exp(contact[:, 2])
     std = np.exp(posterior.log_std.numpy()) * domain.scale
     std[:, 2] *= contact[:, 2]
-    misfit = MISFIT_UNIT * np.sinh(np.linalg.norm(misfit_vector, axis=1, keepdims=True))
+    misfit = MISFIT_LIMIT * np.sinh(np.linalg.norm(misfit_vector, axis=1, keepdims=True))
     for given, expected in zip(answers(folded, charge), (contact, std, misfit), strict=True):
         np.testing.assert_allclose(given, expected, rtol=1e-6)
 

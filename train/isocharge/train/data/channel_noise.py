@@ -36,7 +36,7 @@ LEAST_SHARE = 0.01
 """Smallest white noise of a channel, relative to the noise of its gain at a charge of the usual size.
 
 The lower limit is needed because the presses do not determine the white noise if no charge is small. The quantiles at
-this share and at one minus this share show whether a channel has charges of both signs.
+this share and at one minus this share show whether the charges of a channel vary, and whether they have both signs.
 """
 
 MIN_TRANSITION_RATIO = 0.5
@@ -45,8 +45,11 @@ MIN_TRANSITION_RATIO = 0.5
 With a smaller value, the features of charges with little noise would have a kink where the charge changes its sign.
 """
 
-LARGEST_EXPONENT = 50.0
-"""Largest argument of the hyperbolic sine in the conversion of levels to charges, which limits the charges."""
+LARGEST_LOGARITHM = 50.0
+"""Largest magnitude of a logarithm of a charge, a force or a standard deviation.
+
+Its exponential is finite in single precision, also for charges that are far from those of the training.
+"""
 
 LEAST_GAIN = 1e-4
 """Smallest relative noise of the gain, which is that of a good amplifier.
@@ -133,7 +136,7 @@ class ChannelNoise:
 
     def charge(self, level: Array) -> Array:
         """Convert levels into charges, pC. This method is the inverse of `level`."""
-        exponent = np.clip(level * self.gain, -LARGEST_EXPONENT, LARGEST_EXPONENT)
+        exponent = np.clip(level * self.gain, -LARGEST_LOGARITHM, LARGEST_LOGARITHM)
         return np.asarray(np.sinh(exponent) * self.white / self.gain)
 
     def transition_charge(self, charge: Array) -> Array:

@@ -17,7 +17,7 @@ from isocharge.common.errors import PressError, shown
 from isocharge.serve.model.validity import inside_polygon
 from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses
 from isocharge.simulate import Domain
-from isocharge.train.data.channel_noise import usual_size
+from isocharge.train.data.channel_noise import LEAST_SHARE, usual_size
 
 HULL_RATIO = 0.3
 """Length above which an edge of the outline bends inwards to further places.
@@ -28,8 +28,11 @@ It is relative to the range of the distances between neighbouring places, of whi
 LEAST_RANGE = 1.1
 """Smallest ratio of the largest to the smallest force of a domain, which applies even if all forces are equal."""
 
-LEAST_WIDTH = 1e-3
-"""Smallest ratio of the standard deviations of the places across and along their main direction."""
+LEAST_INDEPENDENCE = 1e-4
+"""Smallest ratio of the smallest to the largest singular value of columns that are linearly independent.
+
+The columns are the standardised charges of the channels, or the coordinates of the places.
+"""
 
 
 @dataclass(frozen=True)
@@ -126,7 +129,7 @@ def outline(places: Array) -> Array:
     """
     # The singular values are proportional to the extents of the places along their principal axes.
     length, width = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
-    if width <= LEAST_WIDTH * length:
+    if width <= LEAST_INDEPENDENCE * length:
         raise PressError(f"expected presses over an area, got {len(places)} places on one line; press beside it, too")
 
     # The nearest place is the place itself, and the second nearest is its nearest neighbour.
@@ -137,20 +140,11 @@ def outline(places: Array) -> Array:
     return np.asarray(shapely.get_coordinates(enlarged.normalize().exterior)[:0:-1])
 
 
-LEAST_VARIATION = 1e-6
-"""Smallest difference from the median that counts as a variation, relative to the largest charge of the channel."""
-
-LEAST_VARYING_SHARE = 0.01
-"""Smallest share of the presses in which the charge of a channel differs from its median."""
-
 USUAL_SHARE = 0.9
 """Share of the values of a column whose distance from the median is at most the usual distance, dimensionless."""
 
 FARTHEST = 1_000.0
 """Largest distance of a value from the median of its column, as a multiple of the usual distance."""
-
-LEAST_INDEPENDENCE = 1e-4
-"""Smallest ratio of the smallest to the largest singular value of the standardised charges of independent channels."""
 
 
 def check_measured_presses(presses: MeasuredPresses) -> None:
@@ -184,14 +178,14 @@ def _check_variation(name: str, charge: Array) -> None:
         charge: Charges of the channel, shape (n,), pC.
 
     Raises:
-        PressError: If fewer than the share `LEAST_VARYING_SHARE` of the charges differ from their median.
+        PressError: If all charges are equal, except for the share `LEAST_SHARE` of the largest and of the smallest.
     """
-    median = np.median(charge)
-    varies = np.abs(charge - median) > LEAST_VARIATION * np.abs(charge).max()
-    if varies.mean() < LEAST_VARYING_SHARE:
+    low, high = np.quantile(charge, (LEAST_SHARE, 1.0 - LEAST_SHARE))
+    if np.isclose(low, high, atol=0.0):
+        equal_count = np.isclose(charge, low, atol=0.0).sum()
         raise PressError(
-            f"channel {shown(name)}: expected charges that vary, got {median:g} in all but {varies.sum()} of "
-            f"{len(charge)} presses; leave the channel out"
+            f"channel {shown(name)}: expected charges that vary, got {low:g} in {equal_count} of {len(charge)} "
+            "presses; leave the channel out"
         )
 
 

@@ -19,11 +19,8 @@ from isocharge.train.data.presses import LabelledPresses
 FORCE_RATIO = 10.0
 """Largest ratio of the largest to the smallest force of the presses on which shares are measured, dimensionless."""
 
-N_RINGS = 24
-"""Number of rings into which the area outside the working area is divided."""
-
-N_SECTORS = 36
-"""Number of sectors into which each ring is divided."""
+N_SECTORS = 24
+"""Number of rings into which the area outside the working area is divided, and of sectors of each ring."""
 
 N_NEIGHBOURS = 8
 """Number of presses of which the share of a sector is the mean. They are the nearest presses to its middle."""
@@ -80,11 +77,11 @@ class OutsidePresses:
         Args:
             is_unnoticed: Whether the answer to each press of `test` is wrong and carries no flag, shape (n,).
         """
-        ring_edges = np.linspace(self.domain.radius, self.outer, N_RINGS + 1)
+        ring_edges = np.linspace(self.domain.radius, self.outer, N_SECTORS + 1)
         distance = 0.5 * (ring_edges[1:] + ring_edges[:-1])
         angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
         direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        middle = distance[:, None, None] * direction  # (x, y), shape (N_RINGS, N_SECTORS, 2)
+        middle = distance[:, None, None] * direction  # (x, y), shape (N_SECTORS, N_SECTORS, 2)
         _, nearest = cKDTree(self.test.contact[:, :2]).query(middle, N_NEIGHBOURS)
         shares = is_unnoticed[nearest].mean(axis=-1).round(2)
 

@@ -34,8 +34,8 @@ YIELD_FORCE = "yield_force_N"
 FEWEST = 500
 """Smallest number of presses for a fit."""
 
-FEWEST_POSITIONS = 50
-"""Smallest number of positions for a fit."""
+FEWEST_PLACES = 50
+"""Smallest number of places for a fit, and smallest number of measured presses for a training or for errors."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
         )
 
     n_position = place_count(presses.contact)
-    fewest_positions = min(fewest, FEWEST_POSITIONS)  # a few presses cannot have more positions than presses
+    fewest_positions = min(fewest, FEWEST_PLACES)  # a few presses cannot have more positions than presses
     if len(presses) < fewest or n_position < fewest_positions:
         raise DatasetError(
             f"expected at least {fewest} presses at {fewest_positions} positions, got {len(presses)} at "
@@ -240,9 +240,6 @@ HELD_PARTS = 5
 It is also the number of networks of a cross-validation.
 """
 
-FEWEST_MEASURED = 50
-"""Smallest number of measured presses for a training, a report or held-out errors."""
-
 
 def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Dataset:
     """Convert measured presses into a dataset. Presses with an unknown place, force or charge are left out.
@@ -253,7 +250,7 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
         probe: Probe with which the presses were made.
 
     Raises:
-        PressError: If a column is missing, or fewer than `FEWEST_MEASURED` presses remain.
+        PressError: If a column is missing, or fewer than `FEWEST_PLACES` presses remain.
     """
     check_known_columns(presses)
     complete_presses = presses[complete(presses)]
@@ -312,11 +309,11 @@ def check_enough(count: int, total_count: int, sensor: str) -> None:
         sensor: Name of the sensor, for the message.
 
     Raises:
-        PressError: If there are fewer than `FEWEST_MEASURED` presses that can be used.
+        PressError: If there are fewer than `FEWEST_PLACES` presses that can be used.
     """
-    if count < FEWEST_MEASURED:
+    if count < FEWEST_PLACES:
         raise PressError(
-            f"expected at least {FEWEST_MEASURED} presses with known place, force and charges, within the "
+            f"expected at least {FEWEST_PLACES} presses with known place, force and charges, within the "
             f"model's forces and radius, got {count} of {total_count}; fewer calibrate a film: isocharge train "
             f"calibrate PRESSES.csv --sensor {sensor} -o FOLDER"
         )

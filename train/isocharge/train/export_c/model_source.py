@@ -39,15 +39,14 @@ from isocharge.serve.model.contact import Contact, Contacts
 from isocharge.serve.model.golden import Golden
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import COLUMNS
-from isocharge.serve.model.validity import Validity
+from isocharge.serve.model.validity import MISFIT_LIMIT, Validity
+from isocharge.train.data.channel_noise import LARGEST_LOGARITHM
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
 from isocharge.train.training.folded_network import (
     ANGLES,
     COSINES_TO_CORRELATIONS,
     LARGEST_INT8,
-    LARGEST_LOGARITHM,
     LOG_STD,
-    MISFIT_UNIT,
     POSITION,
     Activation,
     ChargeFeatures,
@@ -243,7 +242,7 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         table=c_array("COSINES", COSINES_TO_CORRELATIONS.astype(np.float32)),
         cosines=len(COSINES_TO_CORRELATIONS),
         first=ANGLES.start,
-        misfit_unit=c_float(MISFIT_UNIT),
+        misfit_unit=c_float(MISFIT_LIMIT),
     )
 
 

@@ -26,7 +26,7 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.charge_fit import fit_charge_series
 from isocharge.train.data.contact_errors import ContactErrorStatistics, rms, rounded
 from isocharge.train.data.presses import (
-    FEWEST_MEASURED,
+    FEWEST_PLACES,
     HELD_PARTS,
     LabelledPresses,
     check_enough,
@@ -267,7 +267,7 @@ class DatasetEvaluation:
         covered = replace(dataset, samples=samples[is_covered], manifest=manifest)
         if is_measured(dataset):
             check_enough(len(covered.samples), len(samples), dataset.sensor.name)
-            presses, held_out = split_by_position(presses_of(covered, FEWEST_MEASURED), 1.0 / HELD_PARTS)
+            presses, held_out = split_by_position(presses_of(covered, FEWEST_PLACES), 1.0 / HELD_PARTS)
         else:
             presses, held_out = split_by_position(presses_of(covered), TrainingConfig().hold_out)
         return cls(covered, model_folder, presses, held_out, settings)

@@ -30,7 +30,7 @@ from isocharge.train.data.contact_errors import rms, rounded
 from isocharge.train.data.measured_sensor import LEAST_RANGE, PressedArea, check_measured_presses
 from isocharge.train.data.presses import (
     FEWEST,
-    FEWEST_POSITIONS,
+    FEWEST_PLACES,
     HELD_PARTS,
     LabelledPresses,
     check_known_columns,
@@ -213,9 +213,9 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     is_complete = complete(presses)  # whether the place, the force and all charges of each press are known
     usable = presses[is_complete]
     usable_places = place_count(usable.contact)
-    if len(usable) < FEWEST or usable_places < FEWEST_POSITIONS:
+    if len(usable) < FEWEST or usable_places < FEWEST_PLACES:
         raise PressError(
-            f"expected at least {FEWEST} presses at {FEWEST_POSITIONS} places with known place, force and charges, got "
+            f"expected at least {FEWEST} presses at {FEWEST_PLACES} places with known place, force and charges, got "
             f"{len(usable)} at {usable_places}; measure more, or describe the sensor in a file and use "
             "`isocharge train calibrate`, which needs only a few"
         )

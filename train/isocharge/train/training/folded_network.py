@@ -53,6 +53,8 @@ from scipy.linalg import block_diag
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
 from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS
+from isocharge.serve.model.validity import MISFIT_LIMIT
+from isocharge.train.data.channel_noise import LARGEST_LOGARITHM
 
 
 @dataclass(frozen=True)
@@ -186,12 +188,6 @@ LOG_STD = slice(3, 6)
 LOG_FORCE_STD = slice(LOG_STD.stop - 1, LOG_STD.stop)
 """Column of the answers with the logarithm of the standard deviation of the force."""
 
-LARGEST_LOGARITHM = 50.0
-"""Limit of the magnitudes of the logarithms of the force and of the standard deviations.
-
-Their exponentials are finite in single precision, also for charges that are far from those of the training.
-"""
-
 ANGLES = slice(6, 14)
 """Columns of the answers with the angles whose cosines determine the correlations, rad.
 
@@ -214,13 +210,6 @@ COSINES_TO_CORRELATIONS = np.array(
 
 The correlations are those of x with y, of x with the force, and of y with the force.
 """
-
-MISFIT_UNIT = 5.0
-"""Scale of the misfit, in standard deviations of the noise: misfit = MISFIT_UNIT * sinh(|misfit vector|).
-
-The network learns misfits below this value on a linear scale and misfits above this value on a logarithmic scale.
-"""
-
 
 OPSET = 17
 """Version of the ONNX operators, which runtimes since 2022 support."""
@@ -320,9 +309,9 @@ class FoldedNetwork:
         builder.add("Concat <axis = 1>", "plane", "force", to="contact")
         cosines = builder.add("Cos", "angles")
         builder.add("MatMul", cosines, builder.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
-        # The length of the misfit vector is asinh(misfit / MISFIT_UNIT).
+        # The length of the misfit vector is asinh(misfit / MISFIT_LIMIT).
         compressed_misfit = builder.add("ReduceL2 <axes = [1], keepdims = 1>", "misfit_vector")
-        builder.add("Mul", builder.add("Sinh", compressed_misfit), builder.constant(MISFIT_UNIT), to="misfit")
+        builder.add("Mul", builder.add("Sinh", compressed_misfit), builder.constant(MISFIT_LIMIT), to="misfit")
 
         outputs = ", ".join(f"{tensor_type}[n, {width}] {name}" for name, width in OUTPUTS.items())
         nodes = "\n".join(builder.nodes)

@@ -17,7 +17,7 @@ from isocharge.train.data.channel_noise import ChannelNoise, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.training.config import TrainingConfig
 from isocharge.train.training.descent import TrainingStage
-from isocharge.train.training.folded_network import MISFIT_UNIT, ChargeFeatures
+from isocharge.train.training.folded_network import ChargeFeatures
 from isocharge.train.training.network import InverseNetwork, as_tensor, compress_length
 from isocharge.train.training.training_data import Split
 
@@ -109,7 +109,7 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     charges, residuals = examples
     inputs = network.inputs(as_tensor(charges))
     targets = compress_length(torch.tensor(residuals)).float()
-    focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_UNIT))  # compressed length of a residual of length `FOCUS_MISFIT`
+    focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_LIMIT))  # compressed length of a residual of length `FOCUS_MISFIT`
 
     def loss(_: float, random: torch.Generator) -> Tensor:  # the loss is the same in every step
         """Return the weighted mean of the squared distances for a random batch of the examples."""

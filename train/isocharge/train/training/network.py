@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
+from isocharge.serve.model.validity import MISFIT_LIMIT
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.folded_network import (
@@ -30,7 +31,6 @@ from isocharge.train.training.folded_network import (
     LOG_FORCE,
     LOG_STD,
     MEAN,
-    MISFIT_UNIT,
     TANH,
     TURN,
     Activation,
@@ -285,7 +285,7 @@ def feature_values(features: ChargeFeatures, charge: Tensor) -> Tensor:
 def compress_length(residual: Tensor) -> Tensor:
     """Compress the lengths of residuals. The compressed residuals are the targets of the misfit perceptron.
 
-    The length of a residual becomes asinh(length / MISFIT_UNIT).
+    The length of a residual becomes asinh(length / MISFIT_LIMIT).
 
     Args:
         residual: Residuals (Q - Q(c)) / sigma at the nearest contact c, shape (..., n_electrode).
@@ -294,7 +294,7 @@ def compress_length(residual: Tensor) -> Tensor:
         Vectors with the directions of the residuals and the compressed lengths, shape (..., n_electrode).
     """
     length = torch.linalg.vector_norm(residual, dim=-1, keepdim=True)
-    return nn.functional.normalize(residual, dim=-1) * torch.asinh(length / MISFIT_UNIT)
+    return nn.functional.normalize(residual, dim=-1) * torch.asinh(length / MISFIT_LIMIT)
 
 
 def as_tensor(values: Array) -> Tensor:
