@@ -163,7 +163,7 @@ def test_noise_is_estimated_and_noisy_presses_are_not_bad(problem, synthetic, ga
         found = film_estimate(problem, synthetic, presses)
         assert not found.is_bad.any()
         estimates.append(found.film.noise.gain)
-    assert np.mean(estimates) == pytest.approx(gain, rel=0.1)
+    assert np.mean(estimates) == pytest.approx(gain, rel=0.15)
 
 
 @pytest.mark.first_cases(1)
@@ -174,7 +174,7 @@ def test_positions_worse_than_stated_are_not_taken_for_noise(problem, synthetic,
     presses.contact[:, :2] += scatter_mm * np.random.default_rng(0).standard_normal((20, 2))
     found = film_estimate(problem, synthetic, presses)
     assert found.hypothesis.errors.position_ratio == ratio
-    assert found.film.noise.gain < 1.1 * problem.noise.gain
+    assert found.film.noise.gain < 1.2 * problem.noise.gain
     assert found.is_bad.sum() <= 1
     assert abs(found.film.value("pretension") - values[0]) < 3.0 * found.film.std("pretension")
 

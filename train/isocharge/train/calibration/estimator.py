@@ -60,7 +60,7 @@ FORCE_SCATTERS = ((0.0, 0.8), (0.01, 0.1), (0.03, 0.1))
 POSITION_RATIOS = ((1.0, 0.8), (3.0, 0.1), (8.0, 0.1))
 """Errors of the positions relative to the stated ones, with their prior probabilities."""
 
-NOISE_RATIOS = ((1.0, 0.6), *((2.0 ** (step / 2), 0.05) for step in range(1, 9)))
+NOISE_RATIOS = ((1.0, 0.36), *((2.0 ** (step / 2), 0.08) for step in range(1, 9)))
 """Noise that is proportional to the charge, relative to that of a good amplifier, with its prior probabilities."""
 
 MIN_WEIGHT = 1e-6
