@@ -155,9 +155,13 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
     path = sensor_file(tmp_path)
     path.write_text(re.sub(r"pyro_uC_per_m2_K = [0-9.]+", "pyro_uC_per_m2_K = -30.0", path.read_text()))
     cold, message = point(command, path, "--force", 2.0)
-    warm, _ = point(command, path, "--force", 2.0, "--temperature", 0.1)
+    warm, warm_message = point(command, path, "--force", 2.0, "--temperature", 0.1)
     assert "caution: the film is stressed to" in message
     assert warm["charge_pC"]["B"] - cold["charge_pC"]["B"] == pytest.approx(-27.0)
+    assert "--temperature" not in warm_message
+    path.write_text(path.read_text().replace("pyro_uC_per_m2_K = -30.0", ""))
+    _, message_without_pyro = point(command, path, "--temperature", 0.1)
+    assert "caution: --temperature changes no charge" in message_without_pyro
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ from tests.train.random_networks import random_network
 
 from isocharge.common.errors import ModelError, TrainingError
 from isocharge.serve import find_model
-from isocharge.serve.model.session import OUTPUTS as SESSION_OUTPUTS
 from isocharge.serve.model.validity import MISFIT_LIMIT
 from isocharge.simulate import noise_model
 from isocharge.train.model_release.onnx_graph import check_graph, read_graph, write_graph
@@ -148,7 +147,7 @@ def test_a_graph_that_disagrees_with_its_network_is_refused(exact, held_out, gra
         outputs[column] = outputs[column] * (1.0 + 1e-3)
         return tuple(outputs)
 
-    with pytest.raises(TrainingError, match=rf"on {list(SESSION_OUTPUTS)[column]}: half of 64 differences exceed"):
+    with pytest.raises(TrainingError, match=r"got \d of 64 presses that agree"):
         check_graph(graph, changed_outputs, held_out, REFERENCE)
 
 

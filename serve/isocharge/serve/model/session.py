@@ -283,4 +283,4 @@ def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...]) -> Singles:
     bad_columns = np.flatnonzero(~is_finite[row])
     bad_charges = [f"{electrodes[column]!r} ({charges[row, column]})" for column in bad_columns]
     where = f" in row {row} (rows count from 0)" if len(charges) > 1 else ""
-    raise ChargeError(f"expected finite charges (pC), got{where} for electrode {', '.join(bad_charges)}")
+    raise ChargeError(f"expected finite float32 charges (pC), got{where} for electrode {', '.join(bad_charges)}")

@@ -182,13 +182,14 @@ def check_graph(
     exact_outputs = compute_exact(golden_charge.astype(float))
     for exact, (name, output) in zip(exact_outputs, run(session, golden_charge).items(), strict=True):
         tolerance = 0.25 * RELATIVE_TOLERANCE * np.maximum(np.abs(exact), all_floors[name])
-        excess = (np.abs(output - exact) / tolerance).max(axis=1)
-        if not np.median(excess) < 1.0:
-            raise TrainingError(
-                f"the exported graph disagrees with the network on {name}: half of {len(excess)} differences exceed "
-                f"{np.median(excess):.3g} times the rounding error of float32"
-            )
-        is_reproducible &= excess < 1.0
+        is_reproducible &= (np.abs(output - exact) < tolerance).all(axis=1)
+    agreeing_count = int(is_reproducible.sum())
+    if agreeing_count < N_GOLDEN // 4:
+        raise TrainingError(
+            f"expected outputs of the exported graph that agree with those of the network within the rounding error of "
+            f"float32, got {agreeing_count} of {len(golden_charge)} presses that agree; train with more steps or "
+            "another seed"
+        )
     return golden_charge[is_reproducible]
 
 
