@@ -47,7 +47,6 @@ def test_blank_and_comment_lines_are_no_readings(text):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("load:0x3fff0018,len:4", "only hexadecimal numbers"),
         ("801\x1b[2J,799", "printable characters"),
         ("$PZT,1*00", "checksum"),
     ],
@@ -69,6 +68,8 @@ def test_digits_in_words_are_no_numbers(text):
         ("A: + 3.5, B: - 2.5", (3.5, -2.5)),  # a board that prints each sign and then the magnitude
         ("- 3, -4,- 5", (-3.0, -4.0, -5.0)),
         ("(- 3.5; 2)", (-3.5, 2.0)),
+        ("+00003.5-00003.4+00005.8", (3.5, -3.4, 5.8)),
+        ("-3.476E+00-3.443e+00+5.764E-01", (-3.476, -3.443, 0.5764)),
         ("A - 3.5 B - 2", (3.5, 2.0)),
         *((f"{start}\u22121.5,2", (-1.5, 2.0)) for start in ("", "A:")),  # the minus sign of Unicode
     ],
@@ -116,6 +117,8 @@ NOTATIONS = {
     "A = {a} | B = {b} | C = {c} |": "ABC",
     "A -> {a}, B -> {b}, C -> {c}": "ABC",
     "A: {a} nC, B: {b} nC, C: {c} nC": ("A_nC", "B_nC", "C_nC"),
+    "A={a}C B={b}C C={c}C": ("A_coulomb", "B_coulomb", "C_coulomb"),
+    "A: {a} C, B: {b} C, C: {c} C": ("A_coulomb", "B_coulomb", "C_coulomb"),
     "A nC: {a} B nC: {b} C nC: {c}": ("A_nC", "B_nC", "C_nC"),
     "A [nC]: {a}, B [nC]: {b}, C [nC]: {c}": ("ch1_nC", "ch2_nC", "ch3_nC"),
     "A,{a},B,{b},C,{c}": "ABC",
@@ -230,8 +233,16 @@ MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready", "load:0x3fff00
         (["READ 1", "0,2", "READ 1", "1,2", "READ 1", "2,2"], [(0, 2), (1, 2), (2, 2)]),
         (["0x7FF0 0x8001", "0x7FF1 0x8001", "0x7FF2 0x8011"], [(0x7FF0, 0x8001), (0x7FF1, 0x8001), (0x7FF2, 0x8011)]),
         (["7,0x1F", "8,-0x20", "9,0x0"], [(7, 31), (8, -32), (9, 0)]),
+        ([f"seq=0x{n:X} A=-{n}" for n in range(12)], [(-n,) for n in range(12)]),
     ],
-    ids=["a header after a reset", "messages of a board that starts", "an echo", "hexadecimal", "mixed"],
+    ids=[
+        "a header after a reset",
+        "messages of a board that starts",
+        "an echo",
+        "hexadecimal",
+        "mixed",
+        "a hexadecimal counter",
+    ],
 )
 def test_lines_that_are_frames(lines, values):
     assert [frame.values for frame in feed(*lines)] == values

@@ -1,5 +1,6 @@
 """Tests of the device file: its settings, their effects, and files that are refused."""
 
+import tomllib
 from typing import get_args
 
 import numpy as np
@@ -180,6 +181,7 @@ def test_channel_of_each_electrode(names, channels, picked):
         (("x", "y"), {}, r"\[channels\] A = "),
         (("A_nC", "B_nC", "C_nC"), {}, "A_nC' is in nC: convert it to pC"),
         (("AnC", "BnC", "CnC"), {}, "AnC' is in nC: convert it to pC"),
+        (("A_coulomb", "B_coulomb", "C_coulomb"), {}, "A_coulomb' is in coulomb: convert it to pC"),
         (("A_mean", "A_std", "B_mean", "B_std", "C_mean", "C_std"), {}, r"\[channels\] A = "),
         (("A", "B", "z"), {}, r"\[channels\] A = "),
         (("ch3", "ch2", "ch1"), {}, r"ch3'.*\[channels\] A = "),
@@ -195,6 +197,14 @@ def test_unknown_channels_are_refused(names, channels, message):
     stage = Channels(Setup(ELECTRODES, Device(channels=assigned, where="board.toml")))
     with pytest.raises(ChargeError, match=message):
         stage.step(Frame(0, 0, (1.0,) * (len(names) or 3), names=names))
+
+
+def test_advice_for_the_channels_is_a_valid_device_file():
+    electrodes = ("Pad 1", "Pad/2", "ü", "A")
+    with pytest.raises(ChargeError) as error:
+        Channels(Setup(electrodes)).step(Frame(0, 0, (1.0, 2.0)))
+    advice = str(error.value).partition("[channels] ")[2]
+    assert tuple(tomllib.loads(advice.replace(", ", "\n"))) == electrodes
 
 
 @pytest.mark.parametrize("names", [("bat_V", "A", "B", "C"), ("C", "B", "A", "t_mV")])

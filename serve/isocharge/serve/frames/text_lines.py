@@ -78,6 +78,9 @@ _NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
 
 _CHARGE_UNITS = {unit for unit in OTHER_CHARGE_UNITS if unit != "C"}  # C may be the name of an electrode
 
+_SIGNED_NUMBERS = r"(?:[-+][0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?){2,}"
+"""Regular expression of a line of numbers with nothing but their signs between them, such as `+003.5-003.4+005.8`."""
+
 _TELEPLOT = r">([^\s:>][^:]*):(?:[^|]*;)?(?:([0-9.]+):)?([^:;|]*);?(?:\|.*)?"
 """Regular expression of a line of Teleplot. The groups are the name, the latest time and the latest value."""
 
@@ -133,8 +136,9 @@ class Line(NamedTuple):
         names: Name of each number; empty for a number without a name.
         numbers: The numbers as texts.
         starts: Position in the line at which each number begins.
-        is_prose: Whether the line resembles a message, such as `Channel 3 is ready`, because it has at least as many
-            words as numbers. Keys, and words after a comma or another mark, do not count.
+        is_prose: Whether the line resembles a message. Either it has at least as many words as numbers, as in `Channel
+            3 is ready`; keys, and words after a comma or another mark, do not count. Or it has a decimal number after a
+            hexadecimal number, such as the size after the address of a part of a program.
         words: The keys, words and texts in quotes.
     """
 
@@ -164,6 +168,8 @@ def clean_text(text: str) -> str:
         text = re.sub(r"[^\S\t]", " ", text)  # some programs write blanks of fixed width
     text = text.strip().replace("\N{MINUS SIGN}", "-")  # programs with some locales, such as Swedish, write this sign
     text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text)  # a sign apart from its number, as in `A: - 3.5`
+    if re.fullmatch(_SIGNED_NUMBERS, text):
+        text = re.sub(r"(?<=[0-9])(?=[-+])", " ", text)
     if '"' in text or "'" in text:
         text = re.sub(_QUOTED_NUMBER, r"\2", text)
     if text[:1] == ">":
@@ -212,8 +218,7 @@ def parse_line(text: str, *, has_header: bool = False) -> Line:
         has_header: Whether a header names the numbers. Words that alternate with the numbers are not names then.
 
     Raises:
-        ValueError: If the line contains characters that are not printable, or a decimal number after a hexadecimal
-            number, such as the size after the address of a part of a program.
+        ValueError: If the line contains characters that are not printable.
     """
     if not text.replace("\t", " ").isprintable():
         raise ValueError(f"expected printable characters, got {text[:100]!r}")
@@ -223,8 +228,7 @@ def parse_line(text: str, *, has_header: bool = False) -> Line:
         tokens = _with_alternating_names(tokens)
     number_tokens = [token for token in tokens if token.kind in _NUMBER_KINDS]
     kinds = [token.kind for token in number_tokens]
-    if "hexadecimal" in kinds and "number" in kinds[kinds.index("hexadecimal") :]:
-        raise ValueError(f"expected only hexadecimal numbers after the first one, got {text[:100]!r}")
+    begins_with_address = "hexadecimal" in kinds and "number" in kinds[kinds.index("hexadecimal") :]
     names, names_with_units = _names(tokens)
 
     units = {"pC", *_CHARGE_UNITS}
@@ -246,7 +250,7 @@ def parse_line(text: str, *, has_header: bool = False) -> Line:
             skeleton += _CODES[number_kind if token.kind == "number" else token.kind]
     numbers = tuple(token.content for token in number_tokens)
     starts = tuple(token.start for token in number_tokens)
-    is_prose = word_count >= len(numbers)
+    is_prose = begins_with_address or word_count >= len(numbers)
     words = tuple(token.name for token in tokens if token.kind not in ("mark", *_NUMBER_KINDS))
     return Line(text, skeleton + _CODES["end"], tuple(names_with_units), numbers, starts, is_prose, words)
 
@@ -326,10 +330,13 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
         for token, following in pairwise([*parts, _Token("mark", "", 0, False)])
         if token.kind in _NUMBER_KINDS
     ]
+    # A word such as `C` may be the name of an electrode, but a word behind several numbers is no name.
+    repeated_units = {unit for unit in OTHER_CHARGE_UNITS if following_units.count(unit) > 1}
+    known_units = _CHARGE_UNITS | repeated_units
     # The first word after the previous number is a name, or the unit of the previous number.
     preceding_units = [[token.name.strip("[]") for token in path[1:]] for path in _paths(tokens)]
     units = [
-        next((unit for unit in (following, *preceding) if unit in _CHARGE_UNITS), "")
+        next((unit for unit in (following, *preceding) if unit in known_units), "")
         for following, preceding in zip(following_units, preceding_units, strict=True)
     ]
 
@@ -345,9 +352,10 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     alternating_names = (token.name for token in tokens if token.kind == "name")
     if any(token.kind == "name" for token in tokens):
         names = [_NAMES_OF_TIMES.get(kind) or next(alternating_names) for kind in kinds]
+    full_units = ["coulomb" if unit == "C" else unit for unit in units]  # `A_C` would be an electrode with the name C
     names_with_units = [
         f"{name or f'ch{number}'}_{unit}" if unit and unit not in names else name
-        for number, (name, unit) in enumerate(zip(names, units, strict=True), start=1)
+        for number, (name, unit) in enumerate(zip(names, full_units, strict=True), start=1)
     ]
     return names, names_with_units
 

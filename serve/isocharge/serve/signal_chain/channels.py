@@ -137,7 +137,8 @@ class Channels(Stage):
             advice: Part of a sentence about a channel, which begins with a semicolon; empty without advice.
         """
         number = "a frame" if frame.seq is None else f"frame {frame.seq}"
-        example_keys = ", ".join(f'{electrode} = "..."' for electrode in self._electrodes)
+        keys = (name if re.fullmatch("[A-Za-z0-9_-]+", name) else dumps(name) for name in self._electrodes)
+        example_keys = ", ".join(f'{key} = "..."' for key in keys)
         return ChargeError(
             f"{self._reader} expects {len(self._electrodes)} charges {self._electrodes}, {number} has "
             f"{len(frame.values)} {channel_names(frame)}{advice}; choose the "
