@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from itertools import islice
@@ -81,22 +81,35 @@ RecordWriter = Callable[[PredictionRecord], object]
 
 
 def write_records(records: Iterable[PredictionRecord], writers: Iterable[RecordWriter]) -> None:
-    """Pass each record to all writers, and print each new tare.
+    """Pass each record to all writers, and print each new tare, or the charges of the last record without a tare.
 
     Args:
         records: The records.
         writers: Functions that write a record, which are called in their order.
     """
     is_tare_new = True
+    untared_pC: Mapping[str, float | None] | None = None
     for record in records:
         for write in writers:
             write(record)
         if TARE in record.flags:  # the tare is being measured
             is_tare_new = True
+            untared_pC = record.charge_raw_pC
         elif is_tare_new and record.tare_pC is not None:  # an invalid record has no tare
             is_tare_new = False
-            tare_text = ", ".join(f"{electrode} {charge:.2f} pC" for electrode, charge in record.tare_pC.items())
-            say(f"tared: {tare_text}")
+            untared_pC = None
+            say(f"tared: {_listed(record.tare_pC)}")
+    if untared_pC:
+        say(
+            f"caution: no tare, because the film did not rest near zero; the last charges are {_listed(untared_pC)}; "
+            "leave the film alone longer, or state an offset of the board as offset in [gain]"
+        )
+
+
+def _listed(charge_pC: Mapping[str, float | None]) -> str:
+    """Return the charges that are known, with the names of their electrodes, as text."""
+    known_pC = {electrode: charge for electrode, charge in charge_pC.items() if charge is not None}
+    return ", ".join(f"{electrode} {charge:.2f} pC" for electrode, charge in known_pC.items())
 
 
 def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_live: bool) -> Outputs:
