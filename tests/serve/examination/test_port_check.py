@@ -101,6 +101,8 @@ def test_a_board_that_only_sends_nan_is_not_taken_for_counts():
         (charges(offset=(0.0, 120.0, 0.0)), "channel 2 has 120 pC at rest, but a tare accepts at most 100 pC"),
         (charges(noise=8.0), "channel 1 has a noise of "),
         (lambda k: charges()(3 * k), "798 frames were lost"),
+        (charges(encode=lambda f: encode_frame(Frame(f.seq, f.t_us // 1000, f.values))), "took 0.00199 s by the clock"),
+        (charges(encode=lambda f: encode_frame(Frame(f.seq, 1000, f.values))), "took 0 s by the clock of the board"),
         (lambda k: charges()(k) + b"\x07\0" * (k % 4 == 0), "2.0% of the bytes do not belong to good frames"),
         (lambda _: b"", "no bytes were received"),
         (lambda _: b"\xf8\x80\xfe\xff" * 5, "no frames were recognised: try another baud rate"),

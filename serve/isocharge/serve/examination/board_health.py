@@ -109,6 +109,9 @@ def measure_channel_health(
     )
 
 
+LIVE_TIME_s = 0.5
+"""Time that frames of a board need at least to arrive, s. Frames from a file arrive within a shorter time."""
+
 CLEAN_SHARE = 0.99
 """Smallest share of bytes in good frames with a good cable and the right baud rate, dimensionless."""
 
@@ -151,6 +154,14 @@ def transmission_sentences(capture: Capture, received: ReceivedData) -> Iterator
                 "value; if the line is damaged"
             )
         yield f"{damaged}: {advice}"
+    has_clock = bool(capture.frames) and all(frame.t_us is not None for frame in capture.frames)
+    if has_clock and received.span_s > LIVE_TIME_s:
+        clock_span_s = capture.frames[-1].clock_s - capture.frames[0].clock_s
+        if not 0.5 < clock_span_s / received.span_s < 2.0:
+            yield (
+                f"the frames took {clock_span_s:.3g} s by the clock of the board, but arrived within "
+                f"{received.span_s:.3g} s: send a clock that runs, in the unit that its name states (t_us, t_ms or t_s)"
+            )
     if capture.parser.counts.lost:
         yield f"{capture.parser.counts.lost} frames were lost: send fewer frames per second, or use a faster link"
 
