@@ -113,6 +113,7 @@ class TextParser(DelimitedParser):
         self.layout: Layout | None = None
         self._columns = columns
         self._meanings = dict(meanings or {})
+        self._counters = (SEQ, *self._meanings)
         self._headers: deque[str] = deque(maxlen=MAX_CYCLE_LINES)  # lines without numbers
         self.seq_modulus = SEQ_MODULI[0]
         self._last_seq = 0
@@ -180,8 +181,8 @@ class TextParser(DelimitedParser):
         Raises:
             ValueError: If the line cannot be parsed.
         """
-        line = parse_line(text)
-        line_below_header = parse_line(text, has_header=True)
+        line = parse_line(text, counters=self._counters)
+        line_below_header = parse_line(text, has_header=True, counters=self._counters)
         if any(header_names(header, line_below_header) for header in self._headers):
             line = line_below_header
         layout = self.layout

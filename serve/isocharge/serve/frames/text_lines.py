@@ -20,6 +20,7 @@ number have no meaning.
 import json
 import math
 import re
+from collections.abc import Collection
 from functools import reduce
 from itertools import pairwise
 from operator import xor
@@ -210,12 +211,13 @@ def _sentence_content(text: str) -> str:
     return content
 
 
-def parse_line(text: str, *, has_header: bool = False) -> Line:
+def parse_line(text: str, *, has_header: bool = False, counters: Collection[str] = (SEQ,)) -> Line:
     """Take the numbers out of a line of text.
 
     Args:
         text: The line, as `clean_text` returns it.
         has_header: Whether a header names the numbers. Words that alternate with the numbers are not names then.
+        counters: Names of counters and clocks, which are names also if the other numbers of the line have none.
 
     Raises:
         ValueError: If the line contains characters that are not printable.
@@ -229,7 +231,7 @@ def parse_line(text: str, *, has_header: bool = False) -> Line:
     number_tokens = [token for token in tokens if token.kind in _NUMBER_KINDS]
     kinds = [token.kind for token in number_tokens]
     begins_with_address = "hexadecimal" in kinds and "number" in kinds[kinds.index("hexadecimal") :]
-    names, names_with_units = _names(tokens)
+    names, names_with_units = _names(tokens, counters)
 
     units = {"pC", *_CHARGE_UNITS}
     skeleton = ""
@@ -301,7 +303,7 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
     return tokens
 
 
-def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
+def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], list[str]]:
     """Return the name of each number without and with its unit; empty without a name.
 
     The name of a number is the last word or key between this number and the previous number or separator, as in
@@ -318,6 +320,7 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
 
     Args:
         tokens: Parts of the line.
+        counters: Names of counters and clocks.
     """
     paths = [[token.name for token in path if token.kind != "quoted"] for path in _paths(tokens, _SEPARATORS)]
     kinds = [token.kind for token in tokens if token.kind in _NUMBER_KINDS]
@@ -346,7 +349,7 @@ def _names(tokens: list[_Token]) -> tuple[list[str], list[str]]:
     are_units = bool(channels) and not names[channels[0]] and contents[-1].kind == "word"
     names = ["" if are_units and name in words else name for name in names]
     named = [index for index in channels if names[index]]
-    is_single = len(channels) > 1 and len(named) == 1 and names[named[0]] != SEQ
+    is_single = len(channels) > 1 and len(named) == 1 and names[named[0]] not in counters
     if is_single and (named[0] == channels[0] or names[named[0]] in words):
         names[named[0]] = ""
     alternating_names = (token.name for token in tokens if token.kind == "name")
