@@ -193,7 +193,7 @@ class Section:
         dataset_sha256: Checksum of the dataset.
         fitted_presses: Number of presses to which the methods were fitted.
         test_presses: Number of test presses.
-        limits: Cramér-Rao limits of the errors on the test presses, by the names of the errors. They are empty for
+        limits: Cramér-Rao limits of the rms errors on the test presses, by the names of the errors. They are empty for
             measured presses, whose noise is unknown, and without a charge map.
         methods: Records of the methods. The evaluated model is the first one.
         left_out: Reasons why other methods or the limit could not be computed.
@@ -300,7 +300,6 @@ class DatasetEvaluation:
                 cramer_rao = limits_at(charge_map, test.contact, NOISE)
                 limits = {
                     "position_rms_mm": rounded(rms(cramer_rao.position)),
-                    "position_median_mm": rounded(np.median(cramer_rao.position)),
                     "force_rms_percent": rounded(100.0 * rms(cramer_rao.force)),
                 }
         except TrainingError as error:
