@@ -155,6 +155,21 @@ def test_note_for_a_film_that_does_not_fit_states_the_explaining_rig_std(predict
     assert check_presses(predictor, known).fits
 
 
+@pytest.mark.parametrize(("shift_mm", "force_scale"), [((1.0, 0.0), 1.0), ((0.0, 0.0), 3.0)])
+def test_no_rig_std_is_proposed_that_does_not_explain_the_errors(predictor, measure, shift_mm, force_scale):
+    check = check_presses(predictor, measure(30, seed=1, shift_mm=shift_mm, force_scale=force_scale))
+    assert check.fits is False
+    assert not any("-std" in note for note in check.notes)
+
+
+def test_proposed_rig_std_is_not_below_the_stated_one(predictor, measure):
+    """Only the forces scatter; the stated uncertainty of the positions remains."""
+    presses = measure(30, seed=1, noise=0.0)
+    presses.contact[:, 2] *= np.exp(np.random.default_rng(0).normal(0.0, 0.1, 30))
+    note, *_ = check_presses(predictor, presses).notes
+    assert f"--position-std {RIG_STD_MM:g} --force-std 0.0" in note
+
+
 @pytest.mark.parametrize(("misfits", "fits"), [(2, True), (4, False)])
 def test_verdict_depends_on_the_number_of_misfits(film, tmp_path, measure, misfits, fits):
     """Two of 30 presses above the limit that 1 % of good presses exceed are chance, four are not."""

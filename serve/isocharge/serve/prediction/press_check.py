@@ -11,7 +11,7 @@ first appears as a common scale factor of all forces and as a common shift of al
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Any
 
@@ -32,7 +32,7 @@ from isocharge.serve.prediction.press_errors import (
     misfit_limit,
     press_errors,
 )
-from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
+from isocharge.serve.presses.measured_presses import PRESS_RULES, MeasuredPresses, row_words
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor, binomial_distribution
 
 MIN_PRESSES = 3
@@ -202,7 +202,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     # Collect the explanations for the user.
     notes: list[str] = []
     if fits is False:
-        notes += _remedies(position, force)
+        notes += _remedies(errors, is_selected, position, force)
     notes += _exclusion_notes(errors, predictor.validity)
     if is_bad.any():
         bad_lines = row_words(np.array(errors.lines)[is_bad].tolist(), errors.row_noun)
@@ -314,27 +314,33 @@ def _verdict(
     return verdict
 
 
-def _remedies(position: ErrorSummary | None, force: ErrorSummary | None) -> Iterator[str]:
+def _remedies(
+    errors: PressErrors, is_selected: Booleans, position: ErrorSummary | None, force: ErrorSummary | None
+) -> Iterator[str]:
     """Yield notes about possible remedies for a model that does not fit.
 
-    The first note states how large the uncertainty of the rig would have to be to explain the errors. The second note
-    recommends a calibration, or training with the measured presses.
+    The first note states how large the uncertainty of the rig would have to be to explain the errors. It is omitted if
+    no such uncertainty explains them, for example because all presses have the same shift. The second note recommends
+    a calibration, or training with the measured presses.
 
     Args:
+        errors: Errors of all presses.
+        is_selected: Whether each press is counted, shape (n,).
         position: Errors of the positions; None if no position is known.
         force: Errors of the forces; None if no force is known.
     """
-
-    def rig_std(errors: ErrorSummary) -> float:
-        """Return how uncertain the rig would have to be to explain the errors, in their unit."""
-        return math.sqrt(max(errors.rms**2 - errors.noise**2, 0.0))
-
+    rig_std = np.full_like(errors.rig_std, np.nan)
     options = []
     if position is not None:  # the option is the standard deviation of x and of y, not of the distance
-        options.append(f"--position-std {rig_std(position) / math.sqrt(2.0):.2g}")
+        rig_std[:, :FORCE] = math.hypot(position.rig, position.beyond) / math.sqrt(2.0)
+        options.append(f"--position-std {rig_std[0, 0]:.2g}")
     if force is not None:  # the option is relative to the force, not in percent
-        options.append(f"--force-std {0.01 * rig_std(force):.2g}")
-    yield f"the errors would be the rig's if that were as uncertain as {' '.join(options)}"
+        rig_std[:, FORCE] = 0.01 * math.hypot(force.rig, force.beyond)
+        options.append(f"--force-std {rig_std[0, FORCE]:.2g}")
+    is_possible = not PRESS_RULES["force_std"].violations(rig_std[:, FORCE]).any()
+    is_explained = Agreement.from_errors(replace(errors, rig_std=rig_std), is_selected).acceptable
+    if is_possible and is_explained and not Agreement.from_errors(errors, is_selected).acceptable:
+        yield f"the errors would be the rig's if that were as uncertain as {' '.join(options)}"
 
     yield (
         "if the film has changed since its calibration, or was never calibrated: isocharge train calibrate; what no "
