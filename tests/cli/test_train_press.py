@@ -240,10 +240,11 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(
     assert "presses.csv has 2 presses; the same command continues the session" in err
     assert len(read_presses(desk / "presses.csv")) == 2
 
-    code, _, err = command(*PRESS, "--port", "rest.bin", "--press-list", "list.csv")
+    problem = ("--probe", "circle:1.1", "--radius", "7.9")
+    code, _, err = command(*PRESS, *problem, "--port", "rest.bin", "--press-list", "list.csv")
     assert code == 0, err
     assert "presses.csv has 2 presses; the session continues with them" in err
-    assert "isocharge train calibrate presses.csv --sensor four-25um-biaxial" in err
+    assert f"isocharge train calibrate presses.csv --sensor four-25um-biaxial {' '.join(problem)} -o my-film" in err
 
     presses = read_presses(desk / "presses.csv", NAMES)
     clean = charges(places)

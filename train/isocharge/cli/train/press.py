@@ -138,7 +138,10 @@ def press_command(
         raise PressError(f"no press was taken, so {output} is not written")
     if session.refusal:  # the reason why the presses cannot be used for a calibration
         raise PressError(f"{output}: {session.refusal}")
-    say(f"To make a model: isocharge train calibrate {shlex.quote(str(output))} --sensor {sensor} -o my-film")
+    options = ["--sensor", sensor, "--probe", probe, "--radius", f"{radius:g}"]
+    if earlier is not None:
+        options += ["--from", str(earlier)]
+    say(f"To make a model: isocharge train calibrate {shlex.join([str(output), *options])} -o my-film")
 
 
 def _earlier_presses(
