@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from tests.benchmarks.measured_films import measured_presses
 from tests.train.calibration.conftest import rig
+from tests.train.calibration.synthetic_film import SyntheticFilm
 
 from isocharge.common.errors import PressError
-from isocharge.train import calibrate, next_presses
+from isocharge.simulate import Circle, load_sensor
+from isocharge.train import CalibrationProblem, calibrate, next_presses
 
 pytestmark = pytest.mark.usefixtures("never_solved")
 
@@ -27,6 +29,7 @@ def test_errors_become_smaller_and_the_sentences_name_them(problem, synthetic):
     assert f"errors of {after.position_mm:.2g} mm and {after.force_percent:.2g} %" in result.summary[0]
     assert result.cautions == ()
     assert result.properties["pretension"].identified
+    assert re.search(r"changes from the sensor file \(.*\): mean pretension .*; ln of d31 ", result.summary[1])
     std = np.array([one.std for one in result.properties.values()])
     estimated = np.array([one.value for one in result.properties.values()])
     assert (np.abs(estimated - values) < 4.0 * std).all()
@@ -75,6 +78,44 @@ def test_presses_at_one_place_are_named(problem, synthetic):
     contact = np.column_stack([np.full((4, 2), 2.0), [0.2, 0.5, 1.0, 1.5]])
     presses = measured_presses(problem, contact, synthetic.charges(values, contact))
     assert any("at one place" in caution for caution in fit(presses, problem, synthetic).cautions)
+
+
+def test_positions_that_a_stage_reads_at_one_place_are_accepted(problem, synthetic):
+    """A stage reads the same place with a scatter of 5 um; only positions near the centre may be metres."""
+    rng = np.random.default_rng(0)
+    contact = np.column_stack([np.full((8, 2), 3.0), np.geomspace(0.1, 1.9, 8)])
+    charge = synthetic.charges(problem.prior.layout.prior.mean, contact)
+    contact[:, :2] += 0.005 * rng.standard_normal((8, 2))
+    assert any(
+        "at one place" in one for one in fit(measured_presses(problem, contact, charge), problem, synthetic).cautions
+    )
+
+
+def test_presses_with_few_known_values_change_nothing(problem, synthetic):
+    """Two known values do not determine a contact, and state nothing about the film."""
+    _, _, presses = rig(problem, synthetic, 12, seed=17)
+    presses.charge_pC[11, :2] = np.nan
+    presses.contact[11] = np.nan
+    without = fit(presses[:11], problem, synthetic).film
+    film = fit(presses, problem, synthetic).film
+    np.testing.assert_allclose(film.film_values, without.film_values, atol=0.01)
+    assert film.std("pretension") == pytest.approx(without.std("pretension"), rel=0.01)
+
+
+def test_one_press_states_nothing_about_the_noise(problem, synthetic):
+    _, _, presses = rig(problem, synthetic, 1, seed=18)
+    (caution,) = fit(presses, problem, synthetic).cautions
+    assert caution.startswith("all known positions are at one place")
+
+
+def test_three_charges_need_a_known_contact_inside():
+    three = CalibrationProblem(load_sensor("three-25um-biaxial"), Circle(1.0))
+    film = SyntheticFilm(three.prior.layout.prior, three.solved_domain)
+    _, _, presses = rig(three, film, 4, seed=3)
+    presses.contact[:2, 0] = 9.5
+    presses.contact[2:] = np.nan
+    with pytest.raises(PressError, match=r"^lines 2, 3: a calibration takes presses within 8\.5 mm"):
+        fit(presses, three, film)
 
 
 def test_continued_calibration_needs_fewer_presses(problem, synthetic):

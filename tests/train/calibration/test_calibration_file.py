@@ -1,6 +1,7 @@
 """Tests of calibration.json: round trips, and damaged files."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -85,6 +86,16 @@ FAULTS = {
     ),
     "beyond": (lambda table: table["correlations"][1].__setitem__(0, 1.5), r"correlations\[1\]\[0\]: expected"),
 }
+
+
+def test_sensor_file_of_the_earlier_calibration_is_required(tmp_path):
+    """With the calibrated sensor of the same name, each change from the sensor file would count twice."""
+    path = tmp_path / "calibration.json"
+    film = random_film(1)
+    path.write_text(json_text(film_table(PROBLEM, film)))
+    sensor, _ = PROBLEM.prior.layout.prior.film(film.film_values)
+    with pytest.raises(PressError, match=r"another film, piezo, calibration; give that file, not the calibrated"):
+        read_film(path, replace(PROBLEM, sensor=sensor))
 
 
 @pytest.mark.parametrize("name", FAULTS)

@@ -75,17 +75,22 @@ def calibrate(
     """
     ordered_presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
     check_places(ordered_presses, problem.sensor.film)
-    _check_enough_measured(ordered_presses)
+    if _is_uninformative(ordered_presses):
+        raise PressError(
+            f"{len(ordered_presses)} presses of unknown position and force: three charges only determine x, y and the "
+            "force, so they say nothing about the film; give the position or the force of a press (four electrodes "
+            "would have one redundant charge)"
+        )
     # Presses at the edge may lie outside the working area by their errors.
     is_outside = problem.solved_domain.is_outside(ordered_presses.contact)
     outside_cautions = []
     used_presses = ordered_presses
     if is_outside.any():
         outside_words = _outside_words(ordered_presses[is_outside], problem)
-        if len(ordered_presses) == 1:
+        used_presses = ordered_presses[~is_outside]
+        if len(ordered_presses) == 1 or _is_uninformative(used_presses):
             raise PressError(outside_words)
         outside_cautions.append(f"{outside_words}; left out")
-        used_presses = ordered_presses[~is_outside]
     with single_threaded_blas():
         charges = start or solve_even(problem, executor)
         if is_outside.mean() > 0.5:
@@ -198,14 +203,9 @@ def _outside_words(presses: MeasuredPresses, problem: CalibrationProblem) -> str
     )
 
 
-def _check_enough_measured(presses: MeasuredPresses) -> None:
-    """Raise PressError if all contacts are unknown and three charges only determine the contact."""
-    if np.isnan(presses.contact).all() and len(presses.electrodes) <= 3:
-        raise PressError(
-            f"{len(presses)} presses of unknown position and force: three charges only determine x, y and the force, "
-            "so they say nothing about the film; give the position or the force of a press (four electrodes would "
-            "have one redundant charge)"
-        )
+def _is_uninformative(presses: MeasuredPresses) -> bool:
+    """Return whether there are presses, but all contacts are unknown and three charges only determine the contact."""
+    return len(presses) > 0 and len(presses.electrodes) <= 3 and bool(np.isnan(presses.contact).all())
 
 
 def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
@@ -215,12 +215,12 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     if estimation.is_bad.any():
         rows = row_words(presses[estimation.is_bad].lines, presses.row_noun)
         cautions.append(f"{rows}: does not agree with the other presses; left out")
-    if film.noise.gain > MAX_USUAL_NOISE:
+    errors = estimation.hypothesis.errors
+    if errors.noise.gain > MAX_USUAL_NOISE:
         cautions.append(
             f"the charges scatter by about {100.0 * film.noise.gain:.2g} %, which the standard deviations of the model "
             "contain: are the charges read at rest, and does the film lie still?"
         )
-    errors = estimation.hypothesis.errors
     if errors.position_ratio > 1.0:
         cautions.append(
             f"the positions scatter about {errors.position_ratio:.0f} times as much as stated (--position-std): are "
@@ -241,7 +241,7 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
                 "the origin of the stage the centre of the film, and are its axes those of the film?"
             )
     if _is_one_place(presses):
-        cautions.append("all presses are at one place, so they do not determine where the electrodes are")
+        cautions.append("all known positions are at one place, so they do not determine where the electrodes are")
     return cautions
 
 

@@ -23,8 +23,8 @@ MAX_DEAD_RATIO = 0.02
 
 The limit is lower for a channel whose charges are smaller than those of the other channels on some possible film."""
 
-MIN_POSITION_RANGE_MM = 0.05
-"""Smallest credible range of the positions, mm. Positions in a smaller range were probably written in metres."""
+MIN_LARGEST_DISTANCE_MM = 0.05
+"""Smallest credible distance of the outermost press, mm. If it is smaller, the positions were probably in metres."""
 
 
 FORCE_UNITS_N = {"g": 9.80665e-3, "mN": 1e-3, "kg": 9.80665, "lbf": 4.4482216}
@@ -78,8 +78,8 @@ def check_places(presses: MeasuredPresses, film: Film) -> None:
         film: The film, which may be oval.
 
     Raises:
-        PressError: If a position is outside the film, or if the positions are different but all lie within
-            `MIN_POSITION_RANGE_MM` of each other.
+        PressError: If a position is outside the film, or if all positions lie within `MIN_LARGEST_DISTANCE_MM` of the
+            centre, but not all of them are the centre.
     """
     places = presses.contact[:, :2]
     distance = np.hypot(places[:, 0], places[:, 1])
@@ -92,11 +92,11 @@ def check_places(presses: MeasuredPresses, film: Film) -> None:
             f"is off the film, whose radius there is {rim_distance[row]:.4g} mm; positions are in mm from the film's "
             "centre"
         )
-    measured_places = places[np.isfinite(places[:, 0])]
-    spread = np.ptp(measured_places, axis=0).max() if len(measured_places) else 0.0  # larger range of x and y
-    if 0.0 < spread < MIN_POSITION_RANGE_MM:  # a spread of zero is allowed: repeated presses at one place
+    largest_distance = np.fmax.reduce(distance, initial=0.0)  # ignores NaN
+    if 0.0 < largest_distance < MIN_LARGEST_DISTANCE_MM:
         raise PressError(
-            f"all places lie within {spread:.3g} mm of each other; positions are in mm: were they written in metres?"
+            f"all places lie within {largest_distance:.3g} mm of the centre; positions are in mm: were they written in "
+            "metres? Write 0 for the coordinates of presses at the centre"
         )
 
 

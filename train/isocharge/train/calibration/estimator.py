@@ -139,6 +139,14 @@ class Prior:
         mean[self.layout.film] = self.layout.prior.mean
         return mean
 
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Smallest and largest unknowns, each of shape (n_unknown,); infinite except for the properties of the film."""
+        high = np.full(self.layout.coefficients.stop, np.inf)
+        low = -high
+        low[self.layout.film], high[self.layout.film] = self.layout.prior.bounds
+        return low, high
+
     @cached_property
     def parts(self) -> Array:
         """Parts of the covariance of the unknowns, shape (3 + n_session, n_unknown, n_unknown).
@@ -289,7 +297,7 @@ def _estimate_with_errors(
         covariance = np.average(covariances, axis=0, weights=weight)
         covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)
         used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
-        unknowns = _bounded(mean, layout)
+        unknowns = np.clip(mean, *prior.bounds)
 
     best = int(weight.argmax())
     log_contact[is_used] = used_contact
@@ -321,19 +329,16 @@ def _search(charges: FilmCharges, data: PressData, prior: Prior, unknowns: Array
         unknowns: Unknowns from which the search begins.
         contact: Contacts (x, y, ln F) from which it begins.
     """
-    layout = prior.layout
-    low, high = np.full((2, len(unknowns)), np.inf) * [[-1.0], [1.0]]
-    low[layout.film], high[layout.film] = layout.prior.bounds
     variance = np.nan_to_num(data.charge_std**2)  # the largest number for a charge that was not measured
     return robust_estimate(
-        lambda contacts, state: model_values(charges, layout, data, state, contacts),
+        lambda contacts, state: model_values(charges, prior.layout, data, state, contacts),
         data.charge,
         variance[:, :, None] * np.eye(variance.shape[1]),
         StatePrior(prior.mean, prior.covariance(TYPICAL)),
         unknowns,
         contact,
         measured=MeasuredContacts(data.contact, data.contact_std),
-        state_bounds=(low, high),
+        state_bounds=prior.bounds,
     )
 
 
@@ -393,7 +398,9 @@ class _Evidence:
         basis, jacobian = np.linalg.qr(eliminated_jacobian[is_changed])
         residual = basis.T @ eliminated[is_changed]
         by_contact = linearised.contact_jacobian
-        log_contact_volume = -0.5 * np.linalg.slogdet(by_contact.swapaxes(1, 2) @ by_contact)[1].sum()
+        contact_precision = by_contact.swapaxes(1, 2) @ by_contact
+        contact_precision += 1e-6 * np.eye(3)  # without it, the volume of fewer than three measurements is infinite
+        log_contact_volume = -0.5 * np.linalg.slogdet(contact_precision)[1].sum()
         measured_std = np.column_stack([data.charge_std, data.contact_std])
         log_density = -np.log(measured_std[np.isfinite(measured_std)]).sum()
         return cls(
@@ -426,11 +433,3 @@ def _redundancy(data: PressData) -> Array:
     """Return the number of measurements of each press minus the three unknowns of its contact, shape (n,)."""
     measured = np.isfinite(data.charge_std).sum(axis=1) + np.isfinite(data.contact_std).sum(axis=1)
     return np.asarray(np.maximum(measured - 3, 0))
-
-
-def _bounded(unknowns: Array, layout: Layout) -> Array:
-    """Return the unknowns with the properties of the film within their bounds."""
-    bounded = unknowns.copy()
-    low, high = layout.prior.bounds
-    bounded[layout.film] = np.clip(bounded[layout.film], low, high)
-    return bounded

@@ -79,11 +79,6 @@ def _degrees() -> Integers:
     return np.asarray(all_degrees[all_degrees.sum(axis=1) <= DEGREE])
 
 
-def term_names() -> list[str]:
-    """Return the name of each term, which consists of its degrees in x, y and ln F."""
-    return ["".join(map(str, degrees)) for degrees in _degrees().tolist()]
-
-
 def unit_covariance(n_electrode: int) -> Array:
     """Return the prior covariance of the coefficients for a discrepancy of the size 1.
 
@@ -158,7 +153,8 @@ class Layout:
     def names(self) -> tuple[str, ...]:
         """Names of all unknowns."""
         electrodes = self.prior.sensor.electrode_names
-        coefficients = [f"discrepancy {term} {name}" for term in term_names() for name in electrodes]
+        degrees_of_terms = ["".join(map(str, degrees)) for degrees in _degrees().tolist()]  # of x, y and ln F
+        coefficients = [f"discrepancy {term} {name}" for term in degrees_of_terms for name in electrodes]
         return (*self.prior.names, *(one.name for one in SESSION), *coefficients)
 
     @property

@@ -45,7 +45,7 @@ from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor
 from isocharge.simulate import Domain, NoiseModel
 from isocharge.simulate.execution import single_threaded_blas
-from isocharge.simulate.sensor.sensor_file import sensor_to_toml
+from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.film_network import compact_charges, training_data
 from isocharge.train.calibration.problem import CalibrationProblem
@@ -80,6 +80,7 @@ class _CalibrationFile(Struct, frozen=True):
     unknowns: dict[str, _Unknown]
     noise: NoiseModel
     correlations: list[list[Correlation]]
+    described_sensor: dict[str, Any] | None = None  # None in files of earlier releases of isocharge
 
 
 def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any]:
@@ -106,6 +107,7 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
             for name, value, one_std, unit in zip(layout.names, film.values, std, layout.units, strict=True)
         },
         "correlations": [row[:index] for index, row in enumerate(rounded)],
+        "described_sensor": sensor_to_dict(problem.sensor),
     }
 
 
@@ -163,6 +165,16 @@ def _check_same_problem(path: Path, content: _CalibrationFile, problem: Calibrat
                 f"{path}: {key}: expected {cut(str(expected))}, as in this calibration, got {cut(str(got))}; calibrate "
                 "without the earlier calibration"
             )
+    # The properties are deviations from the sensor file, so that they would be wrong with another one.
+    described = plain_values(sensor_to_dict(problem.sensor))
+    earlier = described if content.described_sensor is None else content.described_sensor
+    differences = [key for key in described if described[key] != earlier.get(key)]
+    if differences:
+        raise PressError(
+            f"{path}: expected the sensor file from which this calibration began, got one with another "
+            f"{', '.join(differences)}; give that file, not the calibrated {SENSOR}, or calibrate without the earlier "
+            "calibration"
+        )
 
 
 def _correlations(path: Path, rows: list[list[float]], count: int) -> Array:
@@ -443,7 +455,8 @@ The model was trained, and its errors below were measured, on simulated films th
 |---|---|---|---|---|---|---|
 {property_rows}
 
-Identified: the presses at least halved its standard deviation. `calibration.json` has the correlations.
+The values are changes from the sensor file; that of the pretension is the pretension itself. Identified: the presses at
+least halved its standard deviation. `calibration.json` has the correlations.
 
 - A real film differs from the simulated one: by wrinkles, a seam under an electrode, a spot of glue. Such differences
   are learned from the presses as far as they are smooth. The rest shows as residuals above 1 in the picture.

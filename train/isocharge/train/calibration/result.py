@@ -115,10 +115,13 @@ class CalibrationResult:
         identified = {name: one for name, one in self.properties.items() if one.identified}
         if identified:
             shown = [
-                f"{name.replace('_', ' ')} {one.value:.3g} +- {one.std:.2g}{'' if one.unit == '1' else ' ' + one.unit}"
-                for name, one in identified.items()
+                f"{one.meaning} {one.value:.3g} +- {one.std:.2g}{'' if one.unit == '1' else ' ' + one.unit}"
+                for one in identified.values()
             ]
-            sentences.append(f"The presses determine {', '.join(shown)}.")
+            sentences.append(
+                "The presses determine the following changes from the sensor file (of the mean pretension, the value "
+                f"itself): {'; '.join(shown)}."
+            )
         unidentified = [name.replace("_", " ") for name in self.properties if name not in identified]
         if unidentified:
             sentences.append(
