@@ -88,6 +88,14 @@ def test_picture_has_a_panel_for_each_dataset_with_the_evaluated_model_as_a_star
     assert len(measured.lines) == 2
 
 
+def test_page_does_not_describe_methods_that_are_left_out():
+    record = evaluation.MethodRecord("network", "", 1.0, {"position_rms_mm": 0.1}, 8.0)
+    section = evaluation.Section("film", True, [], 8.0, (0.05, 2.0), None, "", 48, 12, {}, [record], ["too few"])
+    assert "Triangulation" not in page.report_page([section], evaluation.QUICK, {}, "")
+    complete = replace(section, methods=[record, record])
+    assert "fitted to the other 48 presses" in page.report_page([complete], evaluation.QUICK, {}, "")
+
+
 @pytest.mark.slow
 def test_report_command_prints_the_record_and_the_errors(film, tmp_path, command):
     folder = write_sweep(tmp_path / "presses", (film,), Sweep(samples=3000))

@@ -86,17 +86,22 @@ def _conditions(section: Section) -> str:
         f"{max_force:.3g} N."
     )
     if section.measured:
-        return (
-            f"{area} The presses were measured. Triangulation and least squares use a series that is fitted to "
-            f"{section.fitted_presses} presses, and all errors are measured on {section.test_presses} other presses. "
-            "No noise is added. The errors contain the uncertainty of the positions and forces that the test rig "
-            "reports. The Cramér-Rao limit is left out, because the noise is unknown."
+        text = (
+            f"{area} The presses were measured, and all errors are those of {section.test_presses} presses. No noise "
+            "is added. The errors contain the uncertainty of the positions and forces that the test rig reports. The "
+            "Cramér-Rao limit is left out, because the noise is unknown."
         )
-    return (
-        f"{area} The {section.test_presses} test presses are at positions of the dataset that are held out, with the "
-        f"noise `{section.noise}`. Triangulation and least squares use a series that is fitted to the other "
-        f"{section.fitted_presses} presses."
-    )
+    else:
+        text = (
+            f"{area} The {section.test_presses} test presses are at positions of the dataset that are held out, with "
+            f"the noise `{section.noise}`."
+        )
+    if len(section.methods) > 1:
+        text += (
+            " Triangulation and least squares use a series that is fitted to the other "
+            f"{section.fitted_presses} presses."
+        )
+    return text
 
 
 def _table_lines(sections: Sequence[Section]) -> Iterator[str]:
