@@ -58,6 +58,12 @@ def test_held_press_finds_leak_creep_or_drift(law, drift, tau_s, message, scale)
     assert re.search(message, held.description)
 
 
+def test_held_press_is_found_if_a_channel_sends_no_numbers():
+    values = board(lambda t: np.exp(-t / 10.0))
+    values[:, 1] = np.nan
+    assert find_held_press(values, T_S).tau_s == pytest.approx(10.0, rel=0.15)
+
+
 @pytest.mark.parametrize("until_s", [0.0, 7.0])
 def test_no_press_or_a_short_press_has_no_result(until_s):
     assert find_held_press(board(constant, until_s=until_s), T_S) is None

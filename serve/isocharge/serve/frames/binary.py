@@ -31,8 +31,10 @@ CRC = struct.Struct("<H")
 """Format of the checksum CRC-16/CCITT-FALSE, which has the polynomial 0x1021 and the initial value 0xFFFF."""
 
 MAX_STUFFED_LENGTH = cobs.max_encoded_length(HEADER.size + 255 * 4 + CRC.size)
-"""Length of the longest frame after byte stuffing, without its delimiter, bytes. It contains 255 charges, because one
-byte contains their number."""
+"""Length of the longest frame after byte stuffing, without its delimiter, bytes.
+
+The frame contains 255 charges, because one byte contains their number.
+"""
 
 
 def encode_frame(frame: Frame) -> bytes:
