@@ -69,7 +69,7 @@ def test_predict_takes_any_kind_of_numbers(predictor, kind):
         (5.0, r"got an array of shape \(\)"),
         ({"A": 1.0, "B": 2.0, "C": 3.0}, "got {'A': 1.0"),
         ([1.0, None, 3.0], "as numbers"),
-        ([1.0, math.nan, 3.0], r"expected finite charges \(pC\), got for electrode 'B' \(nan\)"),
+        ([1.0, math.nan, 3.0], r"expected finite float32 charges \(pC\), got for electrode 'B' \(nan\)"),
         ([math.inf, 0.0, -math.inf], r"'A' \(inf\), 'C' \(-inf\)"),
         ([1.0, 2.0, 1e39], r"'C' \(1e\+39\)"),
         ((q for q in (1.0, 2.0, math.nan)), "as numbers"),

@@ -152,7 +152,7 @@ BAD = {
         400,
         r"out of range - at .*data\[1\]",
     ),
-    "beyond float32": (changed(data=[1, 2, 1e39]), 400, r"finite charges .* electrode 'C' \(1e\+39\)"),
+    "beyond float32": (changed(data=[1, 2, 1e39]), 400, r"finite float32 charges .* electrode 'C' \(1e\+39\)"),
     "nested data": (
         changed(data=[1, 2, 3]).replace(b"[1,2,3]", b"[" * 500 + b"]" * 500),
         400,
