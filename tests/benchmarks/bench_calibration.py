@@ -30,7 +30,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from time import perf_counter
 
 import numpy as np
@@ -74,7 +74,13 @@ class Bench:
     """One film, from its presses to the errors of its models."""
 
     def __init__(
-        self, problem: CalibrationProblem, noise: NoiseModel, films: dict[float, SolvedFilm], seed: int, executor
+        self,
+        problem: CalibrationProblem,
+        noise: NoiseModel,
+        films: dict[float, SolvedFilm],
+        seed: int,
+        executor,
+        folder: str,
     ) -> None:
         """Measure the presses of a film.
 
@@ -84,11 +90,13 @@ class Bench:
             films: The film after each change of its pretension.
             seed: Seed of the errors of the presses and of the noise.
             executor: Executor that runs the solves of the calibrations.
+            folder: Folder in which the models are written.
         """
         self.problem = problem
         self.noise = noise
         self.films = films
         self.executor = executor
+        self.folder = folder
         self.rng = np.random.default_rng([seed, 51])
         first = next(iter(films.values()))
         self.contact = with_rig_errors(first.contact, self.rng)
@@ -99,10 +107,9 @@ class Bench:
         problem = problem or self.problem
         start = perf_counter()
         result = calibrate(measured_presses(problem, contact, charge), problem, executor=self.executor)
-        with TemporaryDirectory() as folder:
-            predictor = Predictor(write_calibration(result, Path(folder) / "film", executor=self.executor))
-            follower = FilmFollower(predictor)
-        return result, predictor, follower, perf_counter() - start
+        folder = Path(mkdtemp(dir=self.folder)) / "film"
+        predictor = Predictor(write_calibration(result, folder, executor=self.executor))
+        return result, predictor, perf_counter() - start
 
     def later(self, change: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the later contacts on the film after a change, and their charges with noise."""
@@ -115,9 +122,9 @@ class Bench:
         return self.noise.add(np.repeat(charge[:, None], frames, axis=1), self.rng)
 
 
-def observe(follower: FilmFollower, predictor: Predictor, touches: np.ndarray) -> None:
-    """Let a follower observe touches frame by frame, at 100 frames per second and with a second between touches."""
-    follower.reset()
+def follower_after(predictor: Predictor, touches: np.ndarray) -> FilmFollower:
+    """Return a follower that has observed touches frame by frame, 100 frames per second, a second between touches."""
+    follower = FilmFollower(predictor)
     clock_s = 0.0
     for frames in touches:
         for frame in frames:
@@ -125,10 +132,11 @@ def observe(follower: FilmFollower, predictor: Predictor, touches: np.ndarray) -
             clock_s += 0.01
         follower.observe_frame(None, None, (), clock_s)
         clock_s += 1.0
+    return follower
 
 
 def followed_errors(
-    bench: Bench, predictor: Predictor, follower: FilmFollower, change: float, gains: np.ndarray, frames: int
+    bench: Bench, predictor: Predictor, change: float, gains: np.ndarray, frames: int
 ) -> dict[str, dict[str, float]]:
     """Return the errors of contacts after a change, for one draw of the noise of touches and contacts."""
     touches = gains * bench.touches(change, frames)
@@ -136,7 +144,7 @@ def followed_errors(
     charge = gains * charge
 
     def errors_after(touches: np.ndarray) -> dict[str, float]:
-        observe(follower, predictor, touches)
+        follower = follower_after(predictor, touches)
         return errors([follower.follow_contact(predictor.predict(row), row) for row in charge], truth)
 
     ways = {
@@ -159,29 +167,29 @@ def film_results(bench: Bench, counts: list[int], frames: int, *, has_all_cases:
     results = {}
     truth, charge = bench.later(0.0)
     for count in counts:
-        result, predictor, follower, time_s = bench.calibrated(bench.contact[:count], bench.charge[:count])
+        result, predictor, time_s = bench.calibrated(bench.contact[:count], bench.charge[:count])
         answers = [predictor.predict(row) for row in charge]
         results[f"{count} presses"] = errors(answers, truth) | {"time_s": time_s}
         report_progress(f"{count} presses", results[f"{count} presses"])
     if not has_all_cases:
         return results
 
-    _, offset_predictor, *_ = bench.calibrated(bench.contact, bench.charge + OFFSET_pC)
+    _, offset_predictor, _ = bench.calibrated(bench.contact, bench.charge + OFFSET_pC)
     results["offset"] = errors([offset_predictor.predict(row) for row in charge + OFFSET_pC], truth)
     contact = bench.contact.copy()
     contact[:, 2] *= 1.0 + HYSTERESIS * np.sign(bench.rng.standard_normal(len(contact)))
-    _, hysteresis_predictor, *_ = bench.calibrated(contact, bench.charge)
+    _, hysteresis_predictor, _ = bench.calibrated(contact, bench.charge)
     results["hysteresis"] = errors([hysteresis_predictor.predict(row) for row in charge], truth)
 
     cases = [(f"{change:+g} MPa", change, np.ones(len(GAINS))) for change in bench.films]
     for name, change, gains in (*cases, ("gain", 0.0, GAINS)):
-        draws = [followed_errors(bench, predictor, follower, change, gains, frames) for _ in range(DRAWS)]
+        draws = [followed_errors(bench, predictor, change, gains, frames) for _ in range(DRAWS)]
         for way in draws[0]:
             results[f"{way}, {name}"] = mean_values([draw[way] for draw in draws])
         if change != 0.0:
             problem = replace(bench.problem, earlier=result.film.drifted())
             mean_charge = bench.touches(change, frames).mean(axis=1)
-            _, again, *_ = bench.calibrated(np.full((TOUCHES, 3), np.nan), mean_charge, problem)
+            _, again, _ = bench.calibrated(np.full((TOUCHES, 3), np.nan), mean_charge, problem)
             truth, charge = bench.later(change)
             results[f"again, {name}"] = errors([again.predict(row) for row in charge], truth)
     for name, values in results.items():
@@ -218,8 +226,9 @@ def main() -> None:
                 for change in changes
             }
             report_progress("film", {"seed": float(seed)})
-            bench = Bench(problem, noise, films, seed, executor)
-            all_results.append(film_results(bench, counts, asked.frames, has_all_cases=asked.cases == "all"))
+            with TemporaryDirectory() as folder:
+                bench = Bench(problem, noise, films, seed, executor, folder)
+                all_results.append(film_results(bench, counts, asked.frames, has_all_cases=asked.cases == "all"))
     summary = {}
     for name in all_results[0]:
         rows = [results[name] for results in all_results]
