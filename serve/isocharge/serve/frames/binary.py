@@ -30,10 +30,10 @@ HEADER = struct.Struct("<BHIBB")
 CRC = struct.Struct("<H")
 """Format of the checksum CRC-16/CCITT-FALSE, which has the polynomial 0x1021 and the initial value 0xFFFF."""
 
-MAX_STUFFED_LENGTH = cobs.max_encoded_length(HEADER.size + 255 * 4 + CRC.size)
+MAX_STUFFED_LENGTH = len(cobs.encode(b"\x01" * (HEADER.size + 255 * 4 + CRC.size)))
 """Length of the longest frame after byte stuffing, without its delimiter, bytes.
 
-The frame contains 255 charges, because one byte contains their number.
+The frame contains 255 charges, because one byte contains their number. Bytes without a zero become the longest.
 """
 
 
