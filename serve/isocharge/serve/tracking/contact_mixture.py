@@ -265,6 +265,12 @@ stop before the fold.
 SPLIT_DISTANCE = 2.5
 """Distance of an added component from the component that extends across a fold, in standard deviations."""
 
+UPDATE_ITERATIONS = 3
+"""Number of iterations of the Kalman filter in each update."""
+
+INITIAL_ITERATIONS = 20
+"""Number of iterations of the Kalman filter when a touch begins."""
+
 
 class ContactMixture:
     """Gaussian mixture that estimates the position and the force of one contact from the charges of each frame.
@@ -332,10 +338,10 @@ class ContactMixture:
         self._components = None
         self._hypotheses = []
         if previous is not None and dt_s < MAX_GAP_s:
-            self._update(_predicted(previous, dt_s), mean_pC, variance_pC2)
+            self._update(_predicted(previous, dt_s), mean_pC, variance_pC2, UPDATE_ITERATIONS)
         if self._components is None and t_s >= self._next_search_s:
             self._next_search_s = t_s + SEARCH_INTERVAL_s
-            self._update(self._initial_components(), mean_pC, variance_pC2, iterations=20)
+            self._update(self._initial_components(), mean_pC, variance_pC2, INITIAL_ITERATIONS)
         return self._hypotheses
 
     def _initial_components(self, grid_points: int = 13) -> Components:
@@ -358,14 +364,14 @@ class ContactMixture:
         std[RATES] = INITIAL_RATE_STD
         return Components(mean, np.tile(np.diag(std**2), (len(mean), 1, 1)), np.zeros(len(mean)))
 
-    def _update(self, prior: Components, charge_pC: Array, variance_pC2: Array, iterations: int = 3) -> None:
+    def _update(self, prior: Components, charge_pC: Array, variance_pC2: Array, iterations: int) -> None:
         """Update components with charges, and store them with their contacts if the charges are explained.
 
         Args:
             prior: Predicted components. Those that are updated to states beyond `MAX_RELATIVE_RADIUS` are removed.
             charge_pC: Mean charges of this step, shape (n_electrode,), pC.
             variance_pC2: Variances of the charges, shape (n_electrode,), pC^2.
-            iterations: Number of iterations of the Kalman filter. A search over the whole film needs more iterations.
+            iterations: Number of iterations of the Kalman filter.
         """
         updated = update_components(self.charges, prior, charge_pC, variance_pC2, iterations)
         components = updated.components

@@ -116,6 +116,19 @@ SMALLEST_STD = 1e-4
 MAX_DEVIATION = 20.0
 """Largest magnitude of an unknown, in standard deviations before the first touch."""
 
+MAX_MEAN_SQUARE = 3.0
+"""Largest mean squared distance of the latest touches from the predicted touches, for a film that is not lost."""
+
+FADING_TOUCHES = 256
+"""Number of touches after which the knowledge from a touch would have decreased to 1/e.
+
+With a larger number, a sudden change of a film that did not change before is hardly noticed. With a smaller one, forces
+are less accurate.
+"""
+
+MEMORY_TOUCHES = 16
+"""Number of touches after which the weight of a touch in this mean has decreased to 1/e."""
+
 SMALLEST_ERROR_SCALE = 0.2
 """Smallest scale of the error covariance of touches, dimensionless.
 
@@ -261,14 +274,7 @@ class FilmFollower:
         if mean_charge_pC is not None:
             self._observe_touch(mean_charge_pC, clock_s)
 
-    def _observe_touch(
-        self,
-        charge_pC: Array,
-        clock_s: float,
-        fading_touches: int = 256,
-        memory_touches: int = 16,
-        max_mean_square: float = 3.0,
-    ) -> None:
+    def _observe_touch(self, charge_pC: Array, clock_s: float) -> None:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
 
         The charges of a touch have three errors: their noise, the part of the charges that the charge map does not
@@ -279,18 +285,11 @@ class FilmFollower:
         Args:
             charge_pC: Average touch charges near the largest force, shape (n_electrode,), pC.
             clock_s: Time of the touch, s.
-            fading_touches: Number of touches after which the knowledge from a touch would have decreased to 1/e. With a
-                larger number, a sudden change of a film that did not change before is hardly noticed. With a smaller
-                one, forces are less accurate.
-            memory_touches: Number of touches after which the weight of a touch in the mean squared distance has
-                decreased to 1/e.
-            max_mean_square: Largest mean squared distance of the latest touches from the predicted touches, for a film
-                that is not lost.
         """
         elapsed_hours = max(clock_s - self._latest_touch_s, 0.0) / 3600.0
         self._latest_touch_s = clock_s
         self._covariance[0, 0] += self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
-        self._covariance += (np.diag(self._initial_std**2) - self._covariance) / fading_touches
+        self._covariance += (np.diag(self._initial_std**2) - self._covariance) / FADING_TOUCHES
         touch_offset_pC = self._offset_std_pC * self._offset_ratio
         model_error_pC = self._series.charge_std * charge_pC
         variance_pC2 = self.predictor.noise.variance(charge_pC) + model_error_pC**2
@@ -312,10 +311,10 @@ class FilmFollower:
         self._touch_count += 1
 
         # Twice the cost is the squared distance, in which large residuals have little weight.
-        self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / memory_touches
+        self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / MEMORY_TOUCHES
         at_end = (estimate.state <= self._lowest) | (estimate.state >= self._highest)
         was_lost = self.is_lost
-        self.is_lost = self._mean_square > max_mean_square or bool(at_end[0] or at_end[self._offset])
+        self.is_lost = self._mean_square > MAX_MEAN_SQUARE or bool(at_end[0] or at_end[self._offset])
         if self.is_lost and not was_lost:
             self._start_estimate()  # the film may have changed suddenly, so earlier touches do not help
         elif not self.is_lost:

@@ -21,8 +21,17 @@ from isocharge.serve.tracking.motion_filter import VELOCITY, ContactFilter
 CERTAIN_PROBABILITY = 0.97
 """Probability of a contact above which no other contact is reported."""
 
+SLIDE_PROBABILITY = 0.95
+"""Probability that the contact moves, above which it may slide."""
+
 HOLD_TIME_s = 0.2
 """Time at rest after which a hold begins, and longest duration of a tap, s."""
+
+SLIDE_DISTANCE_mm = 0.3
+"""Distance from the position at which the contact last rested, above which a moving contact slides, mm."""
+
+REST_PROBABILITY = 0.5
+"""Probability that the contact moves, below which it is at rest."""
 
 
 class TouchEvents:
@@ -40,14 +49,7 @@ class TouchEvents:
         self._rest_begin_s = t_s  # time at which the contact began to rest at this position
         self._latest_event = "press"
 
-    def step(
-        self,
-        tracked: TrackedContact,
-        t_s: float,
-        slide_distance_mm: float = 0.3,
-        slide_probability: float = 0.95,
-        rest_probability: float = 0.5,
-    ) -> str | None:
+    def step(self, tracked: TrackedContact, t_s: float) -> str | None:
         """Return the event that begins with the next frame of a touch, or None if no event begins.
 
         A slide begins when the contact moves and is away from the position at which it last rested. A hold begins when
@@ -57,18 +59,14 @@ class TouchEvents:
         Args:
             tracked: Tracked contact of the frame. Its attribute `moving` is the probability that the contact moves.
             t_s: Time of the frame, s.
-            slide_distance_mm: Distance from the position at which the contact last rested, above which a moving contact
-                slides, mm.
-            slide_probability: Probability that the contact moves, above which it may slide.
-            rest_probability: Probability that the contact moves, below which it is at rest.
         """
         position = complex(tracked.x_mm, tracked.y_mm)
-        is_away = abs(position - self._rest_position) > slide_distance_mm
-        if tracked.moving > slide_probability:
+        is_away = abs(position - self._rest_position) > SLIDE_DISTANCE_mm
+        if tracked.moving > SLIDE_PROBABILITY:
             if is_away and self._latest_event != "slide":
                 self._latest_event = "slide"
                 return "slide"
-        elif tracked.moving < rest_probability:
+        elif tracked.moving < REST_PROBABILITY:
             if is_away:  # the contact rests at another position than before
                 self._rest_position = position
                 self._rest_begin_s = t_s
